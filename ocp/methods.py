@@ -19,9 +19,8 @@ from ocp.audit.audit import Audit, audit
 from ocp.audit.curvature import Curvature
 from ocp.audit.optimality import optimality
 from ocp.console import interruptible, time_limited
-from ocp.direct.collocation import Collocation
 from ocp.direct.guess import Samples
-from ocp.direct.shooting import MultipleShooting
+from ocp.direct.sensitivity import METHODS
 from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.problem import Problem, checked_problem
@@ -320,7 +319,6 @@ class Certificate:
 
 
 SECOND_SOLVER = "sleqp"
-METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
 
 
 @interruptible

@@ -47,17 +47,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     folder = options.out / "benchmark"
-    found = {}
+    by_name = {}
     for name in progress(options.only or PARTS, "benchmark"):
-        found[name] = run_part(name, folder, options.repeats)
-    if all(name in found for name in TOGETHER):
+        by_name[name] = run_part(name, folder, options.repeats)
+    if all(name in by_name for name in TOGETHER):
         summary: dict[str, Any] = {}
         for name in TOGETHER:
-            summary |= {name if key == "rows" else key: value for key, value in found[name].items()}
+            summary |= {name if key == "rows" else key: value for key, value in by_name[name].items()}
         write(folder / "summary.json", summary)
-    if "optimal_control" in found and options.out.resolve() == ROOT / "results":
-        optimal_control.write_readme(ROOT / "README.md", found["optimal_control"]["first"])
-    for name, numbers in found.items():
+    if "optimal_control" in by_name and options.out.resolve() == ROOT / "results":
+        optimal_control.write_readme(ROOT / "README.md", by_name["optimal_control"]["first"])
+    for name, numbers in by_name.items():
         print(f"{importlib.import_module(f'scripts.timing.{name}').report(numbers)}\n")
     print(f"written to {folder}")
     return 0

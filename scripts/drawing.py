@@ -144,7 +144,7 @@ def add_note(figure: Figure, note: str) -> None:
         figure.supxlabel(text, x=0.01, ha="left", fontsize=NOTE_SIZE, color=COLORS["grey"])
 
 
-def posture(ax: Any, arm: Any, color: Any, width: float = 4.0) -> None:
+def draw_arm(ax: Any, arm: Any, color: Any, width: float = 4.0) -> None:
     """An arm in a plane: links as bars, joints as white dots, the tip as a dot of its colour.
 
     Args:
@@ -233,9 +233,9 @@ def gif(
 def _with_house_colors(picture: Image.Image) -> Image.Image:
     """A picture above a strip of COLORS, so that a palette made of it has them, however little of each is drawn."""
     width, height = picture.size
-    made = Image.new("RGB", (width, height + height // 8), "white")
-    made.paste(picture, (0, 0))
+    result = Image.new("RGB", (width, height + height // 8), "white")
+    result.paste(picture, (0, 0))
     step = width // len(COLORS)
     for k, color in enumerate(COLORS.values()):
-        made.paste(Image.new("RGB", (step, height // 8), color), (k * step, height))
-    return made
+        result.paste(Image.new("RGB", (step, height // 8), color), (k * step, height))
+    return result

@@ -28,10 +28,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = command(__doc__, PAPERS).parse_args(arguments)
     outcomes = [reproduce(name, PAPERS[name], options.out) for name in progress(options.only or PAPERS, "papers")]
     print("\n" + text_table(outcomes, digits=3))
-    found, missing = reproduced.read(options.out, options.only or [*PAPERS])
-    reproduced.write_tables(options.out, found)
-    if found or missing:
-        print("\n" + reproduced.text(found, missing) + "\n")
+    result, missing = reproduced.read(options.out, options.only or [*PAPERS])
+    reproduced.write_tables(options.out, result)
+    if result or missing:
+        print("\n" + reproduced.text(result, missing) + "\n")
     failed = [outcome["paper"] for outcome in outcomes if outcome["status"] != "ok"]
     print(f"failed: {', '.join(failed)}" if failed else f"all written to {options.out}")
     return 1 if failed else 0

@@ -86,7 +86,7 @@ class Case:
 
 def method(owner: Callable[[], Any], name: str, good: Mapping[str, Any], /, **bad: Bad) -> Case:
     """A method of what ``owner`` makes, which is asked for when it is called."""
-    return Case(f"{owner.__name__}.{name}", lambda **given: getattr(owner(), name)(**given), good, bad)
+    return Case(f"{owner.__name__}.{name}", lambda **options: getattr(owner(), name)(**options), good, bad)
 
 
 def panel(cases: Iterable[Case]) -> list[Any]:
@@ -112,5 +112,5 @@ def refusal(case: Case, argument: str, value: Any) -> str:
 
 def assert_refused(case: Case, argument: str) -> None:
     """Each bad value of the argument ends in an error of the package that names something."""
-    told = {label: refusal(case, argument, value) for label, value in case.bad[argument].items()}
-    assert {label: word for label, word in told.items() if word} == {}
+    by_name = {label: refusal(case, argument, value) for label, value in case.bad[argument].items()}
+    assert {label: word for label, word in by_name.items() if word} == {}

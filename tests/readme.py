@@ -10,7 +10,7 @@ README = Path(__file__).resolve().parent.parent / "README.md"
 BLOCK = re.compile(r"(?P<before>[^\n]*)\n```(?P<kind>\w*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL)
 EXTRAS = re.compile(r'`pip install "\.\[([\w,]+)\]"`')
 NAMED = re.compile(r"`([\w.]+\.(?:py|toml))`")
-MADE = "make "
+MAKE_COMMAND = "make "
 """Commands of a clone, which have tests of their own."""
 
 
@@ -31,17 +31,17 @@ def steps() -> list[Step]:
 
     The batch is of one place instead of ten thousand.
     """
-    found = []
+    results = []
     for block in BLOCK.finditer(README.read_text(encoding="utf-8")):
         text, name, extras = block["text"], NAMED.search(block["before"]), EXTRAS.search(block["before"])
-        if text.startswith(MADE):
+        if text.startswith(MAKE_COMMAND):
             continue
         if text.startswith("selfmotion "):
-            found += [Step("", "", tuple(line.partition("#")[0].split())) for line in text.splitlines()]
+            results += [Step("", "", tuple(line.partition("#")[0].split())) for line in text.splitlines()]
             continue
         file = name[1] if name else "first.py"
         if file == "places.py":
             assert text.count("range(100)") == 2
             text = text.replace("range(100)", "range(1)")
-        found.append(Step(file, text, ("python", file) if file.endswith(".py") else (), extras[1] if extras else ""))
-    return found
+        results.append(Step(file, text, ("python", file) if file.endswith(".py") else (), extras[1] if extras else ""))
+    return results

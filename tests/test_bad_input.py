@@ -21,7 +21,7 @@ from tests.ocp.motion.schedule.test_bad_schedules import CASES as SCHEDULES
 from tests.ocp.problem.test_bad_problems import CASES as PROBLEMS
 
 CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *SHAPES, *PROBLEMS, *SCHEDULES, *TASKS, *FILES, *PLANS, *BATCHES]
-MADE_BY_THE_PACKAGE = {
+CREATED_BY_THE_PACKAGE = {
     "Audit",
     "Batch",
     "Candidate",
@@ -61,12 +61,12 @@ MADE_BY_THE_PACKAGE = {
 """Results, protocols and constants: their methods are in the panels, but nobody makes them."""
 WITHOUT_ARGUMENTS = {"Anywhere", "SolverStatus", "paper_example", "reference_tunnel", "standing_example"}
 RAISED = {"DeadEnd", "Unreachable"}
-LOOKED_AT_IN_A_PROBLEM = {"DynamicsSetup", "Following", "Pinned", "RollObstacles", "RollSettings", "StandingSetup"}
+CHECKED_BY_PROBLEMS = {"DynamicsSetup", "Following", "Pinned", "RollObstacles", "RollSettings", "StandingSetup"}
 """Options that a builder checks: their fields are in the panels of dynamics_problem, standing_problem, roll_problem."""
 
 
 def test_everything_a_user_types_is_in_a_panel() -> None:
-    asked = {case.what.partition(".")[0].partition(" ")[0] for case in CASES}
+    request = {case.what.partition(".")[0].partition(" ")[0] for case in CASES}
     faces = {
         *models.__all__,
         *ocp.__all__,
@@ -75,7 +75,7 @@ def test_everything_a_user_types_is_in_a_panel() -> None:
         *ocp.motion.schedule.__all__,
     }
     errors = {name for name in faces if name.endswith(("Error", "Warning")) or name in RAISED}
-    assert faces - asked - errors - MADE_BY_THE_PACKAGE - WITHOUT_ARGUMENTS - LOOKED_AT_IN_A_PROBLEM == set()
+    assert faces - request - errors - CREATED_BY_THE_PACKAGE - WITHOUT_ARGUMENTS - CHECKED_BY_PROBLEMS == set()
 
 
 def test_the_panels_are_large() -> None:

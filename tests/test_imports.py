@@ -338,8 +338,8 @@ PLANTED: list[tuple[Rule, str, dict[str, str]]] = [
 ]
 
 
-@pytest.mark.parametrize(("rule", "told", "lines"), PLANTED, ids=[f"{p[0].__name__}: {p[1]}" for p in PLANTED])
-def test_a_planted_violation_is_named(rule: Rule, told: str, lines: dict[str, str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("rule", "report", "lines"), PLANTED, ids=[f"{p[0].__name__}: {p[1]}" for p in PLANTED])
+def test_a_planted_violation_is_named(rule: Rule, report: str, lines: dict[str, str], tmp_path: Path) -> None:
     files = {file: SOUND.get(file, "") + line + "\n" for file, line in lines.items()}
     broken = rule(architecture_of(tmp_path, {**SOUND, **files}))
-    assert any(told in message for message in broken), broken
+    assert any(report in message for message in broken), broken

@@ -50,20 +50,20 @@ def ill_treated(folder: Path) -> tuple[int, list[str]]:
     from tests.test_bad_input import CASES
 
     rng = np.random.default_rng(SEED)
-    count, found = 0, []
+    count, result = 0, []
     for case in CASES:
         for argument, bad in case.bad.items():
             vast = VAST | (COUNTLESS if WHOLE.keys() <= bad.keys() else {})
-            asked = {label: value for label, value in bad.items() if rng.random() < SHARE} | vast
+            request = {label: value for label, value in bad.items() if rng.random() < SHARE} | vast
             may = "is taken" if (case.what, argument) in TAKEN else ""
-            told = [(label, refusal(case, argument, value)) for label, value in asked.items()]
-            found += [f"{case.what}-{argument}-{label}: {word}" for label, word in told if word not in ("", may)]
-            count += len(asked)
+            matches = [(label, refusal(case, argument, value)) for label, value in request.items()]
+            result += [f"{case.what}-{argument}-{label}: {word}" for label, word in matches if word not in ("", may)]
+            count += len(request)
     for name, (part, wrong) in TEXTS.items():
-        found += [f"{name}: {word}" for word in [refusal(READ, "source", URDF.replace(part, wrong))] if word]
+        result += [f"{name}: {word}" for word in [refusal(READ, "source", URDF.replace(part, wrong))] if word]
     for path in sorted(folder.iterdir()):
-        found += [f"{path.name}: {word}" for word in [refusal(LOAD, "path", path)] if word]
-    return count + len(TEXTS) + len(FILES), found
+        result += [f"{path.name}: {word}" for word in [refusal(LOAD, "path", path)] if word]
+    return count + len(TEXTS) + len(FILES), result
 
 
 LOAD = Case("Solution.load", Solution.load, {}, {})
@@ -72,8 +72,8 @@ READ = Case("from_urdf", Robot.from_urdf, {}, {})
 
 def peak() -> int:
     """Largest resident memory of this process so far, bytes; ru_maxrss would count what its parent had."""
-    told = Path("/proc/self/status").read_text(encoding="utf-8")
-    return 1024 * int(told.split("VmHWM:")[1].split()[0])
+    text = Path("/proc/self/status").read_text(encoding="utf-8")
+    return 1024 * int(text.split("VmHWM:")[1].split()[0])
 
 
 def test_bad_input_and_hostile_files_take_less_than_a_gigabyte(tmp_path: Path) -> None:
@@ -88,14 +88,14 @@ def test_bad_input_and_hostile_files_take_less_than_a_gigabyte(tmp_path: Path) -
     """
     done = run(code, timeout=240.0)
     assert done.returncode == 0, done.stderr
-    numbers, *found = done.stdout.splitlines()
+    numbers, *result = done.stdout.splitlines()
     count, most = map(int, numbers.split())
-    assert [line for line in found if line] == []
+    assert [line for line in result if line] == []
     assert count > 4000
     assert most < MOST_MEMORY
 
 
-def test_what_a_user_gives_is_counted_before_it_is_copied() -> None:
+def test_user_input_is_counted_before_it_is_copied() -> None:
     endless: list[Any] = []
     endless.append(endless)
     for value in VAST.values():

@@ -59,7 +59,7 @@ def test_the_python_blocks_run_in_their_order(page: Path, tmp_path: Path, monkey
             run(page, line, source, namespace)
 
 
-def test_the_readme_plans_and_the_tutorials_do_what_they_are_about() -> None:
+def test_the_readme_and_the_tutorials_run() -> None:
     assert [page for page, _, _ in ALONE.values()].count(README) == 1
     tutorials = {page.stem for page, _, _ in ALONE.values() if page.parent.name == "tutorials"}
     assert tutorials == {page.stem for page in (SITE / "tutorials").glob("*.md")}
@@ -87,25 +87,25 @@ metadata.MetadataPathFinder.find_distributions = lambda *context: (
 def distributions(extras: str) -> set[str]:
     """What `pip install .` brings, with extras that commas part, by the normal names of the distributions."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    found, waiting = set[str](), list(project["dependencies"])
+    result, waiting = set[str](), list(project["dependencies"])
     for extra in filter(None, extras.split(",")):
         waiting += project["optional-dependencies"][extra]
     while waiting:
         words = re.match(r"([\w.-]+)([^;]*)(;.*)?", waiting.pop())
         assert words is not None
         name = normal(words[1])
-        if name not in found and "extra" not in (words[3] or ""):
-            found.add(name)
+        if name not in result and "extra" not in (words[3] or ""):
+            result.add(name)
             with suppress(metadata.PackageNotFoundError):  # of another platform
                 waiting += metadata.requires(name) or []
-    return found
+    return result
 
 
 def normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def test_the_readme_runs_from_first_to_last_with_what_it_says_that_it_needs(tmp_path: Path) -> None:
+def test_the_readme_runs_with_its_stated_requirements(tmp_path: Path) -> None:
     """In a folder that is empty, in processes of their own: without extras but those that a block is said to need."""
     (tmp_path / "hiding").mkdir()
     (tmp_path / "hiding" / "sitecustomize.py").write_text(HIDE, encoding="utf-8")
@@ -122,21 +122,21 @@ def test_the_readme_runs_from_first_to_last_with_what_it_says_that_it_needs(tmp_
 
     assert {"pinocchio", "coal", "yaml", "distributed", "pyarrow", "mcap"} <= set(missing("")[0])
     for gone in ("import coal", "from importlib.metadata import files; files('example-robot-data')"):
-        told = run("", "python", "-c", gone)
-        assert "ModuleNotFoundError" in told.stderr or "PackageNotFoundError" in told.stderr, told
+        completed = run("", "python", "-c", gone)
+        assert "ModuleNotFoundError" in completed.stderr or "PackageNotFoundError" in completed.stderr, completed
     for step in steps():
         if step.file:
             (home / step.file).write_text(step.text, encoding="utf-8")
         if step.extras:
-            told = run("", *step.words)
-            assert f"selfmotion[{step.extras}]" in told.stderr, (step.words, told.stdout, told.stderr)
+            completed = run("", *step.words)
+            assert f"selfmotion[{step.extras}]" in completed.stderr, (step.words, completed.stdout, completed.stderr)
         if step.words:
-            told = run(step.extras, *step.words)
-            assert told.returncode == 0, (step.words, told.stdout, told.stderr)
+            completed = run(step.extras, *step.words)
+            assert completed.returncode == 0, (step.words, completed.stdout, completed.stderr)
     rows = list(csv.DictReader((home / "places.csv").read_text(encoding="utf-8").splitlines()))
     assert [row["status"] for row in rows] == ["done"]
-    made = {path.name for path in home.iterdir()}
-    assert {"plan.csv", "six_axis.urdf", "seam.npz", "seam.html", "report.html", "places"} <= made
+    distinct = {path.name for path in home.iterdir()}
+    assert {"plan.csv", "six_axis.urdf", "seam.npz", "seam.html", "report.html", "places"} <= distinct
 
 
 def missing(extras: str) -> tuple[list[str], list[str]]:
@@ -152,7 +152,7 @@ def missing(extras: str) -> tuple[list[str], list[str]]:
     ]
 
 
-def test_the_readme_shows_what_its_text_says_it_does() -> None:
+def test_the_readme_shows_its_stated_output() -> None:
     names = [step.file or " ".join(step.words[:2]) for step in steps()]
     commands = ["selfmotion plan", "selfmotion check", "selfmotion view", "selfmotion report"]
     assert names == ["first.py", "seam.toml", *commands, "places.py"]

@@ -1,8 +1,7 @@
 """The command `selfmotion`: arguments, output and exit status.
 
 The status is 0 if all requirements hold, 1 if a check fails or is undetermined or there is no plan, 2 for bad input,
-and
-130 after Ctrl-C.
+and 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -39,12 +38,9 @@ from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 __all__ = ["main", "parser"]
 
 ABOUT = """Plan motions of kinematically redundant robot arms, and check joint trajectories from any source."""
-
 PART = re.compile(r"\.[0-9a-f]{8}\.part$")
 """Suffix of a file's name while it is being written."""
-
 CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
-
 EXAMPLES = """examples:
   selfmotion check robot.urdf motion.csv --acceleration 15 --obstacles cell.toml
   selfmotion plan seam.toml -o seam.npz
@@ -53,7 +49,6 @@ EXAMPLES = """examples:
 
 Exit status: 0 all holds, 1 a check fails or is undetermined, or there is no plan, 2 bad input, 130 Ctrl-C.
 `selfmotion COMMAND --help` shows more examples."""
-
 CommandFunction: TypeAlias = Callable[[argparse.Namespace, Progress], tuple[int, str, Any]]
 """Function of a subcommand: options and progress to exit status, text and contents of JSON."""
 
@@ -155,19 +150,16 @@ may follow in brackets: `elbow [deg]`), a JointTrajectory as JSON or YAML, or an
 interpolated as controllers do: linearly from positions alone, by cubics with velocities, by quintics with
 accelerations. Without --rule, a velocity or acceleration between samples counts only as far as every motion through
 the samples needs it."""
-
 CHECK_EXAMPLES = """examples:
   selfmotion check panda.urdf motion.csv
   selfmotion check panda.urdf motion.csv --acceleration 15 --jerk 7500 --acceleration panda_joint1=10
   selfmotion check ur5.urdf log.mcap --tip tool0 --path seam.csv --path-tolerance 0.002 --obstacles cell.toml
   selfmotion check tiago.urdf reach.json --lock gripper_finger_joint=0.02 --standing
   selfmotion check motion.urdf motion.csv --json | jq .faults"""
-
 PLAN = """Plan the lowest-cost motion of a task file, audit it, and write the outputs that the file names.
 
 The task file is TOML: [robot] urdf, tip; [path] file or points, speed; optionally [limits], [cost], [search],
 [scene], [[obstacle]], [output]. An error names its line and what was expected."""
-
 PLAN_EXAMPLES = """examples:
   selfmotion plan seam.toml -o seam.npz
   selfmotion plan seam.toml --json | jq .cost
@@ -188,41 +180,32 @@ seam.toml:
   plan = "seam.npz"
   csv = "seam.csv"
   report = "seam.html\""""
-
 EXPORT = """Write a plan in the format of the file's suffix: .csv, .json and .yaml (the fields of a ROS 2
 JointTrajectory), .mcap (joint states and the tip's path, for ROS 2 and Foxglove), .urdf (the robot of the plan)."""
-
 EXPORT_EXAMPLES = """examples:
   selfmotion export seam.npz seam.csv --period 0.004
   selfmotion export seam.npz seam.mcap"""
-
 REPORT = """Write one HTML file about a plan: the verdict in a sentence, pictures, curves with limits, the audit with
 units. The file loads nothing from another host."""
-
 REPORT_EXAMPLES = """examples:
   selfmotion report seam.npz seam.html --title "Seam 4, cell 2\""""
-
 VIEW = """Show motions: the robot with its meshes, the required and the actual path, frames, ghosts, curves of joints
 and torques with their limits, cost, manipulability, momentum or zero moment point, the closest bodies, and the audit.
 
 The first file is a plan of `selfmotion plan`; other files are compared with it: plans, or trajectories of the same
 robot as `selfmotion check` reads them. A solution of your own problem (Solution.save) is shown with --robot. Without
 --page the page is served on this machine until Ctrl-C; with it it is one file that plays anywhere, without a server."""
-
 VIEW_EXAMPLES = """examples:
   selfmotion view seam.npz
   selfmotion view seam.npz --page seam.html
   selfmotion view optimum.npz pseudo_inverse.csv --page both.html
   selfmotion view circle.npz --robot panda.urdf --tip panda_hand_tcp --lock panda_finger_joint1=0.02"""
-
 CACHE = """Results that are costly to compute and depend only on their input (covers of meshes, pairs that never
 collide, compiled functions of problems) are cached in $XDG_CACHE_HOME/selfmotion, else ~/.cache/selfmotion. After
 `clear` they are computed again. Compiled functions take at most 256 MB; the least recently used are removed first."""
-
 CACHE_EXAMPLES = """examples:
   selfmotion cache
   selfmotion cache clear"""
-
 COMPLETION = """Print a script that completes commands, options and file names.
 
 Write it to a file once, so that completion does not start Python:

@@ -340,11 +340,11 @@ def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> N
 
 
 def check_period(plan: Plan, period: float) -> None:
-    """Raise ProblemError if a sampling period is not positive or gives more than MOST samples."""
+    """Raise ProblemError if a sampling period is not positive or gives too many samples."""
     require.positive("period", period)
-    most = INPUT_LIMITS.count
-    if plan.horizon / period > most:
-        words = f"a period of {period:g} s gives {plan.horizon / period:.3g} samples; at most {most} can be written"
+    count, most = plan.horizon / period, INPUT_LIMITS.count
+    if count > most:
+        words = f"a period of {period:g} s gives {count:.3g} samples; at most {most} can be written"
         raise ProblemError(words, name="period", value=period, limit=plan.horizon / most)
 
 
@@ -372,5 +372,4 @@ WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
     "report": _report,
 }
 """Writers of each kind of output; arguments are the plan, the file, the sampling period in s, and a title."""
-
 EXPORT_KINDS = ("csv", "json", "yaml", "mcap", "urdf")

@@ -24,9 +24,10 @@ from ocp.problem.invariants import bounds_to_solve
 from ocp.problem.values import symbols_of
 from ocp.solution import Sensitivity, Solution
 
-__all__ = ["sensitivity"]
+__all__ = ["METHODS", "sensitivity"]
 
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
+"""Direct methods by the type that a solution stores."""
 SOFTENING = 1e-11
 """Regularisation of dependent rows in the linear system, relative to their size and to the curvature."""
 REFINEMENTS = 4

@@ -28,7 +28,7 @@ import numpy as np
 from ocp.errors import ProblemError
 from ocp.problem.hulls import WORLD, CoveredPairs, Separation
 from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided, evaluate, multiple_of
-from ocp.problem.values import identity, table
+from ocp.problem.values import identity
 
 __all__ = ["Enclosure", "Enclosures", "PrescribedMotion"]
 
@@ -48,50 +48,27 @@ class Enclosure(NamedTuple):
 
 
 class Enclosures:
-    """Bounds of a column of expressions of one symbol over intervals of the symbol.
+    """Bounds of a column of expressions of one scalar symbol over intervals of the symbol.
 
     The bounds hold wherever an entry and all its subexpressions are defined: the square root of a function that becomes
     negative counts where it is real.
 
     Raises:
-        ProblemError: An operation without a rule, by name; another symbol in the values; a shape other than (n, 1).
+        ProblemError: An operation without a rule, by name; another symbol in the values.
     """
 
     def __init__(self, values: Any, symbol: Any, what: str = "bounds") -> None:
-        if not (isinstance(symbol, ca.SX | ca.MX) and symbol.shape == (1, 1) and symbol.is_valid_input()):
-            raise ProblemError(f"{what}: {symbol!r} is not a scalar symbol", name="symbol", value=symbol)
         try:
-            column = ca.densify(type(symbol)(values))
-            function = ca.Function("values", [symbol], [column])
+            function = ca.Function("values", [symbol], [ca.densify(values)])
             self._function = function if isinstance(symbol, ca.SX) else function.expand()
-        except (RuntimeError, NotImplementedError, TypeError) as error:
+        except (RuntimeError, NotImplementedError) as error:
             words = f"{what}: values must be expressions of the symbol alone: {str(error).splitlines()[-1]}"
             raise ProblemError(words, name="values", value=values) from error
-        if column.shape[1] != 1 or column.shape[0] == 0:
-            words = f"{what}: values have shape {column.shape}, expected (n, 1)"
-            raise ProblemError(words, name="values", value=column.shape, limit=("n", 1))
         check_instructions(what, self._function)
 
-    def __call__(self, low: Any, high: Any) -> Enclosure:
-        """Return the bounds over intervals of the symbol.
-
-        Args:
-            low, high: Ends of the intervals. Shape (M,).
-
-        Raises:
-            ProblemError: Ends of different shapes, not finite, or in the wrong order.
-        """
-        starts, ends = (np.atleast_1d(table(f"bounds: {name}", x)) for name, x in (("low", low), ("high", high)))
-        if starts.shape != ends.shape or starts.ndim != 1:
-            words = f"bounds: high has shape {ends.shape}, low has {starts.shape}"
-            raise ProblemError(words, name="high", value=ends.shape, limit=starts.shape)
-        invalid = np.flatnonzero(~(np.isfinite(starts) & np.isfinite(ends) & (starts <= ends)))
-        if invalid.size:
-            wrong = int(invalid[0])
-            words = f"bounds: interval {wrong}, from {starts[wrong]} to {ends[wrong]}, is not finite or is reversed"
-            name = "high" if np.isfinite(starts[wrong]) else "low"
-            raise ProblemError(words, name=name, value=float(ends[wrong]), limit=float(starts[wrong]))
-        jets = self._jets(_Jet(Interval(starts, ends), constant(1.0, starts)))
+    def __call__(self, low: np.ndarray, high: np.ndarray) -> Enclosure:
+        """Return the bounds over intervals of the symbol from ``low`` to ``high``, (M,) each, finite and in order."""
+        jets = self._jets(_Jet(Interval(low, high), constant(1.0, low)))
         return Enclosure(*(np.column_stack([side(jet) for jet in jets]) for side in _SIDES))
 
     def _jets(self, time: _Jet) -> list[_Jet]:

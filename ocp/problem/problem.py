@@ -1,7 +1,4 @@
-"""Optimal control problems, declared variable by variable and equation by equation. Declaring solves nothing.
-
-``str(problem)`` shows all declarations, one a line.
-"""
+"""Optimal control problems, declared variable by variable and equation by equation. Declaring solves nothing."""
 
 from __future__ import annotations
 
@@ -164,8 +161,7 @@ class Problem:
             guess: A value, or a function ``time -> value``.
             unit: Shown beside the values, "rad" or "m/s"; for mixed entries all units, "rad, m".
             scale: Typical size of the entries, by which the solver divides them; nan for an entry, None for all,
-                derives it from the other values and does not scale values of ordinary size. Give it if the entries of
-                one vector differ by orders of magnitude, such as the speeds of a rotor and of an arm.
+                derives it. Give it if entries of one vector differ by orders of magnitude, as rotor and arm speeds do.
         """
         what, values = f"state {name!r}", {"initial": initial, "terminal": terminal, "lower": lower, "upper": upper}
         variable = self._variable("state", name, size, values, guess, unit, scale)
@@ -480,12 +476,9 @@ class Problem:
             for variable in pool.values():
                 if [identity(s) for s in ca.symvar(variable.symbol)] == identities:
                     return variable
-        raise ProblemError(
-            f"{what}: {symbol!r} is not a declared {'state' if what == 'dynamics' else 'state or control'} of "
-            f"problem {self.name!r}; known: {', '.join(pool) or 'none'}",
-            name="state" if what == "dynamics" else "variable",
-            limit=tuple(pool),
-        )
+        kind, name = ("state", "state") if what == "dynamics" else ("state or control", "variable")
+        words = f"{what}: {symbol!r} is not a declared {kind} of problem {self.name!r}"
+        raise ProblemError(f"{words}; known: {', '.join(pool) or 'none'}", name=name, limit=tuple(pool))
 
     def _constraint(
         self,

@@ -54,9 +54,9 @@ class Printed:
         return abs(self.ours - self.printed) <= max(SHARE * abs(self.printed), 10.0**-self.decimals)
 
 
-def _free_floating(told: Mapping[str, Any]) -> Iterator[Printed]:
-    printed, caveats = told["paper"], told["caveats"]
-    ours = {"pseudo-inverse": told["pseudo_inverse"], "optimum": told["optimal"]}
+def _free_floating(report: Mapping[str, Any]) -> Iterator[Printed]:
+    printed, caveats = report["paper"], report["caveats"]
+    ours = {"pseudo-inverse": report["pseudo_inverse"], "optimum": report["optimal"]}
     reasons = {
         "pseudo-inverse": "link length and mount are not printed: 2.1 mm of length make up for all of the first peak",
         "optimum": "the horizon is not printed, ours is 5 s; no extremal found at other horizons has these peaks",
@@ -64,21 +64,21 @@ def _free_floating(told: Mapping[str, Any]) -> Iterator[Printed]:
     for method, why in reasons.items():
         key = "peak_joint_velocity_deg_s"
         pairs = zip(printed[key][method], ours[method][key], strict=True)
-        for joint, (value, found) in enumerate(pairs, 1):
+        for joint, (value, result) in enumerate(pairs, 1):
             quantity = f"{method}: peak velocity of joint {joint}, deg/s"
-            yield Printed("free_floating", "Table 1", quantity, value, found, 3, why)
+            yield Printed("free_floating", "Table 1", quantity, value, result, 3, why)
     for method, decimals in (("pseudo-inverse", 1), ("optimum", 4)):
         values = printed["joint_acceleration_at_peak_deg_s2"][method]
         pairs = zip(values, ours[method]["joint_acceleration_at_peak_deg_s2"], strict=True)
         why = caveats["accelerations"][method]
-        for joint, (value, found) in enumerate(pairs, 1):
+        for joint, (value, result) in enumerate(pairs, 1):
             quantity = f"{method}: acceleration of joint {joint} at that peak, deg/s²"
-            yield Printed("free_floating", "Table 2", quantity, value, found, decimals, why)
-    found = told["pseudo_inverse"]["min_manipulability_time_s"]
-    yield Printed("free_floating", "Figure 13", "pseudo-inverse: least manipulability at, s", 3.0, found, 0)
+            yield Printed("free_floating", "Table 2", quantity, value, result, decimals, why)
+    result = report["pseudo_inverse"]["min_manipulability_time_s"]
+    yield Printed("free_floating", "Figure 13", "pseudo-inverse: least manipulability at, s", 3.0, result, 0)
 
 
-def _standing(told: Mapping[str, Any]) -> Iterator[Printed]:
+def _standing(report: Mapping[str, Any]) -> Iterator[Printed]:
     why = (
         "pinning the zero moment point is unstable at the level of accelerations: {} there. With the sign of C as "
         "printed in (22) the motion of Figure 4 goes on, with an index that is not 1"
@@ -91,34 +91,34 @@ def _standing(told: Mapping[str, Any]) -> Iterator[Printed]:
         "Figure 11": ("table2", "augmented_spring", "zero moment point against a spring"),
     }
     for place, (group, law, title) in cases.items():
-        found = told[group][law]
-        reason = why.format(words.get(found["reason"], found["reason"]))
-        yield Printed("standing", place, f"{title}: stands until, s", END, found["reaches_s"], 3, reason)
+        result = report[group][law]
+        reason = why.format(words.get(result["reason"], result["reason"]))
+        yield Printed("standing", place, f"{title}: stands until, s", END, result["reaches_s"], 3, reason)
 
 
-def _blend(told: Mapping[str, Any]) -> Iterator[Printed]:
+def _blend(report: Mapping[str, Any]) -> Iterator[Printed]:
     columns = ("alpha 30 mm, 90 deg", "lambda 1, 90 deg", "lambda 1, 45 deg")
-    for remaining, *found in told["gamma_table"]:
-        for name, value, ours in zip(columns, PAPER_GAMMA[remaining], found, strict=True):
+    for remaining, *result in report["gamma_table"]:
+        for name, value, ours in zip(columns, PAPER_GAMMA[remaining], result, strict=True):
             yield Printed("blend", "Table 2", f"gamma, Lr {remaining} mm, {name}", value, ours, 3)
     why = (
         "no reading of the mean acceleration gives all four: the ramp to the first one is not printed; the durations "
         "of both blends agree to 2.5 ms"
     )
-    for number, (value, ours) in enumerate(zip(PAPER_TIMES, told["blend_times_s"], strict=True), 1):
+    for number, (value, ours) in enumerate(zip(PAPER_TIMES, report["blend_times_s"], strict=True), 1):
         yield Printed("blend", "Figure 14", f"begin or end of a blend, {number} of 4, s", value, ours, 3, why)
-    errors = told["speed_error_mm_s"]
+    errors = report["speed_error_mm_s"]
     ours = errors["predictor_corrector_2ms"]
     yield Printed("blend", "Figure 18", "largest error of the line speed, mm/s", PAPER_SPEED_ERROR, ours, 1)
 
 
-def _cts(told: Mapping[str, Any]) -> Iterator[Printed]:
-    printed, ours = told["paper"]["table6_s"], told["arithmetic_seconds_of_200_targets"]
+def _cts(report: Mapping[str, Any]) -> Iterator[Printed]:
+    printed, ours = report["paper"]["table6_s"], report["arithmetic_seconds_of_200_targets"]
     why = "the time of another computer; ours is arithmetic alone, compiled"
     for name, mine in (("jacobian", "jacobian, gain 20"), ("combined", "combined")):
         yield Printed("cts", "Table 6", f"200 targets, {name}, s", printed[name], ours[mine], 4, why, timed=True)
     why = "neither link lengths nor the gain of the null term are printed, and the iterations depend on both"
-    ratio = told["time_ratio_jacobian_over_combined"]
+    ratio = report["time_ratio_jacobian_over_combined"]
     quotient = printed["jacobian"] / printed["combined"]
     yield Printed("cts", "Table 6", "times of both, ratio", quotient, ratio, 2, why, timed=True)
 
@@ -133,22 +133,22 @@ READERS: Mapping[str, Callable[[Mapping[str, Any]], Iterator[Printed]]] = {
 
 def read(out: Path, papers: Sequence[str] = tuple(READERS)) -> tuple[list[Printed], list[str]]:
     """The numbers of the papers whose summaries lie in `out`, and what is missing, in words."""
-    found: list[Printed] = []
+    results: list[Printed] = []
     missing = []
     for name in papers:
         if name not in READERS:
             continue
         file = out / name / "summary.json"
         try:
-            found += READERS[name](json.loads(file.read_text(encoding="utf-8")))
+            results += READERS[name](json.loads(file.read_text(encoding="utf-8")))
         except OSError:
             missing.append(f"{name}: there is no {file}")
         except (ValueError, KeyError, TypeError) as error:
             missing.append(f"{name}: {file} is not what its script writes: {type(error).__name__} {error}")
-    return found, missing
+    return results, missing
 
 
-def table(found: Sequence[Printed]) -> list[Row]:
+def table(result: Sequence[Printed]) -> list[Row]:
     """Rows of all numbers."""
     return [
         {
@@ -161,23 +161,23 @@ def table(found: Sequence[Printed]) -> list[Row]:
             "reproduced": one.reproduced,
             "why": "" if one.reproduced else one.why,
         }
-        for one in found
+        for one in result
     ]
 
 
-def text(found: Sequence[Printed], missing: Sequence[str]) -> str:
+def text(result: Sequence[Printed], missing: Sequence[str]) -> str:
     """The table for the terminal: every number, the reasons below it once each, and how many are reproduced."""
     lines = []
-    if found:
-        rows = table(found)
+    if result:
+        rows = table(result)
         reasons = list(dict.fromkeys(row["why"] for row in rows if row["why"]))
         marks = {why: f"({number})" for number, why in enumerate(reasons, 1)}
         shown = [{**{k: v for k, v in row.items() if k != "why"}, "why": marks.get(row["why"], "")} for row in rows]
         lines += [text_table(shown, digits=5), ""]
         lines += [f"{mark} {why}" for why, mark in marks.items()]
     lines += [f"missing: {words}" for words in missing]
-    count = sum(one.reproduced for one in found)
-    lines.append(f"{count} of {len(found)} numbers of the papers are reproduced, to 1 % or a unit of their last digit")
+    count = sum(one.reproduced for one in result)
+    lines.append(f"{count} of {len(result)} numbers of the papers are reproduced, to 1 % or a unit of their last digit")
     return "\n".join(lines)
 
 

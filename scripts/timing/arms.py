@@ -43,7 +43,7 @@ def run(repeats: int = 5) -> dict[str, Any]:
     repeats = min(repeats, 2)
     return {
         "local": local_rows(repeats),
-        "postures": posture_rows(),
+        "postures": configuration_rows(),
         "toppra": [row for seed in range(5) if (row := peer_row(seed)) is not None],
         "ruckig": ruckig_rows(),
         "versions": {name: installed(of) for name, of in DISTRIBUTIONS.items()},
@@ -63,11 +63,11 @@ def targets(times: Array) -> tuple[Array, Array]:
     assert task.position is not None
     assert task.orientation is not None
     of: Any = ca.Function("target", [t], [task.position(t), task.orientation(t)])
-    found = [of(time) for time in times]
-    return np.array([each[0].full().ravel() for each in found]), np.array([each[1].full() for each in found])
+    matches = [of(time) for time in times]
+    return np.array([each[0].full().ravel() for each in matches]), np.array([each[1].full() for each in matches])
 
 
-def misfit(joints: Array, places: Array, axes: Array) -> tuple[float, float]:
+def pose_error(joints: Array, places: Array, axes: Array) -> tuple[float, float]:
     """Largest distance (m) and angle (rad) of the tip to where it should be."""
     tip, worst = tip_function(), np.zeros(2)
     for q, place, axis in zip(joints, places, axes, strict=True):
@@ -109,7 +109,7 @@ def local_rows(repeats: int) -> list[dict[str, Any]]:
 
 def _local_row(name: str, how: str, seconds: float, joints: Array, times: Array) -> dict[str, Any]:
     which = np.linspace(0, len(times) - 1, STEPS[0] + 1).astype(int)
-    place, angle = misfit(joints[which], *targets(times[which]))
+    place, angle = pose_error(joints[which], *targets(times[which]))
     return {"tool": name, "how": how, "seconds": seconds, "misfit_m": place, "misfit_rad": angle}
 
 
@@ -174,7 +174,7 @@ def mink_stepper(start: Array, places: Array, axes: Array, dt: float) -> Callabl
 # ---- postures ----------------------------------------------------------------------------------------------------
 
 
-def posture_rows() -> list[dict[str, Any]]:
+def configuration_rows() -> list[dict[str, Any]]:
     """Random poses that can be reached, from the ready posture: share found, time and misfit of those."""
     machine, tip = FixedBase(PANDA.read()), tip_function()
     robot, rng = machine.robot, np.random.default_rng(0)
@@ -195,12 +195,12 @@ def posture_rows() -> list[dict[str, Any]]:
         finders["ikpy"] = ikpy_finder()
     rows = []
     for name, find in finders.items():
-        found: list[Array | None] = []
+        results: list[Array | None] = []
         find(*poses[0])
-        seconds = least(lambda find=find, found=found: found.extend(find(*pose) for pose in poses), 1)  # type: ignore[misc]
+        seconds = least(lambda find=find, results=results: results.extend(find(*pose) for pose in poses), 1)  # type: ignore[misc]
         fits = [
-            max(misfit(q[None], place[None], axes[None]))
-            for q, (place, axes) in zip(found, poses, strict=True)
+            max(pose_error(q[None], place[None], axes[None]))
+            for q, (place, axes) in zip(results, poses, strict=True)
             if q is not None
         ]
         inside = [fit for fit in fits if fit < REACHED]
@@ -237,8 +237,8 @@ def ikpy_finder() -> Callable[[Array, Array], Array]:
     home[moving] = HOME
 
     def find(place: Array, axes: Array) -> Array:
-        found = chain.inverse_kinematics(place, axes, orientation_mode="all", initial_position=home)
-        return np.asarray(found[moving])
+        solutions = chain.inverse_kinematics(place, axes, orientation_mode="all", initial_position=home)
+        return np.asarray(solutions[moving])
 
     return find
 
@@ -280,17 +280,17 @@ def ruckig_rows() -> list[dict[str, Any]]:
             return schedule(line, wide, joints=joints)
 
         def peer(first: Array = first, last: Array = last) -> Any:
-            asked, found = ruckig.InputParameter(robot.dof), ruckig.Trajectory(robot.dof)
-            asked.current_position, asked.target_position = first.tolist(), last.tolist()
+            request, result = ruckig.InputParameter(robot.dof), ruckig.Trajectory(robot.dof)
+            request.current_position, request.target_position = first.tolist(), last.tolist()
             for name in ("velocity", "acceleration", "jerk"):
-                setattr(asked, f"max_{name}", np.asarray(getattr(limits, name), dtype=float).tolist())
-            asked.synchronization = ruckig.Synchronization.Phase
-            ruckig.Ruckig(robot.dof).calculate(asked, found)
-            return found
+                setattr(request, f"max_{name}", np.asarray(getattr(limits, name), dtype=float).tolist())
+            request.synchronization = ruckig.Synchronization.Phase
+            ruckig.Ruckig(robot.dof).calculate(request, result)
+            return result
 
         plan, motion = ours(), peer()
         places = np.array([motion.at_time(t)[0] for t in np.linspace(0.0, motion.duration, 201)]) - first
-        way = (last - first) / np.linalg.norm(last - first)
+        path = (last - first) / np.linalg.norm(last - first)
         rows.append(
             {
                 "move": number,
@@ -298,7 +298,7 @@ def ruckig_rows() -> list[dict[str, Any]]:
                 "ruckig_s": least(peer, 20),
                 "duration_s": plan.duration,
                 "longer": float(plan.duration / motion.duration - 1),
-                "ruckig_off_line_rad": float(np.abs(places - np.outer(places @ way, way)).max()),
+                "ruckig_off_line_rad": float(np.abs(places - np.outer(places @ path, path)).max()),
                 "largest_demand": largest(plan, joints),
             }
         )

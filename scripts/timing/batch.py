@@ -68,15 +68,15 @@ def plain(processes: int, count: int) -> float:
     return timed(work)[1]
 
 
-def ways(count: int, folder: Path) -> dict[str, tuple[Batch, float]]:
+def measure_methods(count: int, folder: Path) -> dict[str, tuple[Batch, float]]:
     """The same plans by one worker, by two, and by a Dask cluster of two where Dask is installed."""
-    found = {"one worker": plans(1, count, folder), "two workers": plans(2, count, folder)}
+    by_name = {"one worker": plans(1, count, folder), "two workers": plans(2, count, folder)}
     if importlib.util.find_spec("distributed") is not None:
         from distributed import LocalCluster
 
         with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-            found["Dask, two workers"] = plans(cluster.scheduler_address, count, folder)
-    return found
+            by_name["Dask, two workers"] = plans(cluster.scheduler_address, count, folder)
+    return by_name
 
 
 def pace(folder: Path) -> list[float]:
@@ -90,35 +90,35 @@ def run(repeats: int = 5) -> dict[str, Any]:
     runs, alone = [], []
     with tempfile.TemporaryDirectory() as name:
         for _ in progress(range(max(1, min(repeats, 2))), "plans"):
-            runs.append(ways(PLANS, Path(name)))
-            alone.append({way: plain(processes, PLANS) for processes, way in PLAIN.items()})
+            runs.append(measure_methods(PLANS, Path(name)))
+            alone.append({path: plain(processes, PLANS) for processes, path in PLAIN.items()})
         short = Path(name) / "short"
         run_batch(nothing, [{"x": float(i)} for i in range(SHORT)], short, cluster=1)
         written = pace(short)
-    least = {way: min(run[way][1] for run in runs) for way in runs[0]}
-    bare = {way: min(times[way] for times in alone) for way in PLAIN.values()}
-    given = bare[PLAIN[1]] / bare[PLAIN[2]]
-    costs = {way: [result.cost for result in batch] for way, (batch, _) in runs[0].items()}
+    least = {path: min(run[path][1] for run in runs) for path in runs[0]}
+    bare = {path: min(times[path] for times in alone) for path in PLAIN.values()}
+    options = bare[PLAIN[1]] / bare[PLAIN[2]]
+    costs = {path: [result.cost for result in batch] for path, (batch, _) in runs[0].items()}
     rows = [
         {
-            "way": way,
+            "way": path,
             "plans": PLANS,
-            "passed": sum(result.verdict is True for result in runs[0][way][0]),
+            "passed": sum(result.verdict is True for result in runs[0][path][0]),
             "seconds": seconds,
             "times_one_worker": least["one worker"] / seconds,
-            "busy_workers": sum(result.seconds for result in runs[0][way][0]) / runs[0][way][1],
-            "same_costs": costs[way] == costs["one worker"],
+            "busy_workers": sum(result.seconds for result in runs[0][path][0]) / runs[0][path][1],
+            "same_costs": costs[path] == costs["one worker"],
         }
-        for way, seconds in least.items()
+        for path, seconds in least.items()
     ]
     first, last = written[CUT - 1] - written[0], written[-1] - written[-CUT]
     steps = {"first": first / (CUT - 1) * 1e3, "last": last / (CUT - 1) * 1e3}
-    gains = {way: least["one worker"] / seconds for way, seconds in least.items()}
-    shares = {f"{way}, share": gain / given for way, gain in gains.items()}
+    gains = {path: least["one worker"] / seconds for path, seconds in least.items()}
+    shares = {f"{path}, share": gain / options for path, gain in gains.items()}
     figures = gains | shares | {"overhead": written[-1] / (len(written) - 1) * 1e3}
     goals = {name: {"figure": figures.get(name), "goal": goal, "unit": unit} for name, (goal, unit) in GOALS.items()}
     times = [{"record": i, "seconds": written[i]} for i in range(0, len(written), max(1, len(written) // 200))]
-    return {"rows": rows, "plain": {**bare, "gain": given}, "short": times, "ms_a_short_task": steps, "goals": goals}
+    return {"rows": rows, "plain": {**bare, "gain": options}, "short": times, "ms_a_short_task": steps, "goals": goals}
 
 
 def report(numbers: dict[str, Any]) -> str:
@@ -135,11 +135,11 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
     """Times of the ways, and records over time."""
     note = f"{PLANS} plans of a UR5's seam, starts of workers included; short tasks by one worker. One machine."
     with drawing.sheet(path, (1, 2), (7.0, 2.8), note) as (_, axes):
-        ways, records = np.ravel(axes)
+        paths, records = np.ravel(axes)
         names = [row["way"] for row in numbers["rows"]]
-        ways.barh(names, [row["seconds"] for row in numbers["rows"]], 0.5, color=drawing.COLORS["blue"])
-        ways.invert_yaxis()
-        ways.set(xlabel="time, s")
+        paths.barh(names, [row["seconds"] for row in numbers["rows"]], 0.5, color=drawing.COLORS["blue"])
+        paths.invert_yaxis()
+        paths.set(xlabel="time, s")
         times = numbers["short"]
         records.plot([row["seconds"] for row in times], [row["record"] for row in times], color=drawing.COLORS["green"])
         records.set(xlabel="time, s", ylabel="results kept")

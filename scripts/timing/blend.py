@@ -87,8 +87,8 @@ def run(repeats: int = 5, *, segments: Sequence[int] = (1000, 10_000)) -> dict[s
 def samples(path: SmoothPath, plan: Schedule, repeats: int) -> list[dict[str, Any]]:
     """From distance to parameter, by every method, at the control instants inside the first blend of the example."""
     blend = path.blend(0)
-    instants = np.arange(int(plan.duration / PERIOD) + 1) * PERIOD
-    along = plan.at(instants).distance
+    time_samples = np.arange(int(plan.duration / PERIOD) + 1) * PERIOD
+    along = plan.at(time_samples).distance
     s = along[(along > blend.start + 1e-12) & (along < blend.end)]
     x, count = s - blend.start, len(s)
     loops, runs = max(1, 10_000 // count), 20 * repeats  # many short runs: nothing else disturbs the least of them
@@ -110,8 +110,8 @@ def samples(path: SmoothPath, plan: Schedule, repeats: int) -> list[dict[str, An
         u = march(mapping, blend.coefficients, x)
         inputs = mapped_inputs(mapping, blend.coefficients, x, u)
         many = mapping.map(count)
-        found = np.array(many.call(inputs)[0])[1]
-        add(name, "map", 1e9 * least(lambda many=many, inputs=inputs: many.call(inputs), repeats) / count, found)  # type: ignore[misc]
+        result = np.array(many.call(inputs)[0])[1]
+        add(name, "map", 1e9 * least(lambda many=many, inputs=inputs: many.call(inputs), repeats) / count, result)  # type: ignore[misc]
         add(name, "march", 1e9 * least(lambda m=mapping: march(m, blend.coefficients, x), repeats) / count, u)  # type: ignore[misc]
     if has_compiler():
         with compiled(path_function(path)) as called:
@@ -121,12 +121,12 @@ def samples(path: SmoothPath, plan: Schedule, repeats: int) -> list[dict[str, An
     add("SmoothPath.parameter", "numpy", 1e9 * least(lambda: path.parameter(s), repeats) / count, path.parameter(s))
     knots = np.linspace(0, 1, TABLE)
     table = arc_length(blend.coefficients, knots)
-    looked_up = np.interp(x, table, knots)
-    add("table lookup", "numpy", 1e9 * least(lambda: np.interp(x, table, knots), repeats) / count, looked_up)
+    interpolated = np.interp(x, table, knots)
+    add("table lookup", "numpy", 1e9 * least(lambda: np.interp(x, table, knots), repeats) / count, interpolated)
     root = roots(blend.coefficients)
     if root is not None:
-        found = np.array([root(value) for value in x])
-        add("brentq", "scipy", 1e9 * least(lambda: [root(value) for value in x], max(1, repeats // 2)) / count, found)
+        result = np.array([root(value) for value in x])
+        add("brentq", "scipy", 1e9 * least(lambda: [root(value) for value in x], max(1, repeats // 2)) / count, result)
     return rows
 
 
@@ -136,8 +136,8 @@ def _row(method: str, kind: str, how: str, nanoseconds: float, error: float) -> 
 
 def increments(x: Array) -> Array:
     """From distances, shape (M,), m, to the last and the next step to each of them. Shape (M, 2), m."""
-    given = np.diff(x, prepend=0.0)
-    return np.stack([np.concatenate([[0.0], given[:-1]]), given], axis=1)
+    options = np.diff(x, prepend=0.0)
+    return np.stack([np.concatenate([[0.0], options[:-1]]), options], axis=1)
 
 
 def entries(mapping: Any, coefficients: Array) -> Array:
@@ -174,8 +174,8 @@ def planning(limits: LineLimits, repeats: int) -> list[dict[str, Any]]:
         "centripetal and joint limits, arm included": limited,
     }
     rows = [{"plan": name, "ms": 1e3 * least(work, repeats), "duration_s": 0.0} for name, work in works.items()]
-    for row, found in zip(rows, (*(work() for work in list(works.values())[:2]), plan), strict=True):
-        row["duration_s"] = found.duration
+    for row, result in zip(rows, (*(work() for work in list(works.values())[:2]), plan), strict=True):
+        row["duration_s"] = result.duration
     best = solve_minimum_time(path, all_of_them, arm, guess=plan, intervals=100)
     seconds = best.solution.seconds["build"] + best.solution.seconds["solve"]
     name = "the same in minimum time, optimal control"
@@ -266,7 +266,7 @@ def peer_plans(path: SmoothPath, repeats: int) -> dict[str, Any] | None:
     toppra.setup_logging("ERROR")
     s = np.linspace(0, path.length, GRID)
     points, one = path.at(s).position, np.ones((3, 1))
-    found: dict[str, Any] = {"version": version("toppra"), "grid_points": GRID, "plans": [], "profiles": {}}
+    by_name: dict[str, Any] = {"version": version("toppra"), "grid_points": GRID, "plans": [], "profiles": {}}
     for acceleration in ACCELERATIONS:
 
         def planned(most: float = acceleration) -> Any:
@@ -286,7 +286,7 @@ def peer_plans(path: SmoothPath, repeats: int) -> dict[str, Any] | None:
             rate = np.abs(motion(t, 2)).max()
         passed = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
         inside = (passed > path.bounds[1]) & (passed < path.bounds[2])
-        found["plans"].append(
+        by_name["plans"].append(
             {
                 "axis_acceleration": acceleration,
                 "ms": ms,
@@ -298,8 +298,8 @@ def peer_plans(path: SmoothPath, repeats: int) -> dict[str, Any] | None:
         )
         every = slice(None, None, 25)
         name = f"toppra, {acceleration:g} m/s² an axis"
-        found["profiles"][name] = {"distance": passed[every], "speed": velocity[every]}
-    return found
+        by_name["profiles"][name] = {"distance": passed[every], "speed": velocity[every]}
+    return by_name
 
 
 # ---- the page ------------------------------------------------------------------------------------------------

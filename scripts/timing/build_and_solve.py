@@ -106,10 +106,10 @@ def opti_loop(problem: Problem, intervals: int, guess: Solution) -> Any:
 
 def opti_times(problem: Problem, intervals: int, guess: Solution) -> tuple[Any, tuple[float, float]]:
     """The loop and its times to build and to solve, s. Opti makes its solver in the first solve."""
-    opti, made = timed(lambda: opti_loop(problem, intervals, guess))
+    opti, result = timed(lambda: opti_loop(problem, intervals, guess))
     first = timed(opti.solve)[1]
     again = median(opti.solve, 3)
-    return opti, (made + first - again, again)
+    return opti, (result + first - again, again)
 
 
 def growth(rows: list[dict[str, Any]], what: str, per: str | None = None) -> float:

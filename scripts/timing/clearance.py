@@ -24,7 +24,7 @@ from scripts.robots.robots import PANDA, UR5
 from scripts.timing.distances import scene
 from scripts.timing.planning import lanes
 
-SECONDS, PIECES, SEEDS = 10.0, 40, 6
+SECONDS, SEGMENT_COUNT, SEEDS = 10.0, 40, 6
 """Of the motions that are proven clear, or not."""
 CLEARANCE = 0.01
 SWING = 0.45
@@ -41,8 +41,8 @@ GOALS = {"proof": 0.5, "beside what does not bind": 1.5, "beside what binds": 4.
 
 def run(repeats: int = 5) -> dict[str, Any]:
     """Processor times, the least of some runs."""
-    found = [row for case in progress(CASES, "clearance") for row in plans(case, max(1, min(repeats, 3)))]
-    return {"rows": found, "proofs": proofs(repeats), "goals": GOALS}
+    matches = [row for case in progress(CASES, "clearance") for row in plans(case, max(1, min(repeats, 3)))]
+    return {"rows": matches, "proofs": proofs(repeats), "goals": GOALS}
 
 
 def proofs(repeats: int) -> list[dict[str, Any]]:
@@ -52,9 +52,9 @@ def proofs(repeats: int) -> list[dict[str, Any]]:
         return []
     rows = []
     for seed in range(SEEDS):
-        spent, found = least(partial(proven, around, *swing(around.machine.robot, seed)), repeats)
-        row = {"seed": seed, "pairs": len(around.pairs), "looked": found.n_intervals, "proof_s": spent}
-        rows.append({**row, "settled": found.settled, "least_m": found.worst.least})
+        spent, result = least(partial(proven, around, *swing(around.machine.robot, seed)), repeats)
+        row = {"seed": seed, "pairs": len(around.pairs), "looked": result.n_intervals, "proof_s": spent}
+        rows.append({**row, "settled": result.settled, "least_m": result.worst.least})
     return rows
 
 
@@ -73,8 +73,8 @@ def proven(around: CollisionScene, middle: Array, sizes: Array, speeds: Array, p
     def joints(at: Array) -> Array:
         return np.asarray(middle + (sizes * np.sin(SECONDS * at[:, None, None] * speeds + phases)).sum(axis=1))
 
-    breaks = np.linspace(0.0, 1.0, PIECES + 1)
-    rates, seconds = (np.tile((sizes * speeds**k).sum(axis=0), (PIECES, 1)) for k in (1, 2))
+    breaks = np.linspace(0.0, 1.0, SEGMENT_COUNT + 1)
+    rates, seconds = (np.tile((sizes * speeds**k).sum(axis=0), (SEGMENT_COUNT, 1)) for k in (1, 2))
     return clearance_of(around, joints, breaks, SECONDS, rates, seconds, True)
 
 
@@ -91,21 +91,21 @@ def plans(case: str, repeats: int) -> list[dict[str, Any]]:
         "beside what binds": [ball(plain, link)],
     }
     for what, obstacles in around.items():
-        spent, found = least(partial(planned, scene=Scene(obstacles, CLEARANCE)), repeats)
-        held = found.solution.problem.declared.path.get("apart")
+        spent, result = least(partial(planned, scene=Scene(obstacles, CLEARANCE)), repeats)
+        held = result.solution.problem.declared.path.get("apart")
         rows.append({"robot": case, "plan": what, "plan_s": spent, "ratio": spent / rows[0]["plan_s"]})
-        rows[-1] |= {"cost": found.cost, "held": 0 if held is None else held.size}
+        rows[-1] |= {"cost": result.cost, "held": 0 if held is None else held.size}
     return rows
 
 
 def least(work: Callable[[], Any], repeats: int) -> tuple[float, Any]:
     """Least processor time of a number of runs, s, and what the last gave."""
-    spent, found = np.inf, None
+    spent, result = np.inf, None
     for _ in range(repeats):
         began = time.process_time()
-        found = work()
+        result = work()
         spent = min(spent, time.process_time() - began)
-    return spent, found
+    return spent, result
 
 
 def apart(result: Plan, obstacles: Sequence[Shape]) -> Array:
@@ -137,8 +137,8 @@ def ball(plain: Plan, link: str) -> Sphere:
 
 def report(numbers: dict[str, Any]) -> str:
     """The times, and what is asked."""
-    asked = "asked: a proof in 0.5 s, plans at most 1.5 times the plain one beside what does not bind, 4 times beside"
-    return f"{text_table(numbers['rows'], 4)}\n{text_table(numbers['proofs'], 4)}\n{asked} what binds"
+    request = "asked: a proof in 0.5 s, plans at most 1.5 times the plain one beside what does not bind, 4 times beside"
+    return f"{text_table(numbers['rows'], 4)}\n{text_table(numbers['proofs'], 4)}\n{request} what binds"
 
 
 def plot(path: Path, numbers: dict[str, Any]) -> None:

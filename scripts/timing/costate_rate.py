@@ -72,13 +72,13 @@ def microseconds(function: Any, states: np.ndarray, costate: np.ndarray, repeats
 def serial_arm(joints: int) -> FreeFloating:
     """A satellite with an arm of ``joints`` revolute joints about alternate axes."""
     links = [Link("satellite", 100.0, (0.0, 0.0, 0.0), np.diag([60.0, 60.0, 66.0]))]
-    made = []
+    results = []
     for i in range(joints):
         links.append(Link(f"link {i}", 4.0, (0.2, 0.0, 0.02), np.diag([0.02, 0.06, 0.06])))
         axis = [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)][i % 3]
         shift = (1.0, 0.2, 0.1) if i == 0 else (0.4, 0.0, 0.05)
-        made.append(Joint(f"joint {i}", "revolute", links[i].name, links[i + 1].name, shift, axis=axis))
-    return FreeFloating(Robot(tuple(links), tuple(made), tip_translation=(0.4, 0.0, 0.0)), base="spatial")
+        results.append(Joint(f"joint {i}", "revolute", links[i].name, links[i + 1].name, shift, axis=axis))
+    return FreeFloating(Robot(tuple(links), tuple(results), tip_translation=(0.4, 0.0, 0.0)), base="spatial")
 
 
 def costate_function(machine: FreeFloating, rows: list[int]) -> tuple[Any, Any]:

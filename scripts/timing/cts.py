@@ -60,8 +60,8 @@ def run(repeats: int = 5) -> dict[str, Any]:
     for name, function in cases.items():
         for on, rows_in in (("sweep", targets), ("random", spread)):
             if has_compiler():
-                found, mean, worst = compiled_inverse(function, rows_in, repeats)
-                add(f"compiled, {name}", on, mean, float(np.mean(found[:, 8] == 0)), worst)
+                result, mean, worst = compiled_inverse(function, rows_in, repeats)
+                add(f"compiled, {name}", on, mean, float(np.mean(result[:, 8] == 0)), worst)
             many = function.map(COUNT)
             inputs = [ca.DM(rows_in.T), ca.DM.zeros(1, COUNT)]
             status = np.array(many.call(inputs)[3])
@@ -77,12 +77,12 @@ def run(repeats: int = 5) -> dict[str, Any]:
     jacobian = null_space(rigs["reach"], tunnel, targets, first, gain=20.0)
     seconds = least(lambda: null_space(rigs["reach"], tunnel, targets, first, gain=20.0), 2) / COUNT
     add("Jacobian of Table 3, gain 20, Python", "sweep", seconds, float(jacobian.converged.mean()))
-    found_by = {(row["method"], row["targets"]): row["ns_per_target"] for row in rows}
+    times_by = {(row["method"], row["targets"]): row["ns_per_target"] for row in rows}
     goals = {
-        "compiled_limits_off_ns": {"figure": found_by.get(("compiled, I1, limits off", "sweep")), "goal": 250.0},
-        "compiled_joint_limits_ns": {"figure": found_by.get(("compiled, I1, joint limits", "random")), "goal": 1000.0},
+        "compiled_limits_off_ns": {"figure": times_by.get(("compiled, I1, limits off", "sweep")), "goal": 250.0},
+        "compiled_joint_limits_ns": {"figure": times_by.get(("compiled, I1, joint limits", "random")), "goal": 1000.0},
     }
-    if compiled_ns := found_by.get(("compiled, I1, reach", "sweep")):
+    if compiled_ns := times_by.get(("compiled, I1, reach", "sweep")):
         ratio = PAPER_TIMES["combined"] / (COUNT * 1e-9 * compiled_ns)
         goals["paper_time_over_compiled"] = {"figure": ratio, "goal": 100.0}
     peers = peer_times(random_reachable(PEER_COUNT))
@@ -107,11 +107,11 @@ def compiled_inverse(function: Any, targets: Array, repeats: int = 5) -> tuple[A
     previous = np.zeros((1, 1))
     with compiled(function) as rows:
         # short runs: one of many is undisturbed
-        found, mean = rows([targets, previous], max(1, 2000 // len(targets)), 10 * repeats)
+        result, mean = rows([targets, previous], max(1, 2000 // len(targets)), 10 * repeats)
         # calls from Python, only to find the slowest
         alone = [rows([target, previous], 1, 20)[1] for target in targets]
         slowest = np.tile(targets[int(np.argmax(alone))], (100, 1))
-        return found, mean, rows([slowest, previous], 20, 10 * repeats)[1]
+        return result, mean, rows([slowest, previous], 20, 10 * repeats)[1]
 
 
 def peer_times(targets: Array) -> list[dict[str, Any]] | None:
@@ -134,35 +134,35 @@ def peer_times(targets: Array) -> list[dict[str, Any]] | None:
         ((rig.pitch_link, 0, rig.yaw_offset), (0, 0, 0), False),
         ((0, 0, 0), (half, 0, 0), False),
     ]
-    made = [links.OriginLink()]
+    results = [links.OriginLink()]
     for k, (shift, turn, slides) in enumerate(rows):
         axis: dict[str, Any] = (
             {"translation": [0, 0, 1], "joint_type": "prismatic"} if slides else {"rotation": [0, 0, 1]}
         )
         bounds = (LIMITS["lower"][k], LIMITS["upper"][k])
-        made.append(links.URDFLink(f"joint {k + 1}", shift, turn, bounds=bounds, **axis))
+        results.append(links.URDFLink(f"joint {k + 1}", shift, turn, bounds=bounds, **axis))
     tool = ((rig.goose_neck, 0, rig.sting), (0, -half, 0))
-    made.append(links.URDFLink("tool", *tool, joint_type="fixed"))
-    chain = chains.Chain(made, active_links_mask=[False, *[True] * 6, False])
+    results.append(links.URDFLink("tool", *tool, joint_type="fixed"))
+    chain = chains.Chain(results, active_links_mask=[False, *[True] * 6, False])
     home = np.array([0, 0.5, -half, 0.0, 0.0, half, 0.0, 0])
     q = np.array([0.4, -1.8, 0.3, 0.1, 1.4, 0.7])
     ours = np.array(ca.DM(forward(rig, ca.DM(q))))[:3, 0]
     if np.abs(chain.forward_kinematics([0, *q, 0])[:3, 3] - ours).max() > 1e-9:
         raise RuntimeError("the chain given to ikpy is not the rig")
-    made_of: list[dict[str, Any]] = []
+    sources: list[dict[str, Any]] = []
     for task, mode in (("position", None), ("position and direction", "X")):
         good, began = 0, time.perf_counter()
         for x, y, z, yaw, pitch in targets:
             direction = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
             aim = {"target_orientation": direction, "orientation_mode": mode} if mode else {}
-            found = chain.inverse_kinematics([x, y, z], initial_position=home, **aim)
-            pose = chain.forward_kinematics(found)
+            solutions = chain.inverse_kinematics([x, y, z], initial_position=home, **aim)
+            pose = chain.forward_kinematics(solutions)
             there = np.abs(pose[:3, 3] - [x, y, z]).max() < 1e-4
             good += bool(there and (not mode or np.abs(pose[:3, 0] - direction).max() < 1e-3))
         seconds = (time.perf_counter() - began) / len(targets)
         named = {"name": "ikpy", "version": version, "task": task}
-        made_of.append({**named, "seconds": seconds, "success": good / len(targets), "optimal_roll": False})
-    return made_of
+        sources.append({**named, "seconds": seconds, "success": good / len(targets), "optimal_roll": False})
+    return sources
 
 
 def report(summary: dict[str, Any]) -> str:

@@ -116,7 +116,7 @@ def write_problem(name: str, resolution: float, folder: Path) -> None:
         joint = ET.SubElement(root, "joint", name=f"to obstacle {k}", type="fixed")
         ET.SubElement(joint, "parent", link=base)
         ET.SubElement(joint, "child", link=f"obstacle {k}")
-    looked = {
+    checked = {
         frozenset(pair) for pair in CollisionScene(problem.machine, problem.boxes, ignored=problem.ignored).labels
     }
     bodies = [link.name for link in robot.links if link.collisions] + [
@@ -129,7 +129,7 @@ def write_problem(name: str, resolution: float, folder: Path) -> None:
     words += [
         f'<disable_collisions link1="{one}" link2="{other}" reason="Never"/>'
         for one, other in combinations(bodies, 2)
-        if frozenset((one, other)) not in looked
+        if frozenset((one, other)) not in checked
     ]
     spec = find_spec("tesseract_robotics")
     assert spec is not None
@@ -141,16 +141,18 @@ def write_problem(name: str, resolution: float, folder: Path) -> None:
         "bullet": _library(libraries, "tesseract_collision_bullet_factories"),
     }
     fine = [{"name": j.name, "value": resolution / (10 if j.kind == "prismatic" else 1)} for j in first]
-    told: dict[str, Any] = {"libraries": libraries, "base": base, "tip": tip, "split": first[-1].child}
+    by_name: dict[str, Any] = {"libraries": libraries, "base": base, "tip": tip, "split": first[-1].child}
     for kind, text in (("kinematics", KIN), ("contact_managers", CONTACTS)):
-        (folder / f"{kind}.yaml").write_text(text.format(**named, **told, samples=json.dumps(fine)), encoding="utf-8")
+        (folder / f"{kind}.yaml").write_text(
+            text.format(**named, **by_name, samples=json.dumps(fine)), encoding="utf-8"
+        )
         words += [f'<{kind}_plugin_config filename="file://{folder}/{kind}.yaml"/>']
     (folder / "robot.srdf").write_text("\n".join([*words, "</robot>"]), encoding="utf-8")
     ET.ElementTree(root).write(folder / "robot.urdf", encoding="unicode")
     poses = np.column_stack([problem.positions, problem.quaternions]).tolist()
     names = list(robot.joint_names)
-    given = {"joints": names, "middle": [middle.get(name, 0.0) for name in names], "base": base, "tip": tip}
-    (folder / "problem.json").write_text(json.dumps(given | {"poses": poses}), encoding="utf-8")
+    options = {"joints": names, "middle": [middle.get(name, 0.0) for name in names], "base": base, "tip": tip}
+    (folder / "problem.json").write_text(json.dumps(options | {"poses": poses}), encoding="utf-8")
 
 
 def _words(numbers: Any) -> str:
@@ -172,16 +174,16 @@ def plan_written(folder: Path) -> Array | None:
     from tesseract_robotics import tesseract_motion_planners_descartes as descartes
     from tesseract_robotics.tesseract_environment import Environment
 
-    given = json.loads((folder / "problem.json").read_text(encoding="utf-8"))
+    options = json.loads((folder / "problem.json").read_text(encoding="utf-8"))
     environment = Environment()
     texts = [(folder / f"robot.{kind}").read_text(encoding="utf-8") for kind in ("urdf", "srdf")]
     if not environment.init(*texts, common.GeneralResourceLocator()):
         raise RuntimeError("the robot cannot be read")
     arm = common.ManipulatorInfo()
-    arm.manipulator, arm.tcp_frame, arm.working_frame = "arm", given["tip"], given["base"]
+    arm.manipulator, arm.tcp_frame, arm.working_frame = "arm", options["tip"], options["base"]
     program = language.CompositeInstruction()
     program.setManipulatorInfo(arm)
-    for pose in given["poses"]:
+    for pose in options["poses"]:
         place = common.Isometry3d.Identity() * common.Translation3d(*pose[:3]) * common.Quaterniond(*pose[3:])
         point = language.CartesianWaypointPoly_wrap_CartesianWaypoint(language.CartesianWaypoint(place))
         move = language.MoveInstruction(point, language.MoveInstructionType_LINEAR, "profile", arm)
@@ -196,13 +198,13 @@ def plan_written(folder: Path) -> Array | None:
     response = descartes.DescartesMotionPlannerD("Descartes").solve(request)
     if not response.successful:
         return None
-    found = []
+    results = []
     for instruction in response.results.flatten():
         move = language.InstructionPoly_as_MoveInstructionPoly(instruction)
         state = language.WaypointPoly_as_StateWaypointPoly(move.getWaypoint())
         values = dict(zip(state.getNames(), np.ravel(state.getPosition()), strict=True))
-        found.append([values[name] for name in given["joints"]])
-    return np.asarray(np.array(found) + given["middle"])
+        results.append([values[name] for name in options["joints"]])
+    return np.asarray(np.array(results) + options["middle"])
 
 
 if __name__ == "__main__":

@@ -45,11 +45,11 @@ def functions(around: CollisionScene, pairs: list[int]) -> dict[str, Any]:
     q, base = ca.SX.sym("q", around.machine.joint_size), ca.DM(0, 1)
     apart = around.distances(base, q, pairs=pairs, rounding=ROUNDING)
     joints = ca.MX.sym("q", around.machine.joint_size)
-    told = around.distance_gradients(pairs=pairs, rounding=ROUNDING)
+    message = around.distance_gradients(pairs=pairs, rounding=ROUNDING)
     return {
         "distances, one expression": ca.Function("distances", [q], [apart]),
         "and gradients, differentiated": ca.Function("differentiated", [q], [apart, ca.jacobian(apart, q)]),
-        "and gradients, by wrenches": ca.Function("wrenches", [joints], told.call([ca.MX(0, 1), joints, 0.0])),
+        "and gradients, by wrenches": ca.Function("wrenches", [joints], message.call([ca.MX(0, 1), joints, 0.0])),
     }
 
 
@@ -63,10 +63,10 @@ def run(repeats: int = 5) -> dict[str, Any]:
     arm = [k for k, pair in enumerate(labels) if not any(part in name for name in pair for part in HAND)]
     at = 0.3 * np.ones(around.machine.joint_size)
     for name, pairs in (("arm", arm), ("arm and hand", list(range(len(labels))))):
-        made = functions(around, pairs)
-        expected = [np.array(part) for part in made["and gradients, differentiated"].call([at])]
-        check(made["and gradients, by wrenches"].call([at]), expected)
-        for what, function in made.items():
+        result = functions(around, pairs)
+        expected = [np.array(part) for part in result["and gradients, differentiated"].call([at])]
+        check(result["and gradients, by wrenches"].call([at]), expected)
+        for what, function in result.items():
             row = {"shapes": name, "pairs": len(pairs), "function": what}
             rows.append({**row, "us": 1e6 * least_of(function, at, repeats)})
     return {"rows": rows, "goal_us": GOAL}
@@ -74,18 +74,18 @@ def run(repeats: int = 5) -> dict[str, Any]:
 
 def least_of(function: Any, at: np.ndarray, repeats: int) -> float:
     """Least processor time of a call, of bursts of some, s."""
-    given, found = [ca.DM(at)], np.inf
+    options, result = [ca.DM(at)], np.inf
     for _ in range(4 * repeats):
         began = time.process_time()
         for _ in range(CALLS):
-            function.call(given)
-        found = min(found, (time.process_time() - began) / CALLS)
-    return found
+            function.call(options)
+        result = min(result, (time.process_time() - began) / CALLS)
+    return result
 
 
-def check(found: list[Any], expected: list[np.ndarray]) -> None:
+def check(result: list[Any], expected: list[np.ndarray]) -> None:
     """RuntimeError where two ways to the same differ by more than rounding."""
-    error = max(float(np.abs(np.array(one) - other).max()) for one, other in zip(found, expected, strict=True))
+    error = max(float(np.abs(np.array(one) - other).max()) for one, other in zip(result, expected, strict=True))
     if error > 1e-9:
         raise RuntimeError(f"distances by wrenches differ by {error:.1e}")
 

@@ -111,11 +111,11 @@ def compiled(function: Any, flags: Sequence[str] = FLAGS, *, marching: bool = Fa
         run = ctypes.CDLL(str(library)).run
 
         def rows(inputs: Sequence[Array], loops: int, runs: int) -> tuple[Array, float]:
-            given = [np.ascontiguousarray(np.atleast_2d(each), dtype=float) for each in inputs]
-            count = max(len(each) for each in given)
+            options = [np.ascontiguousarray(np.atleast_2d(each), dtype=float) for each in inputs]
+            count = max(len(each) for each in options)
             out = np.empty((count, width))
-            widths = (ctypes.c_int * len(given))(*(each.shape[1] if len(each) > 1 else 0 for each in given))
-            pointers = (ctypes.c_void_p * len(given))(*(each.ctypes.data for each in given))
+            widths = (ctypes.c_int * len(options))(*(each.shape[1] if len(each) > 1 else 0 for each in options))
+            pointers = (ctypes.c_void_p * len(options))(*(each.ctypes.data for each in options))
             place = out.ctypes.data_as(ctypes.c_void_p)
 
             def work() -> None:

@@ -24,7 +24,7 @@ from scripts.timing.tools import TOOLS
 
 ROOT = Path(__file__).resolve().parents[2]
 MESHES = (5, 10, 20, 40, 80)
-ASKED = 1e-6
+TOLERANCE = 1e-6
 """Relative error of the cost at which times are compared."""
 DISTRIBUTIONS = {"rockit": "rockit-meco", "Dymos": "dymos", "Drake": "drake"}
 README_MARKS = ("<!-- made by scripts/benchmark.py -->", "<!-- end -->")
@@ -46,7 +46,7 @@ def run(repeats: int = 5) -> dict[str, Any]:
         for tool in tools
         for row in rows_of(tool, problem, MESHES)
     ]
-    return {"rows": rows, "first": first_within(rows), "versions": versions, "asked": ASKED}
+    return {"rows": rows, "first": first_within(rows), "versions": versions, "asked": TOLERANCE}
 
 
 def installed(distribution: str) -> str:
@@ -63,19 +63,19 @@ def rows_of(tool: str, problem: str, meshes: Iterable[int]) -> list[dict[str, An
     ran = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)})
     blank = {"tool": tool, "problem": problem, "intervals": 0, "how": "", "cold_s": None, "warm_s": None}
     blank |= {"error": None, "cost": None, "cost_then": None, "failed": ""}
-    found = [blank | json.loads(line) for line in ran.stdout.splitlines() if line.startswith("{")]
+    matches = [blank | json.loads(line) for line in ran.stdout.splitlines() if line.startswith("{")]
     last = ran.stderr.strip().splitlines()[-1:] or [f"ended with {ran.returncode}"]
-    return found or [blank | {"failed": last[0][:300]}]
+    return matches or [blank | {"failed": last[0][:300]}]
 
 
-def first_within(rows: Sequence[dict[str, Any]], asked: float = ASKED) -> list[dict[str, Any]]:
+def first_within(rows: Sequence[dict[str, Any]], request: float = TOLERANCE) -> list[dict[str, Any]]:
     """For each problem and tool the coarsest mesh whose cost is so near to the optimum; else the nearest, "reached"
     False; else that there is none, "error" None."""
     first = []
     for problem, tool in dict.fromkeys((row["problem"], row["tool"]) for row in rows):
         mine = [row for row in rows if (row["problem"], row["tool"]) == (problem, tool)]
         done = sorted((row for row in mine if row["error"] is not None), key=lambda row: row["intervals"])
-        near = [row for row in done if row["error"] <= asked]
+        near = [row for row in done if row["error"] <= request]
         best = near[0] if near else min(done, key=lambda row: row["error"], default=mine[0])
         names = ("problem", "tool", "intervals", "error", "cold_s", "warm_s")
         first.append({name: best[name] for name in names} | {"reached": bool(near)})
@@ -139,7 +139,7 @@ def plot(path: Path, summary: dict[str, Any]) -> None:
                 style: Any = {"color": drawing.COLORS[color], "marker": mark, "ms": 4, "lw": 1}
                 axis.loglog([row["cold_s"] for row in mine], errors, "-", label=tool, **style)
                 axis.loglog([row["warm_s"] for row in mine], errors, ":", **style, mfc="white")
-            axis.axhline(ASKED, color=drawing.COLORS["grey"], lw=0.7)
+            axis.axhline(TOLERANCE, color=drawing.COLORS["grey"], lw=0.7)
             axis.set(title=problem)
         for axis in axes[-1]:
             axis.set_xlabel("time, s")

@@ -78,15 +78,15 @@ def row(case: str, search: SearchKind, repeats: int) -> dict[str, Any]:
     """One row: the least time of some runs, as a user would call it."""
     machine, task, start = CASES[case]()
     runs = [timed(lambda: plan(machine, task, start=start, search=search)) for _ in range(max(1, min(repeats, 3)))]
-    found: Plan = runs[-1][0]
+    result: Plan = runs[-1][0]
     goals = GOALS.get(case)
     return {
         "case": case,
         "robot": machine.robot.name,
         "search": search,
-        "postures": len(found.candidates),
-        "intervals": len(found.solution.state_interpolant.breaks) - 1,
-        "cost": found.cost,
+        "postures": len(result.candidates),
+        "intervals": len(result.solution.state_interpolant.breaks) - 1,
+        "cost": result.cost,
         "plan_s": min(seconds for _, seconds in runs),
         "goal_s": None if goals is None else goals[search == "configurations"],
     }
@@ -111,18 +111,18 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
         "one machine; the robots are read before."
     )
     met = sum(1 for row in numbers["rows"] if row["goal_s"] and row["plan_s"] <= row["goal_s"])
-    asked = sum(1 for row in numbers["rows"] if row["goal_s"])
-    title = f"From a task to an audited plan in seconds; {met} of {asked} goals are met"
+    request = sum(1 for row in numbers["rows"] if row["goal_s"])
+    title = f"From a task to an audited plan in seconds; {met} of {request} goals are met"
     with drawing.sheet(path, (1, 1), (7.6, 3.6), note, title=title) as (_, axes):
         axis = np.ravel(axes)[0]
         names = list(CASES)
         for shift, search, color in ((-0.2, "start", "blue"), (0.2, "configurations", "green")):
             rows = [row for row in numbers["rows"] if row["search"] == search]
             places = [names.index(row["case"]) + shift for row in rows]
-            told = {"start": "from the first posture that leads to a plan", "configurations": "from all postures"}[
+            message = {"start": "from the first posture that leads to a plan", "configurations": "from all postures"}[
                 search
             ]
-            axis.barh(places, [row["plan_s"] for row in rows], 0.35, color=drawing.COLORS[color], label=told)
+            axis.barh(places, [row["plan_s"] for row in rows], 0.35, color=drawing.COLORS[color], label=message)
             for place, row in zip(places, rows, strict=True):
                 if row["goal_s"]:
                     axis.plot([row["goal_s"]] * 2, [place - 0.2, place + 0.2], color="black", lw=1)

@@ -115,8 +115,8 @@ def space_arm(repeats: int) -> list[dict[str, Any]]:
     path = urdf_file(*ROBOTS["space arm"][:2])
     if path is None:
         return []
-    given = Robot.from_urdf(path)
-    robot = simplify(given)
+    options = Robot.from_urdf(path)
+    robot = simplify(options)
     machine = FreeFloating(robot)
     rng = np.random.default_rng(SEED)
     base = np.column_stack([rng.normal(size=(COUNT, 3)), rng.normal(size=(COUNT, 4))])
@@ -132,7 +132,7 @@ def space_arm(repeats: int) -> list[dict[str, Any]]:
         rows.append({"function": what, "by": by, "us": 1e6 * seconds, "instructions": instructions})
 
     many, columns = value.map(COUNT), [ca.DM(base.T), ca.DM(q.T)]
-    found = np.array(many.call(columns)[0]).reshape(6, COUNT, -1).transpose(1, 0, 2)
+    result = np.array(many.call(columns)[0]).reshape(6, COUNT, -1).transpose(1, 0, 2)
     if has_compiler():
         for name, flags in FLAGS.items():
             for what, function in (("generalized Jacobian", value), ("its derivative", derivative)):
@@ -140,15 +140,15 @@ def space_arm(repeats: int) -> list[dict[str, Any]]:
                     # bursts of about a millisecond: on a busy machine some of many run undisturbed
                     out, seconds = called([base, q], 10, 100 * repeats)
                 if function is value:
-                    check(out.reshape(COUNT, robot.dof, 6).transpose(0, 2, 1), found, name)
+                    check(out.reshape(COUNT, robot.dof, 6).transpose(0, 2, 1), result, name)
                 add(what, f"compiled, {name}", seconds, function.n_instructions())
     add("generalized Jacobian", "map in CasADi", least(lambda: many.call(columns), repeats) / COUNT)
     one = [[ca.DM(base[i]), ca.DM(q[i])] for i in range(COUNT)]
     seconds = least(lambda: [value.call(each) for each in one], repeats) / COUNT
     add("generalized Jacobian", "one call from Python", seconds)
-    if (peer := pinocchio_jacobian(path, given)) is not None:
+    if (peer := pinocchio_jacobian(path, options)) is not None:
         theirs = np.array([peer(base[i], q[i]) for i in range(COUNT)])
-        check(theirs, found, "Pinocchio")
+        check(theirs, result, "Pinocchio")
         seconds = least(lambda: [peer(base[i], q[i]) for i in range(COUNT)], 10 * repeats) / COUNT
         version = importlib.import_module("pinocchio").__version__
         add("generalized Jacobian", f"Pinocchio {version} and numpy", seconds)
@@ -187,8 +187,8 @@ def pinocchio_jacobian(path: Path, robot: Robot) -> Callable[[Array, Array], Arr
         coupling = inertia[:6, 6:]
         locked = np.triu(inertia[:6, :6])
         locked += np.triu(locked, 1).T
-        found: Array = (tip[:, 6:] - tip[:, :6] @ np.linalg.solve(locked, coupling))[rows]
-        return found
+        result: Array = (tip[:, 6:] - tip[:, :6] @ np.linalg.solve(locked, coupling))[rows]
+        return result
 
     return jacobian
 

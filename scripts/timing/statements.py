@@ -65,8 +65,8 @@ class Statement:
             "below": gap[below],
             "start": form.start.expression,
         }
-        made = {name: form.function(name, [ca.densify(of)], [name]) for name, of in outputs.items()}
-        return made | {"terminal": ca.Function("terminal", [form.x, form.T], [form.terminal])}
+        by_name = {name: form.function(name, [ca.densify(of)], [name]) for name, of in outputs.items()}
+        return by_name | {"terminal": ca.Function("terminal", [form.x, form.T], [form.terminal])}
 
     @property
     def is_cyclic(self) -> bool:

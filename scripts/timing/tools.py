@@ -144,16 +144,16 @@ def dymos(statement: Statement, intervals: int) -> Posed:
                 columns = np.broadcast_to(columns if list(sizes)[k] not in shared else columns[:1], (n, m, width))
                 self.declare_partials(names[i], list(sizes)[k], rows=rows, cols=columns.ravel())
 
-        def given(self, inputs: Any) -> list[Any]:
+        def columns_of(self, inputs: Any) -> list[Any]:
             return [ca.DM(inputs[name] if name in shared else inputs[name].T) for name in sizes]
 
         def compute(self, inputs: Any, outputs: Any) -> None:
-            for name, value in zip(names, self.mapped[0].call(self.given(inputs)), strict=True):
+            for name, value in zip(names, self.mapped[0].call(self.columns_of(inputs)), strict=True):
                 outputs[name] = value.full().T
 
         def compute_partials(self, inputs: Any, partials: Any) -> None:
-            found = self.mapped[1].call(self.given(inputs))
-            for (i, k), slope in zip(pairs, found, strict=True):  # n matrices (m, width) side by side
+            outcome = self.mapped[1].call(self.columns_of(inputs))
+            for (i, k), slope in zip(pairs, outcome, strict=True):  # n matrices (m, width) side by side
                 of = slope.full().reshape(values[i].numel(), -1, symbols[k].numel())
                 partials[names[i], list(sizes)[k]] = of.transpose(1, 0, 2).ravel()
 
@@ -168,8 +168,8 @@ def dymos(statement: Statement, intervals: int) -> Posed:
     phase.set_time_options(fix_initial=True, targets=["t"], **ends)
     fixed = [statement.bounds(kind) for kind in ("initial", "terminal")]
     is_fixed = [(lower == upper).tolist() for lower, upper in fixed]
-    told: dict[str, Any] = {"fix_initial": is_fixed[0], "fix_final": is_fixed[1]}
-    phase.add_state("x", shape=(form.nx,), rate_source="rates", targets=["x"], **told)
+    by_name: dict[str, Any] = {"fix_initial": is_fixed[0], "fix_final": is_fixed[1]}
+    phase.add_state("x", shape=(form.nx,), rate_source="rates", targets=["x"], **by_name)
     phase.add_control("u", shape=(form.nu,), targets=["u"], continuity=False)
     phase.add_parameter("p", val=statement.p, static_target=True, targets=["p"])
     phase.add_state("c", shape=(1,), rate_source="running", targets=["c"], fix_initial=True)
@@ -214,21 +214,21 @@ def _along(statement: Statement) -> Any:
     """The formulas as a casadi Function of (x, u, t, cost so far, p, joints at time 0), by name, without empty ones."""
     formulas, form = statement.formulas, statement.form
     names = ("x", "u", "t", "c", "p", "first")
-    x, u, t, c, p, first = given = [
+    x, u, t, c, p, first = options = [
         ca.SX.sym(n, k) for n, k in zip(names, (form.nx, form.nu, 1, 1, 1, form.nu), strict=True)
     ]
-    found = {name: of(x, u, t, 0, p) for name, of in formulas.items() if name != "terminal" and of.numel_out(0)}
-    found["total"] = c + formulas["terminal"](x, t)
+    by_name = {name: of(x, u, t, 0, p) for name, of in formulas.items() if name != "terminal" and of.numel_out(0)}
+    by_name["total"] = c + formulas["terminal"](x, t)
     sides = [np.concatenate(side) for side in zip(statement.bounds("state"), statement.bounds("control"), strict=True)]
     if (
         which := np.flatnonzero(np.isfinite(sides[0]) & np.isfinite(sides[1]))
     ).size:  # Dymos bounds no vector entry by entry
         lower, upper = (side[which] for side in sides)
         middle, half = (upper + lower) / 2, (upper - lower) / 2
-        found["inside"] = (ca.vertcat(x, u)[which.tolist()] - middle) / half
+        by_name["inside"] = (ca.vertcat(x, u)[which.tolist()] - middle) / half
     if statement.is_cyclic:
-        found["ends"] = x[list(range(form.nu))] - first
-    return ca.Function("along", given, list(found.values()), list(names), list(found))
+        by_name["ends"] = x[list(range(form.nu))] - first
+    return ca.Function("along", options, list(by_name.values()), list(names), list(by_name))
 
 
 def drake(statement: Statement, intervals: int) -> Posed:

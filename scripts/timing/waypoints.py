@@ -50,16 +50,16 @@ def row(name: str, resolution: float | None) -> dict[str, Any]:
             descartes.write_problem(name, resolution, Path(folder))
         module = "waypoints" if resolution is None else "descartes"
         own = [name] if resolution is None else []
-        seconds, memory, said = measured([sys.executable, "-m", f"scripts.timing.{module}", *own, folder])
+        seconds, memory, message = measured([sys.executable, "-m", f"scripts.timing.{module}", *own, folder])
         file = Path(folder) / "joints.npy"
         joints = np.load(file) if file.exists() else None
-    found: dict[str, Any] = {"problem": name, "by": by, "rad": None, "m": None, "published_rad": published}
-    verdict = said
+    by_name: dict[str, Any] = {"problem": name, "by": by, "rad": None, "m": None, "published_rad": published}
+    verdict = message
     if joints is not None:
-        ways, turns = np.abs(np.diff(joints, axis=0)).sum(axis=0), turning(problem)
-        found |= {"rad": float(ways[turns].sum()), "m": float(ways[np.logical_not(turns)].sum())}
+        paths, turns = np.abs(np.diff(joints, axis=0)).sum(axis=0), turning(problem)
+        by_name |= {"rad": float(paths[turns].sum()), "m": float(paths[np.logical_not(turns)].sum())}
         verdict = "; ".join(faults(name, joints)) or "valid"
-    return found | {"cpu_s": seconds, "peak_mb": memory, "verdict": " ".join(verdict.split())}
+    return by_name | {"cpu_s": seconds, "peak_mb": memory, "verdict": " ".join(verdict.split())}
 
 
 def measured(command: list[str]) -> tuple[float, float, str]:
@@ -69,24 +69,28 @@ def measured(command: list[str]) -> tuple[float, float, str]:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY << 30, MEMORY << 30))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 1))
 
-    with tempfile.TemporaryFile() as told:
+    with tempfile.TemporaryFile() as message:
         process = subprocess.Popen(
-            command, preexec_fn=limited, stdout=told, stderr=subprocess.STDOUT, cwd=Path(__file__).resolve().parents[2]
+            command,
+            preexec_fn=limited,
+            stdout=message,
+            stderr=subprocess.STDOUT,
+            cwd=Path(__file__).resolve().parents[2],
         )
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
-        told.seek(0)
-        text = told.read().decode(errors="replace")
+        message.seek(0)
+        text = message.read().decode(errors="replace")
     seconds = used.ru_utime + used.ru_stime
     if "bad_alloc" in text or "MemoryError" in text:
-        said = f"more than {MEMORY} GB"
+        printed = f"more than {MEMORY} GB"
     elif process.returncode == -signal.SIGXCPU or seconds >= SECONDS:
-        said = f"more than {SECONDS} s"
+        printed = f"more than {SECONDS} s"
     elif "failed to build graph" in text:
-        said = "no posture was found at some waypoint, or none that is clear"
+        printed = "no posture was found at some waypoint, or none that is clear"
     else:
-        said = text.strip().splitlines()[-1][-200:] if text.strip() else f"ended with {process.returncode}"
-    return seconds, used.ru_maxrss / 1024, said
+        printed = text.strip().splitlines()[-1][-200:] if text.strip() else f"ended with {process.returncode}"
+    return seconds, used.ru_maxrss / 1024, printed
 
 
 def report(numbers: dict[str, Any]) -> str:
@@ -99,8 +103,8 @@ def report(numbers: dict[str, Any]) -> str:
         peers = [row for row in valid if row["by"] != OURS]
         best = min(peers, key=lambda row: row["rad"], default=None)
         if len(own) > 1 and ours:
-            told = "none is valid" if best is None else f"{best['rad'] / ours:.3g} times ours ({best['by']})"
-            words.append(f"{name}: Descartes {told}")
+            message = "none is valid" if best is None else f"{best['rad'] / ours:.3g} times ours ({best['by']})"
+            words.append(f"{name}: Descartes {message}")
     return "\n".join([text_table(rows, 4), *words])
 
 
@@ -133,11 +137,11 @@ def plot(path: Path, numbers: dict[str, Any]) -> None:
         memory.set(yticks=[], xlabel="peak memory, GB")
         for axis in (lengths, memory):
             axis.invert_yaxis()
-        told = [
+        matches = [
             ("blue" if by == OURS else "orange", 1.0 if by == OURS else 1.0 - 0.25 * (len(kinds) - 1 - k), by)
             for k, by in enumerate(kinds)
         ]
-        patches = [Patch(color=drawing.COLORS[color], alpha=alpha, label=by) for color, alpha, by in told]
+        patches = [Patch(color=drawing.COLORS[color], alpha=alpha, label=by) for color, alpha, by in matches]
         drawing.legend_below(figure, patches, 3)
 
 

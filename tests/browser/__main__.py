@@ -38,27 +38,27 @@ def main() -> int:
     with sync_playwright() as driver:
         flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
         try:
-            browser = driver.chromium.launch(executable_path=found(), args=flags, timeout=60_000)
+            browser = driver.chromium.launch(executable_path=browser_command(), args=flags, timeout=60_000)
         except Error as error:
-            print(f"browser: {found()} does not start: {str(error).splitlines()[0]}", file=sys.stderr)
+            print(f"browser: {browser_command()} does not start: {str(error).splitlines()[0]}", file=sys.stderr)
             return 0 if options.if_there else 1
         options.out.mkdir(parents=True, exist_ok=True)
-        told = failures(Look(browser, options.out), ROOT)
+        report = failures(Look(browser, options.out), ROOT)
         browser.close()
-    for failure in told:
+    for failure in report:
         print(f"FAILED: {failure}", file=sys.stderr)
-    print(f"pictures are in {options.out}; {len(told)} failures")
-    return 1 if told else 0
+    print(f"pictures are in {options.out}; {len(report)} failures")
+    return 1 if report else 0
 
 
-def found() -> str | None:
+def browser_command() -> str | None:
     """The browser's file."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
 def chromium(install: bool) -> str:
     """Nothing when a browser is there or was installed, else what to do."""
-    if found():
+    if browser_command():
         return ""
     if not install:
         return f"there is no chromium, and no page was opened: {COMMAND}"
@@ -67,7 +67,7 @@ def chromium(install: bool) -> str:
         for words in (["update"], ["install", "--yes", "--no-install-recommends", "chromium"]):
             if not ran([*before, "apt-get", "--quiet", *words]):
                 break
-    return "" if found() else f"there is no chromium, and it may not be installed from here: sudo {COMMAND}"
+    return "" if browser_command() else f"there is no chromium, and it may not be installed from here: sudo {COMMAND}"
 
 
 def playwright(install: bool) -> str:

@@ -42,12 +42,12 @@ class Look:
 
     browser: Any
     folder: Path
-    told: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
 
     def check(self, holds: object, words: str) -> None:
         """Tell what does not hold."""
         if not holds:
-            self.told.append(words)
+            self.messages.append(words)
 
     @contextmanager
     def opened(self, address: str, name: str, **settings: Any) -> Iterator[Any]:
@@ -55,15 +55,17 @@ class Look:
         context = self.browser.new_context(**{"viewport": {"width": 1180, "height": 760}, **settings})
         opened = context.new_page()
         opened.set_default_timeout(SLOW)
-        opened.on("console", lambda said: self.check(said.type not in ("error", "warning"), f"{name}: {said.text}"))
+        opened.on(
+            "console", lambda message: self.check(message.type not in ("error", "warning"), f"{name}: {message.text}")
+        )
         opened.on("pageerror", lambda error: self.check(False, f"{name}: {error}"))
         own = urlparse(address).netloc
-        opened.on("request", lambda asked: self.check(_own(asked.url, own), f"{name} asks {asked.url}"))
+        opened.on("request", lambda request: self.check(_own(request.url, own), f"{name} asks {request.url}"))
         try:
             opened.goto(address)
             yield opened
         except Exception as error:  # of the driver: what did not come in time
-            self.told.append(f"{name}: {type(error).__name__}: {str(error).splitlines()[0]}")
+            self.messages.append(f"{name}: {type(error).__name__}: {str(error).splitlines()[0]}")
         finally:
             context.close()
 
@@ -106,7 +108,7 @@ def failures(look: Look, root: Path) -> list[str]:
                 ready(opened)
                 look.picture(opened, "panda_dark")
     site(look, root / "build" / "site")
-    return look.told
+    return look.messages
 
 
 def ready(opened: Any) -> None:
@@ -194,14 +196,14 @@ def poses(look: Look, opened: Any, name: str, first: Animation) -> None:
     robot = first.machine.robot
     links = [robot.root, *(joint.child for joint in robot.joints if joint.moves), TIP_FRAME]
     for time in np.random.default_rng(0).uniform(0.0, first.t[-1], 5):
-        drawn = np.array(opened.evaluate("(time) => [...player.motions[0].at(time)]", time)).reshape(-1, 7)
+        displayed = np.array(opened.evaluate("(time) => [...player.motions[0].at(time)]", time)).reshape(-1, 7)
         joints, base = (
             np.array([[np.interp(time, first.t, column) for column in values.T]])
             for values in (first.joints, first.base)
         )
         frames = frames_along(first.machine, joints, base)
         wanted = np.array([frames.positions[link][0] for link in links])
-        off = float(np.abs(drawn[:, :3] - wanted).max())
+        off = float(np.abs(displayed[:, :3] - wanted).max())
         look.check(off < 2e-3, f"{name}: at {time:.3f} s a link is drawn {off:.2g} m from where it is")
 
 

@@ -53,9 +53,9 @@ def apart(case: Case, run: Run, solution: Solution, times: Iterable[float]) -> A
     return far
 
 
-def largest_error(found: Array, expected: Array, where: Array) -> float:
+def largest_error(result: Array, expected: Array, where: Array) -> float:
     assert where.any()
-    return float(np.abs(found - np.reshape(expected, found.shape))[where].max())
+    return float(np.abs(result - np.reshape(expected, result.shape))[where].max())
 
 
 @every_run

@@ -142,13 +142,13 @@ def test_the_plan_passes_the_audit(case: Case) -> None:
 def test_direct_methods_are_certified_by_the_minimum_principle(case: Case) -> None:
     problem = case.build()
     direct = solve(problem, case.runs[0].method)
-    found = certificate(problem, [direct, solved(case)], tolerance=1e-2)
-    assert found.passed, str(found)
-    assert found.reference.startswith("Indirect")
+    result = certificate(problem, [direct, solved(case)], tolerance=1e-2)
+    assert result.passed, str(result)
+    assert result.reference.startswith("Indirect")
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_the_minimum_principle_cannot_take_is_refused_by_name(name: str) -> None:
+def test_problems_outside_the_minimum_principle_are_refused_by_name(name: str) -> None:
     error, message = REFUSED[name]
     case = next(case for case in CASES if case.name == name)
     with pytest.raises(error, match=message) as caught:

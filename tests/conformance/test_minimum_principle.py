@@ -23,7 +23,7 @@ def principle(case: Case) -> Principle:
     return Principle(case.build())
 
 
-def pieces(case: Case) -> list[tuple[float, float]]:
+def segments(case: Case) -> list[tuple[float, float]]:
     """Intervals free of corners that cover the horizon, at most 1/40 of it each."""
     corners = sorted({0.0, case.horizon, *(s.time for s in case.switches), *case.jumps})
     cuts = np.concatenate(
@@ -34,7 +34,7 @@ def pieces(case: Case) -> list[tuple[float, float]]:
 
 def inner_points(case: Case) -> tuple[Array, Array]:
     """Gauss points of all pieces and their weights. Shapes (K, 12) each."""
-    a, b = np.array(pieces(case)).T[:, :, None]
+    a, b = np.array(segments(case)).T[:, :, None]
     return (a + b) / 2 + (b - a) / 2 * NODES, (b - a) / 2 * WEIGHTS
 
 
@@ -45,7 +45,7 @@ def change_against_integral(case: Case, costate: bool) -> Array:
     rates = p.along(p.costate_rates if costate else p.rates, t.ravel(), case.horizon, case.optimum(t.ravel()))
     integral = np.einsum("kj,kjn->kn", w, rates.reshape(*t.shape, -1))
     edge = 1e-13 * case.horizon  # stay on the piece's side of a jump
-    a, b = np.array(pieces(case)).T
+    a, b = np.array(segments(case)).T
     values = []
     for times in (a + edge, b - edge):
         point = case.optimum(times)

@@ -56,12 +56,12 @@ def test_a_sound_site_breaks_no_law(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize("what", PLANTED)
-def test_a_planted_breach_is_told_by_file_and_link(what: str, tmp_path: Path) -> None:
-    file, text, told = PLANTED[what]
-    found = broken(site_of(tmp_path, {**SOUND, file: SOUND[file] + text}))
-    assert len(found) == 1, found
-    assert found[0].startswith(file)
-    assert told in found[0]
+def test_a_planted_breach_is_reported_with_file_and_link(what: str, tmp_path: Path) -> None:
+    file, text, report = PLANTED[what]
+    result = broken(site_of(tmp_path, {**SOUND, file: SOUND[file] + text}))
+    assert len(result) == 1, result
+    assert result[0].startswith(file)
+    assert report in result[0]
     assert main([str(tmp_path / "site")]) == 1
 
 

@@ -26,7 +26,7 @@ FORMULAS = re.compile(r"\$\$(.+?)\$\$|(?<![\w$])\$([^$\n]+?)\$(?![\w$])", re.DOT
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(SITE)))
-def test_what_a_page_imports_is_there(page: Path) -> None:
+def test_imports_of_pages_exist(page: Path) -> None:
     for line, _, source in blocks(page.read_text(encoding="utf-8")):
         tree = ast.parse(textwrap.dedent(source), str(page))
         for node in ast.walk(tree):
@@ -67,15 +67,15 @@ def test_every_formula_becomes_mathml() -> None:
     for page in PAGES:
         text = re.sub(r"^```.*?^```$|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
         for block, inline in FORMULAS.findall(text):
-            made = convert((block or inline).strip())
-            root = ElementTree.fromstring(made)
+            result = convert((block or inline).strip())
+            root = ElementTree.fromstring(result)
             assert root.tag.endswith("math")
             assert "\\" not in "".join(root.itertext()), f"{page}: {block or inline}"
             count += 1
     assert count > 40
 
 
-def test_what_a_block_prints_and_shows_stands_below_it() -> None:
+def test_output_of_a_block_follows_it() -> None:
     page = textwrap.dedent(
         """
         # A page
@@ -99,12 +99,12 @@ def test_what_a_block_prints_and_shows_stands_below_it() -> None:
         ```
         """
     )
-    told = executed(page, "page")
-    printed, shown, drawn = (told.rindex(word) for word in ("printed 20", "\n21\n", "<svg></svg>"))
-    assert told.index("Words.") > printed
-    assert told.index("Words.") < shown < drawn
-    assert told.count("```python\n") == 3
-    assert "no Python" in told
+    report = executed(page, "page")
+    printed, shown, picture = (report.rindex(word) for word in ("printed 20", "\n21\n", "<svg></svg>"))
+    assert report.index("Words.") > printed
+    assert report.index("Words.") < shown < picture
+    assert report.count("```python\n") == 3
+    assert "no Python" in report
 
 
 def test_a_block_that_fails_ends_the_build_with_its_page_and_line() -> None:
@@ -113,7 +113,7 @@ def test_a_block_that_fails_ends_the_build_with_its_page_and_line() -> None:
 
 
 def test_docstrings_mean_nothing_but_what_they_say() -> None:
-    told = prepared(
+    report = prepared(
         [
             "Half |v|^2, `a|b` and ``c*d``, x_ * y.",
             "",
@@ -124,9 +124,9 @@ def test_docstrings_mean_nothing_but_what_they_say() -> None:
             "    n: |n| of `a_`.",
         ]
     )
-    assert told[0] == "Half \\|v\\|^2, `a|b` and ``c*d``, x\\_ \\* y."
-    assert told[2:6] == ["::", "", "    q = |a| * b", "    + c*"]
-    assert told[-1] == "    n: \\|n\\| of `a_`."
+    assert report[0] == "Half \\|v\\|^2, `a|b` and ``c*d``, x\\_ \\* y."
+    assert report[2:6] == ["::", "", "    q = |a| * b", "    + c*"]
+    assert report[-1] == "    n: \\|n\\| of `a_`."
 
 
 def test_every_number_of_the_papers_stands_on_its_page_with_its_reason() -> None:
@@ -146,25 +146,25 @@ def test_every_number_of_the_papers_stands_on_its_page_with_its_reason() -> None
     assert sum(MARK in page.read_text(encoding="utf-8") for page in PAGES) == 1
 
 
-def test_blocks_that_stand_alone_are_told_from_those_that_go_on() -> None:
-    found = blocks("a\n```python\nx = 1\n```\nb\n```py\nx + 1\n```\n```python3\nno\n```\n")
-    assert [(line, alone) for line, alone, _ in found] == [(3, True), (7, False)]
-    assert [source for _, _, source in found] == ["x = 1\n", "x + 1\n"]
+def test_standalone_blocks_are_distinguished_from_continuations() -> None:
+    result = blocks("a\n```python\nx = 1\n```\nb\n```py\nx + 1\n```\n```python3\nno\n```\n")
+    assert [(line, alone) for line, alone, _ in result] == [(3, True), (7, False)]
+    assert [source for _, _, source in result] == ["x = 1\n", "x + 1\n"]
 
 
-def test_of_what_is_long_the_beginning_is_shown() -> None:
-    told = executed("```python\nfor k in range(61):\n    print('line', k)\n```\n", "page")
-    assert "line 59\n... and 1 lines more" in told
-    assert "line 60" not in told
-    told = executed("```python\nfor k in range(60):\n    print('line', k)\n```\n", "page")
-    assert "line 59" in told
-    assert "lines more" not in told
+def test_long_output_is_truncated_at_its_end() -> None:
+    report = executed("```python\nfor k in range(61):\n    print('line', k)\n```\n", "page")
+    assert "line 59\n... and 1 lines more" in report
+    assert "line 60" not in report
+    report = executed("```python\nfor k in range(60):\n    print('line', k)\n```\n", "page")
+    assert "line 59" in report
+    assert "lines more" not in report
 
 
-def test_every_plan_of_the_gallery_is_played_beside_what_it_is_compared_with() -> None:
-    told = (SITE / "gallery.md").read_text(encoding="utf-8")
+def test_every_plan_of_the_gallery_is_played_beside_its_comparison() -> None:
+    text = (SITE / "gallery.md").read_text(encoding="utf-8")
     plans = sorted((SITE.parent / "results" / "gallery").glob("*.npz"))
-    assert sorted(re.findall(r"```\{player\} (\w+)", told)) == [plan.stem for plan in plans]
+    assert sorted(re.findall(r"```\{player\} (\w+)", text)) == [plan.stem for plan in plans]
     for plan in plans:
         words = command(plan, SITE / "out.html")[3:]
         options = parser().parse_args(words)

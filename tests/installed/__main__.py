@@ -68,7 +68,7 @@ class User:
     """
 
     def __init__(self, home: Path, bin: Path) -> None:
-        self.home, self.bin, self.told = home, bin, list[str]()
+        self.home, self.bin, self.messages = home, bin, list[str]()
 
     def run(self, *words: str) -> subprocess.CompletedProcess[str]:
         """A program of the environment, in the folder, with nothing of this process's paths."""
@@ -82,7 +82,7 @@ class User:
         """Say whether something holds."""
         print(f"{'ok' if good else 'FAILED'}  {what}", flush=True)
         if not good:
-            self.told.append(f"{what}: {shown}")
+            self.messages.append(f"{what}: {shown}")
 
     def does(self, *words: str, makes: str = "") -> str:
         """Run `selfmotion`; it succeeds, and leaves a file."""
@@ -100,19 +100,19 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="selfmotion-installed-") as folder:
         home = Path(folder)
         wheel = options.wheel.resolve() if options.wheel else built(home)
-        told = read_on(home, wheel)
+        report = read_on(home, wheel)
         venv.create(home / "env", with_pip=True)
         user = User(home / "user", home / "env" / "bin")
         user.home.mkdir()
         done = user.run("python", "-m", "pip", "install", "--quiet", f"{wheel}[{EXTRAS}]")
         user.holds(f"pip install {wheel.name}[{EXTRAS}]", done.returncode == 0, done.stderr)
-        if not user.told:
+        if not user.messages:
             used(user)
-        user.told += told
-    for failure in user.told:
+        user.messages += report
+    for failure in user.messages:
         print(f"FAILED: {failure}", file=sys.stderr)
-    print(f"{len(user.told)} failures")
-    return 1 if user.told else 0
+    print(f"{len(user.messages)} failures")
+    return 1 if user.messages else 0
 
 
 def read_on(folder: Path, wheel: Path) -> list[str]:
@@ -131,7 +131,7 @@ def read_on(folder: Path, wheel: Path) -> list[str]:
         if step.words:
             done = user.run(*step.words)
             user.holds(f"README: {' '.join(step.words)}", done.returncode == 0, f"{done.stdout}\n{done.stderr}")
-    return user.told
+    return user.messages
 
 
 def built(folder: Path) -> Path:
@@ -154,8 +154,8 @@ def used(user: User) -> None:
     for ending in ("csv", "json", "yaml", "mcap", "urdf"):
         user.does("export", "seam.npz", f"out.{ending}", makes=f"out.{ending}")
     for ending in ("json", "yaml", "mcap"):
-        said = json.loads(user.does("check", "out.urdf", f"out.{ending}", "--json"))
-        user.holds(f"out.{ending} passes its check", said["passed"] is True, str(said.get("faults")))
+        message = json.loads(user.does("check", "out.urdf", f"out.{ending}", "--json"))
+        user.holds(f"out.{ending} passes its check", message["passed"] is True, str(message.get("faults")))
     user.does("view", "seam.npz", "--page", "seam.html", makes="seam.html")
     text = (user.home / "seam.html").read_text(encoding="utf-8")
     user.holds("the page has at most 8 MB, and the meshes", 500_000 < len(text) < 8_000_000, f"{len(text)} bytes")

@@ -104,7 +104,7 @@ REFUSED: list[tuple[Callable[[Checks], Any], str, str, Any]] = [
 
 @pytest.mark.parametrize(("checks", "kind"), [(require, ModelError), (require_of_ocp, ProblemError)])
 @pytest.mark.parametrize(("check", "message", "name", "limit"), REFUSED)
-def test_a_check_names_what_is_wrong(
+def test_a_check_names_the_invalid_value(
     check: Callable[[Checks], Any], message: str, name: str, limit: Any, checks: Checks, kind: type[Exception]
 ) -> None:
     with pytest.raises(kind, match=message) as caught:

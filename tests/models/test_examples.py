@@ -58,15 +58,15 @@ def test_bodies_are_homogeneous_and_apart_at_zero_and_every_joint_is_limited(nam
         links = [shapes.geometryObjects[k].name.rsplit("_", 1)[0] for k in (one, two)]
         if abs(names.index(links[0]) - names.index(links[1])) > 1:
             shapes.addCollisionPair(pin.CollisionPair(one, two))
-    data, found = model.createData(), pin.GeometryData(shapes)
-    pin.computeDistances(model, data, shapes, found, np.zeros(model.nq))
-    assert min(result.min_distance for result in found.distanceResults) > 0.005
+    data, outcome = model.createData(), pin.GeometryData(shapes)
+    pin.computeDistances(model, data, shapes, outcome, np.zeros(model.nq))
+    assert min(result.min_distance for result in outcome.distanceResults) > 0.005
     around = CollisionScene(FixedBase(robot))
     assert np.array(around.distances(np.zeros(0), np.zeros(robot.dof))).min() > 0
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_tool_axis_points_out_of_the_arm_and_it_reaches_as_far_as_is_said(name: str) -> None:
+def test_the_tool_axis_points_out_of_the_arm_and_the_reach_is_exact(name: str) -> None:
     robot = example_robot(name)
     shoulder = [0.0, 0.0, 0.09] if name == "six_axis" else [0.0, 0.0, 0.34]
     rng = np.random.default_rng(1)

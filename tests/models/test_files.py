@@ -30,7 +30,7 @@ def filled(place: Path) -> tuple[Path, Path]:
     return place / f"{KEY}.json", library
 
 
-def given_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def make_foreign(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Make a path somebody else's: root gives it away, any other user becomes another one."""
     if os.geteuid() == 0:
         os.chown(path, 12345, -1, follow_symlinks=False)
@@ -73,7 +73,7 @@ def test_a_folder_that_others_may_write_is_not_used(place: Path, mode: int, capl
 @pytest.mark.parametrize("whose", ["folder", "above"])
 def test_a_folder_of_somebody_else_is_not_used(place: Path, whose: str, monkeypatch: pytest.MonkeyPatch) -> None:
     filled(place)
-    given_away(place if whose == "folder" else place.parent, monkeypatch)
+    make_foreign(place if whose == "folder" else place.parent, monkeypatch)
     assert (cache.load_value(KEY), cache.load_library(KEY)) == (None, None)
 
 
@@ -106,7 +106,7 @@ def test_a_file_of_others_is_not_believed(place: Path, how: str, monkeypatch: py
         elif how == "others may write":
             file.chmod(0o620)
         else:
-            given_away(file, monkeypatch)
+            make_foreign(file, monkeypatch)
     assert (cache.load_value(KEY), cache.load_library(KEY)) == (None, None)
 
 

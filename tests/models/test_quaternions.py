@@ -23,14 +23,14 @@ def near_half_turns() -> st.SearchStrategy[Array]:
 @given(vectors=st.lists(near_half_turns(), min_size=1, max_size=5))
 def test_quaternions_are_those_of_scipy(vectors: list[Array]) -> None:
     rotation = Rotation.from_rotvec(np.array(vectors))
-    found = quaternion_from_rotation(rotation.as_matrix())
-    assert found.shape == (len(vectors), 4)
-    assert (found[:, 0] >= 0).all()
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-14)
-    again = Rotation.from_quat(np.roll(found, -1, axis=1)).as_matrix()
+    result = quaternion_from_rotation(rotation.as_matrix())
+    assert result.shape == (len(vectors), 4)
+    assert (result[:, 0] >= 0).all()
+    np.testing.assert_allclose(np.linalg.norm(result, axis=1), 1.0, atol=1e-14)
+    again = Rotation.from_quat(np.roll(result, -1, axis=1)).as_matrix()
     np.testing.assert_allclose(again, rotation.as_matrix(), atol=1e-12)
     wanted = np.roll(rotation.as_quat(), 1, axis=1)
-    same = np.abs(np.einsum("mi,mi->m", found, wanted))
+    same = np.abs(np.einsum("mi,mi->m", result, wanted))
     np.testing.assert_allclose(same, 1.0, atol=1e-12)
 
 

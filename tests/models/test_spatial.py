@@ -53,10 +53,10 @@ def scipy_rotation(quaternion: Array) -> Rotation:
     return Rotation.from_quat(quaternion[[1, 2, 3, 0]])
 
 
-def close(found: Any, expected: Any, tolerance: float = 1e-14) -> None:
+def close(result: Any, expected: Any, tolerance: float = 1e-14) -> None:
     """Vectors are compared as vectors, whether they are columns or not."""
     known = np.asarray(expected)
-    np.testing.assert_allclose(numeric(found).reshape(known.shape), known, atol=tolerance)
+    np.testing.assert_allclose(numeric(result).reshape(known.shape), known, atol=tolerance)
 
 
 @given(seeds)
@@ -205,8 +205,8 @@ def test_symbols_of_both_kinds_give_the_numeric_values(symbols: Any) -> None:
         ]
 
     x, y = symbols.sym("x", 6), symbols.sym("y", 6)
-    found = ca.Function("f", [x, y], everything(x, y))(a, b)
-    for one, other in zip(found, everything(ca.DM(a), ca.DM(b)), strict=True):
+    result = ca.Function("f", [x, y], everything(x, y))(a, b)
+    for one, other in zip(result, everything(ca.DM(a), ca.DM(b)), strict=True):
         close(one, numeric(other))
 
 
@@ -214,8 +214,8 @@ def test_symbols_of_both_kinds_give_the_numeric_values(symbols: Any) -> None:
 def test_lists_with_symbols_are_stacked_and_not_read_as_numbers(symbols: Any) -> None:
     a, b = symbols.sym("a"), symbols.sym("b", 2)
 
-    def value(found: Any) -> Array:
-        return numeric(ca.Function("f", [a, b], [found])(3.0, [5.0, 7.0]))
+    def value(result: Any) -> Array:
+        return numeric(ca.Function("f", [a, b], [result])(3.0, [5.0, 7.0]))
 
     assert value(expression([a, 0, 2.5])).ravel().tolist() == [3, 0, 2.5]
     assert value(expression((b, a))).ravel().tolist() == [5, 7, 3]
@@ -271,8 +271,8 @@ def test_structural_zeros_stay_zero_and_cost_nothing() -> None:
     a, b = ca.SX.sym("a", ca.Sparsity.diag(4)), ca.SX.sym("b", 4)
     x = solve_spd(a, b)
     assert ca.Function("f", [a, b], [x]).n_instructions() <= 4 * 5
-    found = ca.Function("f", [a, b], [x])(ca.DM(np.diag([1.0, 2, 4, 8])).sparsity(), [1, 1, 1, 1])
-    np.testing.assert_allclose(numeric(found).ravel(), 1.0)
+    result = ca.Function("f", [a, b], [x])(ca.DM(np.diag([1.0, 2, 4, 8])).sparsity(), [1, 1, 1, 1])
+    np.testing.assert_allclose(numeric(result).ravel(), 1.0)
 
 
 @pytest.mark.parametrize("size", range(3, 8))

@@ -68,7 +68,7 @@ def planned(start: Any) -> Any:
         (lambda: Rig(**{**LENGTHS, "sting": 750.0}), "sting", "millimetres"),
     ],
 )
-def test_what_is_given_in_other_units_is_warned_of_by_name(make: Callable[[], Any], name: str, what: str) -> None:
+def test_values_in_other_units_are_warned_of_by_name(make: Callable[[], Any], name: str, what: str) -> None:
     with pytest.warns(ModelWarning, match=what) as caught:
         make()
     names = [warning.message.name for warning in caught if isinstance(warning.message, ModelWarning)]
@@ -90,13 +90,13 @@ def test_what_is_given_in_other_units_is_warned_of_by_name(make: Callable[[], An
         lambda: CollisionShape("mesh", (1000, 1000, 1000), "part.stl"),
     ],
 )
-def test_what_may_be_meant_is_not_warned_of(make: Callable[[], Any]) -> None:
+def test_plausible_values_cause_no_warning(make: Callable[[], Any]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make()
 
 
-def test_it_is_said_once() -> None:
+def test_the_warning_is_given_once() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default", ModelWarning)
         for _ in range(3):

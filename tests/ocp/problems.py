@@ -205,8 +205,8 @@ def moved() -> Problem:
     problem.dynamics(x, v)
     problem.dynamics(v, u - 0.3 * v * ca.fabs(v) - ca.sin(x))
     problem.horizon(problem.parameter("duration"))
-    way = problem.parameter("way")
-    problem.end("there", x, way, way)
+    path = problem.parameter("way")
+    problem.end("there", x, path, path)
     problem.path("power", u * v, upper=0.8)
     problem.minimize(running=u**2, terminal=v**2)
     return problem

@@ -14,12 +14,12 @@ from tests.ocp.problems import SWING, energy, relative, swing, van_der_pol
 def test_an_active_set_method_confirms_a_plan(method: Any) -> None:
     problem = van_der_pol(upper=0.1)
     plan = solve(problem, method)
-    found = certificate(problem, [plan], second_solver=True)
-    row = found.comparisons[-1]
+    result = certificate(problem, [plan], second_solver=True)
+    row = result.comparisons[-1]
     assert row.name.endswith(", by sleqp")
     assert row.worst < 1e-6
     assert abs(row.cost - plan.cost) < 1e-8
-    assert ", by sleqp" in str(found)
+    assert ", by sleqp" in str(result)
 
 
 @pytest.mark.parametrize("problem", [energy, lambda: energy(lower=-5.0, upper=5.0), van_der_pol])

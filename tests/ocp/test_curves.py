@@ -65,7 +65,7 @@ def test_breaks_belong_to_the_right_and_ends_are_held() -> None:
     np.testing.assert_allclose(stairs()(at)[:, 0], [1.0, 1.0, 1.5, 5.0, 4.5, 4.0, 4.0])
 
 
-def test_both_sides_of_a_break_can_be_asked() -> None:
+def test_both_sides_of_a_break_can_be_evaluated() -> None:
     np.testing.assert_allclose(stairs().within(np.array([0, 1]), np.array([1.0, 0.0]))[:, 0], [2.0, 5.0])
 
 
@@ -104,6 +104,6 @@ def test_integrators_keep_their_tolerance(smooth: bool) -> None:
     x, t = ca.SX.sym("x", 2), ca.SX.sym("t")
     dae = {"x": x, "t": t, "ode": ca.vertcat(x[1], -x[0] + ca.cos(2 * t)), "quad": x[0]}
     places = np.array([0.5, 1.0, 2.0])
-    found = integrator("swung", dae, places.tolist(), smooth=smooth)(x0=[1.0, 0.0])
-    np.testing.assert_allclose(found["xf"].full()[0], (4 * np.cos(places) - np.cos(2 * places)) / 3, atol=1e-9)
-    np.testing.assert_allclose(found["qf"].full()[0], (4 * np.sin(places) - np.sin(2 * places) / 2) / 3, atol=1e-9)
+    result = integrator("swung", dae, places.tolist(), smooth=smooth)(x0=[1.0, 0.0])
+    np.testing.assert_allclose(result["xf"].full()[0], (4 * np.cos(places) - np.cos(2 * places)) / 3, atol=1e-9)
+    np.testing.assert_allclose(result["qf"].full()[0], (4 * np.sin(places) - np.sin(2 * places) / 2) / 3, atol=1e-9)

@@ -84,7 +84,7 @@ def test_a_body_at_rest_on_a_hilltop_rolls_down(method: Any) -> None:
 
 
 @EVERY
-def test_a_pan_tilt_head_does_not_go_the_long_way_round(method: Any) -> None:
+def test_a_pan_tilt_head_turns_by_the_smaller_angle(method: Any) -> None:
     """Least int (cos(tilt) pan')^2 + tilt'^2 between directions on the equator, 4 rad apart the long way: a half turn
     of the sphere is passed, so a great circle the short way over a pole is cheaper."""
     problem = Problem("pan-tilt")

@@ -28,7 +28,7 @@ def test_exceptions_are_of_the_kinds_that_callers_expect() -> None:
 
 
 @pytest.mark.parametrize("kind", [ProblemError, SolveError, AuditError, RefinementWarning])
-def test_exceptions_are_pickled_with_what_they_carry(kind: Any) -> None:
+def test_exceptions_are_pickled_with_their_fields(kind: Any) -> None:
     error = kind("too fast", name="speed", value=3.0, limit=(0.0, 2.0), time=0.5)
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is kind
@@ -38,7 +38,7 @@ def test_exceptions_are_pickled_with_what_they_carry(kind: Any) -> None:
 
 
 @pytest.mark.parametrize("method", [Collocation(6), MultipleShooting(6)])
-def test_a_failure_carries_what_would_have_to_give_way(method: Any) -> None:
+def test_a_failure_carries_the_constraint_to_relax(method: Any) -> None:
     """From 0 to 1 in 1 s at 0.4/s at most: 0.6 is missing, of the end or of the speed."""
     problem, x, u = plant("too far", initial=0.0, u={"lower": -0.4, "upper": 0.4})
     problem.dynamics(x, u)

@@ -160,32 +160,32 @@ def lines(code: str) -> list[list[str]]:
 
 
 def test_ctrl_c_ends_a_solve_at_once_with_its_iterate() -> None:
-    *found, afterwards = lines(DIRECT)
+    *result, afterwards = lines(DIRECT)
     with_a_plan = ["ipopt", "ipopt without check", "fatrop"]
     others = ["second start", "what conflicts", "sleqp", "prepare", "refine", "tighten"]
-    assert [name for name, _, _ in found] == with_a_plan + others
-    assert {word for name, word, _ in found if name in with_a_plan} == {"KeyboardInterrupt with a plan"}
-    assert {word.removesuffix(" with a plan") for _, word, _ in found} == {"KeyboardInterrupt"}
-    assert {late for _, _, late in found} == {"at once"}
+    assert [name for name, _, _ in result] == with_a_plan + others
+    assert {word for name, word, _ in result if name in with_a_plan} == {"KeyboardInterrupt with a plan"}
+    assert {word.removesuffix(" with a plan") for _, word, _ in result} == {"KeyboardInterrupt"}
+    assert {late for _, _, late in result} == {"at once"}
     assert afterwards == ["True False"]
 
 
 def test_ctrl_c_during_a_check_is_no_verdict() -> None:
-    found = lines(CHECKS)
-    assert [name for name, _, _ in found] == [
+    result = lines(CHECKS)
+    assert [name for name, _, _ in result] == [
         "audit", "audit again", "certificate", "indirect", "indirect with its own seed"
     ]  # fmt: skip
-    assert {word.removesuffix(" with a plan") for _, word, _ in found} == {"KeyboardInterrupt"}
-    assert {late for _, _, late in found} == {"at once"}
+    assert {word.removesuffix(" with a plan") for _, word, _ in result} == {"KeyboardInterrupt"}
+    assert {late for _, _, late in result} == {"at once"}
 
 
-def test_ctrl_c_ends_what_is_done_with_machines() -> None:
-    found = lines(MACHINES)
-    assert {word.removesuffix(" with a plan") for _, word, _ in found} == {"KeyboardInterrupt"}, found
-    assert {late for _, _, late in found} == {"at once"}, found
+def test_ctrl_c_ends_planning_of_machines() -> None:
+    result = lines(MACHINES)
+    assert {word.removesuffix(" with a plan") for _, word, _ in result} == {"KeyboardInterrupt"}, result
+    assert {late for _, _, late in result} == {"at once"}, result
 
 
-def test_what_a_handler_of_signals_raises_ends_a_call_too() -> None:
+def test_an_exception_of_a_signal_handler_ends_a_call() -> None:
     """An alarm, say: it is raised where the call was made, and the handler stays as it was."""
 
     class Alarm(Exception):
@@ -288,8 +288,8 @@ def test_one_time_limit_covers_all_starts() -> None:
     prepared = prepare(solved_from_zeros(), Collocation(4000, 4))
     with pytest.raises(SolveError, match="Maximum_WallTime_Exceeded: raise time_limit") as caught:
         prepared.solve(time_limit=0.3)
-    told = str(caught.value).splitlines()
-    assert next(line for line in told if line.startswith("from the ")).startswith("from the guess: Invalid_Number")
+    report = str(caught.value).splitlines()
+    assert next(line for line in report if line.startswith("from the ")).startswith("from the guess: Invalid_Number")
     assert "from the roll-out" not in str(caught.value)
     assert caught.value.solution.start == "zeros"
     assert caught.value.solution.status is SolverStatus.TIME_LIMIT
@@ -340,11 +340,11 @@ def test_a_build_ends_at_the_time_limit(
     monkeypatch: pytest.MonkeyPatch, method: Collocation | MultipleShooting
 ) -> None:
     """After one of its parts: none is a large share of it, and the solver is never made."""
-    made: list[str] = []
-    monkeypatch.setattr("ocp.direct.prepared.build_solver", lambda *_: made.append("solver"))
+    results: list[str] = []
+    monkeypatch.setattr("ocp.direct.prepared.build_solver", lambda *_: results.append("solver"))
     with pytest.raises(SolveError, match="still being built: Maximum_WallTime_Exceeded: raise time_limit") as caught:
         solve(van_der_pol(), method, time_limit=1e-9)
-    assert (caught.value.name, caught.value.solution, made) == ("time_limit", None, [])
+    assert (caught.value.name, caught.value.solution, results) == ("time_limit", None, [])
 
 
 def overtaken(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int, module: Any = ocp.refinement) -> None:
@@ -363,7 +363,7 @@ def overtaken(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int,
 
 
 def test_refinement_ends_at_its_time_limit_with_the_plan_that_it_has() -> None:
-    with pytest.warns(RefinementWarning, match="the time limit is reached: raise time_limit") as told:
+    with pytest.warns(RefinementWarning, match="the time limit is reached: raise time_limit") as report:
         plan = refine(
             long(), Collocation(20), tolerance=1e-13, settings=RefinementSettings(max_intervals=100_000), time_limit=1.0
         )
@@ -371,7 +371,7 @@ def test_refinement_ends_at_its_time_limit_with_the_plan_that_it_has() -> None:
     assert plan.refinement is not None
     assert not plan.refinement.reached
     assert len(plan.control_interpolant.breaks) == plan.refinement.intervals[-1] + 1
-    warning = told[0].message
+    warning = report[0].message
     assert isinstance(warning, RefinementWarning)
     assert warning.name
     assert warning.value > 1.0
@@ -429,15 +429,15 @@ def test_tightening_ends_at_its_time_limit_with_its_best_plan() -> None:
 
 
 @pytest.mark.parametrize("rounds", [1, 2])
-def test_tightening_carries_its_best_plan_and_says_what_remains(rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_tightening_carries_its_best_plan(rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
     method = Collocation(10, scheme="legendre")  # takes four rounds
     overtaken(monkeypatch, Prepared, "solve", rounds + 1, ocp.tightening)
     with pytest.raises(
         SolveError, match=r"Maximum_WallTime_Exceeded: raise time_limit; .* still exceeds its bound"
-    ) as told:
+    ) as report:
         tighten(walled(), method, tolerance=1e-10, time_limit=100.0)
-    assert (told.value.name, told.value.value) == ("time_limit", 100.0)
-    plan = told.value.solution
+    assert (report.value.name, report.value.value) == ("time_limit", 100.0)
+    plan = report.value.solution
     assert not plan.success
     assert plan.status is SolverStatus.TIME_LIMIT
     assert (plan.bound_tightening is None) == (rounds == 1)  # under the bounds of its own round
@@ -480,7 +480,7 @@ def together(call):
     for thread in threads: thread.join()
 """
 
-TOLD = """
+REPORT = """
 assert not errors, errors
 if isinstance(results[0][0], float):
     results = np.round(results, 9).tolist()
@@ -518,8 +518,8 @@ together(lambda: [float(form.sampled([form.f, form.running], x, u, t, 1.0, p)[0]
 
 
 @pytest.mark.parametrize("what", SHARED)
-def test_threads_that_share_something_get_what_one_alone_gets(what: str) -> None:
-    done = run(f"{THREADS}\n{SHARED[what]}\n{TOLD}")
+def test_threads_that_share_objects_get_the_same_results(what: str) -> None:
+    done = run(f"{THREADS}\n{SHARED[what]}\n{REPORT}")
     assert done.returncode == 0, (done.returncode, done.stderr)
     assert done.stdout.split() == ["4", "1"]
 
@@ -542,7 +542,7 @@ def test_without_a_terminal_a_solve_logs_its_start_and_its_end(solver: str, capl
     assert "Maximum_WallTime_Exceeded" in caplog.records[-1].getMessage()
 
 
-def test_what_one_thread_keeps_quiet_does_not_silence_another(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_silenced_thread_does_not_silence_another(capsys: pytest.CaptureFixture[str]) -> None:
     real = sys.stderr
     inside, leave = threading.Event(), threading.Event()
 

@@ -23,14 +23,14 @@ every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 @every_method
 def test_every_method_finds_the_known_optimum(method: Any) -> None:
     case = LogarithmicRegulator()
-    found = solve(case.build(), method)
-    assert found.success
-    assert found.cost == pytest.approx(case.cost, rel=1e-3 if isinstance(method, MultipleShooting) else 1e-6)
-    np.testing.assert_allclose(found["y"].ravel(), case.state(found.t), rtol=1e-3)
+    solution = solve(case.build(), method)
+    assert solution.success
+    assert solution.cost == pytest.approx(case.cost, rel=1e-3 if isinstance(method, MultipleShooting) else 1e-6)
+    np.testing.assert_allclose(solution["y"].ravel(), case.state(solution.t), rtol=1e-3)
 
 
 @every_method
-def test_what_is_prepared_once_solves_as_what_is_solved_anew(method: Any) -> None:
+def test_a_prepared_problem_solves_as_a_new_one(method: Any) -> None:
     problem = started_anywhere()
     prepared = prepare(problem, method)
     for x0 in ([1.0, 0.0], [0.3, -0.2]):
@@ -40,13 +40,13 @@ def test_what_is_prepared_once_solves_as_what_is_solved_anew(method: Any) -> Non
 
 
 @pytest.mark.parametrize("method", [None, "collocation", Collocation, 3])
-def test_what_is_no_method_is_refused(method: Any) -> None:
+def test_invalid_methods_are_refused(method: Any) -> None:
     with pytest.raises(ProblemError, match="a method such as Collocation") as caught:
         solve(energy(), method)
     assert caught.value.name == "method"
 
 
-def test_off_a_stationary_plan_that_is_no_minimum_a_cheaper_one_is_found() -> None:
+def test_a_stationary_plan_that_is_no_minimum_is_improved() -> None:
     """x' = u, least int u^2 / 2 - 3 x^2 + x^4: x = 0 is stationary, the cost falls on both sides of it.
 
     Over pi > pi / sqrt(6) s the rest at 0 is past its conjugate point (Jacobi).
@@ -59,6 +59,6 @@ def test_off_a_stationary_plan_that_is_no_minimum_a_cheaper_one_is_found() -> No
     problem.minimize(running=u**2 / 2 - 3 * x**2 + ca.sumsqr(x**2))
     rest = {"x": 0.0, "u": 0.0}
     assert solve(problem, Collocation(12), guess=rest, check=False).cost == pytest.approx(0.0, abs=1e-9)
-    found = solve(problem, Collocation(12), guess=rest)
-    assert (found.start, found.cost < -1.0) == ("downhill", True)
-    assert np.abs(found["x"]).max() > 0.5
+    solution = solve(problem, Collocation(12), guess=rest)
+    assert (solution.start, solution.cost < -1.0) == ("downhill", True)
+    assert np.abs(solution["x"]).max() > 0.5

@@ -63,29 +63,29 @@ def test_a_joint_beyond_its_limit_by_rounding_is_on_it(entry: Callable[[Array], 
 
 
 def test_velocities_beyond_their_limit_by_rounding_are_on_it() -> None:
-    asked: dict[str, Any] = {"end": [1.5, 0.9], "limits": Limits(velocity=1.1)}
+    request: dict[str, Any] = {"end": [1.5, 0.9], "limits": Limits(velocity=1.1)}
     fast = solve_dynamics(
-        MACHINE, (), 2.0, start=[0.3, 0.9], **asked, setup=DynamicsSetup(start_velocity=[np.nextafter(1.1, 2), 0.0])
+        MACHINE, (), 2.0, start=[0.3, 0.9], **request, setup=DynamicsSetup(start_velocity=[np.nextafter(1.1, 2), 0.0])
     )
     assert fast.at(0.0)["velocities"][0] == pytest.approx(1.1, abs=1e-9)
     with pytest.raises(ProblemError, match=r"'joint1' starts at 1\.1000001, outside its limits -1\.1 \.\. 1\.1;"):
         solve_dynamics(
-            MACHINE, (), 2.0, start=[0.3, 0.9], **asked, setup=DynamicsSetup(start_velocity=[1.1000001, 0.0])
+            MACHINE, (), 2.0, start=[0.3, 0.9], **request, setup=DynamicsSetup(start_velocity=[1.1000001, 0.0])
         )
 
 
-def test_a_declared_value_just_beyond_a_bound_is_told_with_the_digits_that_differ() -> None:
+def test_a_value_just_beyond_a_bound_is_reported_with_differing_digits() -> None:
     with pytest.raises(ProblemError, match=r"1\.0000000001 is outside the bounds \[0, 1\]"):
         Problem("p").state("x", initial=1 + 1e-10, lower=0.0, upper=1.0)
 
 
 @given(st.lists(st.floats(allow_nan=False), min_size=2, max_size=4))
 def test_numbers_that_differ_look_different(numbers: list[float]) -> None:
-    told = format_distinct(*numbers)
-    for one, text in zip(numbers, told, strict=True):
-        for other, beside in zip(numbers, told, strict=True):
+    report = format_distinct(*numbers)
+    for one, text in zip(numbers, report, strict=True):
+        for other, beside in zip(numbers, report, strict=True):
             assert (text == beside) == (repr(one) == repr(other))
 
 
-def test_six_digits_are_enough_for_what_differs_there() -> None:
+def test_six_digits_suffice_for_large_differences() -> None:
     assert format_distinct(-0.0175, 3.75251234) == ["-0.0175", "3.75251"]

@@ -82,35 +82,33 @@ def test_the_tolerance_is_reached(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", START)
-def test_from_a_plan_that_is_audited_already_it_goes_the_same_way(method: str) -> None:
+def test_refinement_from_an_audited_plan_is_the_same(method: str) -> None:
     """As from its first solve; and the audit that comes with it is that of the plan."""
     first = solve(van_der_pol(), START[method])
-    found, audit = refinement.refine_from(first.problem, START[method], (first, first.audit()))
+    result, audit = refinement.refine_from(first.problem, START[method], (first, first.audit()))
     whole = refined(method)
-    assert found.refinement is not None
+    assert result.refinement is not None
     assert whole.refinement is not None
-    assert found.refinement.intervals == whole.refinement.intervals
-    assert found.refinement.reached
-    assert found.cost == pytest.approx(whole.cost, rel=1e-9)
-    assert str(audit) == str(found.audit())
+    assert result.refinement.intervals == whole.refinement.intervals
+    assert result.refinement.reached
+    assert result.cost == pytest.approx(whole.cost, rel=1e-9)
+    assert str(audit) == str(result.audit())
 
 
 @pytest.mark.parametrize("check", [True, False])
-def test_a_round_that_fails_is_begun_elsewhere_only_where_that_is_asked(
-    check: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_round_is_restarted_only_on_request(check: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """One iteration is not enough for a finer mesh."""
-    method, asked = START["radau"], list[bool]()
+    method, request = START["radau"], list[bool]()
     first = solve(van_der_pol(), method)
 
-    def briefly(*told: Any, **more: Any) -> Solution:
-        asked.append(more["check"])
-        return solve(*told, **more)
+    def briefly(*report: Any, **more: Any) -> Solution:
+        request.append(more["check"])
+        return solve(*report, **more)
 
     monkeypatch.setattr(refinement, "solve", briefly)
     with pytest.raises(SolveError, match="from the guess: " if check else "^refinement of .* failed: ") as failed:
         refinement.refine_from(first.problem, method, (first, first.audit()), options={"max_iter": 1}, check=check)
-    assert asked == [check]
+    assert request == [check]
     assert failed.value.solution is not None
     assert not failed.value.solution.success
 
@@ -219,7 +217,7 @@ def test_the_cost_that_held_and_linear_controls_lose_is_brought_under_a_thousand
 
 
 @pytest.mark.parametrize("lost", [1e-3, 1e-5])
-def test_the_cost_is_as_near_to_a_known_optimum_as_is_asked(lost: float) -> None:
+def test_the_cost_is_within_the_requested_tolerance_of_the_optimum(lost: float) -> None:
     regulator = LogarithmicRegulator(horizon=3.0, z0=1.5)
     for method in (MultipleShooting(6, control="linear"), Collocation(6, control="held")):
         solution = refine(regulator.build(), method, tolerance=1e-6, settings=RefinementSettings(limits={"lost": lost}))
@@ -228,7 +226,7 @@ def test_the_cost_is_as_near_to_a_known_optimum_as_is_asked(lost: float) -> None
         assert abs(solution.cost / regulator.cost - 1) <= 1.1 * lost
 
 
-def test_limits_of_the_audit_can_be_asked_for() -> None:
+def test_limits_of_the_audit_can_be_requested() -> None:
     problem = chain_in_a_circle()
     solution = refine(problem, Collocation(5), settings=RefinementSettings(limits={"constraints": 1e-6}))
     assert solution.refinement is not None
@@ -290,15 +288,17 @@ def test_the_mesh_clusters_at_a_switch(method: Method) -> None:
     assert np.abs(mesh[:-1][widths < widths.max() / 3] - switch).max() < 1.5 * widths.max()
 
 
-def test_an_overshoot_that_no_width_lowers_is_told_after_few_rounds() -> None:
+def test_an_irreducible_overshoot_is_reported_after_few_rounds() -> None:
     """Control polynomials through points on both sides of a switch overshoot by the same share in any interval."""
     problem, *_ = hurried()
-    with pytest.warns(RefinementWarning, match=r"'bounds of u' at .* finer intervals do not lower it.*tighten") as told:
+    with pytest.warns(
+        RefinementWarning, match=r"'bounds of u' at .* finer intervals do not lower it.*tighten"
+    ) as report:
         solution = refine(problem, Collocation(7))
     assert solution.refinement is not None
     assert not solution.refinement.reached
     assert len(solution.refinement.intervals) <= 5
-    warning: Any = told[0].message
+    warning: Any = report[0].message
     assert warning.name == "bounds of u"
     assert warning.value > warning.limit
 
@@ -322,26 +322,26 @@ def test_a_problem_without_a_minimum_is_called_so(method: Method) -> None:
     assert caught.value.solution.audit().optimal is False
 
 
-def test_what_finer_intervals_do_not_mend_is_not_reached_and_named() -> None:
+def test_errors_independent_of_the_mesh_are_named_as_not_reached() -> None:
     """An integration error below rounding."""
-    with pytest.warns(RefinementWarning, match="integration error") as told:
+    with pytest.warns(RefinementWarning, match="integration error") as report:
         solution = refine(van_der_pol(), Collocation(4, 5), tolerance=1e-15)
     assert solution.refinement is not None
     assert not solution.refinement.reached
     assert len(solution.refinement.intervals) <= 5
-    warning: Any = told[0].message
+    warning: Any = report[0].message
     assert "integration error" in warning.name
 
 
-def test_what_the_audit_does_not_decide_is_not_reached_though_every_row_holds() -> None:
+def test_undetermined_audits_are_not_reached_though_every_row_holds() -> None:
     """Where a control enters the conditions at the end, the second order is not known."""
     problem = swing(control_ties=True)
-    with pytest.warns(RefinementWarning, match="undetermined: the control") as told:
+    with pytest.warns(RefinementWarning, match="undetermined: the control") as report:
         solution = refine(problem, Collocation(10), tolerance=1e-4, parameters=SWING)
     assert solution.refinement is not None
     assert not solution.refinement.reached
     assert max(values[-1] for values in solution.refinement.errors.values()) <= 1
-    warning: Any = told[0].message
+    warning: Any = report[0].message
     assert warning.name == "undecided"
 
 
@@ -350,13 +350,13 @@ def test_reached_means_that_the_audit_passes(method: str) -> None:
     for declare in (swing, layer, van_der_pol):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RefinementWarning)
-            given = SWING if declare is swing else None
+            options = SWING if declare is swing else None
             solution = refine(
                 declare(),
                 START[method],
                 tolerance=1e-4,
                 settings=RefinementSettings(max_intervals=60),
-                parameters=given,
+                parameters=options,
             )
         assert solution.refinement is not None
         audit = solution.audit()
@@ -406,19 +406,19 @@ def test_given_nodes_are_kept() -> None:
 
 @pytest.mark.parametrize("method", [Collocation(10), MultipleShooting(10, control="linear")], ids=str)
 def test_nodes_are_laid_evenly_between_fractions_and_none_is_wider_than_before(method: Method) -> None:
-    found = method.with_nodes_at([0.25, 0.999, 0.5])
-    assert {0.0, 0.25, 0.5, 0.999, 1.0} <= set(found.fractions)
-    widths = np.diff(found.fractions)
+    result = method.with_nodes_at([0.25, 0.999, 0.5])
+    assert {0.0, 0.25, 0.5, 0.999, 1.0} <= set(result.fractions)
+    widths = np.diff(result.fractions)
     assert widths.max() <= 0.1 + 1e-15
     for left, right in ((0.0, 0.25), (0.25, 0.5), (0.5, 0.999)):
-        inside = widths[(found.fractions[:-1] >= left) & (found.fractions[:-1] < right)]
+        inside = widths[(result.fractions[:-1] >= left) & (result.fractions[:-1] < right)]
         np.testing.assert_allclose(inside, inside[0], rtol=1e-12)
-    assert found.intervals == 3 + 3 + 5 + 1
-    assert type(found) is type(method)
-    assert found.control == method.control
+    assert result.intervals == 3 + 3 + 5 + 1
+    assert type(result) is type(method)
+    assert result.control == method.control
 
 
-def test_a_given_mesh_keeps_its_nodes_and_gets_those_asked_for() -> None:
+def test_an_initial_mesh_keeps_its_nodes_and_gains_requested_ones() -> None:
     method = Collocation(3, mesh=(0.0, 0.1, 0.55, 1.0))
     assert method.with_nodes_at([0.3, 0.1, 1e-12, 0.3 + 1e-12]).mesh == (0.0, 0.1, 0.3, 0.55, 1.0)
     assert method.with_nodes_at([]) == method
@@ -517,12 +517,12 @@ def test_intervals_gather_where_the_solution_is_sharp(method: Method) -> None:
 
 def test_intervals_gather_where_the_costates_are_wrong() -> None:
     """x' = u, x^2 + (width u)^2: states and costates fall as exp(-t / width), and lie still after."""
-    width, asked = 0.02, 1e-6
+    width, request = 0.02, 1e-6
     problem, x, u = plant("falls", initial=1.0)
     problem.dynamics(x, u)
     problem.minimize(running=(x**2 + width**2 * u**2) / 2)
     solution = refine(
-        problem, Collocation(6, 3), tolerance=1.0, settings=RefinementSettings(limits={"costates": asked})
+        problem, Collocation(6, 3), tolerance=1.0, settings=RefinementSettings(limits={"costates": request})
     )
     assert solution.refinement is not None
     assert solution.refinement.reached
@@ -530,12 +530,12 @@ def test_intervals_gather_where_the_costates_are_wrong() -> None:
     assert np.sum(mesh < 10 * width) > 0.8 * count
     row = "costates between the nodes, relative"
     even = solve(problem, Collocation(count, 3)).audit()[row].value
-    assert solution.audit()[row].value <= asked < even / 30
+    assert solution.audit()[row].value <= request < even / 30
     t = np.linspace(0.0, 0.2, 101)
     np.testing.assert_allclose(solution.costate_interpolant(t)[:, 0], width * np.exp(-t / width), atol=1e-3 * width)
 
 
-def test_a_stop_at_the_cap_is_warned_of_and_told() -> None:
+def test_a_stop_at_the_node_limit_is_reported_with_a_warning() -> None:
     with pytest.warns(RefinementWarning, match=r"'layer' stopped at \d+ of at most 12 intervals .*raise max_intervals"):
         solution = refine(layer(), Collocation(4), tolerance=1e-10, settings=RefinementSettings(max_intervals=12))
     assert solution.refinement is not None
@@ -574,7 +574,7 @@ def test_an_uneven_first_mesh_is_kept_and_split() -> None:
         assert np.min(np.abs(solution.control_interpolant.breaks - node)) < 1e-14
 
 
-def test_a_round_that_fails_raises_what_solving_raises() -> None:
+def test_a_failed_round_raises_the_error_of_solving() -> None:
     with pytest.raises(SolveError):
         refine(van_der_pol(), Collocation(3), options={"max_iter": 1})
 
@@ -602,9 +602,9 @@ def test_a_round_that_fails_raises_what_solving_raises() -> None:
     ],
 )
 def test_bad_arguments_are_named(arguments: dict[str, Any], message: str) -> None:
-    given = {"method": Collocation(3), **arguments}
+    options = {"method": Collocation(3), **arguments}
     with pytest.raises(ProblemError, match=message):
-        refine(van_der_pol(), **{**given, "settings": RefinementSettings(**given.get("settings", {}))})
+        refine(van_der_pol(), **{**options, "settings": RefinementSettings(**options.get("settings", {}))})
 
 
 # ---- splitting ---------------------------------------------------------------------------------------------------
@@ -616,13 +616,13 @@ def test_bad_arguments_are_named(arguments: dict[str, Any], message: str) -> Non
 )
 def test_split_meshes_are_finer_ordered_and_never_beyond_the_cap(wanted: list[tuple[int, float]], room: int) -> None:
     n = len(wanted)
-    pieces, bad = np.array([number for number, _ in wanted]), np.array([value for _, value in wanted])
+    segments, bad = np.array([number for number, _ in wanted]), np.array([value for _, value in wanted])
     mesh = np.linspace(0.0, 1.0, n + 1)
-    finer = split(mesh, pieces, bad, n + room)
+    finer = split(mesh, segments, bad, n + room)
     assert finer[0] == 0.0
     assert finer[-1] == 1.0
     assert np.all(np.diff(finer) > 0)
-    assert len(finer) - 1 == min(n + room, pieces.sum())
+    assert len(finer) - 1 == min(n + room, segments.sum())
     assert set(mesh) <= set(finer)
 
 

@@ -144,7 +144,7 @@ def test_unknown_names_are_named(ask: Callable[[Solution], Any], message: str) -
         ask(plan("radau"))
 
 
-def test_a_name_may_be_asked_for_with_a_default() -> None:
+def test_a_name_may_be_requested_with_a_default() -> None:
     sample = plan("radau").at(0.1)
     assert "base" not in sample
     assert sample.get("base") is None
@@ -251,7 +251,7 @@ def test_any_name_of_a_state_survives_the_file(name: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["plan.npz", "plan", "plan.dat", "plän ü.npz"])
-def test_a_file_bears_the_name_that_was_asked(name: str, tmp_path: Path) -> None:
+def test_a_file_has_the_requested_name(name: str, tmp_path: Path) -> None:
     plan("radau").save(str(tmp_path / name))
     assert [path.name for path in tmp_path.iterdir()] == [name]
     assert Solution.load(str(tmp_path / name)).cost == plan("radau").cost
@@ -297,7 +297,7 @@ def test_a_failed_save_leaves_nothing_behind(
     assert (tmp_path / "plan.npz").read_bytes() == before
 
 
-def test_what_cannot_be_written_as_json_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_data_that_json_cannot_write_leave_no_file(tmp_path: Path) -> None:
     with pytest.raises(TypeError):
         dataclasses.replace(plan("radau"), method={"type": object()}).save(tmp_path / "plan.npz")
     assert list(tmp_path.iterdir()) == []
@@ -397,7 +397,7 @@ def edited(path: Path, edit: Callable[[dict[str, Any], dict[str, np.ndarray]], A
         (lambda h, a: h.clear(), "is not a saved solution"),
     ],
 )
-def test_files_that_lack_something_are_refused(edit: Any, message: str, tmp_path: Path) -> None:
+def test_incomplete_files_are_refused(edit: Any, message: str, tmp_path: Path) -> None:
     plan("radau").save(tmp_path / "plan.npz")
     edited(tmp_path / "plan.npz", edit)
     with pytest.raises(ProblemError, match=message):
@@ -476,7 +476,7 @@ WRONG: list[tuple[str, Callable[[dict[str, Any], dict[str, np.ndarray]], Any]]] 
 
 
 @pytest.mark.parametrize(("name", "edit"), WRONG)
-def test_what_is_wrong_in_a_file_is_named(name: str, edit: Any, tmp_path: Path) -> None:
+def test_errors_in_a_file_are_named(name: str, edit: Any, tmp_path: Path) -> None:
     plan("radau").save(tmp_path / "plan.npz")
     edited(tmp_path / "plan.npz", edit)
     with pytest.raises(ProblemError) as caught:
@@ -484,7 +484,7 @@ def test_what_is_wrong_in_a_file_is_named(name: str, edit: Any, tmp_path: Path) 
     assert caught.value.name == name
 
 
-def test_what_an_unsuccessful_plan_lacks_may_be_no_number(tmp_path: Path) -> None:
+def test_missing_values_of_an_unsuccessful_plan_may_be_nan(tmp_path: Path) -> None:
     failed = dataclasses.replace(plan("radau"), success=False, cost=np.nan)
     failed.save(tmp_path / "plan.npz")
     assert np.isnan(Solution.load(tmp_path / "plan.npz").cost)

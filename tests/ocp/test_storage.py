@@ -51,11 +51,11 @@ def refused(path: Path, message: str) -> None:
 def test_arrays_come_back(kind: str, order: str, tmp_path: Path) -> None:
     values = np.asarray(np.arange(24).reshape(2, 3, 4), dtype=kind, order=order)  # type: ignore[call-overload]
     write_arrays(tmp_path / "a.npz", {"values": values, "none": np.zeros((0, 3)), "one": np.array(2.0)})
-    found = read_arrays(tmp_path / "a.npz")
-    np.testing.assert_array_equal(found["values"], values)
-    assert found["values"].dtype == values.dtype.newbyteorder("=")
-    assert found["none"].shape == (0, 3)
-    assert found["one"].shape == ()
+    result = read_arrays(tmp_path / "a.npz")
+    np.testing.assert_array_equal(result["values"], values)
+    assert result["values"].dtype == values.dtype.newbyteorder("=")
+    assert result["none"].shape == (0, 3)
+    assert result["one"].shape == ()
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
@@ -112,7 +112,7 @@ write_arrays(sys.argv[1], {"a": np.ones(100)})
 """
 
 
-def test_what_a_killed_save_left_is_removed_by_the_next_and_what_a_living_one_writes_is_not(tmp_path: Path) -> None:
+def test_remains_of_a_killed_save_are_removed_and_those_of_a_running_one_are_not(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     writers = [
         subprocess.Popen(
@@ -162,7 +162,7 @@ def test_many_saves_of_one_file_at_once_leave_one_whole_file(tmp_path: Path) -> 
     assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
 
 
-def test_what_is_no_file_is_not_replaced_by_one(tmp_path: Path) -> None:
+def test_devices_are_not_replaced_by_files(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.npz")
     (tmp_path / "folder.npz").mkdir()
     for name in ("pipe.npz", "folder.npz"):
@@ -173,7 +173,7 @@ def test_what_is_no_file_is_not_replaced_by_one(tmp_path: Path) -> None:
     assert {file.name for file in tmp_path.iterdir()} == {"pipe.npz", "folder.npz"}
 
 
-def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
+def test_unreadable_solutions_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(ProblemError, match="bytes of arrays"):
         write_arrays(tmp_path / "a.npz", {"a": np.broadcast_to(np.float64(0), (MAX_FILE_BYTES,))})
     assert list(tmp_path.iterdir()) == []
@@ -182,7 +182,7 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
 # ---- reading -----------------------------------------------------------------------------------------------------
 
 
-def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+def test_pipes_are_refused_without_waiting(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.npz")
     (tmp_path / "folder.npz").mkdir()
     for path in (tmp_path / "pipe.npz", tmp_path / "folder.npz", Path("/dev/zero"), Path("/dev/null")):
@@ -194,14 +194,14 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
             Solution.load(wrong)  # type: ignore[arg-type]
 
 
-def lying(data: bytes, told: int) -> bytes:
+def lying(data: bytes, report: int) -> bytes:
     """An archive of one member that says of itself how large it is unpacked, in both places."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
         file.writestr("head.npy", data)
     whole = bytearray(stream.getvalue())
-    struct.pack_into("<I", whole, 22, told)
-    struct.pack_into("<I", whole, whole.index(b"PK\x01\x02") + 24, told)
+    struct.pack_into("<I", whole, 22, report)
+    struct.pack_into("<I", whole, whole.index(b"PK\x01\x02") + 24, report)
     return bytes(whole)
 
 
@@ -259,7 +259,7 @@ def test_reading_bombs_takes_less_than_a_gigabyte(tmp_path: Path) -> None:
     assert done.stdout.split() == ["NoneType", "BadZipFile"], done.stderr
 
 
-def test_no_file_handles_left_is_said_as_what_it_is(tmp_path: Path) -> None:
+def test_exhausted_file_handles_are_reported_as_such(tmp_path: Path) -> None:
     write_arrays(tmp_path / "plan.npz", ARRAYS)
     done = run(f"""
         import os, resource

@@ -61,7 +61,7 @@ def test_limits_hold_between_the_points(method: Any) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
-def test_the_plan_keeps_by_how_much_its_bounds_were_drawn_in(method: Any) -> None:
+def test_the_plan_stores_the_tightening_of_its_bounds(method: Any) -> None:
     """States q, v, control u, path row power: at its own points the plan is within what was left of their bounds."""
     tight = tightened(method)
     mesh = tight.control_interpolant.breaks
@@ -81,14 +81,14 @@ def test_the_plan_keeps_by_how_much_its_bounds_were_drawn_in(method: Any) -> Non
     jumps = [False, False, *[getattr(method, "control", "") != "linear"] * 2]
     below, above = np.where(jumps, tight.bound_tightening[:, owner], shared)
     points = isinstance(method, Collocation) and method.control == "points"  # where all of it is asked
-    looked_at = slice(None) if points else slice(2, 3)
+    checked = slice(None) if points else slice(2, 3)
     inside = (at > 0) & (at < 1)  # the ends of q and v are given
-    assert (values >= lower + below - 1e-7)[inside, looked_at].all()
-    assert (values <= upper - above + 1e-7)[inside, looked_at].all()
+    assert (values >= lower + below - 1e-7)[inside, checked].all()
+    assert (values <= upper - above + 1e-7)[inside, checked].all()
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
-def test_an_active_limit_is_met_where_it_was_drawn_in_to(method: Any) -> None:
+def test_an_active_limit_is_met_at_its_tightened_value(method: Any) -> None:
     tight = tightened(method)
     assert tight.bound_tightening is not None
     at = tight.t / tight.horizon
@@ -98,7 +98,7 @@ def test_an_active_limit_is_met_where_it_was_drawn_in_to(method: Any) -> None:
     assert (reached & (above > 1e-5)).any()
 
 
-def test_a_control_that_may_jump_is_drawn_in_for_its_own_interval_alone() -> None:
+def test_a_control_that_may_jump_is_tightened_in_its_own_interval_alone() -> None:
     """Van der Pol's control leaves its limit in one interval, and only there its polynomial goes beyond."""
     tight = tighten(van_der_pol(lower=-0.5, upper=0.3, horizon=4.0), Collocation(10))
     assert tight.bound_tightening is not None
@@ -119,7 +119,7 @@ def test_few_solves_are_enough(method: Any, monkeypatch: pytest.MonkeyPatch) -> 
     assert len(solved) <= 4
 
 
-def test_a_limit_that_no_point_stands_at_is_drawn_in_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_limit_violated_between_points_is_tightened_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A gate so narrow that all points have 0.2 of room: straight on the way would pass 0.01 beyond it."""
     problem = Problem("gate")
     x, u = problem.state("x", initial=0.0, terminal=1.0), problem.control("u")
@@ -143,16 +143,16 @@ def test_a_limit_that_no_point_stands_at_is_drawn_in_at_once(monkeypatch: pytest
     assert len(solves) <= 5
 
 
-def test_a_node_is_drawn_in_by_the_larger_of_both_sides() -> None:
-    drawn = np.zeros((2, 3, 1))
-    drawn[0, :, 0], drawn[1, :, 0] = [1.0, 3.0, 2.0], [0.0, 0.0, 5.0]
+def test_a_node_is_tightened_by_the_larger_of_both_sides() -> None:
+    tightening = np.zeros((2, 3, 1))
+    tightening[0, :, 0], tightening[1, :, 0] = [1.0, 3.0, 2.0], [0.0, 0.0, 5.0]
     mesh = np.array([0.0, 0.2, 0.7, 1.0])
-    below, above = tightening_at(drawn, mesh, np.array([0.0, 0.1, 0.2, 0.5, 0.7, 0.9, 1.0]))[:, :, 0]
+    below, above = tightening_at(tightening, mesh, np.array([0.0, 0.1, 0.2, 0.5, 0.7, 0.9, 1.0]))[:, :, 0]
     assert below.tolist() == [1, 1, 3, 3, 3, 2, 2]
     assert above.tolist() == [0, 0, 0, 0, 5, 5, 5]
 
 
-def test_what_was_drawn_in_comes_back_from_a_file(tmp_path: Path) -> None:
+def test_tightened_bounds_are_read_from_a_file(tmp_path: Path) -> None:
     tight = tightened(METHODS[0])
     tight.save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
@@ -164,17 +164,17 @@ def test_what_was_drawn_in_comes_back_from_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["intervals", "entries", "negative", "nan", "inf", "words", "flat"])
-def test_a_damaged_file_of_what_was_drawn_in_is_refused(damage: str, tmp_path: Path) -> None:
-    drawn = tightened(METHODS[0]).bound_tightening
-    assert drawn is not None
+def test_a_damaged_file_of_tightened_bounds_is_refused(damage: str, tmp_path: Path) -> None:
+    tightening = tightened(METHODS[0]).bound_tightening
+    assert tightening is not None
     bad = {
-        "intervals": drawn[:, 1:],
-        "entries": drawn[:, :, :2],
-        "negative": drawn - 1.0,
-        "nan": drawn * np.nan,
-        "inf": drawn + np.inf,
-        "words": drawn.astype(str),
-        "flat": drawn[0],
+        "intervals": tightening[:, 1:],
+        "entries": tightening[:, :, :2],
+        "negative": tightening - 1.0,
+        "nan": tightening * np.nan,
+        "inf": tightening + np.inf,
+        "words": tightening.astype(str),
+        "flat": tightening[0],
     }[damage]
     replace(tightened(METHODS[0]), bound_tightening=bad).save(tmp_path / "plan.npz")
     with pytest.raises(ProblemError, match="bound_tightening") as caught:
@@ -182,7 +182,7 @@ def test_a_damaged_file_of_what_was_drawn_in_is_refused(damage: str, tmp_path: P
     assert caught.value.name == "bound_tightening"
 
 
-def test_what_was_drawn_in_follows_the_order_of_the_problem() -> None:
+def test_tightened_bounds_follow_the_order_of_the_problem() -> None:
     tight = tightened(METHODS[0])
     assert tight.bound_tightening is not None
     other = Problem("walled, declared in another order")
@@ -266,7 +266,7 @@ PANEL_METHODS = [
 
 @pytest.mark.parametrize("method", PANEL_METHODS, ids=str)
 @pytest.mark.parametrize("name", PANEL)
-def test_a_tightened_plan_does_what_is_asked_and_is_judged_under_its_own_bounds(name: str, method: Any) -> None:
+def test_a_tightened_plan_meets_its_task_and_is_audited_with_its_bounds(name: str, method: Any) -> None:
     """Where the plan was an optimum before its limits were drawn in, it is one under these."""
     plain, tight = solve(PANEL[name](), method).audit(), tighten(PANEL[name](), method).audit()
     missed = {finding.name for finding in tight.failures if finding.verdict == "feasible"}
@@ -294,14 +294,14 @@ def test_it_takes_parameters_and_a_free_horizon() -> None:
     problem.dynamics(v, u)
     final = problem.horizon(lower=0.1, upper=5.0, guess=1.0)
     problem.minimize(terminal=final, running=1e-3 * u**2)
-    found = tighten(problem, Collocation(12, degree=4), parameters={"top": 0.7})
-    at = found.at_fraction(np.linspace(0, 1, 3001))
+    solution = tighten(problem, Collocation(12, degree=4), parameters={"top": 0.7})
+    at = solution.at_fraction(np.linspace(0, 1, 3001))
     assert at["v"].max() <= 0.7 + 1.001e-6
     assert np.abs(at["u"]).max() <= 4 + 1.001e-6
-    assert found.horizon > 1 / 0.7 + 0.7 / 4  # bang, coast, bang
+    assert solution.horizon > 1 / 0.7 + 0.7 / 4  # bang, coast, bang
 
 
-def test_what_cannot_be_held_is_named() -> None:
+def test_bounds_that_cannot_be_met_are_named() -> None:
     """A bump in time alone, which no plan can avoid and nodes do not see."""
     problem, q, u = plant("bump", state="q", initial=0.0, terminal=1.0)
     problem.dynamics(q, u)

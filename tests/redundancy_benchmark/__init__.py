@@ -54,15 +54,17 @@ class Benchmark:
 @cache
 def robot_of(name: str) -> Robot:
     """One of ROBOTS: its joints those that the benchmark moves, each link's capsule its collision shape."""
-    given = _read("robots.json")[name]
+    options = _read("robots.json")[name]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)  # of the file's own attributes
-        whole = Robot.from_urdf(FOLDER / given["urdf"], tip=given["tip"], root=given["base"])
-    standing = {joint: 0.0 for joint in whole.joint_names if joint not in given["joints"]}
-    robot = lock_joints(whole, standing | given.get("locked", {}))
-    assert robot.joint_names == tuple(given["joints"])
+        whole = Robot.from_urdf(FOLDER / options["urdf"], tip=options["tip"], root=options["base"])
+    standing = {joint: 0.0 for joint in whole.joint_names if joint not in options["joints"]}
+    robot = lock_joints(whole, standing | options.get("locked", {}))
+    assert robot.joint_names == tuple(options["joints"])
     links = tuple(
-        replace(link, collisions=(_capsule(given["capsules"][link.name]),)) if link.name in given["capsules"] else link
+        replace(link, collisions=(_capsule(options["capsules"][link.name]),))
+        if link.name in options["capsules"]
+        else link
         for link in robot.links
     )
     return replace(robot, links=links)
@@ -76,30 +78,30 @@ def ignored_pairs(robot: str) -> tuple[tuple[str, str], ...]:
 @cache
 def problem_of(name: str) -> Benchmark:
     """One of PROBLEMS."""
-    given = _read("problems.json")[name]
-    robot = robot_of(given["robot"])
-    rows = np.loadtxt(FOLDER / given["path"], delimiter=",", skiprows=1)
-    turn = np.array(given["rotation"], dtype=float)
+    options = _read("problems.json")[name]
+    robot = robot_of(options["robot"])
+    rows = np.loadtxt(FOLDER / options["path"], delimiter=",", skiprows=1)
+    turn = np.array(options["rotation"], dtype=float)
     origin = np.zeros(3)
-    if given["offset_frame"] != "world":
+    if options["offset_frame"] != "world":
         frames = link_frames(robot, ca.DM.zeros(robot.dof))
-        origin = np.array(ca.DM(frames[given["offset_frame"]].position)).ravel()
+        origin = np.array(ca.DM(frames[options["offset_frame"]].position)).ravel()
     facing = Rotation.from_quat(rows[:, [5, 6, 7, 4]]) * Rotation.from_matrix(turn)
     return Benchmark(
         machine=FixedBase(robot),
-        positions=np.array(given["offset"]) + origin + rows[:, 1:4] @ turn.T,
+        positions=np.array(options["offset"]) + origin + rows[:, 1:4] @ turn.T,
         quaternions=facing.as_quat()[:, [3, 0, 1, 2]],
-        boxes=tuple(Box(box["size"], box["center"]) for box in given["boxes_in_base"]),
-        ignored=ignored_pairs(given["robot"]),
-        torm_length_rad=given["torm_length_rad"],
-        torm_length_m=given["torm_length_m"],
+        boxes=tuple(Box(box["size"], box["center"]) for box in options["boxes_in_base"]),
+        ignored=ignored_pairs(options["robot"]),
+        torm_length_rad=options["torm_length_rad"],
+        torm_length_m=options["torm_length_m"],
     )
 
 
 def tip_and_file(name: str) -> tuple[str, str, str]:
     """Link of the tip, name of the URDF file and link of the base of a problem's robot."""
-    given = _read("robots.json")[_read("problems.json")[name]["robot"]]
-    return given["tip"], given["urdf"], given["base"]
+    options = _read("robots.json")[_read("problems.json")[name]["robot"]]
+    return options["tip"], options["urdf"], options["base"]
 
 
 def _read(file: str) -> Any:

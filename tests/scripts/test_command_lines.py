@@ -26,14 +26,14 @@ def test_every_script_is_short_and_runs_as_a_file_from_anywhere(name: str, tmp_p
     file = FOLDER / f"{name}.py"
     assert len(file.read_text(encoding="utf-8").splitlines()) < 100
     command = [sys.executable, str(file), "--help"]
-    told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120).stdout
-    assert all(option in told for option in OPTIONS[name])
+    report = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120).stdout
+    assert all(option in report for option in OPTIONS[name])
 
 
 def test_a_script_runs_as_a_module() -> None:
     command = [sys.executable, "-m", "scripts.reproduce", "--help"]
-    told = subprocess.run(command, cwd=FOLDER.parent, capture_output=True, text=True, check=True, timeout=120).stdout
-    assert "--only" in told
+    report = subprocess.run(command, cwd=FOLDER.parent, capture_output=True, text=True, check=True, timeout=120).stdout
+    assert "--only" in report
 
 
 def test_there_is_no_other_script() -> None:

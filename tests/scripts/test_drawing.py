@@ -54,7 +54,7 @@ def test_a_table_reads_back_as_it_was_written(tmp_path: Path) -> None:
     assert [float(row["value"]) for row in read] == pytest.approx([1 / 3, -2e-15], rel=1e-9)
 
 
-def test_json_takes_arrays_and_refuses_what_is_not_finite(tmp_path: Path) -> None:
+def test_json_accepts_arrays_and_refuses_infinite_numbers(tmp_path: Path) -> None:
     path = tmp_path / "summary.json"
     write(path, {"peaks": np.array([1.5, -2.0]), "passed": np.bool_(True), "deep": {"count": np.int64(3)}})
     assert json.loads(path.read_text(encoding="utf-8")) == {"peaks": [1.5, -2.0], "passed": True, "deep": {"count": 3}}
@@ -75,7 +75,7 @@ def test_text_columns_line_up() -> None:
     assert lines[3].endswith("  -123.5")
 
 
-def test_a_figure_has_the_size_asked_for_and_nothing_of_the_time_it_was_made(tmp_path: Path) -> None:
+def test_a_figure_has_the_requested_size_and_no_time_stamp(tmp_path: Path) -> None:
     for name in ("one.png", "two.png"):
         with sheet(tmp_path / name, (1, 2), (4.0, 2.0), "assumed. " * 30, title="It is found") as (_, axes):
             assert axes.shape == (1, 2)
@@ -84,9 +84,9 @@ def test_a_figure_has_the_size_asked_for_and_nothing_of_the_time_it_was_made(tmp
         assert picture.size == (600, 300)
     for ending in ("png", "svg", "caption.txt"):
         assert (tmp_path / f"one.{ending}").read_bytes() == (tmp_path / f"two.{ending}").read_bytes()
-    told = (tmp_path / "one.caption.txt").read_text(encoding="utf-8")
-    assert told.startswith("It is found\n")
-    assert told.split().count("assumed.") == 30  # the whole, of which the figure shows the first sentence
+    text = (tmp_path / "one.caption.txt").read_text(encoding="utf-8")
+    assert text.startswith("It is found\n")
+    assert text.split().count("assumed.") == 30  # the whole, of which the figure shows the first sentence
 
 
 def test_committed_pictures_are_small() -> None:

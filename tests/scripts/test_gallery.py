@@ -97,7 +97,7 @@ def test_the_cyclic_plan_returns_within_the_limits_where_the_pseudo_inverse_drif
     assert (np.diff(drift) > 0.1).all()
 
 
-def test_the_cheapest_of_all_postures_lies_in_another_family_than_the_best_conditioned_start(coarse: Gallery) -> None:
+def test_the_lowest_cost_start_lies_in_another_family_than_the_best_conditioned_one(coarse: Gallery) -> None:
     row = coarse.rows["posture_set"]
     assert 0.98 * row["cost_optimal"] <= row["bound"] <= row["cost_optimal"]
     assert row["cost_optimal"] < 0.8 * row["cost_from_the_best_conditioned_start"]
@@ -115,39 +115,43 @@ def test_the_cheapest_of_all_postures_lies_in_another_family_than_the_best_condi
     assert len(set(homes)) == 1
 
 
-def test_no_posture_of_the_ring_is_reached_from_its_beginning_and_leads_to_its_end(tmp_path: Path) -> None:
+def test_no_configuration_of_the_ring_connects_its_start_and_end(tmp_path: Path) -> None:
     example = reconfiguration.plan(coarse=True)
-    made, reached = example.made, example.reached
+    result, reached = example.made, example.reached
     assert all(audit.feasible for audit in example.audits)
-    assert all(piece.audit().passed for piece in made.segments)
-    assert (len(made.reconfigurations), made.fewest) == (1, 1)
+    assert all(segment.audit().passed for segment in result.segments)
+    assert (len(result.reconfigurations), result.fewest) == (1, 1)
     assert not (reached.from_the_beginning & reached.to_the_end).any()
-    (change,) = made.reconfigurations
-    for own, apart in ((reached.from_the_beginning, made.segments[0]), (reached.to_the_end, made.segments[1])):
-        begin = 0.0 if apart is made.segments[0] else change.time
+    (change,) = result.reconfigurations
+    for own, apart in ((reached.from_the_beginning, result.segments[0]), (reached.to_the_end, result.segments[1])):
+        begin = 0.0 if apart is result.segments[0] else change.time
         for k in np.flatnonzero((reached.times >= begin) & (reached.times <= begin + apart.horizon)):
             charts = reached.charts.centers[own & (reached.charts.layer == k)]
             far = np.abs(charts - apart.at(reached.times[k] - begin)["joints"]).max(axis=1)
             assert far.min() < 0.07  # each piece runs through its own postures
-    machine, joints = example.machine, np.concatenate([piece["joints"] for piece in made.segments])
-    times = np.concatenate([begin + piece.t for begin, piece in zip(made.start_times, made.segments, strict=True)])
+    machine, joints = example.machine, np.concatenate([segment["joints"] for segment in result.segments])
+    times = np.concatenate(
+        [begin + segment.t for begin, segment in zip(result.start_times, result.segments, strict=True)]
+    )
     rotations, places = placed(robots.PANDA, joints, machine.robot.tip_link)
     angle = np.pi * (2 * rest_to_rest(times / reconfiguration.DURATION) - 1)
     radius = reconfiguration.RADIUS
-    way = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(len(times), reconfiguration.HEIGHT)])
-    np.testing.assert_allclose(places, way, atol=1e-6)
+    path = np.column_stack(
+        [radius * np.cos(angle), radius * np.sin(angle), np.full(len(times), reconfiguration.HEIGHT)]
+    )
+    np.testing.assert_allclose(places, path, atol=1e-6)
     np.testing.assert_allclose(rotations, np.broadcast_to(reconfiguration.DOWN, rotations.shape), atol=1e-6)
     reconfiguration.draw(example, tmp_path, animation=False)
     assert (tmp_path / "reconfiguration.png").stat().st_size > 1e4
 
 
-def test_the_standing_robot_stays_up_where_instant_resolution_tips_it(coarse: Gallery) -> None:
+def test_the_standing_robot_stands_where_instantaneous_resolution_tips_it(coarse: Gallery) -> None:
     row = coarse.rows["mobile_manipulator"]
     assert row["zmp_margin_local_m"] < 0 < row["zmp_margin_optimal_m"]
     assert row["tip_error"] < 1e-3  # the hand's path is a constraint on accelerations there
 
 
-def test_the_pushing_robot_stays_on_its_feet_where_instant_resolution_tips_it(coarse: Gallery) -> None:
+def test_the_pushing_robot_stands_where_instantaneous_resolution_tips_it(coarse: Gallery) -> None:
     row = coarse.rows["pushing"]
     assert row["zmp_margin_local_m"] < 0
     assert row["zmp_margin_optimal_m"] > 0.99 * pushing.MARGIN
@@ -155,7 +159,7 @@ def test_the_pushing_robot_stays_on_its_feet_where_instant_resolution_tips_it(co
     assert not row["audit_tolerances"]
 
 
-def test_what_acts_on_the_pushing_hand_is_the_reaction_of_its_push() -> None:
+def test_the_load_on_the_pushing_hand_is_the_reaction_of_its_force() -> None:
     machine, _ = pushing.anymal()
     (wrench,) = pushing.reaction(machine)(ca.DM(0.0), ca.DM.zeros(3))
     np.testing.assert_array_equal(np.array(ca.DM(wrench.force)).ravel() + pushing.PUSH, 0.0)
@@ -174,15 +178,15 @@ def placed(file: robots.RobotFile, joints: Array, frame: str) -> tuple[Array, Ar
     """Rotations and positions of a frame by Pinocchio; joints that the plan does not move stand at zero."""
     model = pinocchio.buildModelFromUrdf(str(file.path))
     data, robot = model.createData(), file.read()
-    found = []
+    results = []
     for row in joints:
         q = pinocchio.neutral(model)
         for name, value in zip(robot.joint_names, row, strict=True):
             q[model.joints[model.getJointId(name)].idx_q] = value
         pinocchio.framesForwardKinematics(model, data, q)
         pose = data.oMf[model.getFrameId(frame)]
-        found.append((pose.rotation.copy(), pose.translation.copy()))
-    return np.array([turn for turn, _ in found]), np.array([place for _, place in found])
+        results.append((pose.rotation.copy(), pose.translation.copy()))
+    return np.array([turn for turn, _ in results]), np.array([place for _, place in results])
 
 
 def test_the_panda_goes_round_its_circle_by_another_librarys_kinematics(coarse: Gallery) -> None:
@@ -215,16 +219,16 @@ def test_the_tool_of_the_ur5_stands_on_the_panel_by_another_librarys_kinematics(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_plan_can_be_played_from_its_file_alone(coarse: Gallery, name: str) -> None:
-    made = Plan.load(coarse.folder / f"{name}.npz")
-    at = made.at(np.linspace(0.0, made.horizon, 5))
-    frames = frames_along(made.machine, at["joints"], at.get("base"))
+    loaded = Plan.load(coarse.folder / f"{name}.npz")
+    at = loaded.at(np.linspace(0.0, loaded.horizon, 5))
+    frames = frames_along(loaded.machine, at["joints"], at.get("base"))
     assert np.isfinite(frames.tip).all()
-    assert len(frames.positions) == len(made.machine.robot.links) + 1
-    for target in made.targets:
-        done = made.sampled(target.t).tip[:, :3]
+    assert len(frames.positions) == len(loaded.machine.robot.links) + 1
+    for target in loaded.targets:
+        done = loaded.sampled(target.t).tip[:, :3]
         np.testing.assert_allclose(done, np.where(np.isnan(target.position), done, target.position), atol=2e-3)
-    local = read_trajectory(coarse.folder / f"{name}.local.csv", joints=made.names)
-    assert local.names == made.names
+    local = read_trajectory(coarse.folder / f"{name}.local.csv", joints=loaded.names)
+    assert local.names == loaded.names
     assert (coarse.folder / f"{name}.npz").stat().st_size < 400_000
     with Image.open(coarse.folder / f"{name}.png") as picture:
         assert min(picture.size) > 500
@@ -265,7 +269,7 @@ def test_the_load_that_is_known_stays_within_the_torques_of_another_library(tmp_
     full = model.copy()
     full.inertias[hand.parentJoint] += hand.placement.act(block)
     for name, motion in example.motions.items():
-        found = np.zeros_like(motion.torques)
+        result = np.zeros_like(motion.torques)
         for k in range(len(motion.t)):
             q = pinocchio.neutral(model)
             q[7:] = 0.02
@@ -274,9 +278,9 @@ def test_the_load_that_is_known_stays_within_the_torques_of_another_library(tmp_
                 np.concatenate([part[k], [0.0, 0.0]]) for part in (motion.velocities, motion.accelerations)
             )
             one = full if motion.in_hand[k] else model
-            found[k] = pinocchio.rnea(one, one.createData(), q, rates, second)[:7]
-        np.testing.assert_allclose(motion.torques, found, atol=1e-8)
-        most = (np.abs(found) / robots.PANDA.read().effort).max()
+            result[k] = pinocchio.rnea(one, one.createData(), q, rates, second)[:7]
+        np.testing.assert_allclose(motion.torques, result, atol=1e-8)
+        most = (np.abs(result) / robots.PANDA.read().effort).max()
         assert most < 1 + 1e-6 if name == "load known" else most > 1.01
     pick_and_place.draw(example, tmp_path, animation=False)
     with Image.open(tmp_path / "pick_and_place.png") as picture:
@@ -299,10 +303,10 @@ def test_a_tumbling_body_is_caught_and_its_momentum_stays_in_another_simulation(
 
 
 def test_a_chain_of_two_plans_costs_more_where_a_wheel_takes_the_momentum() -> None:
-    found = capture_family.planned(0.1, "wheel")
-    assert found.passed
-    assert found.chain == pytest.approx(found.approach + found.detumble)
-    assert found.together < 0.95 * found.chain
+    result = capture_family.planned(0.1, "wheel")
+    assert result.passed
+    assert result.chain == pytest.approx(result.approach + result.detumble)
+    assert result.together < 0.95 * result.chain
 
 
 def test_the_summary_holds_every_example(coarse: Gallery) -> None:
@@ -320,8 +324,8 @@ def test_roll_is_the_angle_about_the_tools_own_axis() -> None:
     about_z = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     turned = pose.rotations[TIP_FRAME].copy()
     turned[1] = turned[1] @ about_z
-    found = ur5.roll(Frames({TIP_FRAME: turned}, {}))
-    assert found[1] - found[0] == pytest.approx(angle)
+    result = ur5.roll(Frames({TIP_FRAME: turned}, {}))
+    assert result[1] - result[0] == pytest.approx(angle)
 
 
 def test_the_turn_of_a_base_is_its_angle_whatever_the_sign_of_its_quaternion() -> None:
@@ -344,7 +348,7 @@ def test_an_animation_moves_from_its_first_picture_to_its_last(tmp_path: Path) -
         assert np.any(np.asarray(film.convert("RGB")) != first)
 
 
-def test_without_the_robots_it_says_what_to_install(
+def test_without_the_robots_the_package_to_install_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def absent(name: str) -> Any:
@@ -384,7 +388,7 @@ def test_an_interruption_that_a_solver_keeps_to_itself_is_noticed(
     assert "stopped" in capsys.readouterr().err
 
 
-def test_what_fails_is_told_and_does_not_stop_the_rest(
+def test_failures_are_reported_and_do_not_stop_the_rest(
     coarse: Gallery, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fails(coarse: bool = False) -> Any:

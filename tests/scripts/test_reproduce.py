@@ -79,7 +79,7 @@ def test_a_failing_script_does_not_stop_the_others(
     assert printed.rstrip().endswith("failed: bad")
 
 
-def test_a_script_that_cannot_be_imported_is_told(
+def test_a_script_that_cannot_be_imported_is_reported(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(reproduce, "PAPERS", {"missing": "scripts.no_such_paper"})

@@ -28,29 +28,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=20.0, help="after which no further problem is begun")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder for sweep/sweep.txt")
-    given = parser.parse_args(arguments)
-    families = [given.only] if given.only else list(COUNTS)
-    if given.seed is not None:
+    options = parser.parse_args(arguments)
+    families = [options.only] if options.only else list(COUNTS)
+    if options.seed is not None:
         for family in families:
-            judged(family, given.seed, given.method, show=True)
+            judged(family, options.seed, options.method, show=True)
         return 0
     # families in turn, so that a run that is cut short has seen all of them
-    counts = {family: max(1, round(COUNTS[family] * given.share)) for family in families}
+    counts = {family: max(1, round(COUNTS[family] * options.share)) for family in families}
     tasks = sorted(
         ((family, seed) for family in families for seed in range(counts[family])),
         key=lambda task: task[1] / counts[task[0]],
     )
     began = time.time()
-    work = partial(one, methods=given.method, until=began + 60 * given.minutes)
-    if given.workers > 1:
-        with ProcessPoolExecutor(given.workers) as pool:
-            verdicts = [v for found in pool.map(work, tasks, chunksize=4) for v in found]
+    work = partial(one, methods=options.method, until=began + 60 * options.minutes)
+    if options.workers > 1:
+        with ProcessPoolExecutor(options.workers) as pool:
+            verdicts = [v for result in pool.map(work, tasks, chunksize=4) for v in result]
     else:
         verdicts = [v for task in tasks for v in work(task)]
     text = f"{table(verdicts)}\n\n{len(verdicts)} plans in {time.time() - began:.0f} s"
     print(text)
-    if given.out:
-        folder = given.out / "sweep"
+    if options.out:
+        folder = options.out / "sweep"
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "sweep.txt").write_text(text + "\n")
     return int(any(v.outcome == "false pass" for v in verdicts))

@@ -23,7 +23,7 @@ from ocp.motion.search.search import AtlasSearch
 from ocp.motion.search.steps import PathLength, SquaredRates, StepCost, Steps
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.search.test_charts import planar
-from tests.ocp.motion.search.test_values import INSTANTS, SECONDS, reached
+from tests.ocp.motion.search.test_values import SECONDS, TIME_SAMPLES, reached
 from tests.sweep.results import Sweep, parser
 
 KINDS = dict.fromkeys(("plain", "cut", "slow", "turning", "two"), 200)
@@ -49,12 +49,12 @@ def judged(kind: str, seed: int) -> dict[str, Any]:
     machine = planar(lengths, limit, speed)
     joints = rng.uniform(-1.0, 1.0, size) * min(limit, 2.0)
     first = np.array(ca.DM(machine.tip_pose((), joints).position)).ravel()[:2]
-    ways = rng.normal(size=(2, 2))
-    ways *= np.array([[rng.uniform(0.1, 0.4)], [0.1]]) / np.linalg.norm(ways, axis=1)[:, None]
-    s = np.linspace(0, 1, INSTANTS)[:, None]
-    places = first + s * ways[0] + 4 * s * (1 - s) * ways[1]
+    paths = rng.normal(size=(2, 2))
+    paths *= np.array([[rng.uniform(0.1, 0.4)], [0.1]]) / np.linalg.norm(paths, axis=1)[:, None]
+    s = np.linspace(0, 1, TIME_SAMPLES)[:, None]
+    places = first + s * paths[0] + 4 * s * (1 - s) * paths[1]
     places *= np.minimum(1.0, 0.97 * lengths.sum() / np.linalg.norm(places, axis=1).max())
-    times = np.linspace(0, SECONDS, INSTANTS)
+    times = np.linspace(0, SECONDS, TIME_SAMPLES)
     price, seconds = cost(weights), float(times[1])
     metric = weights if cost is SquaredRates else np.ones(size)
     space = JointSpace(machine, machine.robot.lower, machine.robot.upper, metric)
@@ -71,9 +71,9 @@ def judged(kind: str, seed: int) -> dict[str, Any]:
 
     begun, steps, bound = time.process_time(), np.inf, np.inf
     try:
-        instants = [TimeSample(sets, k) for k in range(INSTANTS)]
+        instants = [TimeSample(sets, k) for k in range(TIME_SAMPLES)]
         search = AtlasSearch(
-            space, instants, Steps(times, price, np.repeat(most[None], INSTANTS - 1, axis=0)), seeds=seeds
+            space, instants, Steps(times, price, np.repeat(most[None], TIME_SAMPLES - 1, axis=0)), seeds=seeds
         )
         path, bound = search.solve(np.inf)
         steps = np.inf if path is None else search.path_cost(path)
@@ -86,8 +86,8 @@ def judged(kind: str, seed: int) -> dict[str, Any]:
         wrong.append("dearer")
     if np.isfinite(steps) and bound < (1 - GAPS[two]) * steps:
         wrong.append("gap")
-    found = {"cost": cost.__name__, "steps": steps, "bound": bound, "least": least}
-    return found | {"wrong": wrong, "seconds": time.process_time() - begun}
+    by_name = {"cost": cost.__name__, "steps": steps, "bound": bound, "least": least}
+    return by_name | {"wrong": wrong, "seconds": time.process_time() - begun}
 
 
 def _by_three(lengths: Array, at: Array, limit: float) -> Array:
@@ -97,13 +97,13 @@ def _by_three(lengths: Array, at: Array, limit: float) -> Array:
 
 def _by_four(lengths: Array, at: Array, limit: float) -> Array:
     """Postures of an arm of four joints, of the first two all angles."""
-    found = []
+    results = []
     for angle in np.linspace(-limit, limit, COARSE):
         c, s = np.cos(angle), np.sin(angle)
         beyond = np.array([[c, s], [-s, c]]) @ at - [lengths[0], 0.0]
         rest = reached(lengths[1:], beyond, limit, COARSE)
-        found.append(np.column_stack([np.full(len(rest), angle), rest]))
-    return np.vstack(found)
+        results.append(np.column_stack([np.full(len(rest), angle), rest]))
+    return np.vstack(results)
 
 
 def _least(nodes: list[Array], price: StepCost, seconds: float, most: Array, space: JointSpace) -> float:
@@ -113,9 +113,9 @@ def _least(nodes: list[Array], price: StepCost, seconds: float, most: Array, spa
         before = np.full(len(here), np.inf)
         share = max(1, AT_ONCE // max(len(there), 1))
         for first in range(0, len(here), share):
-            way = there - here[first : first + share, None]
-            way[..., space.periodic] -= FULL_TURN * np.round(way[..., space.periodic] / FULL_TURN)
-            total = np.where((np.abs(way) <= most).all(axis=2), value + price.evaluate(way, seconds), np.inf)
+            path = there - here[first : first + share, None]
+            path[..., space.periodic] -= FULL_TURN * np.round(path[..., space.periodic] / FULL_TURN)
+            total = np.where((np.abs(path) <= most).all(axis=2), value + price.evaluate(path, seconds), np.inf)
             before[first : first + share] = total.min(axis=1, initial=np.inf)
         value = before
     return float(value.min(initial=np.inf))
@@ -127,7 +127,7 @@ def main() -> None:
         shown.append(row)
         if row["wrong"]:
             print(row, flush=True)
-    print(f"{sweep.told(shown)}; {sum(np.isfinite(row['steps']) for row in shown)} have a motion")
+    print(f"{sweep.summary(shown)}; {sum(np.isfinite(row['steps']) for row in shown)} have a motion")
 
 
 if __name__ == "__main__":

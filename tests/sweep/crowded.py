@@ -91,8 +91,8 @@ def least_by_coal(result: Plan, boxes: Sequence[Box]) -> float:
     around = CollisionScene(result.machine, boxes, CLEARANCE)
     pairs = np.arange(len(around.pairs))
     times = np.linspace(0.0, result.horizon, COARSE + 1)
-    found = _by_coal(around, np.asarray(result.at(times)["joints"]), pairs)
-    least, near = float(found.min(initial=np.inf)), found < NEAR
+    outcome = _by_coal(around, np.asarray(result.at(times)["joints"]), pairs)
+    least, near = float(outcome.min(initial=np.inf)), outcome < NEAR
     steps = np.flatnonzero(near.any(axis=1))
     if steps.size:
         between = np.linspace(-1, 1, 2 * FINE // COARSE + 1) * (result.horizon / COARSE)
@@ -113,7 +113,7 @@ def _by_coal(around: CollisionScene, joints: np.ndarray, pairs: np.ndarray) -> n
     bodies = [in_coal(body.shape) for body in around.bodies]
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.enable_signed_distance = True
-    found = np.full((len(joints), len(around.pairs)), np.inf)
+    outcome = np.full((len(joints), len(around.pairs)), np.inf)
 
     def apart(one: int, other: int, m: int) -> float:
         sides = []
@@ -132,26 +132,28 @@ def _by_coal(around: CollisionScene, joints: np.ndarray, pairs: np.ndarray) -> n
     for k in pairs:
         for m in range(len(joints)):
             one, other = around.pairs[k, :2].tolist()
-            found[m, k] = apart(one, other, m)
+            outcome[m, k] = apart(one, other, m)
             if k in around.covers:
-                found[m, k] = max(found[m, k], min(apart(i, j, m) for i, j in around.covers[k].tolist()))
-    return found
+                outcome[m, k] = max(outcome[m, k], min(apart(i, j, m) for i, j in around.covers[k].tolist()))
+    return outcome
 
 
-def planned(given: Crowd, **options: Any) -> Plan | str:
+def planned(arguments: Crowd, **options: Any) -> Plan | str:
     """The plan, or the first line of why there is none."""
     try:
-        return plan(given.machine, given.tasks, scene=Scene(obstacles=given.boxes, clearance=CLEARANCE), **options)
+        return plan(
+            arguments.machine, arguments.tasks, scene=Scene(obstacles=arguments.boxes, clearance=CLEARANCE), **options
+        )
     except (ProblemError, SolveError) as error:
         return str(error).split("\n")[0]
 
 
-def by_postures(given: Crowd, count: int) -> Plan | None:
+def by_configurations(options: Crowd, count: int) -> Plan | None:
     """The first plan from one of so many postures that are clear at the start."""
-    around = CollisionScene(given.machine, given.boxes, CLEARANCE)
-    found = inverse_kinematics(given.machine, given.tasks, scene=around, starts=4 * count, near=given.start)
-    for posture in found[:count]:
-        result = planned(given, start=posture.joints, search="start")
+    around = CollisionScene(options.machine, options.boxes, CLEARANCE)
+    solutions = inverse_kinematics(options.machine, options.tasks, scene=around, starts=4 * count, near=options.start)
+    for configuration in solutions[:count]:
+        result = planned(options, start=configuration.joints, search="start")
         if isinstance(result, Plan):
             return result
         if "no joint positions put" in result:  # on the way, from wherever it comes
@@ -159,32 +161,34 @@ def by_postures(given: Crowd, count: int) -> Plan | None:
     return None
 
 
-def result(robot: str, seed: int, postures: int) -> Row:
+def result(robot: str, seed: int, configurations: int) -> Row:
     """A task planned: cost and least distance by coal, or why there is no plan and what a search of postures finds."""
     task, begun = crowd(robot, seed), time.process_time()
-    found = planned(task)
+    outcome = planned(task)
     row: Row = {"seconds": time.process_time() - begun}
-    if isinstance(found, Plan):
-        passed, least = found.audit().passed, least_by_coal(found, task.boxes)
+    if isinstance(outcome, Plan):
+        passed, least = outcome.audit().passed, least_by_coal(outcome, task.boxes)
         wrong = ["touches"] * (passed and least < CLEARANCE - 1e-6) + ["audit"] * (not passed)
-        return row | {"cost": found.cost, "passed": passed, "least": least, "wrong": wrong}
-    other = by_postures(task, postures) if postures else None
+        return row | {"cost": outcome.cost, "passed": passed, "least": least, "wrong": wrong}
+    other = by_configurations(task, configurations) if configurations else None
     return row | {
-        "said": found,
+        "said": outcome,
         "other": None if other is None else other.cost,
         "wrong": ["lost"] * (other is not None),
     }
 
 
 def main() -> int:
-    given = parser(__doc__, COUNTS)
-    given.add_argument("--postures", type=int, default=30, help="of the search that the share solved is compared with")
-    options = given.parse_args()
+    arguments = parser(__doc__, COUNTS)
+    arguments.add_argument(
+        "--postures", type=int, default=30, help="of the search that the share solved is compared with"
+    )
+    options = arguments.parse_args()
     sweep, shown = Sweep(__file__, options, COUNTS), []
     for row in sweep.rows(lambda robot, seed, _: result(robot, seed, options.postures)):
         shown.append(row)
         print(row, flush=True)
-    print(f"{sweep.told(shown)}; {sum('cost' in row for row in shown)} solved")
+    print(f"{sweep.summary(shown)}; {sum('cost' in row for row in shown)} solved")
     return int(any("touches" in row["wrong"] for row in shown))
 
 

@@ -135,8 +135,8 @@ def arm(fast: float = 10.0) -> Problem:
     start = np.array([0.0, -0.6, 0.1, -2.2, 0.2, 1.7, 0.7])
     begin = np.array(ca.DM(FixedBase(robot).tip_pose(np.zeros(0), start).position)).ravel()
     task = TipTask.along(smooth(Line.through([begin, begin + np.array([0.1, 0.12, -0.06])]), deviation=1e-3), 0.1)
-    asked: dict[str, Any] = {"start": start, "horizon": task.duration}
-    return minimum_velocity_problem(FixedBase(robot), tasks=task, **asked)
+    request: dict[str, Any] = {"start": start, "horizon": task.duration}
+    return minimum_velocity_problem(FixedBase(robot), tasks=task, **request)
 
 
 def gantry(fast: float = 10.0) -> Problem:
@@ -184,13 +184,13 @@ class Subject:
 @cache
 def subject(kind: str) -> Subject:
     make, method, others = PLANS[kind]
-    told: dict[str, Any] = {"parameters": {"price": 2.0}} if kind == "timed" else {}
+    report: dict[str, Any] = {"parameters": {"price": 2.0}} if kind == "timed" else {}
     problem = make()
-    plan = solve(problem, method, **told)
+    plan = solve(problem, method, **report)
     if not plan.audit().passed:
         raise ValueError(f"the plan {kind} does not pass as it is: {plan.audit()}")
-    best = solve(problem, method.halved(), guess=plan, **told).cost
-    narrower = tuple(solve(make(other), method, guess=plan, **told) for other in others)
+    best = solve(problem, method.halved(), guess=plan, **report).cost
+    narrower = tuple(solve(make(other), method, guess=plan, **report) for other in others)
     places = np.linspace(0.0, 1.0, 2001)
     x, u = plan.state_interpolant(places), plan.control_interpolant(places)
     sizes = tuple(spread(values) for values in (x, u))
@@ -221,21 +221,21 @@ def at(form: Formulation, plan: Solution, s: Any) -> list[Any]:
     return [x, u, t[None], plan.horizon, p, form.signals_at(t).T]
 
 
-def measured(given: Subject, plan: Solution) -> float:
+def measured(options: Subject, plan: Solution) -> float:
     """By how much a plan misses its problem, the largest of all shares over MATTERS: 1 and more matters."""
-    form = Formulation.of(given.problem)
-    mesh, (size_x, size_u) = plan.control_interpolant.breaks, given.sizes
+    form = Formulation.of(options.problem)
+    mesh, (size_x, size_u) = plan.control_interpolant.breaks, options.sizes
     n, p, horizon = len(mesh) - 1, form.parameter_vector(plan.parameters), plan.horizon
     rates = ca.Function("rates", inputs(form), [ca.vertcat(form.f, form.running)]).map(n)
     low, high = form.bound_values(p)
-    width, pieces = np.diff(mesh), np.arange(n)
+    width, segments = np.diff(mesh), np.arange(n)
 
     def flow(y: Array, place: float) -> Array:
         s = mesh[:-1] + width * place
-        u = plan.control_interpolant.within(pieces, np.full(n, place)).T
-        found = rates(y[:-1], u, (s * horizon)[None], np.full((1, n), horizon), np.tile(p[:, None], n),
+        u = plan.control_interpolant.within(segments, np.full(n, place)).T
+        result = rates(y[:-1], u, (s * horizon)[None], np.full((1, n), horizon), np.tile(p[:, None], n),
                       form.signals_at(s * horizon).T)  # fmt: skip
-        return np.array(found) * width * horizon
+        return np.array(result) * width * horizon
 
     y = np.vstack([plan.state_interpolant(mesh[:-1] + 1e-13).T, np.zeros(n)])
     step, off = 1.0 / STEPS, [0.0]
@@ -250,12 +250,12 @@ def measured(given: Subject, plan: Solution) -> float:
     ends = plan.state_interpolant(np.array([0.0, 1.0]))
     final = form.terminal_cost(ends[1], ends[0], plan.control_interpolant(np.zeros(1))[0], horizon=horizon, p=p)
     cost = float(y[-1].sum()) + final
-    shares = [max(off), abs(plan.cost - cost) / abs(given.optimum), (cost - given.optimum) / abs(given.optimum)]
+    shares = [max(off), abs(plan.cost - cost) / abs(options.optimum), (cost - options.optimum) / abs(options.optimum)]
 
     s = (mesh[:-1, None] + width[:, None] * np.linspace(0.0, 1.0, PLACES)).ravel()
     rows = ca.Function("rows", inputs(form), [form.path.expression]).map(len(s))
     x, u, t, *_ = at(form, plan, s)
-    u = plan.control_interpolant.within(np.repeat(pieces, PLACES), np.tile(np.linspace(0.0, 1.0, PLACES), n)).T
+    u = plan.control_interpolant.within(np.repeat(segments, PLACES), np.tile(np.linspace(0.0, 1.0, PLACES), n)).T
     many = np.full((1, len(s)), horizon), np.tile(p[:, None], len(s)), form.signals_at(s * horizon).T
     g = np.array(rows(x, u, t, *many)).reshape(len(form.path), len(s))
     places = form.bounds.places
@@ -268,7 +268,7 @@ def measured(given: Subject, plan: Solution) -> float:
 
     beyond(x, places["state"], size_x)
     beyond(u, places["control"], size_u)
-    beyond(g, form.path.bounds, given.rows)
+    beyond(g, form.path.bounds, options.rows)
     for end, k in (("initial", 0), ("terminal", 1)):
         beyond(ends[k][:, None], places[end], size_x, low[places[end]] == high[places[end]])
     begin, after = (form.start, ends[0]), (form.end, ends[1])
@@ -304,50 +304,50 @@ def redrawn(plan: Solution, pool: str, change: Callable[[Array, Array, Array], A
     s = (curve.breaks[:-1, None] + np.diff(curve.breaks)[:, None] * curve.nodes).ravel()
     values = change(s, curve.values.reshape(-1, columns).copy(), np.repeat(np.arange(count), nodes))
     curve = replace(curve, values=values.reshape(count, nodes, columns))
-    told = {name: given.copy() for name, given in getattr(plan, pool).items()}
+    by_name = {name: options.copy() for name, options in getattr(plan, pool).items()}
     seen = curve(np.clip(plan.t / plan.horizon, 0.0, 1.0))
     before = getattr(plan, CURVES[pool])(np.clip(plan.t / plan.horizon, 0.0, 1.0))
     offset = 0
-    for name, given in told.items():
-        columns = slice(offset, offset + given.shape[1])
-        told[name] = given + (seen - before)[:, columns]
-        offset += given.shape[1]
-    changes: dict[str, Any] = {pool: told, CURVES[pool]: curve}
+    for name, options in by_name.items():
+        columns = slice(offset, offset + options.shape[1])
+        by_name[name] = options + (seen - before)[:, columns]
+        offset += options.shape[1]
+    changes: dict[str, Any] = {pool: by_name, CURVES[pool]: curve}
     return replace(plan, **changes)
 
 
-def tightened(given: Subject, rng: Any, size: float) -> Solution:
+def tightened(options: Subject, rng: Any, size: float) -> Solution:
     """The plan of a narrower problem, whose bounds are said to have been tightened."""
-    if not given.others:
-        return replace(given.plan, bound_tightening=np.full(shape_drawn(given), size))
-    other = given.others[rng.integers(len(given.others))]
-    drawn = np.zeros(shape_drawn(given))
-    form, narrow = Formulation.of(given.problem), Formulation.of(other.problem)
+    if not options.others:
+        return replace(options.plan, bound_tightening=np.full(random_shape(options), size))
+    other = options.others[rng.integers(len(options.others))]
+    tightening = np.zeros(random_shape(options))
+    form, narrow = Formulation.of(options.problem), Formulation.of(other.problem)
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
     p = form.parameter_vector(other.parameters)
     for side, sign in ((0, -1.0), (1, 1.0)):
         wide, own = form.bound_values(p)[side][index], narrow.bound_values(p)[side][index]
         with np.errstate(invalid="ignore"):
             by = np.nan_to_num(sign * (wide - own), nan=0.0, posinf=0.0, neginf=0.0)
-        drawn[side] = np.maximum(by, 0.0)
-    found = replace(other, problem=given.problem, bound_tightening=drawn)
-    return without_multipliers(found) if rng.random() < 0.5 else found
+        tightening[side] = np.maximum(by, 0.0)
+    result = replace(other, problem=options.problem, bound_tightening=tightening)
+    return without_multipliers(result) if rng.random() < 0.5 else result
 
 
-def shape_drawn(given: Subject) -> tuple[int, int, int]:
-    form = Formulation.of(given.problem)
-    return 2, len(given.plan.control_interpolant.breaks) - 1, form.nx + form.nu + len(form.path)
+def random_shape(options: Subject) -> tuple[int, int, int]:
+    form = Formulation.of(options.problem)
+    return 2, len(options.plan.control_interpolant.breaks) - 1, form.nx + form.nu + len(form.path)
 
 
 def without_multipliers(plan: Solution) -> Solution:
     return replace(redrawn(plan, "costates", lambda s, v, k: 0 * v), multipliers=0 * plan.multipliers)
 
 
-def edited(given: Subject, kind: str, rng: Any, size: float) -> Solution:
+def edited(options: Subject, kind: str, rng: Any, size: float) -> Solution:
     """The plan after an edit of some size, of the spread of what is edited."""
-    plan = given.plan
+    plan = options.plan
     pool = ["states", "controls"][rng.integers(2)]
-    spread = given.sizes[pool == "controls"]
+    spread = options.sizes[pool == "controls"]
     column = int(rng.integers(len(spread)))
     by = size * float(spread[column]) * rng.choice([-1.0, 1.0])
 
@@ -360,8 +360,8 @@ def edited(given: Subject, kind: str, rng: Any, size: float) -> Solution:
     if kind == "bulged":
         return redrawn(plan, pool, lambda s, v, k: added(v, by * np.sin(np.pi * s) ** 2))
     if kind == "drifted":  # a state and the control that drives it
-        column = min(column, len(given.sizes[1]) - 1, len(given.sizes[0]) - 1)
-        by = size * float(given.sizes[0][column])
+        column = min(column, len(options.sizes[1]) - 1, len(options.sizes[0]) - 1)
+        by = size * float(options.sizes[0][column])
         moved = redrawn(plan, "states", lambda s, v, k: added(v, by * s))
         return redrawn(moved, "controls", lambda s, v, k: added(v, by / plan.horizon))
     if kind == "one interval":
@@ -379,15 +379,15 @@ def edited(given: Subject, kind: str, rng: Any, size: float) -> Solution:
     if kind == "cost":
         return replace(plan, cost=plan.cost * (1 - size) if rng.random() < 0.8 else float(rng.choice([np.nan, np.inf])))
     if kind == "tightened":
-        return tightened(given, rng, size)
+        return tightened(options, rng, size)
     if kind == "tightened elsewhere":
-        return replace(plan, bound_tightening=rng.random(shape_drawn(given)) * size)
+        return replace(plan, bound_tightening=rng.random(random_shape(options)) * size)
     if kind == "tightened without rows":
-        form = Formulation.of(given.problem)
-        return replace(plan, bound_tightening=np.full((*shape_drawn(given)[:2], form.nx + form.nu), size))
-    if kind == "another problem's" and given.others:
-        other = given.others[int(rng.integers(len(given.others)))]
-        return replace(other, problem=given.problem)
+        form = Formulation.of(options.problem)
+        return replace(plan, bound_tightening=np.full((*random_shape(options)[:2], form.nx + form.nu), size))
+    if kind == "another problem's" and options.others:
+        other = options.others[int(rng.integers(len(options.others)))]
+        return replace(other, problem=options.problem)
     if kind == "parameters" and plan.parameters:
         return replace(plan, parameters={name: value * (1 + size) for name, value in plan.parameters.items()})
     if kind == "not a number":
@@ -407,12 +407,12 @@ KINDS = (
 
 def tried(kind: str, seed: int) -> Row:
     """What became of an edit: "caught", "harmless", and what is promised and broken in ``wrong``."""
-    given, began = subject(kind), time.process_time()
+    options, began = subject(kind), time.process_time()
     rng = np.random.default_rng([7, seed, sorted(PLANS).index(kind)])
     what, size = KINDS[int(rng.integers(len(KINDS)))], float(10 ** rng.uniform(-5.0, 0.0))
     wrong: list[str] = []
     share, outcome = np.nan, "refused"
-    plan = edited(given, what, rng, size)
+    plan = edited(options, what, rng, size)
     try:
         if rng.random() < 0.3:
             with tempfile.TemporaryDirectory() as folder:
@@ -427,7 +427,7 @@ def tried(kind: str, seed: int) -> Row:
     else:
         outcome = "harmless" if passed else "caught"
     if passed:
-        share = measured(given, plan)
+        share = measured(options, plan)
         if share > 1.0:
             wrong.append("passes though it matters")
     seconds = time.process_time() - began
@@ -436,14 +436,14 @@ def tried(kind: str, seed: int) -> Row:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     counts = dict.fromkeys(PLANS, EACH)
-    given = parser(__doc__, counts).parse_args(arguments)
-    sweep = Sweep(__file__, given, counts)
+    options = parser(__doc__, counts).parse_args(arguments)
+    sweep = Sweep(__file__, options, counts)
     rows = list(sweep.rows(lambda kind, seed, _: tried(kind, seed)))
     for kind in PLANS:
         own = [row for row in rows if row["kind"] == kind]
-        told = [f"{sum(row['outcome'] == word for row in own)} {word}" for word in ("caught", "refused", "harmless")]
-        print(f"{kind:<10} {', '.join(told)}, {sum(bool(row['wrong']) for row in own)} wrong")
-    print(sweep.told(rows))
+        matches = [f"{sum(row['outcome'] == word for row in own)} {word}" for word in ("caught", "refused", "harmless")]
+        print(f"{kind:<10} {', '.join(matches)}, {sum(bool(row['wrong']) for row in own)} wrong")
+    print(sweep.summary(rows))
     return int(any(row["wrong"] for row in rows))
 
 

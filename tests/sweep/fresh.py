@@ -47,8 +47,8 @@ def of_gallery(file: Path) -> dict[str, Any]:
 
 
 def free_floating() -> dict[str, Any]:
-    found = agreement(problem(), null_space_problem())
-    named = {"rates": found.rates, "null space": found.null_space}
+    result = agreement(problem(), null_space_problem())
+    named = {"rates": result.rates, "null space": result.null_space}
     return {f"{form}, {name}": plan for form, plans in named.items() for name, plan in plans.items()}
 
 
@@ -91,9 +91,9 @@ def main() -> int:
     for name in options.parse_args().only.split(","):
         for what, plan in SUBJECTS[name]().items():
             with TemporaryDirectory() as folder:
-                found = list(differences(plan, Path(folder)))
-            bad += bool(found)
-            print(f"{name}: {what}: {'; '.join(found) or 'the same'}, {len(plan.audit().findings)} rows", flush=True)
+                result = list(differences(plan, Path(folder)))
+            bad += bool(result)
+            print(f"{name}: {what}: {'; '.join(result) or 'the same'}, {len(plan.audit().findings)} rows", flush=True)
     return 1 if bad else 0
 
 

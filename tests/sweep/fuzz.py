@@ -47,7 +47,7 @@ from ocp.app.files.task_file import read_obstacles, read_task
 from ocp.motion.schedule import JointTrajectory
 from tests.ocp.app.motions import NAMES, URDF, smooth
 from tests.ocp.motion.plan.test_path_plan import path
-from tests.ocp.motion.plan.test_segmented_plan import made
+from tests.ocp.motion.plan.test_segmented_plan import segmented_plan
 
 Random: TypeAlias = np.random.Generator
 Mutator: TypeAlias = Callable[[bytes, Random], bytes]
@@ -132,16 +132,16 @@ def cut(data: bytes, rng: Random) -> bytes:
 def repeated(data: bytes, rng: Random) -> bytes:
     """A piece many times, up to some 100 kB."""
     a, b = sorted(int(k) for k in rng.integers(0, len(data) + 1, 2))
-    piece = data[a : a + min(b - a, 200)]
-    return data[:a] + piece * int(rng.integers(2, 500)) + data[a:]
+    segment = data[a : a + min(b - a, 200)]
+    return data[:a] + segment * int(rng.integers(2, 500)) + data[a:]
 
 
 def crafted(data: bytes, rng: Random) -> bytes:
     """A number or a word that becomes one of VALUES."""
-    found = [*(NUMBER if rng.random() < 0.6 else WORD).finditer(data)]
-    if not found:
+    results = [*(NUMBER if rng.random() < 0.6 else WORD).finditer(data)]
+    if not results:
         return data
-    chosen = found[int(rng.integers(len(found)))]
+    chosen = results[int(rng.integers(len(results)))]
     value = VALUES[int(rng.integers(len(VALUES)))].encode()
     return data[: chosen.start()] + value + data[chosen.end() :]
 
@@ -165,9 +165,9 @@ def overwritten(data: bytes, rng: Random) -> bytes:
         ("<d", (np.nan, np.inf, 1e308, 5e-324)),
         ("<f", (np.nan, -np.inf, 3e38, 1e-45)),
     ][int(rng.integers(5))]
-    piece = struct.pack(kind, values[int(rng.integers(len(values)))])
-    place = int(rng.integers(0, max(1, len(data) - len(piece))))
-    return data[:place] + piece + data[place + len(piece) :]
+    segment = struct.pack(kind, values[int(rng.integers(len(values)))])
+    place = int(rng.integers(0, max(1, len(data) - len(segment))))
+    return data[:place] + segment + data[place + len(segment) :]
 
 
 BYTES_CHANGED: tuple[Mutator, ...] = (flipped, spliced, cut, repeated, overwritten)
@@ -446,7 +446,7 @@ def solution_file() -> bytes:
 KINDS: dict[str, Kind] = {
     "plan": Kind(".npz", plan_file, lambda file: Plan.load(file).audit(), in_archive()),
     "path": Kind(".npz", lambda: saved(path()), lambda file: Plan.load(file).audit(), in_archive()),
-    "segments": Kind(".npz", lambda: saved(made()), lambda file: Plan.load(file).audit(), in_archive()),
+    "segments": Kind(".npz", lambda: saved(segmented_plan()), lambda file: Plan.load(file).audit(), in_archive()),
     # the audit of a problem whose dynamics were changed into stiff ones may rightly take longer than a reader
     "solution": Kind(".npz", solution_file, Solution.load, in_archive()),
     "urdf": Kind(".urdf", URDF.encode, read_robot, mostly(changed_xml)),
@@ -509,7 +509,7 @@ def tried(kind: Kind, data: bytes, place: Path) -> Trial:
         _read_in_child(kind, file, sink)
     os.close(sink)
     with os.fdopen(source, "rb") as stream:
-        told = stream.read().decode(errors="replace")
+        report = stream.read().decode(errors="replace")
     _, status = os.waitpid(child, 0)
     after = contents(root)
     if after != before:
@@ -519,9 +519,9 @@ def tried(kind: Kind, data: bytes, place: Path) -> Trial:
         return Trial("written", ", ".join(changed))
     if os.WIFSIGNALED(status):
         name = signal.Signals(os.WTERMSIG(status)).name
-        return Trial("hang" if name in ("SIGPROF", "SIGALRM", "SIGXCPU") else "crash", f"{name} {told}")
-    outcome, _, words = told.partition("\n")
-    return Trial(outcome, words) if outcome in OUTCOMES else Trial("crash", f"status {status} {told}")
+        return Trial("hang" if name in ("SIGPROF", "SIGALRM", "SIGXCPU") else "crash", f"{name} {report}")
+    outcome, _, words = report.partition("\n")
+    return Trial(outcome, words) if outcome in OUTCOMES else Trial("crash", f"status {status} {report}")
 
 
 def _read_in_child(kind: Kind, file: Path, sink: int) -> None:
@@ -567,15 +567,15 @@ def trials(kind: Kind, count: int, seed: int) -> Iterator[tuple[bytes, Trial]]:
 
 def fuzzed(name: str, count: int, seed: int, keep: Path | None = None) -> Counter[str]:
     """Count the outcomes of a kind; print what is not good, and keep its files in a folder."""
-    found: Counter[str] = Counter()
+    result: Counter[str] = Counter()
     for number, (data, trial) in enumerate(trials(KINDS[name], count, seed)):
-        found[trial.outcome] += 1
+        result[trial.outcome] += 1
         if trial.outcome not in GOOD or (not number and trial.outcome != "read"):
             print(f"{name} {number}: {trial.outcome}: {trial.words}", file=sys.stderr)
             if keep is not None:
                 keep.mkdir(parents=True, exist_ok=True)
                 (keep / f"{name.replace(' ', '_')}-{number}{KINDS[name].suffix}").write_bytes(data)
-    return found
+    return result
 
 
 def main() -> int:
@@ -584,13 +584,13 @@ def main() -> int:
     options.add_argument("--only", default=",".join(KINDS), help=f"kinds: {', '.join(KINDS)} (default: all)")
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--keep", type=Path, help="folder for files that are not read as they should be")
-    given = options.parse_args()
+    arguments = options.parse_args()
     bad = 0
     print(f"{'':12}" + "".join(f"{outcome:>9}" for outcome in OUTCOMES))
-    for name in given.only.split(","):
-        found = fuzzed(name, given.count, given.seed, given.keep)
-        bad += sum(count for outcome, count in found.items() if outcome not in GOOD)
-        print(f"{name:12}" + "".join(f"{found[outcome]:9}" for outcome in OUTCOMES), flush=True)
+    for name in arguments.only.split(","):
+        result = fuzzed(name, arguments.count, arguments.seed, arguments.keep)
+        bad += sum(count for outcome, count in result.items() if outcome not in GOOD)
+        print(f"{name:12}" + "".join(f"{result[outcome]:9}" for outcome in OUTCOMES), flush=True)
     return 1 if bad else 0
 
 

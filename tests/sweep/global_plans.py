@@ -30,7 +30,7 @@ COUNTS = {"panda": 14, "ur5": 13, "planar": 13}
 """Tasks of each."""
 GAPS = {1: 0.02, 2: 0.1}
 SHARE = 0.1
-LOOKED = 5
+CHECKED_COUNT = 5
 """Times at which a task must be within reach."""
 
 
@@ -44,12 +44,12 @@ def task_of(kind: str, seed: int) -> tuple[FixedBase, TipTask]:
         joints = rng.uniform(0.8 * low, 0.8 * high)
         pose = machine.tip_pose((), joints)
         first, turn = np.array(ca.DM(pose.position)).ravel(), np.array(ca.DM(pose.rotation))
-        ways = rng.normal(size=(2, 3))
-        ways *= np.array([[rng.uniform(0.1, 0.3)], [rng.uniform(0.0, 0.1)]]) / np.linalg.norm(ways, axis=1)[:, None]
+        paths = rng.normal(size=(2, 3))
+        paths *= np.array([[rng.uniform(0.1, 0.3)], [rng.uniform(0.0, 0.1)]]) / np.linalg.norm(paths, axis=1)[:, None]
 
-        def where(t: Any, first: Array = first, ways: Array = ways) -> Any:
+        def where(t: Any, first: Array = first, paths: Array = paths) -> Any:
             s = t / SECONDS
-            return ca.DM(first) + s * ca.DM(ways[0]) + ca.sin(2 * np.pi * s) * ca.DM(ways[1])
+            return ca.DM(first) + s * ca.DM(paths[0]) + ca.sin(2 * np.pi * s) * ca.DM(paths[1])
 
         if kind == "panda":
             task = TipTask(position=where, orientation=turn, duration=SECONDS)
@@ -58,7 +58,7 @@ def task_of(kind: str, seed: int) -> tuple[FixedBase, TipTask]:
         else:
             task = TipTask(position=lambda t, where=where: where(t)[:2], rows=[3, 4], duration=SECONDS)
         try:
-            for t in np.linspace(0, SECONDS, LOOKED):
+            for t in np.linspace(0, SECONDS, CHECKED_COUNT):
                 inverse_kinematics(machine, task, time=float(t), starts=16)
         except Unreachable:
             continue
@@ -71,8 +71,8 @@ def by_search(kind: str, seed: int) -> dict[str, Any]:
     row: dict[str, Any]
     begun = time.process_time()
     try:
-        found = plan(machine, task, search="global", scene=False)
-        row = {"cost": found.cost, "bound": found.bound, "passed": found.audit().passed}
+        result = plan(machine, task, search="global", scene=False)
+        row = {"cost": result.cost, "bound": result.bound, "passed": result.audit().passed}
     except (SolveError, ProblemError) as error:
         row = {"cost": np.inf, "bound": 0.0, "passed": False, "said": str(error)[:200]}
     return row | {"seconds": time.process_time() - begun}
@@ -83,10 +83,10 @@ def by_starts(kind: str, seed: int, starts: int) -> dict[str, Any]:
     machine, task = task_of(kind, seed)
     begun, best, failed, k = time.process_time(), np.inf, 0, 0
     while k < starts:
-        for posture in inverse_kinematics(machine, task, seed=1000 * seed + k, starts=starts):
+        for configuration in inverse_kinematics(machine, task, seed=1000 * seed + k, starts=starts):
             k += 1
             try:
-                best = min(best, plan(machine, task, start=posture.joints, search="start", scene=False).cost)
+                best = min(best, plan(machine, task, start=configuration.joints, search="start", scene=False).cost)
             except (SolveError, ProblemError):
                 failed += 1
             if k == starts:
@@ -96,24 +96,24 @@ def by_starts(kind: str, seed: int, starts: int) -> dict[str, Any]:
 
 def faults(kind: str, row: dict[str, Any]) -> list[str]:
     """What a task's result breaks of what is promised."""
-    found = list[str]()
+    result = list[str]()
     if row["cost"] > row["best"] * (1 + 1e-6):
-        found.append("dearer")
+        result.append("dearer")
     if row["bound"] > min(row["best"], row["cost"]) * (1 + 1e-6):
-        found.append("bound above")
+        result.append("bound above")
     if np.isfinite(row["cost"]) and row["bound"] < (1 - GAPS[KINDS[kind][1]]) * row["cost"]:
-        found.append("gap")
+        result.append("gap")
     if row["seconds"] > SHARE * row["starts_seconds"]:
-        found.append("slow")
+        result.append("slow")
     if np.isfinite(row["cost"]) and not row["passed"]:
-        found.append("audit")
-    return found
+        result.append("audit")
+    return result
 
 
 def main() -> None:
-    given = parser(__doc__, COUNTS)
-    given.add_argument("--starts", type=int, default=200)
-    options = given.parse_args()
+    arguments = parser(__doc__, COUNTS)
+    arguments.add_argument("--starts", type=int, default=200)
+    options = arguments.parse_args()
     sweep, shown = Sweep(__file__, options, COUNTS), []
 
     def result(kind: str, seed: int, known: Row | None) -> Row:
@@ -129,7 +129,7 @@ def main() -> None:
             f"{row['bound'] / row['cost']:.4f}  time {row['seconds'] / row['starts_seconds']:.3f}  {row['wrong']}",
             flush=True,
         )
-    print(sweep.told(shown))
+    print(sweep.summary(shown))
 
 
 if __name__ == "__main__":

@@ -66,12 +66,12 @@ def judged(family: str, seed: int, methods: Iterable[str] | None = None, show: b
         if family == QUADRATIC:
             return _quadratic(seed, methods, show)
         known = FAMILIES[family](seed)
-        found = []
+        results = []
         for name in methods or [name for name in METHODS if (family, name) not in BEYOND]:
             began = time.monotonic()
-            plan, said = _solved(known.problem, METHODS[name](SIZES[seed % 7 % 4]))
+            plan, message = _solved(known.problem, METHODS[name](SIZES[seed % 7 % 4]))
             if plan is None:
-                found.append(Verdict(family, name, seed, "unsolved", np.nan, said, time.monotonic() - began))
+                results.append(Verdict(family, name, seed, "unsolved", np.nan, message, time.monotonic() - began))
                 continue
             audit = plan.audit()
             seconds = time.monotonic() - began
@@ -84,8 +84,8 @@ def judged(family: str, seed: int, methods: Iterable[str] | None = None, show: b
             if show:
                 print(f"{family}, seed {seed}, {name}: {outcome}; cost off by {off:.2e}, missed by {missed:.2e}")
                 print(audit)
-            found.append(Verdict(family, name, seed, outcome, off, _why(audit), seconds))
-        return found
+            results.append(Verdict(family, name, seed, outcome, off, _why(audit), seconds))
+        return results
 
 
 def _quadratic(seed: int, methods: Iterable[str] | None, show: bool) -> list[Verdict]:
@@ -94,12 +94,12 @@ def _quadratic(seed: int, methods: Iterable[str] | None, show: bool) -> list[Ver
     problem, family = quadratic.problem(), f"{QUADRATIC}, {kind}"
     family += ", given end" if quadratic.fixed else ", free end"
     names = list(methods) if methods else ["drawn", list(METHODS)[seed % len(METHODS)]]
-    found = []
+    results = []
     for name in names:
         began = time.monotonic()
         if name == "drawn" and kind == "bounds met":
             continue  # beyond its bounds
-        plan, said = (
+        plan, message = (
             (quadratic.plan(problem), "")
             if name == "drawn"
             else _solved(problem, METHODS[name](24), check=False, options={"max_iter": 200})
@@ -107,7 +107,7 @@ def _quadratic(seed: int, methods: Iterable[str] | None, show: bool) -> list[Ver
         if plan is None:
             # a method may see for itself that there is no minimum
             outcome = "unsolved" if minimum and kind != "bounds met" else "fail"
-            found.append(Verdict(family, name, seed, outcome, np.nan, said, time.monotonic() - began))
+            results.append(Verdict(family, name, seed, outcome, np.nan, message, time.monotonic() - began))
             continue
         audit = plan.audit()
         seconds = time.monotonic() - began
@@ -123,8 +123,8 @@ def _quadratic(seed: int, methods: Iterable[str] | None, show: bool) -> list[Ver
         if show:
             print(f"{family}, seed {seed}, {name}: {outcome}; minimum: {minimum}, least curvature {curved:.3g}")
             print(audit)
-        found.append(Verdict(family, name, seed, outcome, float(curved), _why(audit), seconds))
-    return found
+        results.append(Verdict(family, name, seed, outcome, float(curved), _why(audit), seconds))
+    return results
 
 
 def _exact(quadratic: Quadratic) -> float:
@@ -161,8 +161,8 @@ def _outcome(audit: Any, sound: bool, unsound: bool) -> str:
 
 
 def _why(audit: Any) -> str:
-    told = [f"{f.name} {f.value:.1e}" for f in audit.failures]
-    return "; ".join([*told, *([audit.undecided] if getattr(audit, "undecided", "") else [])])
+    matches = [f"{f.name} {f.value:.1e}" for f in audit.failures]
+    return "; ".join([*matches, *([audit.undecided] if getattr(audit, "undecided", "") else [])])
 
 
 OUTCOMES = ("pass", "false pass", "fail", "false fail", "undecided", "unsolved", "unknown")

@@ -173,7 +173,7 @@ def main() -> None:
     for row in sweep.rows(lambda kind, seed, _: result(options.data, kind, seed)):
         rows.append(row)
         print(row, flush=True)
-    print(sweep.told(rows))
+    print(sweep.summary(rows))
     for mode in ("", " time"):
         planned = [row for row in rows if row["kind"].endswith(" time") == bool(mode) and "length" in row]
         if planned:

@@ -39,7 +39,7 @@ COARSE, CLOSE = 600, 120
 """Times over the whole motion, and about every event."""
 EXACT = 1e-6
 """m: to which coal measures."""
-Way = Callable[[Any], Any]
+Trajectory = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
@@ -86,16 +86,16 @@ def _shape(rng: np.random.Generator, thin: bool) -> Any:
     if thin:
         return Box((rng.uniform(0.3, 0.8), 0.002, 0.002))
     size = rng.uniform(0.02, 0.09)
-    made: list[Callable[[], Any]] = [
+    results: list[Callable[[], Any]] = [
         lambda: Sphere(size, (0, 0, 0)),
         lambda: Capsule(size / 2, (0, 0, -size), (0, size, size)),
         lambda: Box(size * rng.uniform(0.5, 2.0, size=3)),
         lambda: Mesh(size * rng.normal(size=(12, 3))),
     ]
-    return made[int(rng.integers(len(made)))]()
+    return results[int(rng.integers(len(results)))]()
 
 
-def _between(far: np.ndarray, aim: np.ndarray, share: Callable[[Any], Any]) -> Way:
+def _between(far: np.ndarray, aim: np.ndarray, share: Callable[[Any], Any]) -> Trajectory:
     return lambda t: ca.DM(far) + share(t) * ca.DM(aim - far)
 
 
@@ -107,37 +107,37 @@ def _turned(angle: Any) -> Any:
 def _once(share: Callable[[float, float], Callable[[Any], Any]], low: float = -5.0, high: float = -0.5) -> Any:
     """A motion from far to aim by a share, with an event at one time, of a random width in powers of ten, s."""
 
-    def made(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
+    def trajectory(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
         width = float(10 ** rng.uniform(low, high))
         return _between(far, aim, share(when, width)), None, [(when, 2 * width)]
 
-    return made
+    return trajectory
 
 
 def _again(share: Callable[[float, float], Callable[[Any], Any]], low: float, high: float) -> Any:
     """A motion of a random rate between two, from far to aim by a share, which is there at one time."""
 
-    def made(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
+    def trajectory(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
         return _between(far, aim, share(rng.uniform(low, high), when)), None, [(when, 0.05)]
 
-    return made
+    return trajectory
 
 
 def _table(kind: str) -> Any:
-    def made(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
+    def trajectory(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
         knots = np.unique([0.0, *rng.uniform(0, SECONDS, 8), when - 0.02, when, when + 0.02, SECONDS])
         values = np.clip(rng.normal(0.2, 0.3, len(knots)), -0.5, 0.8)
         values[knots == when] = 1.0
         table = ca.interpolant("table", kind, [knots.tolist()], values.tolist())
         return _between(far, aim, lambda t: table(t)), None, [(when, 0.03)]
 
-    return made
+    return trajectory
 
 
 def _spinning(rng: np.random.Generator, when: float, aim: np.ndarray, far: np.ndarray) -> Any:
     rate = rng.uniform(5, 60)
     turn = rng.choice(np.array(["even", "to and fro", "by steps"]))
-    angle: dict[str, Way] = {
+    angle: dict[str, Trajectory] = {
         "even": lambda t: rate * t,
         "to and fro": lambda t: rate * ca.fabs(t - when),
         "by steps": lambda t: ca.floor(3 * t) + rate * ca.fmax(0.0, t - when),
@@ -166,10 +166,10 @@ MOTIONS: dict[str, Any] = {
 """Motions: of a generator, a time, where it goes then and where it comes from, to position, rotation and events."""
 
 
-def proven(robot: str, given: Obstacle) -> tuple[CollisionScene, Clearance]:
+def proven(robot: str, options: Obstacle) -> tuple[CollisionScene, Clearance]:
     """What is proven of the motion beside an obstacle, of the pairs with it alone."""
     machine = ROBOTS[robot]()
-    around = CollisionScene(machine, [given.moving])
+    around = CollisionScene(machine, [options.moving])
     problem, q = problem_of(machine, ENDS[robot])
     ClearanceConstraints(around).declare(problem, machine.base_home(), q, horizon=SECONDS)
     beside = [k for k, pair in enumerate(around.labels) if "obstacle 0" in pair]
@@ -177,9 +177,9 @@ def proven(robot: str, given: Obstacle) -> tuple[CollisionScene, Clearance]:
     return around, clearance(Formulation.of(problem), apart, motion(robot), np.zeros(0))
 
 
-def least_by_coal(robot: str, given: Obstacle, around: CollisionScene) -> dict[tuple[str, str], float]:
+def least_by_coal(robot: str, options: Obstacle, around: CollisionScene) -> dict[tuple[str, str], float]:
     """Least distances of the obstacle from each body, m."""
-    about = [np.linspace(at - width, at + width, CLOSE + 1) for at, width in given.events]
+    about = [np.linspace(at - width, at + width, CLOSE + 1) for at, width in options.events]
     times = np.unique(np.clip(np.concatenate([np.linspace(0, SECONDS, COARSE + 1), *about]), 0.0, SECONDS))
     joints = motion(robot).state_interpolant(times / SECONDS)
     q, t = ca.SX.sym("q", joints.shape[1]), ca.SX.sym("t")
@@ -187,7 +187,7 @@ def least_by_coal(robot: str, given: Obstacle, around: CollisionScene) -> dict[t
     frames = np.array(placed(joints.T, times[None])).T.reshape(len(times), -1, 4, 3)
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.enable_signed_distance = True
-    found = {}
+    by_name = {}
     for label, (one, other, _) in zip(around.labels, around.pairs.tolist(), strict=True):
         if "obstacle 0" not in label:
             continue
@@ -201,29 +201,29 @@ def least_by_coal(robot: str, given: Obstacle, around: CollisionScene) -> dict[t
                 both += [geometry, moved if body.frame >= 0 else place]
             result.clear()
             least = min(least, float(coal.distance(*both, request, result)))
-        found[label] = least
-    return found
+        by_name[label] = least
+    return by_name
 
 
 def result(robot: str, seed: int) -> Row:
     """What is said of an obstacle, the least distance that is proven and the one by coal, m."""
-    given, begun = obstacle(robot, seed), time.process_time()
-    row: Row = {"motion": given.motion, "wrong": []}
+    options, begun = obstacle(robot, seed), time.process_time()
+    row: Row = {"motion": options.motion, "wrong": []}
     try:
-        around, found = proven(robot, given)
+        around, outcome = proven(robot, options)
     except (ModelError, ProblemError) as error:
         return row | {"seconds": time.process_time() - begun, "said": "refused", "why": str(error)}
-    worst = found.worst
+    worst = outcome.worst
     assert worst is not None
-    row |= {"seconds": time.process_time() - begun, "looked": found.n_intervals}
-    known = least_by_coal(robot, given, around)
-    above = [near.bodies for near in found.pairs if not near.least <= max(known[near.bodies], 0.0) + EXACT]
-    least = min(near.least for near in found.pairs)
-    said = "proven" if not worst.missed else "in collision" if worst.distance < 0 else "not proven"
-    find_collisions = said == "proven" and min(known.values()) < -EXACT
+    row |= {"seconds": time.process_time() - begun, "looked": outcome.n_intervals}
+    known = least_by_coal(robot, options, around)
+    above = [near.bodies for near in outcome.pairs if not near.least <= max(known[near.bodies], 0.0) + EXACT]
+    least = min(near.least for near in outcome.pairs)
+    message = "proven" if not worst.missed else "in collision" if worst.distance < 0 else "not proven"
+    find_collisions = message == "proven" and min(known.values()) < -EXACT
     numbers = {"least": None if not np.isfinite(least) else least, "by_coal": min(known.values())}
     wrong = [f"above the truth: {pair}" for pair in above] + ["touches"] * find_collisions
-    return row | numbers | {"said": said, "why": found.reason, "wrong": wrong}
+    return row | numbers | {"said": message, "why": outcome.reason, "wrong": wrong}
 
 
 def main() -> int:
@@ -231,8 +231,8 @@ def main() -> int:
     for row in sweep.rows(lambda robot, seed, _: result(robot, seed)):
         shown.append(row)
         print(row, flush=True)
-    said = Counter(row["said"] for row in shown)
-    print(f"{sweep.told(shown)}; {', '.join(f'{count} {what}' for what, count in sorted(said.items()))}")
+    message = Counter(row["said"] for row in shown)
+    print(f"{sweep.summary(shown)}; {', '.join(f'{count} {what}' for what, count in sorted(message.items()))}")
     return int(any(row["wrong"] for row in shown))
 
 

@@ -73,11 +73,11 @@ def miss(known: Known, plan: Solution, places: int = 12) -> float:
             here = curve.breaks[k] + (curve.breaks[k + 1] - curve.breaks[k]) * (j + 1) / places - 1e-13
             defect = np.abs(plan.state_interpolant(np.array([here]))[0, index] - state)
             worst = max(worst, float((defect / spread).max()))
-    for given, found in ((known.start, x[0]), (known.end, x[-1])):
-        held = np.isfinite(given)
-        worst = max(worst, float((np.abs(found - given) / spread)[held].max(initial=0.0)))
-    piece, place = np.repeat(np.arange(n), 21), np.tile(np.linspace(0, 1, 21), n)
-    pushes = curve.within(piece, place)
+    for options, result in ((known.start, x[0]), (known.end, x[-1])):
+        held = np.isfinite(options)
+        worst = max(worst, float((np.abs(result - options) / spread)[held].max(initial=0.0)))
+    segment, place = np.repeat(np.arange(n), 21), np.tile(np.linspace(0, 1, 21), n)
+    pushes = curve.within(segment, place)
     for name, (low, high) in known.bounds.items():
         values = x[:, known.states.index(name)] if name in known.states else pushes
         size = max(abs(bound) for bound in (low, high) if np.isfinite(bound))
@@ -110,15 +110,15 @@ def regulator(seed: int) -> Known:
 
 def fastest(q0: float, v0: float, q1: float, v1: float) -> float:
     """Least time of x'' = u, |u| <= 1, between two states: one switch at most."""
-    found = []
+    results = []
     for sign in (1.0, -1.0):
         squared = (v0**2 + v1**2) / 2 + sign * (q1 - q0)
         if squared >= 0:
             for top in (np.sqrt(squared), -np.sqrt(squared)):
                 before, after = top - sign * v0, top - sign * v1
                 if min(before, after) >= -1e-12:
-                    found.append(before + after)
-    return float(min(found))
+                    results.append(before + after)
+    return float(min(results))
 
 
 def minimum_time(seed: int) -> Known:
@@ -181,11 +181,11 @@ def pendulum(seed: int) -> Known:
     def beside(plan: Solution) -> float:
         values = [plan["a"], plan["w"], plan.costate("a"), plan.costate("w")]
         t, keep = np.unique(plan.t, return_index=True)
-        found = solve_bvp(canonical, ends_met, t, np.hstack(values)[keep].T, tol=1e-9, max_nodes=20000)
-        if not found.success:
+        result = solve_bvp(canonical, ends_met, t, np.hstack(values)[keep].T, tol=1e-9, max_nodes=20000)
+        if not result.success:
             return float("nan")
         spend: Any = lambda t, y: [*canonical(t, y[:4]), y[3] ** 2 / 4]  # noqa: E731
-        along = solve_ivp(spend, (0, horizon), [*found.y[:, 0], 0.0], rtol=1e-10, atol=1e-12)
+        along = solve_ivp(spend, (0, horizon), [*result.y[:, 0], 0.0], rtol=1e-10, atol=1e-12)
         return float(along.y[4, -1])
 
     rate: Rate = lambda t, x, u: np.array([x[1], -stiff * np.sin(x[0]) - drag * x[1] + u[0]])  # noqa: E731

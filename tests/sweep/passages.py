@@ -36,7 +36,7 @@ LOSS = 30.0
 """Factor of manipulability that the pseudo-inverse loses."""
 DEGREE = 40
 """Of the Chebyshev series that tell the path."""
-PIECES = 3
+SEGMENT_COUNT = 3
 """Harmonics of the motion that is made."""
 MOST = 1.0
 """rad/s: about how fast its joints are."""
@@ -86,11 +86,11 @@ def passage(seed: int, beyond: float = 0.0) -> Passage:
     rate = ca.Function("rate", [b, q, u], [machine.base_rate(b, q, u)])
     frame = machine.tip_pose(b, q)
     tip = ca.Function("tip", [b, q], [frame.position, frame.rotation])
-    whole, paces = seed % 2 == 0, np.pi * np.arange(1, PIECES + 1) / SECONDS
+    whole, paces = seed % 2 == 0, np.pi * np.arange(1, SEGMENT_COUNT + 1) / SECONDS
     t = (1 - np.cos(np.linspace(0, np.pi, 8 * DEGREE))) * SECONDS / 2
     while True:
         start = rng.uniform(-1.5, 1.5, 7)
-        waves = rng.normal(size=(PIECES, 7)) * MOST / np.sqrt(PIECES)
+        waves = rng.normal(size=(SEGMENT_COUNT, 7)) * MOST / np.sqrt(SEGMENT_COUNT)
 
         def joints(s: Any, start: Array = start, waves: Array = waves) -> Array:
             return np.asarray(start + np.sin(np.multiply.outer(s, paces)) / paces @ waves)
@@ -106,12 +106,12 @@ def passage(seed: int, beyond: float = 0.0) -> Passage:
         quaternions = quaternion_from_rotation(np.array(turns).reshape(3, len(t), 3).transpose(1, 0, 2))
         flips = np.cumprod(np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0))
         quaternions[1:] *= flips[:, None]
-        way = np.array(places).T + np.outer(t, [beyond / SECONDS, 0.0, 0.0])
-        told: dict[str, Any] = {"position": series(t, way), "duration": SECONDS}
+        path = np.array(places).T + np.outer(t, [beyond / SECONDS, 0.0, 0.0])
+        by_name: dict[str, Any] = {"position": series(t, path), "duration": SECONDS}
         turn = series(t, quaternions)
         if whole:
-            told["orientation"] = lambda s, turn=turn: turn(s) / ca.norm_2(turn(s))
-        task = TipTask(**told)
+            by_name["orientation"] = lambda s, turn=turn: turn(s) / ca.norm_2(turn(s))
+        task = TipTask(**by_name)
         if beyond:
             return Passage(machine, task, start, t, joints(t), np.inf)
         local = resolve(machine, tasks=task, start_joints=start, horizon=SECONDS, samples=101, tolerance=1e-7)
@@ -121,10 +121,10 @@ def passage(seed: int, beyond: float = 0.0) -> Passage:
         return Passage(machine, task, start, t, joints(t), cost)
 
 
-def planned(given: Passage, **options: Any) -> Plan | str:
+def planned(arguments: Passage, **options: Any) -> Plan | str:
     """The plan, or the first lines of why there is none."""
     try:
-        return plan(given.machine, given.task, start=given.start, scene=False, **options)
+        return plan(arguments.machine, arguments.task, start=arguments.start, scene=False, **options)
     except (ProblemError, SolveError) as error:
         return f"{type(error).__name__} {error}"[:300]
 
@@ -134,13 +134,13 @@ def result(kind: str, seed: int) -> Row:
     beyond = kind == "beyond"
     task = passage(seed if beyond else 2 * seed + (kind == "place"), BEYOND * beyond)
     begun = time.process_time()
-    found = planned(task)
+    outcome = planned(task)
     row: Row = {"seconds": time.process_time() - begun, "made_with": task.cost}
-    if isinstance(found, str):
+    if isinstance(outcome, str):
         late = row["seconds"] > SOON
-        return row | {"said": found, "wrong": ["late"] * late if beyond else ["not planned"]}
-    passed = found.audit().passed
-    return row | {"cost": found.cost, "passed": passed, "wrong": ["planned"] * beyond + ["audit"] * (not passed)}
+        return row | {"said": outcome, "wrong": ["late"] * late if beyond else ["not planned"]}
+    passed = outcome.audit().passed
+    return row | {"cost": outcome.cost, "passed": passed, "wrong": ["planned"] * beyond + ["audit"] * (not passed)}
 
 
 def main() -> None:
@@ -148,7 +148,7 @@ def main() -> None:
     for row in sweep.rows(lambda kind, seed, _: result(kind, seed)):
         shown.append(row)
         print(row, flush=True)
-    print(f"{sweep.told(shown)}; {sum('cost' in row for row in shown)} planned")
+    print(f"{sweep.summary(shown)}; {sum('cost' in row for row in shown)} planned")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from ocp import Problem, Solution
-from tests.ocp.audit.drawn import drawn
+from tests.ocp.audit.drawn import random_program
 from tests.ocp.problems import Array
 
 __all__ = ["KINDS", "Quadratic", "random_quadratic"]
@@ -134,7 +134,7 @@ class Quadratic:
 
         held = {} if self.push is None else {"w": 1.0}
         states, costates = {"x": lambda t: along(t)[:, :n]}, {"x": lambda t: along(t)[:, n:]}
-        return drawn(problem, states, {"u": controls, **held}, costates, self.horizon, 40)
+        return random_program(problem, states, {"u": controls, **held}, costates, self.horizon, 40)
 
 
 def random_quadratic(seed: int) -> tuple[Quadratic, bool, str]:
@@ -148,7 +148,7 @@ def random_quadratic(seed: int) -> tuple[Quadratic, bool, str]:
     while True:
         n, m = int(rng.integers(1, 5)), int(rng.integers(1, 3))
         q, f, r = rng.normal(size=(n, n)), rng.normal(size=(n, n)), rng.normal(size=(m, m))
-        drawn_one = Quadratic(
+        instance = Quadratic(
             a=rng.normal(size=(n, n)),
             b=rng.normal(size=(n, m)),
             q=float(rng.uniform(0.5, 6.0)) * (q + q.T) / 2,
@@ -162,38 +162,38 @@ def random_quadratic(seed: int) -> tuple[Quadratic, bool, str]:
             push=rng.normal(size=n) if kind == "held at a bound" else None,
             pull=0.0,
         )
-        if not controllable(drawn_one) or np.linalg.eigvalsh(drawn_one.q)[0] > 0:
+        if not controllable(instance) or np.linalg.eigvalsh(instance.q)[0] > 0:
             continue
         if seed // 16 % 2:  # near the first horizon at which it is no minimum any more
-            first = drawn_one.longest_minimum(4.0)
+            first = instance.longest_minimum(4.0)
             if not 0.3 < first < 3.0:
                 continue
             share = rng.uniform(2 * NEAR, 0.2)
-            drawn_one = replace(drawn_one, horizon=first * (1 - share if minimum else 1 + share))
-        counts = [drawn_one.conjugate_points(drawn_one.horizon)]
+            instance = replace(instance, horizon=first * (1 - share if minimum else 1 + share))
+        counts = [instance.conjugate_points(instance.horizon)]
         if (counts[0] == 0) is not minimum:
             continue
-        counts += [drawn_one.conjugate_points(drawn_one.horizon * (1 + share)) for share in (-NEAR, NEAR)]
+        counts += [instance.conjugate_points(instance.horizon * (1 + share)) for share in (-NEAR, NEAR)]
         if len(set(counts)) > 1:
             continue
-        along, size = drawn_one.extremal()
+        along, size = instance.extremal()
         if size > 30:
             continue
         if kind == "held at a bound":  # pulled at so that it stays there
-            costates = along(np.linspace(0, drawn_one.horizon, 201))[:, n:]
-            pull = 2.0 + 1.2 * float(np.abs(costates @ drawn_one.push).max())
-            drawn_one = replace(drawn_one, pull=pull)
+            costates = along(np.linspace(0, instance.horizon, 201))[:, n:]
+            pull = 2.0 + 1.2 * float(np.abs(costates @ instance.push).max())
+            instance = replace(instance, pull=pull)
         if kind == "bounds inside":
-            path = along(np.linspace(0, drawn_one.horizon, 201))
-            u = np.linalg.solve(drawn_one.r, drawn_one.s.T @ path[:, :n].T + drawn_one.b.T @ path[:, n:].T)
-            drawn_one = replace(drawn_one, bound=1.5 * float(np.abs(u).max()) or 1.0)
+            path = along(np.linspace(0, instance.horizon, 201))
+            u = np.linalg.solve(instance.r, instance.s.T @ path[:, :n].T + instance.b.T @ path[:, n:].T)
+            instance = replace(instance, bound=1.5 * float(np.abs(u).max()) or 1.0)
         if kind == "bounds met":
-            path = along(np.linspace(0, drawn_one.horizon, 201))
-            u = np.linalg.solve(drawn_one.r, drawn_one.s.T @ path[:, :n].T + drawn_one.b.T @ path[:, n:].T)
+            path = along(np.linspace(0, instance.horizon, 201))
+            u = np.linalg.solve(instance.r, instance.s.T @ path[:, :n].T + instance.b.T @ path[:, n:].T)
             if not np.abs(u).max() > 0.1:
                 continue
-            drawn_one = replace(drawn_one, bound=0.8 * float(np.abs(u).max()))
-        return drawn_one, minimum, kind
+            instance = replace(instance, bound=0.8 * float(np.abs(u).max()))
+        return instance, minimum, kind
 
 
 def controllable(problem: Quadratic) -> bool:
@@ -206,25 +206,25 @@ def controllable(problem: Quadratic) -> bool:
     return bool(sizes[n - 1] > 0.05 * sizes[0])
 
 
-def least_curvature(problem: Quadratic, plan: Solution, pieces: int = 160) -> float:
+def least_curvature(problem: Quadratic, plan: Solution, segments: int = 160) -> float:
     """Least curvature of the cost over controls that are held on equal pieces, where the plan is inside its bounds.
 
     Dense and independent: exact steps of the linear system, the cost by Simpson's rule, ends that are given taken out
     by a singular value decomposition. Relative to the least curvature in the controls alone.
     """
     n, m = problem.b.shape
-    step = problem.horizon / pieces
+    step = problem.horizon / segments
     whole = np.zeros((n + m, n + m))
     whole[:n, :n], whole[:n, n:] = problem.a, problem.b
     half, full = expm(whole * step / 2), expm(whole * step)
-    middle_times = (np.arange(pieces) + 0.5) / pieces
+    middle_times = (np.arange(segments) + 0.5) / segments
     values = plan.at_fraction(middle_times)["u"]
-    edges = [plan.at_fraction(np.clip(middle_times + shift / pieces, 0, 1))["u"] for shift in (-0.45, 0.45)]
+    edges = [plan.at_fraction(np.clip(middle_times + shift / segments, 0, 1))["u"] for shift in (-0.45, 0.45)]
     inside = np.all([np.abs(v) < problem.bound * (1 - 1e-4) for v in (values, *edges)], axis=0)
-    cost = np.zeros((pieces * m, pieces * m))
-    reach = np.zeros((n, pieces * m))
-    for k in range(pieces):
-        own = np.zeros((m, pieces * m))
+    cost = np.zeros((segments * m, segments * m))
+    reach = np.zeros((n, segments * m))
+    for k in range(segments):
+        own = np.zeros((m, segments * m))
         own[:, k * m : (k + 1) * m] = np.eye(m)
         middle, after = half[:n, :n] @ reach + half[:n, n:] @ own, full[:n, :n] @ reach + full[:n, n:] @ own
         for share, x in ((1, reach), (4, middle), (1, after)):

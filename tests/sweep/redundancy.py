@@ -25,7 +25,7 @@ from tests.sweep.results import Row, Sweep, parser
 
 REVOLUTE, PRISMATIC = np.radians(7.0), 0.02
 """rad and m: less than this between two waypoints."""
-ASKED = {"fetch_arm__hello": 48.9, "fetch_arm__s": 10.45}
+HORIZONS = {"fetch_arm__hello": 48.9, "fetch_arm__s": 10.45}
 """rad, at most; of the others what is published, or a bound above it."""
 SECONDS, MEGABYTES = 60.0, 2000.0
 """Of one problem, at most."""
@@ -34,13 +34,13 @@ SECONDS, MEGABYTES = 60.0, 2000.0
 def planned(problem: Benchmark) -> PathPlan:
     """The shortest way, rad and m counted alike."""
     turns = turning(problem)
-    found = plan(
+    outcome = plan(
         problem.machine,
         Waypoints(problem.positions, problem.quaternions, step=np.where(turns, REVOLUTE, PRISMATIC) * (1 - 1e-9)),
         scene=Scene(obstacles=problem.boxes, ignored=problem.ignored),
     )
-    assert isinstance(found, PathPlan)
-    return found
+    assert isinstance(outcome, PathPlan)
+    return outcome
 
 
 def turning(problem: Benchmark) -> Array:
@@ -50,7 +50,7 @@ def turning(problem: Benchmark) -> Array:
 
 def faults(name: str, joints: Array) -> list[str]:
     """What is not valid in a way through a problem's waypoints, (N, n), by Pinocchio and coal."""
-    problem, found = problem_of(name), list[str]()
+    problem, outcome = problem_of(name), list[str]()
     robot = problem.machine.robot
     tip, file, base = tip_and_file(name)
     model = pin.buildModelFromUrdf(str(FOLDER / file))
@@ -67,37 +67,37 @@ def faults(name: str, joints: Array) -> list[str]:
         off = np.linalg.norm(pose.translation - position), np.linalg.norm(pin.log3(turn.T @ pose.rotation))
         worst = np.maximum(worst, off)
     if worst[0] > 1e-4 or worst[1] > np.radians(0.1):
-        found.append(f"the tip misses its poses by {worst[0]:.2g} m, {worst[1]:.2g} rad")
+        outcome.append(f"the tip misses its poses by {worst[0]:.2g} m, {worst[1]:.2g} rad")
     steps = np.abs(np.diff(joints, axis=0))
     if not (steps < np.where(turning(problem), REVOLUTE, PRISMATIC)).all():
-        found.append(f"joints move {steps.max(axis=0)} between waypoints")
+        outcome.append(f"joints move {steps.max(axis=0)} between waypoints")
     if not ((joints >= robot.lower - 1e-9) & (joints <= robot.upper + 1e-9)).all():
-        found.append("joints pass their limits")
-    ways = {link.name: {joint.name for joint in robot.path_to(link.name) if joint.moves} for link in robot.links}
-    looked_at = {
+        outcome.append("joints pass their limits")
+    paths = {link.name: {joint.name for joint in robot.path_to(link.name) if joint.moves} for link in robot.links}
+    checked = {
         pair: values
         for pair, values in by_coal(problem, joints).items()
-        if not pair <= ways.keys()
-        or len(set.symmetric_difference(*(ways[link] for link in pair))) > 1  # not neighbours
+        if not pair <= paths.keys()
+        or len(set.symmetric_difference(*(paths[link] for link in pair))) > 1  # not neighbours
     }
-    nearest = min((float(values.min()), sorted(pair)) for pair, values in looked_at.items())
+    nearest = min((float(values.min()), sorted(pair)) for pair, values in checked.items())
     if nearest[0] < 0:
-        found.append(f"{nearest[1]} overlap by {-nearest[0]:.2g} m")
-    return found
+        outcome.append(f"{nearest[1]} overlap by {-nearest[0]:.2g} m")
+    return outcome
 
 
 def result(name: str) -> Row:
     """A problem planned and checked, by the process that this is called in."""
-    problem, asked = problem_of(name), ASKED.get(name, problem_of(name).torm_length_rad)
+    problem, request = problem_of(name), HORIZONS.get(name, problem_of(name).torm_length_rad)
     row, wrong = Row(), list[str]()
     try:
-        found = planned(problem)
+        outcome = planned(problem)
         used = resource.getrusage(resource.RUSAGE_SELF)
-        ways, turns = np.abs(np.diff(found.joints, axis=0)).sum(axis=0), turning(problem)
-        row |= {"rad": float(ways[turns].sum()), "m": float(ways[np.logical_not(turns)].sum()), "asked": asked}
-        row |= {"bound": found.bound}
-        wrong += faults(name, found.joints)
-        if asked is not None and row["rad"] > asked >= (found.bound or 0.0):
+        paths, turns = np.abs(np.diff(outcome.joints, axis=0)).sum(axis=0), turning(problem)
+        row |= {"rad": float(paths[turns].sum()), "m": float(paths[np.logical_not(turns)].sum()), "asked": request}
+        row |= {"bound": outcome.bound}
+        wrong += faults(name, outcome.joints)
+        if request is not None and row["rad"] > request >= (outcome.bound or 0.0):
             wrong.append("longer")
     except SolveError as error:
         used = resource.getrusage(resource.RUSAGE_SELF)
@@ -119,7 +119,7 @@ def main() -> None:
     for row in sweep.rows(apart):
         shown.append(row)
         print(row, flush=True)
-    print(sweep.told(shown))
+    print(sweep.summary(shown))
 
 
 if __name__ == "__main__":

@@ -36,14 +36,14 @@ class Sweep:
         code: Of what does them, as of `code_of`.
     """
 
-    def __init__(self, file: str, given: argparse.Namespace, counts: Mapping[str, int]) -> None:
+    def __init__(self, file: str, options: argparse.Namespace, counts: Mapping[str, int]) -> None:
         """
         Args:
             file: Of the module that does them.
-            given: Of `parser`.
+            options: Of `parser`.
             counts: Cases of each kind.
         """
-        self.given, self.counts, self.code = given, counts, code_of(Path(file))
+        self.options, self.counts, self.code = options, counts, code_of(Path(file))
 
     def rows(self, result: Callable[[str, int, Row | None], Row]) -> Iterator[Row]:
         """Every case, from the file or done now and added to it; the kinds in turn.
@@ -52,30 +52,30 @@ class Sweep:
             result: Of a case, given what the file has of it, None where it has nothing. What is promised and broken is
                 its ``wrong``, a list of words.
         """
-        given, known, end = self.given, rows_of(self.given.out), time.time() + MINUTE * self.given.minutes
+        options, known, end = self.options, rows_of(self.options.out), time.time() + MINUTE * self.options.minutes
         for kind, seed in self.cases():
             row = known.get((kind, seed))
-            old = row is None or (given.again and row["code"] != self.code)
+            old = row is None or (options.again and row["code"] != self.code)
             if old and time.time() < end:
-                made = {"kind": kind, "seed": seed, "version": ocp.__version__, "code": self.code}
-                known[kind, seed] = row = made | result(kind, seed, row)
-                _write(given.out, known)
-                write_table(given.out.parent)
+                by_name = {"kind": kind, "seed": seed, "version": ocp.__version__, "code": self.code}
+                known[kind, seed] = row = by_name | result(kind, seed, row)
+                _write(options.out, known)
+                write_table(options.out.parent)
             if row is not None:
                 yield row
 
     def cases(self) -> list[Case]:
         """Kinds and seeds, in the order in which they are done."""
-        counts = {kind: count for kind, count in self.counts.items() if kind in (self.given.only or self.counts)}
-        found = [
+        counts = {kind: count for kind, count in self.counts.items() if kind in (self.options.only or self.counts)}
+        matches = [
             (kind, seed)
             for seed in range(max(counts.values()))
             for kind, count in counts.items()
-            if seed < count and (self.given.seed is None or seed == self.given.seed)
+            if seed < count and (self.options.seed is None or seed == self.options.seed)
         ]
-        return found[: self.given.count]
+        return matches[: self.options.count]
 
-    def told(self, rows: list[Row]) -> str:
+    def summary(self, rows: list[Row]) -> str:
         """How many of some rows are of this code, how many of older, and how many of each are wrong."""
         words = []
         for what, own in (("this code", True), ("older code", False)):
@@ -97,14 +97,14 @@ def code_of(sweep: Path, root: Path = ROOT) -> str:
 
 def parser(description: str | None, kinds: Mapping[str, int]) -> argparse.ArgumentParser:
     """The options that all sweeps share."""
-    made = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("--out", type=Path, required=True, help="file of results, a line of JSON each")
-    made.add_argument("--only", choices=list(kinds), action="append")
-    made.add_argument("--seed", type=int, help="this one of each kind")
-    made.add_argument("--count", type=int, help="so many cases, of the kinds in turn")
-    made.add_argument("--minutes", type=float, default=60.0, help="after which no further case is begun")
-    made.add_argument("--again", action="store_true", help="those whose results are of older code once more")
-    return made
+    result = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    result.add_argument("--out", type=Path, required=True, help="file of results, a line of JSON each")
+    result.add_argument("--only", choices=list(kinds), action="append")
+    result.add_argument("--seed", type=int, help="this one of each kind")
+    result.add_argument("--count", type=int, help="so many cases, of the kinds in turn")
+    result.add_argument("--minutes", type=float, default=60.0, help="after which no further case is begun")
+    result.add_argument("--again", action="store_true", help="those whose results are of older code once more")
+    return result
 
 
 def rows_of(file: Path) -> dict[Case, Row]:

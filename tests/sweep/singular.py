@@ -28,7 +28,7 @@ from tests.sweep.results import Row, Sweep, parser
 PERTURBATION = 1e-12
 """rad, m or of a unit vector."""
 PERTURBED = 10
-SAME_COST, DEARER = 1e-6, 1e-4
+SAME_COST, COST_INCREASE = 1e-6, 1e-4
 """Relative difference of the costs of perturbed motions, and by how much a plan may cost more than its comparison."""
 DAMPING, STEPS, FEEDBACK, TOLERANCE = 1e-3, 800, 0.5, 1e-5
 """Damping in the units of the Jacobian, steps, share of the error that a step corrects, and m or rad of the error."""
@@ -169,13 +169,15 @@ def result(motion: Motion, perturbed: int = PERTURBED) -> Row:
         displacement, axis = motion.displacement + size * rng.uniform(-1, 1, 3), size * rng.uniform(-1, 1, 3)
         start = joints if k % 2 else motion.joints  # every second time the task alone moves
         try:
-            made = plan_bare(machine(motion.arm), motion.task(joints, displacement, axis), start=start, search="start")
-            costs.append(float(made.cost))
+            instance = plan_bare(
+                machine(motion.arm), motion.task(joints, displacement, axis), start=start, search="start"
+            )
+            costs.append(float(instance.cost))
         except (SolveError, ProblemError) as error:
             costs.append(np.inf)
             reasons.append(str(error))
     wrong = []
-    if np.isfinite(reference) and not max(costs) <= reference * (1 + DEARER):
+    if np.isfinite(reference) and not max(costs) <= reference * (1 + COST_INCREASE):
         wrong.append(f"costs {max(costs):g}, damped least squares {reference:g}")
     if np.isfinite(costs).any() and not max(costs) <= min(costs) * (1 + SAME_COST):
         wrong.append(f"costs from {min(costs):g} to {max(costs):g}")
@@ -199,7 +201,7 @@ def main() -> None:
         print(row, flush=True)
     done = sum("damped" in row for row in shown)
     planned = sum("damped" in row and "cost" in row for row in shown)
-    print(f"{sweep.told(shown)}; damped least squares does {done}, of which {planned} are planned")
+    print(f"{sweep.summary(shown)}; damped least squares does {done}, of which {planned} are planned")
 
 
 if __name__ == "__main__":

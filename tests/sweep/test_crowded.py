@@ -11,9 +11,9 @@ pytestmark = pytest.mark.long
 
 
 @pytest.mark.parametrize(("robot", "seed"), [("ur5", 15), ("panda", 1), ("panda", 2), ("two arms", 31)])
-def test_what_is_planned_among_boxes_is_clear_by_coal(robot: str, seed: int) -> None:
-    given = crowd(robot, seed)
-    result = planned(given)
+def test_plans_among_boxes_are_collision_free_by_coal(robot: str, seed: int) -> None:
+    options = crowd(robot, seed)
+    result = planned(options)
     assert isinstance(result, Plan), result
     assert result.audit().passed
-    assert least_by_coal(result, given.boxes) >= CLEARANCE - 1e-6
+    assert least_by_coal(result, options.boxes) >= CLEARANCE - 1e-6

@@ -15,25 +15,25 @@ pytestmark = pytest.mark.xdist_group("random frauds")  # one process, so that ev
 @pytest.mark.parametrize("seed", [100, 101, 102])
 @pytest.mark.parametrize("kind", list(PLANS))
 def test_no_edit_that_matters_passes(kind: str, seed: int) -> None:
-    assert not (found := tried(kind, seed))["wrong"], found
+    assert not (result := tried(kind, seed))["wrong"], result
 
 
 @pytest.mark.parametrize("kind", [kind for kind, (_, _, others) in PLANS.items() if others and kind != "cart-pole"])
 @pytest.mark.parametrize("seed", range(4))
 def test_no_plan_of_narrower_bounds_passes_as_one_of_wider_ones(kind: str, seed: int) -> None:
     """With their tightening told or not, and with their multipliers or none."""
-    given = subject(kind)
-    plan = edited(given, "tightened", np.random.default_rng(seed), 0.1)
-    assert measured(given, plan) > 1.0
+    options = subject(kind)
+    plan = edited(options, "tightened", np.random.default_rng(seed), 0.1)
+    assert measured(options, plan) > 1.0
     assert not plan.audit().passed
     assert not replace(plan, bound_tightening=None).audit().passed
 
 
 @pytest.mark.parametrize("kind", list(PLANS))
-def test_the_measure_tells_what_is_edited_from_what_is_not(kind: str) -> None:
+def test_the_measure_distinguishes_edited_from_original_text(kind: str) -> None:
     """Much less than a thousandth of the plan itself, and what larger edits are off by."""
-    given, rng = subject(kind), np.random.default_rng(0)
-    assert measured(given, given.plan) < 0.2
-    assert measured(given, edited(given, "cost", rng, 0.01)) == pytest.approx(10, rel=0.2)
-    assert measured(given, edited(given, "bulged", rng, 0.05)) > 1.0
-    assert measured(given, edited(given, "horizon", rng, 0.01)) > 1.0
+    options, rng = subject(kind), np.random.default_rng(0)
+    assert measured(options, options.plan) < 0.2
+    assert measured(options, edited(options, "cost", rng, 0.01)) == pytest.approx(10, rel=0.2)
+    assert measured(options, edited(options, "bulged", rng, 0.05)) > 1.0
+    assert measured(options, edited(options, "horizon", rng, 0.01)) > 1.0

@@ -14,9 +14,9 @@ from tests.sweep.fuzz import GOOD, KINDS, Kind, planted, trials, tried
 
 @pytest.mark.parametrize("name", KINDS)
 def test_mutated_files_are_read_or_refused(name: str) -> None:
-    found = [trial for _, trial in trials(KINDS[name], 25, 7)]
-    assert found[0].outcome == "read", found[0]
-    assert [trial for trial in found if trial.outcome not in GOOD] == []
+    matches = [trial for _, trial in trials(KINDS[name], 25, 7)]
+    assert matches[0].outcome == "read", matches[0]
+    assert [trial for trial in matches if trial.outcome not in GOOD] == []
 
 
 def fills(file: Path) -> Any:
@@ -44,5 +44,5 @@ def crashes(file: Path) -> None:
     ("read", "outcome"),
     [(fills, "memory"), (waits, "hang"), (writes, "written"), (raises, "foreign"), (crashes, "crash")],
 )
-def test_what_goes_wrong_is_seen(read: Any, outcome: str, tmp_path: Path) -> None:
+def test_failures_are_detected(read: Any, outcome: str, tmp_path: Path) -> None:
     assert tried(Kind(".csv", lambda: b"", read), b"", planted(tmp_path)).outcome == outcome

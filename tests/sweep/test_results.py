@@ -24,16 +24,14 @@ def swept(file: Path, *options: str, code: str = "") -> tuple[Sweep, list[Row], 
     return sweep, list(sweep.rows(result)), done
 
 
-def test_a_case_that_is_in_the_file_is_not_done_again_until_that_is_asked_for_and_the_code_is_another(
-    tmp_path: Path,
-) -> None:
+def test_recorded_cases_are_repeated_on_request_or_for_changed_code(tmp_path: Path) -> None:
     file = tmp_path / "made" / "some.jsonl"
     cases = [("small", 0), ("large", 0), ("small", 1), ("small", 2)]  # the kinds in turn
     assert swept(file, "--count", "2", code="old")[2] == cases[:2]
     sweep, rows, done = swept(file)
     assert done == cases[2:]
     assert [row["code"] == sweep.code for row in rows] == [False, False, True, True]
-    assert sweep.told(rows) == "4 of 4 cases: 2 of this code, 0 of them wrong; 2 of older code, 1 of them wrong"
+    assert sweep.summary(rows) == "4 of 4 cases: 2 of this code, 0 of them wrong; 2 of older code, 1 of them wrong"
     assert swept(file, "--again", "--minutes", "0")[2] == []
     sweep, rows, done = swept(file, "--again")
     assert done == cases[:2]
@@ -47,14 +45,14 @@ def test_the_table_counts_the_last_result_of_each_case_by_the_code_of_it(tmp_pat
     swept(file, code="old")
     code = swept(file, "--again", "--only", "large")[0].code
     with (tmp_path / TABLE).open() as table:
-        found = [
+        matches = [
             (row["kind"], row["code"], row["cases"], row["wrong"], row["broken"], row["figures"])
             for row in csv.DictReader(table)
         ]
-    assert found == [("small", "old", "3", "0", "", ""), ("large", code, "1", "1", "dear 1", "length 2.5")]
+    assert matches == [("small", "old", "3", "0", "", ""), ("large", code, "1", "1", "dear 1", "length 2.5")]
 
 
-def test_what_was_done_is_in_the_file_when_the_next_case_is_stopped(tmp_path: Path) -> None:
+def test_finished_cases_are_recorded_when_the_next_is_stopped(tmp_path: Path) -> None:
     file = tmp_path / "some.jsonl"
     sweep = Sweep(__file__, parser("", COUNTS).parse_args(["--out", str(file)]), COUNTS)
 

@@ -16,14 +16,14 @@ from tests.sweep.quadratics import least_curvature, random_quadratic
 
 @pytest.mark.parametrize("seed", range(16))
 def test_no_extremal_that_is_no_minimum_passes_and_the_minima_do(seed: int) -> None:
-    found = judged(QUADRATIC, seed, ["drawn"])
-    assert {verdict.outcome for verdict in found} <= {"pass", "fail"}, table(found)
+    result = judged(QUADRATIC, seed, ["drawn"])
+    assert {verdict.outcome for verdict in result} <= {"pass", "fail"}, table(result)
 
 
 @pytest.mark.parametrize("family", OPTIMA)
 def test_no_plan_passes_whose_cost_is_off_and_the_optima_do(family: str) -> None:
-    found = [verdict for seed in (0, 3, 10) for verdict in judged(family, seed, ["held", "linear", "radau"])]
-    assert {verdict.outcome for verdict in found} <= {"pass", "fail"}, table(found)
+    matches = [verdict for seed in (0, 3, 10) for verdict in judged(family, seed, ["held", "linear", "radau"])]
+    assert {verdict.outcome for verdict in matches} <= {"pass", "fail"}, table(matches)
 
 
 def test_conjugate_points_are_those_of_the_dense_second_variation() -> None:
@@ -46,8 +46,8 @@ def test_the_least_time_is_that_of_a_linear_program() -> None:
             left = step * (n - np.arange(n) - 0.5)  # s, from the middle of each step to the end
             rows = np.array([step * left, np.full(n, step)])
             free = np.array([ends[0] + ends[1] * factor * least, ends[1]])
-            found = linprog(np.zeros(n), A_eq=rows, b_eq=ends[2:] - free, bounds=(-1, 1))
-            assert found.success is feasible
+            result = linprog(np.zeros(n), A_eq=rows, b_eq=ends[2:] - free, bounds=(-1, 1))
+            assert result.success is feasible
 
 
 def test_a_plan_that_is_moved_misses_by_as_much() -> None:

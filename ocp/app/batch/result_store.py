@@ -50,10 +50,8 @@ __all__ = [
 
 MAX_DEPTH = 64
 """Largest depth of nested data."""
-
 KINDS: dict[str, type[Plan] | type[Solution]] = {"Plan": Plan, "Solution": Solution}
 """Types stored in files of their own, by the name in a result's text."""
-
 DATA = "numbers, texts, True, False, None, and lists and dictionaries by name of these"
 
 
@@ -215,15 +213,10 @@ def file_of(value: Plan | Solution) -> bytes:
 
 
 FORMAT = 2
-
 HEAD = "batch.json"
-
 LOCK = "lock"
-
 OWN_NAMES = {HEAD, "results", LOCK}
-
 STATUSES = ("done", "failed", "killed")
-
 RECORD_FIELDS = {
     "key": str,
     "task": object,

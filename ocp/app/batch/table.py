@@ -59,7 +59,7 @@ class Result:
     message: str
     neighbour: str | None
     scalars: Mapping[str, Any] = field(repr=False)
-    _ledger: ResultStore = field(repr=False, compare=False)
+    _store: ResultStore = field(repr=False, compare=False)
 
     @property
     def value(self) -> Any:
@@ -72,11 +72,11 @@ class Result:
         if self.status != "done":
             words = f"task {self.task!r} {self.status}: {self.error} {self.message}"
             raise SolveError(words, name="task", value=self.task)
-        record = self._ledger.read(self.key)
+        record = self._store.read(self.key)
         if record is None:
-            words = f"the result {self.key} in {self._ledger.folder} is missing or damaged; run the batch again"
+            words = f"the result {self.key} in {self._store.folder} is missing or damaged; run the batch again"
             raise ProblemError(words, name="key", value=self.key)
-        return self._ledger.value(record)
+        return self._store.value(record)
 
     def row(self) -> dict[str, Any]:
         """Return a row of a table: ``COLUMNS``, and ``task.NAME`` and ``result.NAME`` of numbers and texts.
@@ -96,7 +96,7 @@ def row_of(record: Mapping[str, Any], store: ResultStore) -> Result:
     entries = value if isinstance(value, dict) else {}
     scalars = {name: entry for name, entry in entries.items() if isinstance(entry, str | int | float)}
     names = ("key", "task", "status", "cost", "verdict", "seconds", "error", "message", "neighbour")
-    return Result(**{name: record[name] for name in names}, scalars=scalars, _ledger=store)
+    return Result(**{name: record[name] for name in names}, scalars=scalars, _store=store)
 
 
 class Batch:
@@ -108,7 +108,7 @@ class Batch:
     """
 
     def __init__(self, store: ResultStore, results: Sequence[Result]) -> None:
-        self.folder = require.instance("Batch: ledger", store, ResultStore).folder
+        self.folder = require.instance("Batch: store", store, ResultStore).folder
         self.results = require.each("Batch: results", results, Result)
 
     def __len__(self) -> int:

@@ -40,9 +40,7 @@ __all__ = [
 ]
 
 FileName = str | PathLike[str]
-
 BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
-
 QUOTED_CHARACTERS = 120
 """A message quotes at most so much of a line."""
 
@@ -120,7 +118,6 @@ def is_number(cell: str) -> bool:
 
 
 NUMBER = re.compile(r"[-+]?(?:\d[\d_]*(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
-
 SCALARS: dict[str, Any] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
     **{
@@ -129,11 +126,8 @@ SCALARS: dict[str, Any] = {
     **{word: float(word.replace(".", "")) for word in (".inf", "+.inf", "-.inf", ".nan")},
 }
 """Values of plain YAML scalars that are neither numbers nor texts."""
-
 TAGS = {None, "!", *(f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map"))}
-
 TOO_DEEP = f"values are nested more than {INPUT_LIMITS.nesting} deep"
-
 _NO_KEY = object()
 
 
@@ -265,7 +259,6 @@ def children_of(value: Any) -> list[Any]:
 
 
 MARK = "written by selfmotion"
-
 SUFFIXES = {
     "plan": (".npz",),
     "csv": (".csv",),
@@ -275,7 +268,6 @@ SUFFIXES = {
     "urdf": (".urdf",),
     "report": (".html", ".htm"),
 }
-
 SIGNATURES = {
     "json": re.compile(rb'\{"header": \{"stamp": \{"sec": 0, "nanosec": 0\}, "frame_id": ""\}, "joint_names": \['),
     "yaml": re.compile(rf"# {MARK}\n".encode()),

@@ -305,22 +305,16 @@ def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> 
 
 PLAN = "#0072B2"
 """Colour of the plan, or of the main motion."""
-
 COMPARED = "#D55E00"
 """Colour of motions compared with it: the pseudo-inverse, the method of a paper, another plan."""
-
 LIMIT = "#6E6E6E"
 """Colour of limits; dashed."""
-
 FAULT = "#CC79A7"
 """Colour of violations."""
-
 TIP = "#009E73"
 """Colour of the tip path."""
-
 SCENE = "#6E6E6E"
 """Colour of obstacles."""
-
 TIP_FRAME = "the tip frame"
 """Key of the tip among the frames; no drawn link can have this name."""
 

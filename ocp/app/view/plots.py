@@ -45,9 +45,7 @@ __all__ = [
 
 STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
 """Settings of matplotlib."""
-
 STYLE |= {"text.parse_math": False}  # a joint's name may contain a dollar
-
 DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Line styles of the motions compared with a plan, so that colour is not the only distinction."""
 

@@ -40,7 +40,6 @@ __all__ = ["Report", "draw_scene", "report_of_check", "report_of_plan"]
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """Content security policy of the page: no script runs, and nothing is loaded."""
-
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --soft: #f3f5f7; --line: #d5dae0;
   --good: #00734f; --bad: #b23b00 }

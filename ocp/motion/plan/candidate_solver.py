@@ -344,11 +344,9 @@ class CandidateSolver(Solver):
         if _refinable_failures(audit):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RefinementWarning)
-                current_mesh = mesh.with_mesh(solution.state_interpolant.breaks)
-                options = self._options(motion, current_mesh, solution.cost, self.settings.fine_options)
-                solution, audit = refine_from(
-                    motion.problem, current_mesh, (solution, audit), options=options, check=check
-                )
+                current, plan = mesh.with_mesh(solution.state_interpolant.breaks), (solution, audit)
+                options = self._options(motion, current, solution.cost, self.settings.fine_options)
+                solution, audit = refine_from(motion.problem, current, plan, options=options, check=check)
             if not _refinable_failures(audit):
                 refined_solution = self._refine_for_tasks(motion, mesh, solution, check)
                 if refined_solution is not solution:

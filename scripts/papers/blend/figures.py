@@ -103,8 +103,8 @@ def _differences(folder: Path) -> None:
     )
     title = "Figures 8 and 9: with λ = 1 the curvature jumps where a blend begins and ends, with λ = 3 it does not"
     titles = ("λ = 1 (figure 8)", "λ = 3 (figure 9)", "quintic, λ = 1.5")
-    told: dict[str, Any] = {"title": title, "sharey": "row", "sharex": True}
-    with sheet(folder / "fig08_09_differences.png", (2, 3), (8.2, 4.7), note, **told) as (_, axes):
+    by_name: dict[str, Any] = {"title": title, "sharey": "row", "sharex": True}
+    with sheet(folder / "fig08_09_differences.png", (2, 3), (8.2, 4.7), note, **by_name) as (_, axes):
         for column, (shape, kind), title in zip(axes.T, SHAPES, titles, strict=True):
             path = corner(90, 30 * MM, shape, kind)
             count = int(path.length / MM)
@@ -130,13 +130,13 @@ def _path(folder: Path, results: Results) -> None:
     s = np.linspace(0, path.length, 2000)
     smooth = path.at(s).position / MM
     off = [float(np.linalg.norm(smooth - point / MM, axis=1).min()) for point in POINTS]
-    told: dict[str, Any] = {
+    by_name: dict[str, Any] = {
         "title": f"Figure 13: two cubic blends round the path's corners, {off[1]:.0f} and {off[2]:.0f} mm inside them",
         "width_ratios": (1.25, 1),
     }
     grey = {"color": COLORS["grey"], "lw": 1.1, "ls": DASHES[3]}
     note = "Cubic blends with λ = 3, Lr = 150 mm; thick: the blends"
-    with sheet(folder / "fig13_path.png", (1, 2), (8.4, 3.9), note, **told) as (_, axes):
+    with sheet(folder / "fig13_path.png", (1, 2), (8.4, 3.9), note, **by_name) as (_, axes):
         above, height = axes[0]
         done = 0.0
         for i, length in enumerate(task.lengths):
@@ -217,8 +217,8 @@ def _joints(folder: Path, results: Results) -> None:
     )
     for file, title, values, labels, quills in kinds:
         shape, size = (len(values), 2), (8.2, 2.9 * len(values))
-        told: dict[str, Any] = {"title": title, "sharex": True, "xlabel": TIME}
-        with sheet(folder / file, shape, (size[0], size[1] + 0.3), f"{ASSUMING}. {NOTE}", **told) as (_, axes):
+        by_name: dict[str, Any] = {"title": title, "sharex": True, "xlabel": TIME}
+        with sheet(folder / file, shape, (size[0], size[1] + 0.3), f"{ASSUMING}. {NOTE}", **by_name) as (_, axes):
             for row, value, label, quill in zip(axes, values, labels, quills, strict=True):
                 for joint, dash in zip((0, 1, 3), DASHES, strict=False):
                     row[0].plot(t, np.degrees(value[:, joint]), ls=dash, label=JOINTS[joint])
@@ -243,7 +243,7 @@ def _line_speed(folder: Path, results: Results) -> None:
     edges = plan.time_at(path.bounds[1:5])
     exits = exit_steps(results)
     mapped, ours = (float(np.abs(_within(results, edges, mapping)).max()) for mapping in MAPPINGS)
-    told: dict[str, Any] = {
+    by_name: dict[str, Any] = {
         "title": f"Figure 18: on the blends the line speed stays within {ours:.2g} mm/s of 1000 mm/s, by the paper's "
         f"mapping within {mapped:.2g} mm/s"
     }
@@ -252,7 +252,7 @@ def _line_speed(folder: Path, results: Results) -> None:
         "mapping leaves the chord against the arc alone, the paper's drifts, which shows as one step of "
         f"{exits[0]:+.1f} and {exits[1]:+.1f} mm/s (beyond the axis) where its blends end."
     )
-    with sheet(folder / "fig18_line_speed.png", (1, 3), (9.4, 3.8), note, **told) as (_, axes):
+    with sheet(folder / "fig18_line_speed.png", (1, 3), (9.4, 3.8), note, **by_name) as (_, axes):
         left, centre, right = axes[0]
         left.plot(middle, speed / MM)
         left.set(xlabel=TIME, ylabel="line speed, mm/s", title="line speed")
@@ -278,8 +278,8 @@ def _within(results: Results, edges: Array, mapping: str) -> Array:
 def _mapping(folder: Path, results: Results) -> None:
     note = "90° corner at 1000 mm/s; cubic with λ = 3, quintic with λ = 1.5. Below 1e-9 the curves show rounding."
     title = "The paper's mapping drifts the more the smaller the blend; Gauss-Legendre and Newton hardly do"
-    told: dict[str, Any] = {"title": title, "sharex": True, "sharey": "row"}
-    with sheet(folder / "mapping_errors.png", (2, 2), (8.6, 6.1), note, **told) as (figure, axes):
+    by_name: dict[str, Any] = {"title": title, "sharex": True, "sharey": "row"}
+    with sheet(folder / "mapping_errors.png", (2, 2), (8.6, 6.1), note, **by_name) as (figure, axes):
         for row, key, label in (
             (axes[0], "drift_um", "|drift| at the blend's end, µm"),
             (axes[1], "true_speed_error_mm_s", "worst |speed error|, mm/s"),
@@ -378,7 +378,7 @@ def _animation(folder: Path, results: Results) -> None:
             ax.remove()
         ax = figure.add_subplot(axes[0, 0].get_gridspec()[:, 0])
         ax.plot(whole[:, 0], whole[:, 1], color=COLORS["grey"], lw=0.8, ls=DASHES[3], label="path")
-        (drawn,) = ax.plot([], [], color=COLORS["green"], lw=2, label="drawn")
+        (picture,) = ax.plot([], [], color=COLORS["green"], lw=2, label="drawn")
         (arm,) = ax.plot([], [], "o-", color=COLORS["blue"], lw=5, ms=8, mfc="white", alpha=0.8, label="arm")
         ax.set_aspect("equal")
         ax.set(xlim=(-480, 860), ylim=(-60, 800), xlabel="x, mm", ylabel="y, mm")
@@ -401,12 +401,12 @@ def _animation(folder: Path, results: Results) -> None:
             elbow = ARM.upper_arm * np.array([np.cos(q[0]), np.sin(q[0])]) / MM
             tip = elbow + ARM.forearm * np.array([np.cos(q[0] + q[1]), np.sin(q[0] + q[1])]) / MM
             arm.set_data([0, elbow[0], tip[0]], [0, elbow[1], tip[1]])
-            drawn.set_data(whole[:done, 0], whole[:done, 1])
+            picture.set_data(whole[:done, 0], whole[:done, 1])
             for dot, values in moving:
                 dot.set_data([time], [np.interp(time, fine.t, values)])
             title.set_text(f"t = {time:.2f} s")
             yield figure
 
-    artists = [drawn, arm, *(dot for dot, _ in moving), title]
+    artists = [picture, arm, *(dot for dot, _ in moving), title]
     gif(folder / "motion.gif", frames(), seconds=FRAME, moving=artists)
     caption(folder / "motion.gif", "A SCARA runs the path with its two blends, in real time", f"{ASSUMING}. {NOTE}")

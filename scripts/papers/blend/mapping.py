@@ -47,8 +47,8 @@ def mapping_errors(blend: Blend, distances: Array, period: float, mapping: Any) 
 
 def samples_in(blend: Blend, profile: SpeedProfile, period: float) -> Array:
     """Distances from a blend's start of the control instants inside it. Shape (M,), m."""
-    instants = np.arange(int(profile.duration / period) + 1) * period
-    along = profile.at(instants).distance - blend.start
+    time_samples = np.arange(int(profile.duration / period) + 1) * period
+    along = profile.at(time_samples).distance - blend.start
     # the first sample at the very start would be a step of rounding size
     return np.asarray(along[(along > 1e-12) & (along < blend.length)])
 

@@ -86,13 +86,13 @@ def compute() -> Results:
     peak = schedule(cubic, LineLimits(SPEED, MEAN_ACCELERATION, JERK))
     along, along_quintic = scara_along(ARM, cubic, ELBOW), scara_along(ARM, quintic, ELBOW)
     line = LineLimits(SPEED, acceleration, JERK)
-    bent = LineLimits(SPEED, acceleration, JERK, CENTRIPETAL)
+    perturbed = LineLimits(SPEED, acceleration, JERK, CENTRIPETAL)
     whole = LineLimits(SPEED, acceleration, JERK, CENTRIPETAL, JOINT_LIMITS)
     cases = {
         "cubic, line speed": (cubic, along, line),
-        "cubic, + centripetal": (cubic, along, bent),
+        "cubic, + centripetal": (cubic, along, perturbed),
         "quintic, line speed": (quintic, along_quintic, line),
-        "quintic, + centripetal": (quintic, along_quintic, bent),
+        "quintic, + centripetal": (quintic, along_quintic, perturbed),
         "quintic, + joints": (quintic, along_quintic, whole),
     }
     plans = {}
@@ -147,7 +147,7 @@ def exit_steps(results: Results, mapping: str = "predictor_corrector") -> list[f
     return [float(error) for error in results.speed_errors[mapping][after]]
 
 
-def asked_centripetal(path: SmoothPath) -> list[float]:
+def required_centripetal(path: SmoothPath) -> list[float]:
     """Largest centripetal acceleration of each blend at the asked speed, m/s^2."""
     peaks = []
     for vertex in range(len(path.remaining)):

@@ -18,7 +18,7 @@ from scripts.papers.blend.example import (
     PERIOD,
     SPEED,
 )
-from scripts.papers.blend.results import Results, asked_centripetal, exit_steps
+from scripts.papers.blend.results import Results, exit_steps, required_centripetal
 from scripts.papers.run import Content, Row, Table, compared, text_table
 
 SAMPLES = 20001
@@ -41,13 +41,13 @@ def files(results: Results) -> Mapping[str, Content]:
 
 def report(results: Results) -> str:
     """Paper value, our value and the difference, and every table."""
-    found = summary(results)
-    error = found["speed_error_mm_s"]
+    result = summary(results)
+    error = result["speed_error_mm_s"]
     steps = ", ".join(f"{value:+.2f}" for value in error["predictor_corrector_2ms_blend_ends"])
-    jumps = ", ".join(f"{value:.3g}" for value in found["curvature_jumps_cubic_per_mm"])
-    centripetal = ", ".join(f"{value:.0f}" for value in found["asked_centripetal_mm_s2"])
-    speeds = ", ".join(f"{value:.0f}" for value in found["speed_for_centripetal_limit_mm_s"]["speeds"])
-    dips = [f"  {name}: {dip}" for name, dips in found["dips"].items() for dip in dips]
+    jumps = ", ".join(f"{value:.3g}" for value in result["curvature_jumps_cubic_per_mm"])
+    centripetal = ", ".join(f"{value:.0f}" for value in result["asked_centripetal_mm_s2"])
+    speeds = ", ".join(f"{value:.0f}" for value in result["speed_for_centripetal_limit_mm_s"]["speeds"])
+    dips = [f"  {name}: {dip}" for name, dips in result["dips"].items() for dip in dips]
     return "\n".join(
         [
             "Printed numbers",
@@ -56,7 +56,7 @@ def report(results: Results) -> str:
             "\nTimes, in both readings of the acceleration",
             text_table(event_table(results)),
             "no reading gives all four printed times; the blends' durations agree within 2.5 ms in both",
-            f"\nlengths {np.round(found['lengths_mm'], 5).tolist()} mm, total {found['total_length_mm']:.5f} mm",
+            f"\nlengths {np.round(result['lengths_mm'], 5).tolist()} mm, total {result['total_length_mm']:.5f} mm",
             f"duration {results.mean.duration:.6f} s (mean reading), {results.peak.duration:.6f} s (peak reading)",
             f"of the speed error {error['predictor_corrector_2ms_true']:.4f} mm/s are true, the rest is chord against "
             f"arc; the default mapping's true one is {error['gauss_2ms']:.1e} mm/s",
@@ -64,11 +64,11 @@ def report(results: Results) -> str:
             "\nBoth mappings on the example\n" + text_table(results.mappings, 4),
             "\nAnd on 90 deg corners of other sizes\n" + text_table(results.small_blends, 4),
             f"\ncurvature jumps of the cubic at the ends of its blends: {jumps} /mm; quintic at most "
-            f"{found['max_curvature_jump_quintic']:.1e} /mm",
+            f"{result['max_curvature_jump_quintic']:.1e} /mm",
             f"centripetal acceleration that the example asks in its blends at 1000 mm/s: {centripetal} mm/s²; "
             f"{CENTRIPETAL / MM:g} mm/s² would permit {speeds} mm/s",
             "\nUnder more limits: the schedule and the minimum time of the optimal control problem",
-            text_table(found["limited"], 5),
+            text_table(result["limited"], 5),
             *dips,
             f"\n{NOTE}",
         ]
@@ -146,12 +146,12 @@ def limit_table(results: Results) -> list[Row]:
 def summary(results: Results) -> dict[str, Any]:
     """The numbers that matter, lengths in mm where the paper has them so; times in the mean reading unless said."""
     cubic, quintic = results.cubic, results.quintic
-    asked = asked_centripetal(cubic)
+    request = required_centripetal(cubic)
 
     def of(rows: Sequence[Row], key: str, **wanted: Any) -> float:
         return float(next(row[key] for row in rows if all(row[name] == value for name, value in wanted.items())))
 
-    def found(mapping: str, key: str, blend: str = "line-line") -> float:
+    def value_of(mapping: str, key: str, blend: str = "line-line") -> float:
         return of(results.mappings, key, mapping=mapping, blend=blend, period_ms=2)
 
     def drift(mapping: str, remaining: float) -> float:
@@ -172,13 +172,13 @@ def summary(results: Results) -> dict[str, Any]:
         "blend_times_paper_s": PAPER_TIMES,
         "speed_error_mm_s": {
             "paper": PAPER_SPEED_ERROR,
-            "predictor_corrector_2ms": found("predictor_corrector", "chord_speed_error_mm_s"),
-            "predictor_corrector_2ms_true": found("predictor_corrector", "true_speed_error_mm_s"),
-            "predictor_corrector_2ms_line_arc": found("predictor_corrector", "chord_speed_error_mm_s", "line-arc"),
+            "predictor_corrector_2ms": value_of("predictor_corrector", "chord_speed_error_mm_s"),
+            "predictor_corrector_2ms_true": value_of("predictor_corrector", "true_speed_error_mm_s"),
+            "predictor_corrector_2ms_line_arc": value_of("predictor_corrector", "chord_speed_error_mm_s", "line-arc"),
             "predictor_corrector_2ms_blend_ends": exit_steps(results),
-            "gauss_2ms": found("gauss_newton", "true_speed_error_mm_s"),
-            "gauss_2ms_line_arc": found("gauss_newton", "true_speed_error_mm_s", "line-arc"),
-            "gauss_2ms_chord": found("gauss_newton", "chord_speed_error_mm_s"),
+            "gauss_2ms": value_of("gauss_newton", "true_speed_error_mm_s"),
+            "gauss_2ms_line_arc": value_of("gauss_newton", "true_speed_error_mm_s", "line-arc"),
+            "gauss_2ms_chord": value_of("gauss_newton", "chord_speed_error_mm_s"),
         },
         "drift_mm": {
             f"{name}_1ms_{remaining}mm": drift(mapping, remaining)
@@ -188,10 +188,10 @@ def summary(results: Results) -> dict[str, Any]:
         "max_curvature_jump_cubic": float(cubic.curvature_jumps().max()) * MM,
         "max_curvature_jump_quintic": float(quintic.curvature_jumps().max()) * MM,
         "curvature_jumps_cubic_per_mm": cubic.curvature_jumps() * MM,
-        "asked_centripetal_mm_s2": [value / MM for value in asked],
+        "asked_centripetal_mm_s2": [value / MM for value in request],
         "speed_for_centripetal_limit_mm_s": {
             "limit_mm_s2": CENTRIPETAL / MM,
-            "speeds": [float(np.sqrt(CENTRIPETAL / value)) * SPEED / MM for value in asked],
+            "speeds": [float(np.sqrt(CENTRIPETAL / value)) * SPEED / MM for value in request],
         },
         "limited": limit_table(results),
         "dips": {name: [str(dip) for dip in plan.schedule.dips] for name, plan in results.plans.items()},

@@ -17,7 +17,7 @@ from models.cts.clearance import rig_capsules
 from models.cts.rig import INCH
 from ocp.app.view.appearance import Part, part_of, rod
 from ocp.app.view.rendering import Camera, Layer, render, tube
-from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, gif, legend_below, posture, sheet
+from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, draw_arm, gif, legend_below, sheet
 from scripts.papers.cts.plan import draw_plan
 from scripts.papers.cts.results import GAINS, NOTE, SCALE, Results, corners, scene
 
@@ -68,8 +68,8 @@ def _joints(folder: Path, results: Results) -> None:
             if lost
             else "all iterations reach the global optimum, which the closed form gives at once"
         )
-        told: dict[str, Any] = {"title": title, "sharex": True, "xlabel": "target z, in"}
-        with sheet(path, (2, 3), (9.0, 5.4), note, **told) as (figure, axes):
+        by_name: dict[str, Any] = {"title": title, "sharex": True, "xlabel": "target z, in"}
+        with sheet(path, (2, 3), (9.0, 5.4), note, **by_name) as (figure, axes):
             for k, ax in enumerate(axes.flat):
                 ax.plot(z, closed[:, k], color=COLORS["blue"], lw=2.2, label="closed form: the global optimum")
                 for i, ((method, gain, label), mark) in enumerate(zip(ITERATIONS, METHOD_MARKS, strict=True)):
@@ -105,16 +105,16 @@ def _rig(path: Path, results: Results) -> None:
     rows = np.linspace(0, len(places) - 1, 5).astype(int)
     lines = skeleton(results.rig, table.joints[rows])
     turn = float(np.degrees(np.ptp(table.joints[:, 5])))
-    told: dict[str, Any] = {
+    by_name: dict[str, Any] = {
         "title": f"Figure 6: over the sweep the roll turns by {turn:.0f}°, and the goose-neck goes round the middle",
         "width_ratios": (5.5, 1),
         "sharey": True,
     }
-    with sheet(path, (1, 2), (9.6, 3.2), f"{ASSUMING}. {NOTE}", **told) as (_, axes):
+    with sheet(path, (1, 2), (9.6, 3.2), f"{ASSUMING}. {NOTE}", **by_name) as (_, axes):
         for ax, (i, k) in zip(axes[0], ((0, 2), (1, 2)), strict=True):
             for number, (line, row) in enumerate(zip(lines, rows, strict=True)):
                 color = TIME_COLORS(number / (len(rows) - 1))
-                posture(ax, line[:, [i, k]], color, 3.6)
+                draw_arm(ax, line[:, [i, k]], color, 3.6)
                 ax.plot([], [], color=color, lw=3.6, label=f"z = {results.targets[row, 2] / INCH:.1f} in")
             ax.plot(places[:, i], places[:, k], color=COLORS["green"], lw=1.6, zorder=5, label="path of $P_G$")
             center = results.tunnel.center / INCH
@@ -128,33 +128,35 @@ def _rig(path: Path, results: Results) -> None:
 
 def _release(folder: Path, results: Results) -> None:
     """The store release: the rig as it follows, curves, and an animation."""
-    found = results.release
-    around, closest = _Scene(results), int(found.clearance.argmin())
+    result = results.release
+    around, closest = _Scene(results), int(result.clearance.argmin())
     note = (
         "The rig and the wing as capsules and a box; earlier postures pale; green: the path of the goose-neck's end. "
         f"Store, ejectors and air chosen, model scale {SCALE:g}; walls and wing chosen. {NOTE}"
     )
     title = (
         f"The rig takes the store along its free fall and comes no nearer to the wing or a wall than "
-        f"{found.clearance[closest] / INCH:.1f} in"
+        f"{result.clearance[closest] / INCH:.1f} in"
     )
     with sheet(folder / "release.png", (2, 4), (9.6, 5.4), note, title=title) as (figure, axes):
         grid = axes[0, 0].get_gridspec()
         for ax in axes[:, :2].flat:
             ax.remove()
         big = figure.add_subplot(grid[:, :2])
-        big.imshow(around.picture((0, len(found.t) // 2, len(found.t) - 1), (1000, 1000)), interpolation="antialiased")
+        big.imshow(
+            around.picture((0, len(result.t) // 2, len(result.t) - 1), (1000, 1000)), interpolation="antialiased"
+        )
         big.set_axis_off()
         first, second, third, fourth = axes[0, 2], axes[0, 3], axes[1, 2], axes[1, 3]
-        move = found.table.targets[:, :3] - found.table.targets[0, :3]
+        move = result.table.targets[:, :3] - result.table.targets[0, :3]
         for k, (label, dash) in enumerate(zip("xyz", DASHES, strict=False)):
-            first.plot(found.t, move[:, k] / INCH, ls=dash, label=label)
+            first.plot(result.t, move[:, k] / INCH, ls=dash, label=label)
         for k, (label, dash) in enumerate(zip(("yaw", "pitch, nose down"), DASHES, strict=False)):
-            second.plot(found.t, np.degrees(found.table.targets[:, 3 + k]), ls=dash, label=label)
-        third.plot(found.t, np.degrees(found.table.joints[:, 5]))
-        fourth.plot(found.t, found.clearance / INCH)
+            second.plot(result.t, np.degrees(result.table.targets[:, 3 + k]), ls=dash, label=label)
+        third.plot(result.t, np.degrees(result.table.joints[:, 5]))
+        fourth.plot(result.t, result.clearance / INCH)
         fourth.annotate(
-            f"{found.nearest[0]} to {found.nearest[1]}", (0.04, 0.05), xycoords="axes fraction", fontsize=7.5
+            f"{result.nearest[0]} to {result.nearest[1]}", (0.04, 0.05), xycoords="axes fraction", fontsize=7.5
         )
         labels = ("displacement, in", "attitude, deg", "roll $q_6$, deg", "clearance of the rig, in")
         for ax, label in zip((first, second, third, fourth), labels, strict=True):
@@ -173,12 +175,12 @@ class _Scene:
     """The rig, the store and the wing as solids, at every sample of the release; in inches."""
 
     def __init__(self, results: Results) -> None:
-        found = results.release
-        self.lines = skeleton(results.rig, found.table.joints)
-        self.places = corners(results, found.table) / INCH
+        result = results.release
+        self.lines = skeleton(results.rig, result.table.joints)
+        self.places = corners(results, result.table) / INCH
         q = ca.SX.sym("q", 6)
         self.radii = [link.radius / INCH for link in rig_capsules(results.rig, q).values()]
-        yaw, pitch = found.table.targets[:, 3:].T
+        yaw, pitch = result.table.targets[:, 3:].T
         axis = np.column_stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
         length = SCALE * 2.2 / INCH
         self.stores = np.stack([self.lines[:, -1] - 0.2 * length * axis, self.lines[:, -1] + 0.8 * length * axis], 1)
@@ -195,13 +197,13 @@ class _Scene:
 
     def at(self, row: int) -> list[Part]:
         """The rig, blue, and the store, dark."""
-        found = []
+        results = []
         for start, end, radius in zip(self.lines[row, :-1], self.lines[row, 1:], self.radii, strict=True):
             if np.linalg.norm(end - start) > 1e-6:
                 bar = rod(start, end, radius)
-                found.append(part_of("", bar.vertices, bar.faces, (*to_rgb(COLORS["blue"]), 1.0)))
+                results.append(part_of("", bar.vertices, bar.faces, (*to_rgb(COLORS["blue"]), 1.0)))
         store = rod(self.stores[row, 0], self.stores[row, 1], 0.07 * SCALE * 2.2 / INCH)
-        return [*found, part_of("", store.vertices, store.faces, (0.2, 0.2, 0.22, 1.0))]
+        return [*results, part_of("", store.vertices, store.faces, (0.2, 0.2, 0.22, 1.0))]
 
     def picture(self, rows: Sequence[int], size: tuple[int, int]) -> Any:
         """At the last of some samples solid, at those before pale."""
@@ -211,7 +213,7 @@ class _Scene:
 
 
 def _animate(path: Path, results: Results, around: _Scene) -> None:
-    found = results.release
+    result = results.release
     with sheet(None, (1, 1), (5.2, 4.6)) as (figure, axes):
         figure.set_dpi(100)
         ax = axes[0, 0]
@@ -222,7 +224,7 @@ def _animate(path: Path, results: Results, around: _Scene) -> None:
         add_note(figure, "Store, ejectors, air, walls, wing and link lengths chosen")
 
         def frames() -> Iterator[Figure]:
-            for row, time in enumerate(found.t):
+            for row, time in enumerate(result.t):
                 image.set_data(around.picture((row,), (500, 400)))
                 title.set_text(f"{time:.2f} s, slowed down")
                 yield figure

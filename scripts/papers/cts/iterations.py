@@ -111,8 +111,8 @@ def combined(
     close = ca.Function("close", [x, r], list(inverse(rig, x, r, branch)))
 
     def joints_of(target: Array, roll: float) -> Array:
-        found, reach = close(target, roll)
-        return np.array(found).ravel() if float(ca.mmin(reach)) >= 0 else np.full(6, np.nan)
+        result, reach = close(target, roll)
+        return np.array(result).ravel() if float(ca.mmin(reach)) >= 0 else np.full(6, np.nan)
 
     return _iterated(
         rows,

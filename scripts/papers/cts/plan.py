@@ -103,11 +103,11 @@ def plan_sweep(rig: Rig, tunnel: Tunnel) -> RollPlan:
     return RollPlan(t, kept, alone, solution.cost, audit.passed, str(audit))
 
 
-def plan_summary(found: RollPlan) -> dict[str, Any]:
+def plan_summary(result: RollPlan) -> dict[str, Any]:
     """The numbers that matter."""
 
     def of(course: Course) -> dict[str, float]:
-        integral = float(np.trapezoid(course.index, found.t))
+        integral = float(np.trapezoid(course.index, result.t))
         return {
             "index_integral_s": integral,
             "rate_max_rad_s": float(np.abs(course.rate).max()),
@@ -115,17 +115,17 @@ def plan_summary(found: RollPlan) -> dict[str, Any]:
         }
 
     return {
-        "plan": of(found.plan),
-        "each_target_by_itself": of(found.single),
-        "cost": found.cost,
-        "audit_passed": found.passed,
+        "plan": of(result.plan),
+        "each_target_by_itself": of(result.single),
+        "cost": result.cost,
+        "audit_passed": result.passed,
         "rate_limit_rad_s": RATE_LIMIT,
         "acceleration_limit_rad_s2": ACCELERATION_LIMIT,
         "clearance_m": CLEARANCE,
     }
 
 
-def draw_plan(path: Path, found: RollPlan) -> None:
+def draw_plan(path: Path, result: RollPlan) -> None:
     """Roll, roll rate, I1 and clearance of the plan and of each target by itself."""
     note = (
         f"{ASSUMING}. Least integral of I1 + {RATE_WEIGHT:g} rate² + {ACCELERATION_WEIGHT:g} acceleration² over "
@@ -139,8 +139,10 @@ def draw_plan(path: Path, found: RollPlan) -> None:
     )
     with sheet(path, (2, 2), (8.2, 5.3), note, title=title, sharex=True, xlabel="time, s") as (_, axes):
         for ax, name, label in zip(axes.flat, names, labels, strict=True):
-            ax.plot(found.t, getattr(found.single, name), ls=DASHES[1], color=COLORS["orange"], label="each by itself")
-            ax.plot(found.t, getattr(found.plan, name), color=COLORS["blue"], label="whole trajectory")
+            ax.plot(
+                result.t, getattr(result.single, name), ls=DASHES[1], color=COLORS["orange"], label="each by itself"
+            )
+            ax.plot(result.t, getattr(result.plan, name), color=COLORS["blue"], label="whole trajectory")
             ax.set_ylabel(label)
         limits = ((axes[0, 1], RATE_LIMIT, "limit"), (axes[1, 1], CLEARANCE, "least allowed"))
         for ax, limit, label in limits:

@@ -144,10 +144,10 @@ def arithmetic_times(
 
     newton = each(newton_step(rig, tunnel), [rows, rolls, rolls])
     jacobian = each(null_space_step(rig, tunnel), [rows, joints, rolls])
-    found = {"combined": newton * float(runs["i1", "combined", 0.0].iterations.mean()) + each(close, [rows, rolls])}
+    by_name = {"combined": newton * float(runs["i1", "combined", 0.0].iterations.mean()) + each(close, [rows, rolls])}
     for gain in GAINS:
-        found[f"jacobian, gain {gain:g}"] = jacobian * float(runs["i1", "jacobian", gain].iterations.mean())
-    return found
+        by_name[f"jacobian, gain {gain:g}"] = jacobian * float(runs["i1", "jacobian", gain].iterations.mean())
+    return by_name
 
 
 def repeated(work: Callable[[], Any], repeats: int = 3) -> tuple[Any, float]:
@@ -175,8 +175,8 @@ def random_study(rig: Rig, tunnel: Tunnel, seed: int = 7) -> dict[str, float]:
     best = np.full(RANDOM, np.inf)
     for angle in np.linspace(-np.pi, np.pi, DENSE, endpoint=False):
         best = np.minimum(best, np.array(grid(targets, np.full((1, RANDOM), angle)))[0])
-    _, found, active, status = (np.array(p)[0] for p in optimal_inverse(rig, tunnel).map(RANDOM)(targets, 0 * roll))
-    ours = np.where(status == 0, found, np.inf)
+    _, result, active, status = (np.array(p)[0] for p in optimal_inverse(rig, tunnel).map(RANDOM)(targets, 0 * roll))
+    ours = np.where(status == 0, result, np.inf)
     return {
         "targets": RANDOM,
         "newton_maximum_share": float(np.mean(bend[settled] < 0)),

@@ -31,14 +31,14 @@ def files(results: Results) -> Mapping[str, Content]:
 
 def report(results: Results) -> str:
     """Paper value, our value and the difference, and every table."""
-    found, plan = results.release, plan_summary(results.plan)
+    result, plan = results.release, plan_summary(results.plan)
     parts = [
         f"Table 6, time of 200 targets\n{text_table(time_table(results), 4)}\n{TIME_NOTE}",
         "Iterations\n" + text_table(method_table(results), 4),
         "Reference rolls\n" + text_table(reference_table(results), 8),
         "Random targets\n" + text_table([results.random], 4),
-        f"Store release: tracked to {found.tracking[:, 0].max():.1e} m, {found.tracking[:, 1].max():.1e} rad;\n"
-        f"least clearance {found.clearance.min():.4f} m, {found.nearest[0]} to {found.nearest[1]}",
+        f"Store release: tracked to {result.tracking[:, 0].max():.1e} m, {result.tracking[:, 1].max():.1e} rad;\n"
+        f"least clearance {result.clearance.min():.4f} m, {result.nearest[0]} to {result.nearest[1]}",
         "Whole sweep planned at once\n"
         + text_table([plan["plan"], plan["each_target_by_itself"]], 4)
         + f"\n{results.plan.audit}",
@@ -109,7 +109,7 @@ def summary(results: Results) -> dict[str, Any]:
     methods = {
         (row["index"], row["method"], row["gain"]): {name: row[name] for name in kept} for row in method_table(results)
     }
-    found, seconds, arithmetic = results.release, results.seconds, results.arithmetic
+    result, seconds, arithmetic = results.release, results.seconds, results.arithmetic
     content: dict[str, Any] = {
         "paper": {
             "source": "Lee, Lee 2017: kinematics of a captive trajectory simulation system",
@@ -134,12 +134,12 @@ def summary(results: Results) -> dict[str, Any]:
         "arithmetic_seconds_of_200_targets": arithmetic,
         "seconds_of_200_targets": seconds,
         "release": {
-            "seconds": float(found.t[-1]),
-            "tracking_m": found.tracking[:, 0].max(),
-            "tracking_rad": found.tracking[:, 1].max(),
-            "least_clearance_m": found.clearance.min(),
-            "nearest": list(found.nearest),
-            "roll_range_rad": float(np.ptp(found.table.joints[:, 5])),
+            "seconds": float(result.t[-1]),
+            "tracking_m": result.tracking[:, 0].max(),
+            "tracking_rad": result.tracking[:, 1].max(),
+            "least_clearance_m": result.clearance.min(),
+            "nearest": list(result.nearest),
+            "roll_range_rad": float(np.ptp(result.table.joints[:, 5])),
         },
         "plan": plan_summary(results.plan),
         "table6_note": TIME_NOTE,

@@ -44,7 +44,7 @@ class Extremal:
         cost: J of (27) by collocation on `intervals`.
         indirect_cost: By the minimum principle, nan where it was not solved.
         newton_steps: Of the minimum principle. segments: On how many it was solved last.
-        found: From how many first guesses. first_found: The first of these.
+        guess_count: Number of first guesses that lead to it. first_guess: The first of these.
         intervals: Of the direct solution.
         verdict: "extremal" where both methods agree and pass their audits, else that they do not.
         best: Least cost of the extremals found at this horizon; not more than that.
@@ -57,8 +57,8 @@ class Extremal:
     indirect_cost: float
     newton_steps: int
     segments: int
-    found: int
-    first_found: str
+    guess_count: int
+    first_guess: str
     intervals: int
     verdict: str
     best: bool
@@ -139,8 +139,8 @@ def search(make: MakeProblem, horizon: float, start_base: Array, start_joints: A
             sound = _joined(sound, replace(group, plan=settled.plan))
     extremals = sorted((_polished(problem, group, meshes[id(group.plan)]) for group in sound), key=lambda e: e.cost)
     best = next((e for e in extremals if e.verdict == CONFIRMED), None)
-    found = sum(group.count for group in sound)
-    yield Search(horizon, STARTS, solved, solved - found, tuple(replace(e, best=e is best) for e in extremals))
+    result = sum(group.count for group in sound)
+    yield Search(horizon, STARTS, solved, solved - result, tuple(replace(e, best=e is best) for e in extremals))
 
 
 def _starts(
@@ -196,8 +196,8 @@ def _polished(problem: Problem, group: Group, intervals: int) -> Extremal:
         indirect_cost=indirect.cost if indirect.success else np.nan,
         newton_steps=indirect.iterations,
         segments=method.segments,
-        found=group.count,
-        first_found=group.first,
+        guess_count=group.count,
+        first_guess=group.first,
         intervals=intervals,
         verdict=CONFIRMED if agree else DIRECT_ONLY,
         best=False,
@@ -213,13 +213,13 @@ def table(searches: Sequence[Search], paper_peaks: Sequence[float]) -> list[Row]
             "horizon_s": e.horizon,
             "cost_direct": f"{e.cost:.12g}",
             "cost_indirect": f"{e.indirect_cost:.12g}" if np.isfinite(e.indirect_cost) else "",
-            "found": e.found,
+            "found": e.guess_count,
             "starts": one.starts,
             **{f"joint{i + 1}_peak_deg_s": float(peak) for i, peak in enumerate(np.degrees(e.peaks))},
             "largest_difference_from_paper_deg_s": _from_paper(e, paper_peaks),
             "intervals": e.intervals,
             "newton_steps": e.newton_steps,
-            "first_found_from": e.first_found,
+            "first_found_from": e.first_guess,
             "verdict": e.verdict,
             "best": e.best,
         }
@@ -240,7 +240,7 @@ def summary(searches: Sequence[Search], paper_peaks: Sequence[float]) -> dict[st
                 "solved": one.solved,
                 "rejected": one.rejected,
                 "best_cost": one.best.indirect_cost,
-                "best_found": one.best.found,
+                "best_found": one.best.guess_count,
                 "best_peak_joint_velocity_deg_s": np.degrees(one.best.peaks),
                 "costs": [e.indirect_cost for e in one.extremals if e.verdict == CONFIRMED],
             }

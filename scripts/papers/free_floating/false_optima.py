@@ -197,7 +197,7 @@ def first_guess(
 def _jump(plan: Solution) -> float:
     """Largest jump of a joint velocity between two intervals, deg/s."""
     curve = plan.control_interpolant
-    pieces = np.arange(len(curve.breaks) - 1)
-    left = curve.within(pieces[:-1], np.ones(len(pieces) - 1))
-    right = curve.within(pieces[1:], np.zeros(len(pieces) - 1))
+    segments = np.arange(len(curve.breaks) - 1)
+    left = curve.within(segments[:-1], np.ones(len(segments) - 1))
+    right = curve.within(segments[1:], np.zeros(len(segments) - 1))
     return float(np.degrees(np.abs(right - left).max()))

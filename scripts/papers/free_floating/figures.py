@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from models import FreeFloating
 from models.checks import Array
-from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, caption, gif, posture, sheet, time_bar
+from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, caption, draw_arm, gif, sheet, time_bar
 from scripts.papers.free_floating.extremals import CONFIRMED, NOT_GLOBAL, Search
 from scripts.papers.free_floating.false_optima import EXTREMAL, FALSE, HORIZON, Trial
 from scripts.papers.free_floating.motion import Motion, outline
@@ -58,8 +58,8 @@ def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion
         f"On the same line the optimum needs {100 * costs[1] / costs[0]:.0f} % of the pseudo-inverse's integral of "
         "half the squared joint rates"
     )
-    told: dict[str, Any] = {"title": title, "xlabel": "x, m", "sharey": True}
-    with sheet(folder / "fig03_08_motion.png", (1, 2), (8.2, 5.6), note, **told) as (figure, axes):
+    by_name: dict[str, Any] = {"title": title, "xlabel": "x, m", "sharey": True}
+    with sheet(folder / "fig03_08_motion.png", (1, 2), (8.2, 5.6), note, **by_name) as (figure, axes):
         for ax, motion, name, number in zip(axes[0], motions, NAMES, (3, 8), strict=True):
             _strobe(ax, machine, motion)
             ax.set_title(f"{name} (figure {number})")
@@ -173,9 +173,9 @@ def _false_optima(folder: Path, trials: Sequence[Trial]) -> None:
             right.legend(loc="best")
 
 
-def _costates(folder: Path, found: Agreement) -> None:
+def _costates(folder: Path, result: Agreement) -> None:
     """Costates of the direct plan on those of the minimum principle, above their difference."""
-    direct, indirect = found.plan, found.multiple
+    direct, indirect = result.plan, result.multiple
     fine = np.linspace(0.0, 1.0, 501)
     solved, reported = costates(indirect, fine), costates(direct)
     off = np.abs(costate_difference(direct, indirect))
@@ -203,19 +203,19 @@ def _costates(folder: Path, found: Agreement) -> None:
         axes[0, 0].text(0.03, 0.92, text, transform=axes[0, 0].transAxes, fontsize=8, va="top")
 
 
-def _hamiltonian(folder: Path, found: Agreement) -> None:
+def _hamiltonian(folder: Path, result: Agreement) -> None:
     """How far H strays from its mean along the solution of every method."""
     colors = ("black", "purple", "blue", "green", "yellow", "orange", "sky")
     title, note = "Every method keeps the Hamiltonian constant, as far as its order allows", f"{ASSUMING}. {NOTE}"
     with sheet(folder / "hamiltonian.png", (1, 1), (8.2, 4.6), note, title=title) as (figure, axes):
         ax = axes[0, 0]
-        for k, ((name, (t, value)), color) in enumerate(zip(hamiltonians(found).items(), colors, strict=True)):
+        for k, ((name, (t, value)), color) in enumerate(zip(hamiltonians(result).items(), colors, strict=True)):
             mean = value.mean()
             label = f"{name}\nmean H = {mean:.12f}"
             dash = DASHES[(k + k // 4) % 4]  # curves that cover each other get different ones
             ax.semilogy(*_tops(t, np.abs(value - mean)), color=COLORS[color], ls=dash, label=label)
-        ax.set(xlabel="time, s", ylim=(1e-14, 1e-3), xlim=(0, found.plan.horizon))
-        width = found.plan.horizon / BINS
+        ax.set(xlabel="time, s", ylim=(1e-14, 1e-3), xlim=(0, result.plan.horizon))
+        width = result.plan.horizon / BINS
         ax.set_ylabel(f"|H − its mean|, rad$^2$/s$^2$, largest in every {width:g} s")
         figure.legend(loc="outside right center", fontsize=7)
 
@@ -265,7 +265,7 @@ def _costs(ax: Any, searches: Sequence[Search]) -> None:
         for e in one.extremals:  # by cost: a label that would cover the one below moves up
             height = PANEL * np.log(e.cost / low) / np.log(high / low)
             above = max(height, above + LINE)
-            text, place = f"{e.cost:.5f} ({e.found}×)", (8, above - height)
+            text, place = f"{e.cost:.5f} ({e.guess_count}×)", (8, above - height)
             ax.annotate(text, (e.horizon, e.cost), place, textcoords="offset points", fontsize=7.5, va="center")
     ax.set(xlabel="horizon, s", ylabel="cost J, rad$^2$/s")
     ax.set_title(f"Extremals from {searches[0].starts} first guesses at each horizon (how often each was found)")
@@ -312,8 +312,8 @@ def _pair(
 ) -> None:
     """Quantities of both motions over time, a row of axes each."""
     size = (8.2, height)
-    told: dict[str, Any] = {"xlabel": "time, s", "sharex": True, "sharey": "row", "title": title}
-    with sheet(path, (len(rows), 2), size, f"{ASSUMING}. {NOTE}", **told) as (_, axes):
+    by_name: dict[str, Any] = {"xlabel": "time, s", "sharex": True, "sharey": "row", "title": title}
+    with sheet(path, (len(rows), 2), size, f"{ASSUMING}. {NOTE}", **by_name) as (_, axes):
         for line, (label, names, of) in zip(axes, rows, strict=True):
             for ax, motion in zip(line, motions, strict=True):
                 _curves(ax, motion.t, of(motion), names)
@@ -339,7 +339,7 @@ def _strobe(ax: Any, machine: FreeFloating, motion: Motion) -> None:
         square, arm = shape(motion.base[k], motion.joints[k])
         ends = time in (0.0, horizon)  # the base hardly moves: only its first and last place stand out
         ax.fill(*square.T, facecolor=(*color[:3], 0.13 if ends else 0.0), edgecolor=color, lw=1.4 if ends else 0.6)
-        posture(ax, arm, color, 4.5)
+        draw_arm(ax, arm, color, 4.5)
     ax.set_aspect("equal")
 
 

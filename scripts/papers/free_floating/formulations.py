@@ -35,10 +35,10 @@ def problem(horizon: float = HORIZON, *, machine: Machine | None = None, guess_d
         guess_damping: 0.001 to 0.02 lead to J = 1.7351, 0.03 to J = 1.7467.
     """
     machine = machine or paper_example()
-    found = minimum_velocity_problem(machine, TASK, horizon, start=START_JOINTS)
+    result = minimum_velocity_problem(machine, TASK, horizon, start=START_JOINTS)
     local = damped_motion(machine, horizon, guess_damping)
-    _begin_from(found, local, {"rates": local.joint_rates})
-    return found
+    _begin_from(result, local, {"rates": local.joint_rates})
+    return result
 
 
 def null_space_problem(horizon: float = HORIZON, *, machine: Machine | None = None) -> Problem:
@@ -51,24 +51,24 @@ def null_space_problem(horizon: float = HORIZON, *, machine: Machine | None = No
     """
     machine = machine or paper_example()
     equations, robot = bind(machine, TASK), machine.robot
-    found = Problem("minimum velocity, null space")
+    result = Problem("minimum velocity, null space")
     base: Any = np.zeros(0)
     if machine.base_size:
-        base = found.state("base", initial=machine.base_home(), unit="m, rad")
-    joints = found.state("joints", initial=START_JOINTS, lower=robot.lower, upper=robot.upper, unit=robot.unit())
-    null = found.control("null", machine.joint_size, guess=0.0, unit=robot.unit("/s"))
-    found.horizon(horizon)
-    jacobian, wanted = equations.jacobian(base, joints), equations.right(base, joints, equations.targets(found.time))
+        base = result.state("base", initial=machine.base_home(), unit="m, rad")
+    joints = result.state("joints", initial=START_JOINTS, lower=robot.lower, upper=robot.upper, unit=robot.unit())
+    null = result.control("null", machine.joint_size, guess=0.0, unit=robot.unit("/s"))
+    result.horizon(horizon)
+    jacobian, wanted = equations.jacobian(base, joints), equations.right(base, joints, equations.targets(result.time))
     both = least_rates(jacobian, ca.horzcat(wanted, ca.mtimes(jacobian, null)))
     idle = both[:, 1]  # G# G u, without effect
     rates = null + both[:, 0] - idle
     base_rate, rates, idle = ca.cse([machine.base_rate(base, joints, rates), rates, idle])
     if machine.base_size:
-        found.dynamics(base, base_rate)
-    found.dynamics(joints, rates)
-    found.minimize(running=ca.sumsqr(idle) / 2 + ca.sumsqr(rates) / 2)
-    _begin_from(found, damped_motion(machine, horizon, DAMPING), {})
-    return found
+        result.dynamics(base, base_rate)
+    result.dynamics(joints, rates)
+    result.minimize(running=ca.sumsqr(idle) / 2 + ca.sumsqr(rates) / 2)
+    _begin_from(result, damped_motion(machine, horizon, DAMPING), {})
+    return result
 
 
 def damped_motion(machine: Machine, horizon: float, damping: float) -> LocalSolution:

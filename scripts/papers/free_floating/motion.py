@@ -133,14 +133,14 @@ def momentum(machine: FreeFloating, base: Array, joints: Array, base_rates: Arra
         placement = machine.world_from_base(base)
         frames = link_frames(machine.robot, joints, placement)
         centers = centers_of_mass(machine.robot, joints, placement)
-        found: Any = ca.SX(3, 1)
+        result: Any = ca.SX(3, 1)
         for link in machine.robot.links:
             center, turn = centers[link.name], frames[link.name].rotation
             velocity = ca.jtimes(center, configuration, rate)
             spin = ca.dot(turn[:, 1], ca.jtimes(turn[:, 0], configuration, rate))  # y . dx/dt: rotation about z
             turning = link.mass * (center[0] * velocity[1] - center[1] * velocity[0]) + link.inertia[2, 2] * spin
-            found += ca.vertcat(turning, link.mass * velocity[:2])
-        return found
+            result += ca.vertcat(turning, link.mass * velocity[:2])
+        return result
 
     return _along(total, base, joints, base_rates, joint_rates)
 

@@ -87,18 +87,18 @@ def costate_difference(direct: Solution, indirect: Solution) -> Array:
     return np.asarray((costates(direct) - theirs) / np.abs(theirs).max())
 
 
-def hamiltonians(found: Agreement) -> dict[str, tuple[Array, Array]]:
+def hamiltonians(result: Agreement) -> dict[str, tuple[Array, Array]]:
     """Times (M,), s, and H (M,), rad^2/s^2, of every solution, by its name and formulation."""
-    pools: Mapping[str, Mapping[str, Solution]] = {"rates": found.rates, "null space": found.null_space}
+    pools: Mapping[str, Mapping[str, Solution]] = {"rates": result.rates, "null space": result.null_space}
     curves = {}
     for form, pool in pools.items():
         for name, solution in pool.items():
-            value = found.certificates[form].audits[name].optimality.hamiltonian.values
+            value = result.certificates[form].audits[name].optimality.hamiltonian.values
             curves[f"{name} ({form})"] = (solution.t, value)
     return curves
 
 
-def certificate_rows(found: Agreement) -> list[Row]:
+def certificate_rows(result: Agreement) -> list[Row]:
     """Both certificates as one table; differences relative to the minimum principle of the same formulation."""
     return [
         {
@@ -114,19 +114,19 @@ def certificate_rows(found: Agreement) -> list[Row]:
             "audit": c.passed,
             "agrees": c.worst <= one.tolerance,
         }
-        for form, one in found.certificates.items()
+        for form, one in result.certificates.items()
         for c in one.comparisons
     ]
 
 
-def indirect_summary(found: Agreement, start: Array) -> dict[str, Any]:
+def indirect_summary(result: Agreement, start: Array) -> dict[str, Any]:
     """Numbers of the minimum principle by multiple shooting, and by backward shooting beneath it.
 
     Args:
         start: States (base, joints) that the motion starts from. Shape (6,).
     """
-    audits = found.certificates["rates"].audits
-    names = {id(solution): name for name, solution in found.rates.items()}
+    audits = result.certificates["rates"].audits
+    names = {id(solution): name for name, solution in result.rates.items()}
 
     def numbers(solution: Solution) -> dict[str, Any]:
         first = np.concatenate([solution["base"][0], solution["joints"][0]])
@@ -139,7 +139,7 @@ def indirect_summary(found: Agreement, start: Array) -> dict[str, Any]:
             "hamiltonian_drift": audits[names[id(solution)]].optimality.hamiltonian.drift,
             "costate_at_end": np.abs(costates(solution)[-1]).max(),
             "start_error": np.abs(first - start).max(),
-            "costate_difference_from_direct": np.abs(costate_difference(found.plan, solution)).max(),
+            "costate_difference_from_direct": np.abs(costate_difference(result.plan, solution)).max(),
         }
 
-    return {**numbers(found.multiple), "backward": numbers(found.backward)}
+    return {**numbers(result.multiple), "backward": numbers(result.backward)}

@@ -115,18 +115,18 @@ def compute() -> Results:
     near_peaks = pseudo_inverse(machine, np.unique(np.concatenate([grid(), *around]).round(9)))
 
     rates, null_space = problem(), null_space_problem()
-    found = agreement(rates, null_space)
-    audit = found.plan.audit()
+    result = agreement(rates, null_space)
+    audit = result.plan.audit()
     study = false_optima.trials(problem(false_optima.HORIZON), START_BASE, START_JOINTS)
     return Results(
         machine=machine,
         local=local,
         near_peaks=near_peaks,
-        optimal=motion_of_plan(machine, found.plan, grid(), ROWS, found.backward),
-        agreement=found,
+        optimal=motion_of_plan(machine, result.plan, grid(), ROWS, result.backward),
+        agreement=result,
         audit=audit,
         laws=laws(machine, audit, TIP_VELOCITY),
-        convergence=convergence(rates, null_space, found),
+        convergence=convergence(rates, null_space, result),
         sensitivity=sensitivity(),
         trials=list(progress(study, "false optima", len(false_optima.GUESSES))),
         searches=[search(horizon) for horizon in extremals.HORIZONS],
@@ -148,11 +148,11 @@ def convergence(rates: Problem, null_space: Problem, known: Agreement) -> list[R
     reference = known.backward.cost
     rows: list[Row] = []
     for name, order, intervals, method in progress(runs, "convergence"):
-        found = solve(null_space if isinstance(method, MultipleShooting) else rates, method)
-        rows.append(_convergence_row(name, intervals, order, found, reference))
-    for shooting, found in (("forward multiple", known.multiple), ("backward", known.backward)):
+        solution = solve(null_space if isinstance(method, MultipleShooting) else rates, method)
+        rows.append(_convergence_row(name, intervals, order, solution, reference))
+    for shooting, solution in (("forward multiple", known.multiple), ("backward", known.backward)):
         name = f"minimum principle, {shooting} shooting"
-        rows.append(_convergence_row(name, BACKWARD.segments, 0, found, reference))
+        rows.append(_convergence_row(name, BACKWARD.segments, 0, solution, reference))
     return rows
 
 
@@ -179,12 +179,12 @@ def grid() -> Array:
     return np.linspace(0.0, HORIZON, round(HORIZON / STEP) + 1)
 
 
-def _convergence_row(method: str, intervals: int, order: int, found: Solution, reference: float) -> Row:
+def _convergence_row(method: str, intervals: int, order: int, result: Solution, reference: float) -> Row:
     return {
         "method": method,
         "intervals": intervals,
         "order": order or "",
-        "cost": f"{found.cost:.14g}",
-        "difference": found.cost - reference,
-        "iterations": found.iterations,
+        "cost": f"{result.cost:.14g}",
+        "difference": result.cost - reference,
+        "iterations": result.iterations,
     }

@@ -80,7 +80,8 @@ def _extremals(results: Results) -> str:
     rows = [{name: row[name] for name in columns} for row in extremals.table(results.searches, PEAKS)]
     lines = ["Extremals at other horizons, from seeded first guesses", text_table(rows)]
     lines += [
-        f"  {one.horizon:g} s: best J = {one.best.indirect_cost:.9f}, from {one.best.found} of {one.starts} guesses; "
+        f"  {one.horizon:g} s: best J = {one.best.indirect_cost:.9f}, "
+        f"from {one.best.guess_count} of {one.starts} guesses; "
         f"{len(one.extremals)} extremals, {one.rejected} plans jump or change on a finer mesh"
         for one in results.searches
     ]
@@ -123,8 +124,8 @@ def acceleration_table(results: Results) -> list[Row]:
 
 def summary(results: Results) -> dict[str, Any]:
     """The numbers that matter, nested by what they belong to."""
-    local, found, trials = results.local, results.agreement, results.trials
-    plan, reference = found.plan, found.backward.cost
+    local, result, trials = results.local, results.agreement, results.trials
+    plan, reference = result.plan, result.backward.cost
     least = int(local.manipulability.argmin())
     peaks = {name: motion.peak_joint_rates() for name, motion in results.tabled.items()}
     at_peaks = {name: np.degrees(motion.accelerations_at_peaks()) for name, motion in results.tabled.items()}
@@ -156,10 +157,10 @@ def summary(results: Results) -> dict[str, Any]:
             "multiple_shooting": {
                 "control": SECOND_OPINION.control,
                 "intervals": SECOND_OPINION.intervals,
-                **solved(found.shooting),
+                **solved(result.shooting),
             },
-            "indirect": indirect_summary(found, START),
-            "certified": {name: one.passed for name, one in found.certificates.items()},
+            "indirect": indirect_summary(result, START),
+            "certified": {name: one.passed for name, one in result.certificates.items()},
             "peak_joint_velocity_deg_s": np.degrees(peaks["optimum"][0]),
             "peak_time_s": peaks["optimum"][1],
             "joint_acceleration_at_peak_deg_s2": at_peaks["optimum"],

@@ -56,11 +56,11 @@ def draw_animations(
     _animate(folder / "lift.gif", scenes, times.tolist(), SLOWER * LIFT_FRAME, note)
 
 
-def _scene(title: str, found: Local) -> Scene:
-    if found.reason in ("stands", "joint_limit"):
-        return Scene(title, found.shown)
-    words = {"tips": "tips", "lift_off": "lifts off", "divergence": "diverges"}.get(found.reason, "breaks down")
-    return Scene(title, found.shown, f"{words} at {found.time:.2f} s", found.time)
+def _scene(title: str, result: Local) -> Scene:
+    if result.reason in ("stands", "joint_limit"):
+        return Scene(title, result.shown)
+    words = {"tips": "tips", "lift_off": "lifts off", "divergence": "diverges"}.get(result.reason, "breaks down")
+    return Scene(title, result.shown, f"{words} at {result.time:.2f} s", result.time)
 
 
 def _tips(motion: StandingMotion) -> tuple[str, float]:

@@ -190,17 +190,17 @@ def run_case(case: Case) -> Local:
     def run(**settings: Any) -> Any:
         return resolve_accelerations(machine(), task, start, HORIZON, external=external, **settings)
 
-    found = run(**case.settings)
-    beyond = run(**case.settings, stop_at_lift_off=False) if found.stopped else found
-    reason, time = fails(found.motion)
-    if found.stopped is not None and (found.stopped.time <= time or reason == "joint_limit"):
-        reason, time = found.stopped.reason, found.stopped.time
+    completed = run(**case.settings)
+    beyond = run(**case.settings, stop_at_lift_off=False) if completed.stopped else completed
+    reason, time = fails(completed.motion)
+    if completed.stopped is not None and (completed.stopped.time <= time or reason == "joint_limit"):
+        reason, time = completed.stopped.reason, completed.stopped.time
     return Local(
         case,
-        found.motion,
+        completed.motion,
         beyond.motion,
-        motion_cost(found.motion),
-        float(found.tip_error.max()),
+        motion_cost(completed.motion),
+        float(completed.tip_error.max()),
         reason,
         time,
         beyond.stopped.time if beyond.stopped else None,
@@ -240,14 +240,14 @@ def layer_rows() -> list[Row]:
     ]
     rows: list[Row] = []
     for layers in trials:
-        found = run_case(Case(1, "", _augmented(*layers)))
+        result = run_case(Case(1, "", _augmented(*layers)))
         rows.append(
             {
                 "layers": "; ".join(f"{one.index} {one.form} {one.demand:g}" for one in layers) or "none",
-                "reason": found.reason,
-                "time_s": found.time,
-                "diverges_s": "never" if found.diverges is None else found.diverges,
-                "index_min": float(found.motion.index.min()),
+                "reason": result.reason,
+                "time_s": result.time,
+                "diverges_s": "never" if result.diverges is None else result.diverges,
+                "index_min": float(result.motion.index.min()),
             }
         )
     return rows
@@ -259,15 +259,15 @@ def stabiliser_rows() -> list[Row]:
     for pole in (3.0, 3.5, 4.0, 5.0):
         for gain in (0.0, 1.0, 2.0):
             chosen = Stabiliser((pole, pole, pole), gradient=gain)
-            found = run_case(Case(1, "", {"law": "stabilised", "stabiliser": chosen}))
-            motion = found.motion
+            result = run_case(Case(1, "", {"law": "stabilised", "stabiliser": chosen}))
+            motion = result.motion
             rows.append(
                 {
                     "poles_1_s": pole,
                     "damping_1_s": chosen.damping,
                     "p1_gain_1_s2": gain,
-                    "reason": found.reason,
-                    "cost": found.cost,
+                    "reason": result.reason,
+                    "cost": result.cost,
                     "index_min": float(motion.index.min()),
                     "peak_joint_velocity_rad_s": float(np.abs(motion.joint_velocities).max()),
                     "peak_joint_acceleration_rad_s2": float(np.abs(motion.joint_accelerations).max()),

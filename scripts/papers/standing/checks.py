@@ -35,7 +35,7 @@ def check(key: str, plan: Plan) -> Row:
     def beyond(values: np.ndarray, most: np.ndarray) -> float:
         return max(0.0, float((np.abs(values) - most).max()))
 
-    found = {
+    by_name = {
         "zmp_excess_m": region_excess(request.rule, motion),
         "joint_excess_rad": max(0.0, float(motion.joint_excess.max())),
         "velocity_excess_rad_s": beyond(motion.joint_velocities, bounds.velocity),
@@ -52,12 +52,12 @@ def check(key: str, plan: Plan) -> Row:
         "method": METHOD_NAMES[request.transcription],
         "intervals": request.intervals,
         "instants": request.intervals * FINER,
-        "drawn": request.drawn,
-        **found,
+        "drawn": request.has_figure,
+        **by_name,
         "zmp_min_m": float(motion.zero_moment_point[:, 1].min()),
         "zmp_max_m": float(motion.zero_moment_point[:, 1].max()),
         "vertical_force_min_n": float(motion.ground_force[:, 2].min()),
-        "holds": all(found[name] <= limit for name, limit in ALLOWED.items()),
+        "holds": all(by_name[name] <= limit for name, limit in ALLOWED.items()),
         "audit": "; ".join(f"{name} {value:.2g} > {most:.2g}" for name, value, most in missed) or "passed",
     }
 

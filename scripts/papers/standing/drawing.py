@@ -12,7 +12,7 @@ import numpy as np
 
 from models import link_frames
 from models.machines.standing import StandingMotion
-from scripts.drawing import COLORS, DASHES, TIME_COLORS, posture
+from scripts.drawing import COLORS, DASHES, TIME_COLORS, draw_arm
 from scripts.papers.standing.cases import Array, Local, machine
 from scripts.papers.standing.plans import Plan
 
@@ -122,7 +122,7 @@ def strobe(ax: Any, motion: StandingMotion, until: float, horizon: float) -> Non
         k = nearest(motion.t, time)
         color = TIME_COLORS(time / horizon)
         arm = arm_points(motion.joints[k])
-        posture(ax, arm, color, 3.4)
+        draw_arm(ax, arm, color, 3.4)
         ax.plot(motion.center_of_mass[k, 1], motion.center_of_mass[k, 2], "+", color=color, ms=6, mew=1.2, zorder=6)
         ax.plot(motion.zero_moment_point[k, 1], 0.0, "D", color=color, ms=3.6, mec="white", mew=0.4, zorder=7)
     axes_frame(ax)

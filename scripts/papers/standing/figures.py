@@ -83,8 +83,8 @@ def _compared(path: Path, title: str, shown: Sequence[Curve], quantities: Sequen
     """Quantities in rows, the first moments beside the whole motion."""
     last = max(one.diverges or 0.0 for one in shown)
     size = (8.4, 2.1 + 1.75 * len(quantities))
-    told: dict[str, Any] = {"title": title, "sharey": "row", "xlabel": "time, s"}
-    with sheet(path, (len(quantities), 2), size, f"{MARKS}. {note}", **told) as (fig, axes):
+    by_name: dict[str, Any] = {"title": title, "sharey": "row", "xlabel": "time, s"}
+    with sheet(path, (len(quantities), 2), size, f"{MARKS}. {note}", **by_name) as (fig, axes):
         for column, end in zip(axes.T, (1.1 * last, HORIZON), strict=True):
             lines = diagrams(column, shown, quantities, end)
         for ax in axes[:, 1]:
@@ -109,16 +109,16 @@ def _draw_motions(folder: Path, one: Mapping[str, Local], best: Mapping[str, Pla
     }
     pictures: list[tuple[str, str, StandingMotion, float]] = []
     for name, head in heads.items():
-        found = one[name]
-        whole = found.diverges is None
-        pictures.append((head, _short(found), found.shown, HORIZON if whole else found.diverges or 0.0))
+        result = one[name]
+        whole = result.diverges is None
+        pictures.append((head, _short(result), result.shown, HORIZON if whole else result.diverges or 0.0))
     for name, head in (("optimal_pinned_points", "optimal, pinned at 0"), ("optimal_range", "optimal, in the foot")):
         pictures.append((head, "stands to the end", best[name].motion, HORIZON))
     note = f"{SYMBOLS}. Only joint limits keep the arm out of the ground. {ASSUMED}. {CHOSEN}. {GAINS}. {SETTINGS}."
     fallen = sum(one[name].diverges is not None or one[name].reason == "tips" for name in heads)
     title = f"Figure 7: {fallen} of the {len(heads)} local laws fall, the two plans stand to the end"
-    told: dict[str, Any] = {"title": title, "sharey": True, "xlabel": "y, m"}
-    with sheet(folder / "fig07_motions.png", (2, 4), (9.4, 7.0), note, **told) as (fig, axes):
+    by_name: dict[str, Any] = {"title": title, "sharey": True, "xlabel": "y, m"}
+    with sheet(folder / "fig07_motions.png", (2, 4), (9.4, 7.0), note, **by_name) as (fig, axes):
         for ax, (head, verdict, motion, until) in zip(axes.flat, pictures, strict=True):
             strobe(ax, motion, until, HORIZON if until == HORIZON else until)
             ax.set_title(f"{head}\n{verdict}", fontsize=8.5)
@@ -128,10 +128,10 @@ def _draw_motions(folder: Path, one: Mapping[str, Local], best: Mapping[str, Pla
         fig.axes[-1].set_ylabel("share of the time shown: to the end, or until it diverges")
 
 
-def _short(found: Local) -> str:
-    if found.reason == "lift_off":
-        return f"lifts off {found.time:.3f} s, diverges {found.diverges:.3f} s"
-    return found.words.split(" (")[0]
+def _short(result: Local) -> str:
+    if result.reason == "lift_off":
+        return f"lifts off {result.time:.3f} s, diverges {result.diverges:.3f} s"
+    return result.words.split(" (")[0]
 
 
 def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan]) -> None:
@@ -163,15 +163,15 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
         right.set(xlabel="time, s", ylabel="stability index", xlim=(0.0, HORIZON), ylim=(-8.4, 3.4))
         right.legend(loc="upper left", fontsize=7.5)
 
-    told: dict[str, Any] = {}
+    by_name: dict[str, Any] = {}
     held, upright = two["augmented_spring"], two["stabilised_spring"]
     laws = [curve_of(held, "yellow", 0), curve_of(upright, "green", 1)]
     shown = [*laws, curve_of(pinned, "black", 3), curve_of(plan, "blue", 0)]
     note = f"{SYMBOLS}. {MARKS}. {ASSUMED}. {GAINS}. {SETTINGS}."
     largest = float(np.abs(plan.motion.external_force[:, 1]).max())
     title = f"Figure 11: pulled by a spring of up to {largest:.0f} N the pinned laws fall; planned, the robot stands"
-    told |= {"title": title, "xlabel": "time, s"}
-    with sheet(folder / "fig11_spring.png", (2, 3), (9.2, 7.4), note, **told) as (fig, axes):
+    by_name |= {"title": title, "xlabel": "time, s"}
+    with sheet(folder / "fig11_spring.png", (2, 3), (9.2, 7.4), note, **by_name) as (fig, axes):
         pictures: tuple[tuple[str, Any, float], ...] = (
             (f"(a) augmented law\n{_short(held)}", held.shown, held.diverges or HORIZON),
             ("optimal, pinned at 0\nstands to the end", pinned.motion, HORIZON),
@@ -193,8 +193,8 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
 def _draw_plans(folder: Path, plans: Mapping[str, Mapping[str, Plan]]) -> None:
     """Write the figures of the plans of each task."""
     for task in ("table1", "table2"):
-        drawn = [plan for plan in plans[task].values() if plan.request.drawn]
-        shown = [curve_of(plan, *STYLES[plan.request.title]) for plan in drawn]
+        plotted = [plan for plan in plans[task].values() if plan.request.has_figure]
+        shown = [curve_of(plan, *STYLES[plan.request.title]) for plan in plotted]
         _draw_task(folder / f"optimal_{task}.png", f"Table {task[-1]}", shown)
     _draw_lift(folder, plans["minimum_time"])
 
@@ -247,8 +247,8 @@ def _draw_lift(folder: Path, lifts: Mapping[str, Plan]) -> None:
     title = f"To stay on its foot the fastest lift of 0.8 m takes {slower} longer"
     _four(folder / "minimum_time.png", title, f"{ASSUMING}. {note}", shown, kinds, longest, 3)
     note = f"{SYMBOLS}. {note}"
-    told: dict[str, Any] = {"title": title, "sharey": True}
-    with sheet(folder / "minimum_time_motion.png", (1, 3), (9.0, 4.7), note, **told) as (fig, axes):
+    by_name: dict[str, Any] = {"title": title, "sharey": True}
+    with sheet(folder / "minimum_time_motion.png", (1, 3), (9.0, 4.7), note, **by_name) as (fig, axes):
         for ax, plan in zip(axes[0], lifts.values(), strict=True):
             strobe(ax, plan.motion, plan.solution.horizon, longest)
             ax.set_title(f"{plan.request.title}: {plan.solution.horizon:.4f} s")

@@ -66,7 +66,7 @@ class Request:
             between the nodes, limits drawn in to hold there too, for plans that switch; ``held``: held over the
             intervals, as the reference has them, which costs more where a constraint of the ground is active.
         intervals: Of the plan.
-        drawn: Whether figures and animations show it; such plans must stand every check and their audit.
+        has_figure: Whether figures and animations show it; such plans must stand every check and their audit.
     """
 
     task: Task
@@ -74,7 +74,7 @@ class Request:
     rule: ZmpRule
     transcription: Transcription = "points"
     intervals: int = 100
-    drawn: bool = True
+    has_figure: bool = True
 
 
 @dataclass(frozen=True)
@@ -109,14 +109,16 @@ PLANS: Mapping[str, Mapping[str, Request]] = {
         "optimal_range": Request("table1", "in the foot less 0.02 m", InFoot(MARGIN)),
         "optimal_index_half": Request("table1", "index ≥ 0.5", IndexAtLeast(0.5)),
         "optimal_index_nine_tenths": Request("table1", "index ≥ 0.9", IndexAtLeast(0.9)),
-        "optimal_pinned": Request("table1", "pinned at 0, held", Pinned(), "held", HELD["table1"], drawn=False),
+        "optimal_pinned": Request("table1", "pinned at 0, held", Pinned(), "held", HELD["table1"], has_figure=False),
         "optimal_pinned_points": Request("table1", "pinned at 0", Pinned()),
         "optimal_free": Request("table1", "no ZMP rule", Anywhere()),
     },
     "table2": {
         "optimal_spring": Request("table2", "in the foot less 0.02 m", InFoot(MARGIN)),
         "optimal_spring_index_nine_tenths": Request("table2", "index ≥ 0.9", IndexAtLeast(0.9)),
-        "optimal_spring_pinned": Request("table2", "pinned at 0, held", Pinned(), "held", HELD["table2"], drawn=False),
+        "optimal_spring_pinned": Request(
+            "table2", "pinned at 0, held", Pinned(), "held", HELD["table2"], has_figure=False
+        ),
         "optimal_spring_pinned_points": Request("table2", "pinned at 0", Pinned()),
         "optimal_spring_free": Request("table2", "no ZMP rule", Anywhere()),
     },
@@ -220,14 +222,14 @@ def fine_motion(request: Request, solution: Solution) -> tuple[StandingMotion, A
 
 def held_plans(plans: Mapping[str, Mapping[str, Plan]]) -> dict[str, dict[str, Held]]:
     """The plans as the reference has them, accelerations held over as many intervals. By task and summary key."""
-    found: dict[str, dict[str, Held]] = {}
+    by_name: dict[str, dict[str, Held]] = {}
     for task, group in plans.items():
         there = {one.request.rule: one.solution for one in group.values() if one.request.transcription == "held"}
         for key, plan in progress(group.items(), f"held, {task}"):
             request = replace(plan.request, transcription="held", intervals=HELD[task])
             solution = there.get(request.rule) or solved(request)
-            found.setdefault(task, {})[key] = Held(solution, fine_motion(request, solution)[0])
-    return found
+            by_name.setdefault(task, {})[key] = Held(solution, fine_motion(request, solution)[0])
+    return by_name
 
 
 def convergence_rows(plans: Mapping[str, Mapping[str, Plan]], held: Mapping[str, Mapping[str, Held]]) -> list[Row]:
@@ -245,8 +247,8 @@ def convergence_rows(plans: Mapping[str, Mapping[str, Plan]], held: Mapping[str,
     costs: dict[tuple[str, str, Transcription, int], float] = {}
     for item in progress(work, "convergence"):
         task, key, kind, intervals = item
-        found = known.get(item) or solved(replace(PLANS[task][key], transcription=kind, intervals=intervals))
-        costs[item] = found.cost
+        result = known.get(item) or solved(replace(PLANS[task][key], transcription=kind, intervals=intervals))
+        costs[item] = result.cost
     rows: list[Row] = []
     for (task, key, kind, intervals), cost in costs.items():
         best: Transcription = "linear" if task == "minimum_time" else "points"

@@ -112,8 +112,8 @@ def files(results: Results) -> Mapping[str, Content]:
 def sound(results: Results) -> bool:
     """Whether every drawn plan holds what it must between its nodes and its audit finds nothing beyond its limit."""
     held = all(row["holds"] for row in results.checks if row["drawn"])
-    drawn = [plan for group in results.plans.values() for plan in group.values() if plan.request.drawn]
-    return held and not any(plan.audit.failures for plan in drawn)
+    plotted = [plan for group in results.plans.values() for plan in group.values() if plan.request.has_figure]
+    return held and not any(plan.audit.failures for plan in plotted)
 
 
 def report(results: Results) -> str:
@@ -168,13 +168,13 @@ def summary(results: Results) -> dict[str, Any]:
         numbers = {name: value for name, value in row.items() if name not in ("task", "motion", "time_s")}
         content[row["task"]][row["motion"]] = numbers
     for task, laws in results.local.items():
-        for key, found in laws.items():
-            stopped = found.reason in ("lift_off", "divergence", "breakdown")
+        for key, result in laws.items():
+            stopped = result.reason in ("lift_off", "divergence", "breakdown")
             content[task][key] |= {
-                "verdict": found.words,
-                "fails_s": None if found.reason == "stands" else found.time,
-                "stopped_s": found.time if stopped else None,
-                "diverges_s": found.diverges,
+                "verdict": result.words,
+                "fails_s": None if result.reason == "stands" else result.time,
+                "stopped_s": result.time if stopped else None,
+                "diverges_s": result.diverges,
             }
     checks = {(row["task"], row["plan"]): row for row in results.checks}
     for task, plans in results.plans.items():
@@ -188,16 +188,16 @@ def summary(results: Results) -> dict[str, Any]:
                 "undecided": plan.audit.undecided,
                 "held": held_numbers(results.held[task][key]),
                 "holds_between_nodes": row["holds"],
-                "drawn": plan.request.drawn,
+                "drawn": plan.request.has_figure,
             }
     for key, plan in results.plans["minimum_time"].items():
         content["minimum_time"][f"{key}_s"] = plan.solution.horizon
     content["convergence"] = results.convergence
-    drawn = [row for row in results.checks if row["drawn"]]
+    plotted = [row for row in results.checks if row["drawn"]]
     content["checks"] = {
         "allowed": ALLOWED,
-        "worst_of_drawn_plans": {name: max(row[name] for row in drawn) for name in ALLOWED},
-        "all_drawn_plans_hold": all(row["holds"] for row in drawn),
+        "worst_of_drawn_plans": {name: max(row[name] for row in plotted) for name in ALLOWED},
+        "all_drawn_plans_hold": all(row["holds"] for row in plotted),
         "sound": sound(results),
     }
     return content
@@ -207,9 +207,11 @@ def motion_table(results: Results) -> list[Row]:
     """Cost, index, limits and peak rates of every motion, local and optimal."""
     rows: list[Row] = []
     for task in results.plans:
-        for key, found in results.local.get(task, {}).items():
-            verdict = {"reason": found.reason, "time_s": found.time}
-            rows.append(_motion_row(task, key, found.case.title, verdict, found.cost, found.motion, found.tip_error))
+        for key, result in results.local.get(task, {}).items():
+            verdict = {"reason": result.reason, "time_s": result.time}
+            rows.append(
+                _motion_row(task, key, result.case.title, verdict, result.cost, result.motion, result.tip_error)
+            )
         for key, plan in results.plans[task].items():
             motion, title = plan.motion, f"optimal, {plan.request.title}"
             tipping = motion.t[motion.foot_margin < 0]

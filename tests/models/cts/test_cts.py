@@ -71,18 +71,18 @@ def test_inverse_of_forward_holds_the_joints_among_its_branches() -> None:
     """
     rig, count = reference_rig(), 100_000
     q = np.random.default_rng(6).uniform(-np.pi, np.pi, (6, count))
-    bent = np.abs(np.cos(q[3]) * np.sin(q[1]))
+    perturbed = np.abs(np.cos(q[3]) * np.sin(q[1]))
     joints, x, roll = ca.SX.sym("q", 6), ca.SX.sym("x", 5), ca.SX.sym("roll")
     pose = np.array(ca.Function("f", [joints], [forward(rig, joints)]).map(count)(q))
     nearest, exact = np.full((2, count), np.inf)
     for branch in BRANCHES:
-        found = ca.Function("i", [x, roll], [inverse(rig, x, roll, branch)[0]]).map(count)(pose[:5], pose[5:])
-        nearest = np.minimum(nearest, np.abs(np.array(found) - q).max(axis=0))
+        result = ca.Function("i", [x, roll], [inverse(rig, x, roll, branch)[0]]).map(count)(pose[:5], pose[5:])
+        nearest = np.minimum(nearest, np.abs(np.array(result) - q).max(axis=0))
         extended = joints_by_geometry(rig, pose[:5].astype(np.longdouble), pose[5].astype(np.longdouble), branch)[0]
         exact = np.fmin(exact, np.abs(extended - q).max(axis=0).astype(float))
-    assert (nearest * bent).max() < 1e-14
-    assert nearest[bent > 2e-5].max() < 1e-10
-    assert np.mean(bent > 2e-5) > 0.9995
+    assert (nearest * perturbed).max() < 1e-14
+    assert nearest[perturbed > 2e-5].max() < 1e-10
+    assert np.mean(perturbed > 2e-5) > 0.9995
     assert np.mean(nearest > 1e-10) <= 1e-4
     assert nearest.max() < 3 * exact.max()
 

@@ -47,13 +47,13 @@ def test_no_roll_of_a_dense_grid_is_clear_and_better(clearance: float, weight: f
     )
     costs, distances = grid_costs(weight, 0.1, rate_weight)
     for row, cost, distance in zip(TARGETS, costs, distances, strict=True):
-        joints, found, _, status, gap = function(row, 0.0)
+        joints, result, _, status, gap = function(row, 0.0)
         assert int(status) == 0
         assert float(gap) >= clearance
-        assert float(found) <= np.where(distance >= clearance, cost, np.inf).min() + 1e-9
+        assert float(result) <= np.where(distance >= clearance, cost, np.inf).min() + 1e-9
         roll = float(joints[5])
         nearest = np.abs(np.linspace(-np.pi, np.pi, 1440, endpoint=False) - roll).argmin()
-        assert float(found) == pytest.approx(cost[nearest], abs=5e-3)
+        assert float(result) == pytest.approx(cost[nearest], abs=5e-3)
 
 
 def test_the_best_roll_is_found_where_the_best_clear_roll_of_the_grid_is_elsewhere() -> None:
@@ -105,7 +105,7 @@ def test_a_target_that_is_never_clear_is_marked_and_leaves_the_others_alone() ->
         ({"softness": 0.0}, "width"),
     ],
 )
-def test_what_cannot_be_asked_is_named(options: dict[str, Any], reason: str) -> None:
+def test_invalid_requests_are_refused_by_name(options: dict[str, Any], reason: str) -> None:
     with pytest.raises(ModelError, match=reason):
         collision_free_inverse(RIG, TUNNEL, AROUND, **options)
     with pytest.raises(ModelError, match="empty"):

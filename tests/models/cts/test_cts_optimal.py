@@ -154,7 +154,7 @@ def test_equal_weights_have_the_closed_form_of_one_harmonic() -> None:
     assert roll == pytest.approx(np.arctan2(offset[1], -offset[2]), abs=1e-12)
 
 
-def test_roll_is_given_in_the_turn_of_the_previous_one() -> None:
+def test_the_roll_is_in_the_turn_of_the_previous_roll() -> None:
     function = optimal_inverse(RIG, TUNNEL)
     target = np.array([100, 6, 0, 0, 0]) * [INCH, INCH, INCH, 1, 1]
     for turns in (-3, 0, 2):
@@ -267,7 +267,7 @@ def test_a_sequence_passes_its_rolls_on() -> None:
         (np.zeros((2, 5)), {"rate_weight": -1.0}, "rate_weight must be a finite number, zero or above, not -1.0"),
     ],
 )
-def test_what_cannot_be_asked_is_named(targets: Any, options: dict[str, Any], reason: str) -> None:
+def test_invalid_requests_are_refused_by_name(targets: Any, options: dict[str, Any], reason: str) -> None:
     with pytest.raises(ModelError, match=reason):
         solve_table(RIG, TUNNEL, targets, **options)
 

@@ -104,7 +104,7 @@ def test_yaw_and_pitch_are_those_of_the_rig() -> None:
         (lambda: soft_minimum([], 1.0), "a list of 1 to"),
     ],
 )
-def test_what_cannot_be_is_named(make: Callable[[], Any], message: str) -> None:
+def test_impossible_targets_are_refused_by_name(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
         make()
 
@@ -128,11 +128,11 @@ def test_distance_of_capsules_is_that_of_their_points(seed: int) -> None:
     one, other = random_capsule(rng), random_capsule(rng)
     if seed % 5 == 0:
         other = Capsule(other.radius, other.start, other.start + 0.5 * (one.end - one.start))  # parallel
-    found = number(capsule_to_capsule(one, other)) + one.radius + other.radius
+    result = number(capsule_to_capsule(one, other)) + one.radius + other.radius
     p, q = along(one, 400), along(other, 400)
     sampled = np.linalg.norm(p[:, None] - q[None], axis=2).min()
-    assert found <= sampled + 1e-9
-    assert found >= sampled - 0.02
+    assert result <= sampled + 1e-9
+    assert result >= sampled - 0.02
 
 
 @few
@@ -141,11 +141,11 @@ def test_distance_of_a_capsule_to_a_box_is_that_of_its_points(seed: int) -> None
     rng = np.random.default_rng(seed)
     turn = turns(rng.normal(size=(1, 4)))[0]
     box, capsule = Box(rng.uniform(0.2, 2, 3), rng.normal(size=3), turn), random_capsule(rng)
-    found = number(capsule_to_box(capsule, box)) + capsule.radius
+    result = number(capsule_to_box(capsule, box)) + capsule.radius
     over = np.abs((along(capsule) - box.position) @ turn) - box.size / 2
     sampled = (np.linalg.norm(np.maximum(over, 0), axis=1) + np.minimum(over.max(axis=1), 0)).min()
-    assert found == pytest.approx(sampled, abs=2e-3)
-    assert found <= sampled + 1e-7
+    assert result == pytest.approx(sampled, abs=2e-3)
+    assert result <= sampled + 1e-7
 
 
 def test_distance_to_a_box_has_the_derivative_of_the_nearest_points() -> None:
@@ -194,6 +194,6 @@ def test_the_capsules_join_the_frames_of_the_rig() -> None:
 
 def test_every_link_is_held_against_everything_around() -> None:
     around = CollisionScene(Box((np.inf, 2, 2)), (Box((2, 2, 0.2), (2, 0, 1)),), (Capsule(0.2, (0, 0, 2), (3, 0, 2)),))
-    found = clearances(reference_rig(), ca.DM([0.3, -1.8, 0.3, 0.2, 1.4, 0.9]), around)
-    assert len(found) == 6 * 3
-    assert all(np.isfinite(number(gap)) for gap in found.values())
+    result = clearances(reference_rig(), ca.DM([0.3, -1.8, 0.3, 0.2, 1.4, 0.9]), around)
+    assert len(result) == 6 * 3
+    assert all(np.isfinite(number(gap)) for gap in result.values())

@@ -26,8 +26,8 @@ every_rig = pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS)
 def test_no_roll_of_a_grid_is_better_than_the_best_of_the_minima(rig: Any, weight: float) -> None:
     rng, gain = np.random.default_rng(4), checked_gain(weight)
     targets, previous = random_targets(rng, 12), rng.uniform(-3, 3, 12)
-    found = np.array(convex_minima(rig, TUNNEL, gain).map(12)(targets, previous[None]))
-    for target, before, rolls in zip(targets.T, previous, found.T, strict=True):
+    values = np.array(convex_minima(rig, TUNNEL, gain).map(12)(targets, previous[None]))
+    for target, before, rolls in zip(targets.T, previous, values.T, strict=True):
         low, high = (float(ca.DM(end)) for end in roll_window(rig, before))
         grid = np.linspace(low, high, 2000)
 
@@ -42,10 +42,10 @@ def test_no_roll_of_a_grid_is_better_than_the_best_of_the_minima(rig: Any, weigh
 
 
 @given(st.floats(-9, 9), st.floats(-np.pi, np.pi))
-def test_a_roll_is_told_in_the_turn_that_is_nearest_to_the_one_before(previous: float, roll: float) -> None:
-    found = float(ca.DM(unwrap_roll(RIGS["free"], ca.DM(np.cos(roll)), ca.DM(np.sin(roll)), ca.DM(previous))))
-    assert abs(found - previous) <= np.pi + 1e-12
-    assert np.sin((found - roll) / 2) == pytest.approx(0, abs=1e-12)
+def test_the_roll_is_in_the_turn_nearest_to_the_previous_roll(previous: float, roll: float) -> None:
+    result = float(ca.DM(unwrap_roll(RIGS["free"], ca.DM(np.cos(roll)), ca.DM(np.sin(roll)), ca.DM(previous))))
+    assert abs(result - previous) <= np.pi + 1e-12
+    assert np.sin((result - roll) / 2) == pytest.approx(0, abs=1e-12)
 
 
 @given(st.floats(-9, 9))

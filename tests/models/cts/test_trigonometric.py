@@ -68,7 +68,7 @@ def test_series_multiply_and_add_as_their_values(one: Any, other: Any) -> None:
 
 @settings(max_examples=40)
 @given(st.tuples(angle, angle), st.tuples(st.floats(0.2, 2.9), st.floats(0.2, 2.9)), st.floats(1e-3, 1e3))
-def test_the_roots_of_a_product_of_two_lines_are_where_each_cuts_the_circle(
+def test_roots_of_a_product_of_two_lines_are_their_intersections_with_the_circle(
     middles: Any, widths: Any, factor: float
 ) -> None:
     """(cos(x - a) - cos w) vanishes at a - w and a + w; where no two roots are nearly one."""

@@ -121,8 +121,8 @@ def test_torques_accelerate_the_joints_as_in_mujoco(arms: int, carried: tuple[fl
     base, joints, rates, accelerations = state(machine, 2)
     n = machine.joint_size
     b, q, v, a = (ca.SX.sym("z", size) for size in (7, n, n, n))
-    found = ca.Function("t", [b, q, v, a], [joint_torques(machine, b, q, v, a)])
-    torques = np.array(found(base, joints, rates, accelerations)).ravel()
+    result = ca.Function("t", [b, q, v, a], [joint_torques(machine, b, q, v, a)])
+    torques = np.array(result(base, joints, rates, accelerations)).ravel()
     model, data = moving(machine, base, joints, rates)
     order = [model.joint(name).dofadr[0] for name in machine.robot.joint_names]
     data.qfrc_applied[order] = torques
@@ -133,18 +133,18 @@ def test_torques_accelerate_the_joints_as_in_mujoco(arms: int, carried: tuple[fl
     assert np.array(again).ravel() == pytest.approx(torques, rel=1e-12, abs=1e-12)
 
 
-@pytest.mark.parametrize("told", [{"wrenches": [Wrench("hub", (1, 0, 0))]}, {"gravity": (0.0, 0.0, -1.6)}])
-def test_nothing_acts_from_outside_on_a_machine_that_floats(told: dict[str, Any]) -> None:
+@pytest.mark.parametrize("report", [{"wrenches": [Wrench("hub", (1, 0, 0))]}, {"gravity": (0.0, 0.0, -1.6)}])
+def test_nothing_acts_from_outside_on_a_machine_that_floats(report: dict[str, Any]) -> None:
     machine = FreeFloating(wheeled(1))
     n = machine.joint_size
     b, q, v, a = (ca.SX.sym("z", size) for size in (7, n, n, n))
     with pytest.raises(ProblemError, match="conserves its momentum") as caught:
-        joint_torques(machine, b, q, v, a, **told)
-    assert caught.value.name == next(iter(told))
+        joint_torques(machine, b, q, v, a, **report)
+    assert caught.value.name == next(iter(report))
 
 
 @pytest.mark.parametrize(
-    ("told", "name"),
+    ("report", "name"),
     [
         ({"axes": np.zeros((1, 3))}, "axes"),
         ({"axes": [1.0, 0.0, 0.0]}, "axes"),
@@ -153,7 +153,7 @@ def test_nothing_acts_from_outside_on_a_machine_that_floats(told: dict[str, Any]
         ({"link": "bus"}, "bus"),
     ],
 )
-def test_what_is_no_wheel_is_refused_by_name(told: dict[str, Any], name: str) -> None:
+def test_what_is_no_wheel_is_refused_by_name(report: dict[str, Any], name: str) -> None:
     with pytest.raises(ModelError) as caught:
-        with_wheels(satellite(1), **{"axes": np.eye(3), "inertia": 0.02, **told})
+        with_wheels(satellite(1), **{"axes": np.eye(3), "inertia": 0.02, **report})
     assert caught.value.name == name

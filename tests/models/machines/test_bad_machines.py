@@ -109,7 +109,7 @@ def arm() -> Scara:
 BOLTED_CASES = [
     Case(
         "CollisionScene",
-        lambda **given: CollisionScene(**given),
+        lambda **options: CollisionScene(**options),
         {"machine": ARMOURED, "obstacles": [Sphere(0.1, (2.0, 0.0, 0.0))], "clearance": 0.01},
         {
             "obstacles": SEQUENCE | {"array": np.ones(3), "two": [Sphere(0.1, (2.0, 0.0, 0.0)), 1.0]},
@@ -353,7 +353,7 @@ CASES = [*BOLTED_CASES, *FLOATING_CASES, *ACTUATOR_CASES, *STANDING_CASES, *STAN
 
 
 @pytest.mark.parametrize("case", good_calls(CASES))
-def test_what_is_good_is_taken(case: Case) -> None:
+def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 

@@ -80,7 +80,7 @@ def points_of(scene: CollisionScene, machine: Any) -> Any:
     """Return a CasADi Function (base, q, time) -> points of each pair in its reference frame."""
     base, q, t = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
     frames = ca.reshape(scene.placements(base, q, t), 12, -1)
-    found = []
+    results = []
     for one, other, seen in scene.pairs:
         turn, origin = (ca.SX.eye(3), ca.SX(3, 1))
         if seen >= 0:
@@ -92,8 +92,8 @@ def points_of(scene: CollisionScene, machine: Any) -> Any:
                 own = ca.reshape(frames[:9, body.frame], 3, 3)
                 core = ca.mtimes(own, core) + ca.repmat(frames[9:, body.frame], 1, core.shape[1])
             sides.append(ca.mtimes(turn.T, core - ca.repmat(origin, 1, core.shape[1])))
-        found.append([ca.densify(side) for side in sides])
-    return ca.Function("points", [base, q, t], [part for pair in found for part in pair])
+        results.append([ca.densify(side) for side in sides])
+    return ca.Function("points", [base, q, t], [part for pair in results for part in pair])
 
 
 @pytest.mark.parametrize("name", machines())
@@ -106,21 +106,21 @@ def test_distances_are_those_of_the_hulls(name: str) -> None:
     rounded = ca.Function("rounded", [base, q, t], [scene.distances(base, q, t, rounding=1e-3)])
     points = points_of(scene, machine)
     for b, j in zip(*configurations(machine, 40, 1), strict=True):
-        told, below = np.array(exact(b, j, 0.0)).ravel(), np.array(rounded(b, j, 0.0)).ravel()
-        assert np.all(below <= told + 1e-9)
+        report, below = np.array(exact(b, j, 0.0)).ravel(), np.array(rounded(b, j, 0.0)).ravel()
+        assert np.all(below <= report + 1e-9)
         sides = [np.array(part).T for part in points(b, j, 0.0)]
         for i, (one, other, _) in enumerate(scene.pairs):
             a, c = sides[2 * i][None], sides[2 * i + 1][None]
             shapes = scene.bodies[one].shape, scene.bodies[other].shape
             radii = shapes[0].swept_radius + shapes[1].swept_radius
-            way = -shapes[1].normal[None] if isinstance(shapes[1], HalfSpace) else nearest_directions(a, c)[0]
-            gap = gap_along(way, a, c)[0]
+            path = -shapes[1].normal[None] if isinstance(shapes[1], HalfSpace) else nearest_directions(a, c)[0]
+            gap = gap_along(path, a, c)[0]
             if any(isinstance(shape, Cylinder) for shape in shapes):  # of which the distance is a bound from below
-                assert told[i] <= gap - radii + 1e-7
+                assert report[i] <= gap - radii + 1e-7
             elif gap > 1e-6 or isinstance(shapes[1], HalfSpace):
-                assert_allclose(told[i], gap - radii, atol=1e-7)
+                assert_allclose(report[i], gap - radii, atol=1e-7)
             else:
-                assert told[i] <= 1e-6 - radii
+                assert report[i] <= 1e-6 - radii
 
 
 @pytest.mark.parametrize("name", machines())
@@ -145,8 +145,8 @@ def test_no_point_moves_or_bends_by_more_than_its_levers_say(name: str) -> None:
             unit = at[3:7]
             rate[3:7] -= unit * (unit @ rate[3:7])
             push[3:7] -= unit * (unit @ push[3:7] + rate[3:7] @ rate[3:7])
-        found = [np.linalg.norm(np.array(part), axis=0).max() for part in moved(at, rate, push)]
-        speeds, bends = np.array(found[: len(parts)]), np.array(found[len(parts) :])
+        matches = [np.linalg.norm(np.array(part), axis=0).max() for part in moved(at, rate, push)]
+        speeds, bends = np.array(matches[: len(parts)]), np.array(matches[len(parts) :])
         slow = lever @ np.abs(rate)
         most = lever @ np.abs(push) + 2 * (turn @ np.abs(rate)) * slow
         # of a swelling nothing is seen here; the core's points move less than it says
@@ -160,23 +160,23 @@ def test_no_point_moves_or_bends_by_more_than_its_levers_say(name: str) -> None:
 def test_each_obstacle_that_moves_is_where_it_is_then() -> None:
     """Two of them, others between: beside each link as if it stood where it is at that time."""
     machine = machines()["arm"]
-    ways: list[Any] = [lambda t: (0.5, 0.3 * t, 0.5), lambda t: (-0.4 * t, 0.2, 0.3 + t**2)]
-    moving = [MovingObstacle(OBSTACLES[1], ways[0], turned), MovingObstacle(OBSTACLES[2], ways[1])]
+    paths: list[Any] = [lambda t: (0.5, 0.3 * t, 0.5), lambda t: (-0.4 * t, 0.2, 0.3 + t**2)]
+    moving = [MovingObstacle(OBSTACLES[1], paths[0], turned), MovingObstacle(OBSTACLES[2], paths[1])]
     scene = CollisionScene(machine, (OBSTACLES[0], moving[0], OBSTACLES[3], moving[1]))
     q, t = ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
-    found = ca.Function("found", [q, t], [scene.distances((), q, t)])
+    result = ca.Function("found", [q, t], [scene.distances((), q, t)])
     for j, at in zip(configurations(machine, 5, 3)[1], (0.0, 0.3, 0.7, 1.0, 2.0), strict=True):
         placed = []
-        for one, way, turn in zip(moving, ways, (np.array(ca.DM(turned(at))), np.eye(3)), strict=True):
-            placed.append(one.shape.placed(turn, np.array(way(at))))
+        for one, path, turn in zip(moving, paths, (np.array(ca.DM(turned(at))), np.eye(3)), strict=True):
+            placed.append(one.shape.placed(turn, np.array(path(at))))
         still = CollisionScene(machine, (OBSTACLES[0], placed[0], OBSTACLES[3], placed[1]))
         known = dict(zip(still.labels, np.array(ca.DM(still.distances((), ca.DM(j)))).ravel(), strict=True))
-        told = dict(zip(scene.labels, np.array(found(j, at)).ravel(), strict=True))
-        assert {one for label in told for one in label if one.startswith("obstacle")} == {
+        report = dict(zip(scene.labels, np.array(result(j, at)).ravel(), strict=True))
+        assert {one for label in report for one in label if one.startswith("obstacle")} == {
             f"obstacle {k}" for k in range(4)
         }
         for label, value in known.items():
-            assert told[label] == pytest.approx(value, abs=1e-9)
+            assert report[label] == pytest.approx(value, abs=1e-9)
 
 
 def test_scaled_machines_have_scaled_distances_and_levers() -> None:
@@ -221,14 +221,14 @@ def test_a_pair_is_ignored_by_its_names() -> None:
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_refused(case: str) -> None:
-    given, word = BAD[case]
+def test_invalid_arguments_are_refused(case: str) -> None:
+    options, word = BAD[case]
     with pytest.raises(ModelError, match=word):
-        CollisionScene(FixedBase(armoured_arm()), **given)
+        CollisionScene(FixedBase(armoured_arm()), **options)
 
 
 @pytest.mark.parametrize(
-    ("given", "word"),
+    ("options", "word"),
     [
         ({"shape": HalfSpace((0, 0, 1), (0, 0, 0))}, "half-space"),
         ({"shape": 3}, "shape"),
@@ -241,22 +241,22 @@ def test_what_is_refused(case: str) -> None:
         ({"rotation": lambda t: 2 * ca.SX.eye(3)}, "rotation .* is not a rotation matrix"),
     ],
 )
-def test_what_does_not_move(given: dict[str, Any], word: str) -> None:
+def test_parts_that_do_not_move(options: dict[str, Any], word: str) -> None:
     good: dict[str, Any] = {"shape": Sphere(0.1, (0, 0, 0)), "position": lambda t: (t, 0, 0)}
     with pytest.raises(ModelError, match=word):
-        MovingObstacle(**{**good, **given})
+        MovingObstacle(**{**good, **options})
 
 
 @pytest.mark.parametrize(
-    ("given", "word"),
+    ("options", "word"),
     [
         ({"rotation": lambda t: (1 + t) * ca.SX.eye(3)}, r"rotation .* at 0\.00195312 s"),
         ({"position": lambda t: (ca.sqrt(0.5 - t), 0, 0)}, r"position .* is not finite, at 0\.501953 s"),
         ({"position": lambda t: (1 / t, 0, 0)}, r"position .* is not finite, at 0 s"),
     ],
 )
-def test_a_motion_that_is_none_at_some_time_is_told_with_the_time(given: dict[str, Any], word: str) -> None:
-    moving = MovingObstacle(**{"shape": Sphere(0.1, (0, 0, 0)), "position": lambda t: (t, 0, 0), **given})
+def test_an_undefined_motion_is_reported_with_its_time(options: dict[str, Any], word: str) -> None:
+    moving = MovingObstacle(**{"shape": Sphere(0.1, (0, 0, 0)), "position": lambda t: (t, 0, 0), **options})
     scene = CollisionScene(FixedBase(armoured_arm()), [moving])
     with pytest.raises(ModelError, match=word) as caught:
         scene.check_motions(0.0, 1.0)
@@ -275,7 +275,7 @@ def test_a_slide_without_limits() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{}, (), None, "arm", 1.0, FixedBase, Robot((Link("alone"),))], ids=repr)
-def test_what_is_no_machine_has_no_surroundings(wrong: Any) -> None:
+def test_only_machines_have_a_collision_scene(wrong: Any) -> None:
     with pytest.raises(ModelError, match="scene: machine must be a FixedBase") as caught:
         CollisionScene(wrong)
     assert caught.value.name == "machine"
@@ -290,8 +290,8 @@ def test_gradients_of_distances_are_their_derivatives(name: str, rounding: float
     order = np.random.default_rng(6).permutation(len(scene.pairs)).tolist()
     function = scene.distance_gradients(pairs=order, rounding=rounding)
     base, q, t = ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size), ca.SX.sym("t")
-    told = scene.distances(base, q, t, pairs=order, rounding=rounding)
-    known = ca.Function("known", [base, q, t], [told, ca.jacobian(told, ca.vertcat(base, q))])
+    report = scene.distances(base, q, t, pairs=order, rounding=rounding)
+    known = ca.Function("known", [base, q, t], [report, ca.jacobian(report, ca.vertcat(base, q))])
     for b, j, at in zip(*configurations(machine, 15, 7), np.linspace(0.0, 2.0, 15), strict=True):
         values, slopes = (np.array(part) for part in function(b, j, at))
         expected, derived = (np.array(part) for part in known(b, j, at))
@@ -343,23 +343,23 @@ def test_a_mesh_near_a_primitive_is_checked_by_its_hull(hooked: FixedBase, tmp_p
     pair = next(k for k, label in enumerate(scene.labels) if label[0].startswith("link0") and label[1] == "link2")
     assert isinstance(scene.bodies[scene.pairs[pair, 0]].shape, Mesh)
     assert [scene.bodies[j].name for _, j in scene.cover_pairs[pair]] == ["link2", "link2"]
-    postures = np.random.default_rng(4).uniform(-2.5, 2.5, (40, 4))
+    samples = np.random.default_rng(4).uniform(-2.5, 2.5, (40, 4))
     q = ca.SX.sym("q", 4)
     covers = ca.Function("covers", [q], [scene.distances((), q, pairs=[pair])])
-    by_covers = np.array(covers.map(40)(postures.T)).ravel()
-    distances = distances_along(scene, np.zeros(0), postures, np.zeros(40))
+    by_covers = np.array(covers.map(40)(samples.T)).ravel()
+    distances = distances_along(scene, np.zeros(0), samples, np.zeros(40))
     assert (distances[:, pair] >= by_covers - 1e-5).all()
-    only = distances_along(scene, np.zeros(0), postures, np.zeros(40), pairs=[pair])
+    only = distances_along(scene, np.zeros(0), samples, np.zeros(40), pairs=[pair])
     assert_allclose(only[:, pair], distances[:, pair], atol=1e-12)
     assert np.isinf(np.delete(only, pair, axis=1)).all()
-    for posture, expected in zip(postures, distances[:, pair], strict=True):
-        for collision in find_collisions(scene, np.zeros(0), posture[None], np.zeros(1)):
+    for configuration, expected in zip(samples, distances[:, pair], strict=True):
+        for collision in find_collisions(scene, np.zeros(0), configuration[None], np.zeros(1)):
             if collision.pair == pair:
-                least = float(covers(posture))
+                least = float(covers(configuration))
                 assert collision.protrusion == pytest.approx(expected - least, abs=1e-5)
 
 
-def test_meshes_up_to_three_joints_apart_are_looked_at_as_their_hulls(hooked: FixedBase, tmp_path: Path) -> None:
+def test_meshes_up_to_three_joints_apart_are_checked_as_hulls(hooked: FixedBase, tmp_path: Path) -> None:
     """Their distances are those of their covers, from below; gradients by the soft minimum; others are covers alone."""
     scene = CollisionScene(hooked, folders=[tmp_path])
     hulls = [isinstance(scene.bodies[one].shape, Mesh) for one, _, _ in scene.pairs]
@@ -376,8 +376,8 @@ def test_meshes_up_to_three_joints_apart_are_looked_at_as_their_hulls(hooked: Fi
     covers = [body for body in scene.bodies if not isinstance(body.shape, Mesh)]
     frames = link_frames(hooked.robot, q)
     for rounding in (0.0, 3e-3):
-        told = scene.distances((), q, rounding=rounding)
-        function = ca.Function("known", [q], [told, ca.jacobian(told, q)])
+        report = scene.distances((), q, rounding=rounding)
+        function = ca.Function("known", [q], [report, ca.jacobian(report, q)])
         gradients = scene.distance_gradients(rounding=rounding)
         each = {
             (i, j): [
@@ -388,11 +388,11 @@ def test_meshes_up_to_three_joints_apart_are_looked_at_as_their_hulls(hooked: Fi
             for (i, j), hull in zip(links, hulls, strict=True) if hull
         }  # fmt: skip
         least = ca.Function("least", [q], [ca.vertcat(*(ca.mmin(ca.vertcat(*of)) for of in each.values()))])
-        for posture in np.random.default_rng(9).uniform(-2, 2, (8, 4)):
-            values, slopes = (np.array(part) for part in function(posture))
-            found, derived = (np.array(part) for part in gradients((), posture, 0.0))
-            assert_allclose(found, values, atol=1e-12)
+        for configuration in np.random.default_rng(9).uniform(-2, 2, (8, 4)):
+            values, slopes = (np.array(part) for part in function(configuration))
+            result, derived = (np.array(part) for part in gradients((), configuration, 0.0))
+            assert_allclose(result, values, atol=1e-12)
             assert_allclose(derived, slopes, atol=1e-8)
-            short = np.array(least(posture)).ravel() - values.ravel()[hulls]
+            short = np.array(least(configuration)).ravel() - values.ravel()[hulls]
             assert (short >= -1e-12).all()
             assert (short <= (rounding / 4 + 1e-6) * np.log(4) + 1e-12).all()

@@ -53,14 +53,14 @@ def area(corners: np.ndarray) -> float:
 
 def test_wheels_stand_on_their_lowest_lines_and_a_ball_on_its_lowest_point() -> None:
     text = wheels_and_ball()
-    found = footprint(Robot.from_urdf(text))
-    assert found.links == ("left", "right", "caster")
-    assert found.translation[2] == pytest.approx(0.052, abs=1e-15)
+    result = footprint(Robot.from_urdf(text))
+    assert result.links == ("left", "right", "caster")
+    assert result.translation[2] == pytest.approx(0.052, abs=1e-15)
     expected = {(0.2, 0.27), (0.2, -0.27), (-0.25, 0.0)}
-    assert {tuple(np.round(v, 12)) for v in found.support.vertices} == expected
+    assert {tuple(np.round(v, 12)) for v in result.support.vertices} == expected
 
 
-def test_what_is_higher_than_the_depth_does_not_touch() -> None:
+def test_points_above_the_contact_depth_are_not_in_contact() -> None:
     text = wheels_and_ball()
     robot = Robot.from_urdf(text)
     with pytest.raises(ModelError, match=r"'caster'.*one point or line"):
@@ -71,11 +71,11 @@ def test_what_is_higher_than_the_depth_does_not_touch() -> None:
 
 def test_a_standing_cylinder_gives_a_polygon_inside_its_rim() -> None:
     text = cart(part("foot", "0.1 -0.2 -0.3", '<cylinder length="0.5" radius="0.15"/>'))
-    found = footprint(Robot.from_urdf(text))
-    away = np.linalg.norm(found.support.vertices - [0.1, -0.2], axis=1)
+    result = footprint(Robot.from_urdf(text))
+    away = np.linalg.norm(result.support.vertices - [0.1, -0.2], axis=1)
     np.testing.assert_allclose(away, 0.15, atol=1e-14)
-    assert 0.99 * np.pi * 0.15**2 < found.support.area < np.pi * 0.15**2
-    assert found.translation[2] == pytest.approx(0.55)
+    assert 0.99 * np.pi * 0.15**2 < result.support.area < np.pi * 0.15**2
+    assert result.translation[2] == pytest.approx(0.55)
 
 
 def test_the_pose_of_the_legs_counts() -> None:
@@ -140,11 +140,11 @@ def test_a_root_link_that_is_not_upright_is_set_upright() -> None:
     turned = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     upright = footprint(Robot.from_urdf(text))
     robot = Robot.from_urdf(lying)
-    found = footprint(robot, rotation=turned)
+    result = footprint(robot, rotation=turned)
     shift = turned @ [0.3, 0.1, 0.2]
-    np.testing.assert_allclose(found.support.vertices, upright.support.vertices + shift[:2], atol=1e-12)
-    assert found.translation[2] == pytest.approx(upright.translation[2] - shift[2])
-    frames = link_frames(robot, [], (ca.DM(found.rotation), ca.DM(found.translation)))
+    np.testing.assert_allclose(result.support.vertices, upright.support.vertices + shift[:2], atol=1e-12)
+    assert result.translation[2] == pytest.approx(upright.translation[2] - shift[2])
+    frames = link_frames(robot, [], (ca.DM(result.rotation), ca.DM(result.translation)))
     assert float(frames["caster"].position[2]) == pytest.approx(0.03)  # its radius: it touches z = 0
     with pytest.raises(ModelError, match="not a rotation"):
         footprint(robot, rotation=2 * np.eye(3))
@@ -152,9 +152,9 @@ def test_a_root_link_that_is_not_upright_is_set_upright() -> None:
 
 def test_a_simplified_robot_stands_on_the_same_shapes() -> None:
     robot = Robot.from_urdf(wheels_and_ball())
-    found, whole = footprint(simplify(robot)), footprint(robot)
-    assert (found.links, whole.links) == (("base",), ("left", "right", "caster"))
-    np.testing.assert_allclose(found.support.vertices, whole.support.vertices, atol=1e-15)
+    result, whole = footprint(simplify(robot)), footprint(robot)
+    assert (result.links, whole.links) == (("base",), ("left", "right", "caster"))
+    np.testing.assert_allclose(result.support.vertices, whole.support.vertices, atol=1e-15)
 
 
 def test_a_mesh_below_all_shapes_is_refused() -> None:
@@ -169,19 +169,19 @@ def test_footprints_of_real_robots() -> None:
     """TIAGo on two wheels and four casters, ANYmal on the lowest points of its four feet: figures of their files."""
     package, ending, options = ROBOTS["tiago"]
     file = urdf_file(package, ending)
-    found = footprint(Robot.from_urdf(file, **options))
+    result = footprint(Robot.from_urdf(file, **options))
     corners = {(-0.1895, 0.102), (-0.1895, -0.102), (0.0, 0.2222), (0.0, -0.2222), (0.1535, 0.102), (0.1535, -0.102)}
-    assert {tuple(v + 0.0) for v in found.support.vertices.round(9)} == corners
-    assert abs(found.translation[2]) < 1e-9
+    assert {tuple(v + 0.0) for v in result.support.vertices.round(9)} == corners
+    assert abs(result.translation[2]) < 1e-9
     package, ending, options = ROBOTS["anymal-kinova"]
     file = urdf_file(package, ending)
     robot = Robot.from_urdf(file, **options)
     feet = ["LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT"]
     q = np.random.default_rng(4).uniform(-0.02, 0.02, robot.dof)
-    found = footprint(robot, q=q, links=feet, depth=0.1)
+    result = footprint(robot, q=q, links=feet, depth=0.1)
     frames = link_frames(robot, q)
     centers = [numeric(frames[foot].point(ca.DM([0, 0, 0.02325])))[:2, 0] for foot in feet]
-    np.testing.assert_allclose(sorted(map(tuple, found.support.vertices)), sorted(map(tuple, centers)), atol=1e-12)
+    np.testing.assert_allclose(sorted(map(tuple, result.support.vertices)), sorted(map(tuple, centers)), atol=1e-12)
 
 
 def test_source_may_be_a_file(tmp_path: Path) -> None:

@@ -69,9 +69,9 @@ def case(seed: int, size: int, base: Base) -> Case:
 cases, spatial_cases = (st.builds(case, seeds, st.integers(1, 7), kind) for kind in (bases, st.just("spatial")))
 
 
-def close(found: Any, expected: Any, tolerance: float) -> None:
+def close(result: Any, expected: Any, tolerance: float) -> None:
     """Vectors are compared as vectors, whether they are columns or not."""
-    value, known = numeric(found), np.asarray(expected)
+    value, known = numeric(result), np.asarray(expected)
     np.testing.assert_allclose(value.reshape(known.shape) if known.ndim else value, known, atol=tolerance)
 
 
@@ -176,8 +176,8 @@ def test_momentum_is_conserved_along_an_integrated_motion(seed: int, size: int, 
         moved = motion.center(place, time)
         np.testing.assert_allclose(moved, center + full[3:] / machine.robot.total_mass * time, atol=1e-8)
         about_origin = np.concatenate([full[:3] + np.cross(moved, full[3:]), full[3:]])
-        found = momentum_by_differences(machine.robot, motion.poses(place, time, 2e-3), 2e-3)
-        np.testing.assert_allclose(found[rows], about_origin[rows], atol=1e-6 if carried else 1e-7)
+        result = momentum_by_differences(machine.robot, motion.poses(place, time, 2e-3), 2e-3)
+        np.testing.assert_allclose(result[rows], about_origin[rows], atol=1e-6 if carried else 1e-7)
         if base == "spatial":
             assert np.linalg.norm(place[3:]) == pytest.approx(1.0, abs=1e-10)
 
@@ -195,8 +195,8 @@ def test_generalized_jacobian_agrees_with_finite_differences_of_the_tip(case: Ca
     turning = sum(w * numeric(tip.rotation) for w, tip in zip(weights, tips, strict=True))
     here = machine.tip_pose(place, motion.joints(time))
     turning = turning @ numeric(here.rotation).T
-    found = numeric(machine.tip_jacobian(place, motion.joints(time))) @ motion.joint_rates(time)
-    np.testing.assert_allclose(found, [turning[2, 1], turning[0, 2], turning[1, 0], *speed], atol=1e-8)
+    result = numeric(machine.tip_jacobian(place, motion.joints(time))) @ motion.joint_rates(time)
+    np.testing.assert_allclose(result, [turning[2, 1], turning[0, 2], turning[1, 0], *speed], atol=1e-8)
 
 
 @few
@@ -253,7 +253,7 @@ def test_a_quaternion_off_the_unit_sphere_moves_the_same_machine(case: Case, nor
     close(machine.base_rate(scaled, q, rates)[3:], norm * rate[3:], 1e-10)
 
 
-def test_elimination_about_the_center_of_mass_is_the_cheaper_one() -> None:
+def test_elimination_about_the_center_of_mass_takes_fewer_operations() -> None:
     def count(machine: FreeFloating, matrix: Callable[[Any, Any], Any]) -> int:
         variables = [ca.SX.sym("base", machine.base_size), ca.SX.sym("q", machine.joint_size)]
         return int(ca.Function("f", variables, [matrix(*variables)]).n_instructions())
@@ -312,7 +312,7 @@ def test_machines_that_cannot_float_are_refused(robot: Robot, base: Any, message
         FreeFloating(robot, base)
 
 
-def test_point_masses_on_a_bent_arm_have_inertia_enough() -> None:
+def test_point_masses_on_a_folded_arm_have_enough_inertia() -> None:
     links = tuple(Link(name, 1.0, (0.5, 0, 0)) for name in "abc")
     joints = (Joint("j", "revolute", "a", "b", (1, 0, 0)), Joint("k", "revolute", "b", "c", (1, 0, 0)))
     machine = FreeFloating(Robot(links, joints), "spatial")
@@ -348,13 +348,13 @@ def test_a_rigid_body_with_locked_joints_turns_about_its_axis_and_drifts() -> No
 
 
 @pytest.mark.parametrize("name", ["floating manipulator", "panda", "talos"])
-def test_the_momentum_that_is_given_is_that_of_pinocchio(name: str) -> None:
-    package, ending, told = ROBOTS[name]
+def test_the_momentum_equals_that_of_pinocchio(name: str) -> None:
+    package, ending, report = ROBOTS[name]
     path = urdf_file(package, ending)
-    robot = Robot.from_urdf(path, **told)
+    robot = Robot.from_urdf(path, **report)
     peer, rng = Peer.of(path, robot), np.random.default_rng(7)
-    given = rng.normal(size=6)
-    machine = FreeFloating(robot, conserved_momentum=given)
+    options = rng.normal(size=6)
+    machine = FreeFloating(robot, conserved_momentum=options)
     b, q, rates = (ca.SX.sym(n, k) for n, k in (("b", 7), ("q", robot.dof), ("r", robot.dof)))
     moved = ca.Function("f", [b, q, rates], [machine.base_twist(b, q, rates), machine.tip_twist(b, q, rates)])
     frame = peer.model.getFrameId(robot.tip_link)
@@ -364,11 +364,11 @@ def test_the_momentum_that_is_given_is_that_of_pinocchio(name: str) -> None:
         state = replace(state, base_twist=twist)
         configuration, velocity = peer.configuration(state), peer.velocity(state)
         momentum = pinocchio.computeCentroidalMomentum(peer.model, peer.data, configuration, velocity)
-        np.testing.assert_allclose(swapped(np.array(momentum.vector)), given, atol=1e-9)
+        np.testing.assert_allclose(swapped(np.array(momentum.vector)), options, atol=1e-9)
         pinocchio.forwardKinematics(peer.model, peer.data, configuration, velocity)
         world = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        found = pinocchio.getFrameVelocity(peer.model, peer.data, frame, world).vector
-        np.testing.assert_allclose(tip, swapped(np.array(found)), atol=1e-9)
+        result = pinocchio.getFrameVelocity(peer.model, peer.data, frame, world).vector
+        np.testing.assert_allclose(tip, swapped(np.array(result)), atol=1e-9)
 
 
 @pytest.mark.parametrize("momentum", [(1.0, 2.0, 3.0), (np.nan,) * 6, "fast"])

@@ -106,8 +106,8 @@ def test_symbols_of_both_kinds_give_the_numeric_values(symbols: Any, kind: str) 
         return results
 
     variables = [symbols.sym("base", machine.base_size), symbols.sym("q", robot.dof), symbols.sym("rates", robot.dof)]
-    found = ca.Function("f", variables, everything(*variables))(*numbers)
-    for one, other in zip(found, everything(*numbers), strict=True):
+    result = ca.Function("f", variables, everything(*variables))(*numbers)
+    for one, other in zip(result, everything(*numbers), strict=True):
         assert one.shape == other.shape
         np.testing.assert_allclose(numeric(one), numeric(other), atol=1e-12)
 
@@ -142,7 +142,7 @@ FIXED, FLOATING, ONE, TWO, THREE = FixedBase(planar_chain([1.0], [1.0])), paper_
         (lambda: FixedBase(FIXED.robot, rotation=np.ones((3, 3))), r"fixed base: rotation .* not a rotation matrix"),
     ],
 )
-def test_vectors_of_a_wrong_size_and_what_is_no_rotation_are_refused(call: Callable[[], Any], message: str) -> None:
+def test_vectors_of_a_wrong_size_and_invalid_rotations_are_refused(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
         call()
 

@@ -42,7 +42,7 @@ def test_forward_kinematics_are_those_of_the_arm_as_a_tree_of_links(seed: int) -
 
 
 @given(seeds, st.sampled_from(["left", "right"]), st.sampled_from(["inside", "stretched", "folded"]))
-def test_the_inverse_leads_back_to_the_point_with_the_elbow_asked(seed: int, elbow: Any, where: str) -> None:
+def test_the_inverse_leads_back_to_the_point_with_the_requested_elbow(seed: int, elbow: Any, where: str) -> None:
     rng = np.random.default_rng(seed)
     arm = Scara(10 ** rng.uniform(-1, 1), 10 ** rng.uniform(-1, 1), mount=rng.normal(size=3))
     radius = {"inside": rng.uniform(arm.inner, arm.outer), "stretched": arm.outer, "folded": arm.inner}[where]
@@ -76,8 +76,8 @@ def test_the_turn_is_the_smallest_that_brings_a_range_within_its_limits_and_none
     quill = arm.robot.moving_joints[joint].kind == "prismatic"
     turns = [0.0] if quill else sorted((2 * np.pi * k for k in range(-9, 10)), key=abs)
     held = [turn for turn in turns if low[joint] <= least + turn and most + turn <= high[joint]]
-    found = arm.whole_turn(joint, least, most)
-    assert found == (pytest.approx(held[0], abs=1e-12) if held else None)
+    result = arm.whole_turn(joint, least, most)
+    assert result == (pytest.approx(held[0], abs=1e-12) if held else None)
 
 
 @settings(max_examples=40)
@@ -159,7 +159,7 @@ TILTED = Path.through([(0.5, 0, 0), (0.5, 0.2, 0)], [turned((0, 0, 0)), turned((
         (lambda: along((0.5, 0, 0), (0.5, 0.3, 0), (-0.5, -0.3 + 1e-5, 0)), "singular column"),  # between the samples
     ],
 )
-def test_what_the_arm_cannot_do_is_a_named_error(make: Callable[[], Any], message: str) -> None:
+def test_infeasible_targets_of_the_arm_are_named_errors(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
         make()
 

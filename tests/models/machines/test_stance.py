@@ -144,12 +144,12 @@ def test_at_rest_the_center_of_pressure_is_under_the_center_of_mass() -> None:
             assert float(stance.friction_margin(name, loads[name], 0.5)) == pytest.approx((0.5 * stance.weight) ** 2)
 
 
-def test_what_a_sole_bears_does_not_depend_on_where_and_how_it_lies() -> None:
+def test_loads_of_a_sole_do_not_depend_on_its_pose() -> None:
     """A foothold and its load moved and turned together: same pressure, same rooms at the edges and in friction."""
     rng = np.random.default_rng(2)
     steps = talos_steps(1, 1.0, 1.0)
     moment, force = rng.normal(size=3), rng.normal(size=3) + np.array([0.0, 0.0, 5.0])
-    found = []
+    results = []
     for turn, place in ((np.eye(3), np.zeros(3)), random_frame(rng)):
         stance = Stance.on(steps.robot, steps.feet, {"left": Foothold(place, turn)})
         load = ca.DM(np.concatenate([turn @ moment, turn @ force]))
@@ -158,9 +158,9 @@ def test_what_a_sole_bears_does_not_depend_on_where_and_how_it_lies() -> None:
             stance.edge_moments("left", load, 0.01),
             stance.friction_margin("left", load, 0.7),
         )
-        found.append(np.concatenate([numeric(part).ravel() for part in parts]))
-    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
-    assert len(found[0]) == 6  # a rectangle has four edges
+        results.append(np.concatenate([numeric(part).ravel() for part in parts]))
+    np.testing.assert_allclose(results[1], results[0], rtol=0, atol=1e-9)
+    assert len(results[0]) == 6  # a rectangle has four edges
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.8])
@@ -200,7 +200,7 @@ def test_a_sole_tips_about_the_edge_that_the_center_of_pressure_leaves(margin: f
         np.testing.assert_allclose(rooms, np.sort(expected), atol=1e-9)
 
 
-def test_the_hull_of_the_soles_holds_exactly_what_they_can_share() -> None:
+def test_the_hull_of_the_soles_contains_exactly_the_shared_pressure_centers() -> None:
     """A vertical load anywhere in the hull is shared by points of the soles; outside of it by none."""
     feet = planar_feet()
     footholds = {"left": Foothold.level(0.0, 0.0), "right": Foothold.level(0.5, 0.0)}
@@ -223,7 +223,7 @@ def test_the_hull_of_the_soles_holds_exactly_what_they_can_share() -> None:
         assert solver.stats()["success"] is expected
 
 
-def test_what_nothing_stands_on_is_refused_by_name() -> None:
+def test_supports_without_area_are_refused_by_name() -> None:
     robot, feet = planar_biped(), planar_feet()
     with pytest.raises(ModelError, match="no footholds"):
         Stance.on(robot, feet, {})

@@ -61,8 +61,8 @@ def flat(value: Any) -> Array:
     return numeric(value).ravel()
 
 
-def close(found: Any, expected: Any, relative: float = 1e-9, absolute: float = 1e-9) -> None:
-    np.testing.assert_allclose(flat(found), expected, rtol=relative, atol=absolute)
+def close(result: Any, expected: Any, relative: float = 1e-9, absolute: float = 1e-9) -> None:
+    np.testing.assert_allclose(flat(result), expected, rtol=relative, atol=absolute)
 
 
 def pressure_point(reaction: Array) -> Array:
@@ -132,8 +132,8 @@ def test_zmp_ground_force_and_torque_equal_an_independent_library(
     other = robot.links[int(rng.integers(size + 1))].name
     wrenches = [hand(rng, machine), Wrench(other, rng.normal(scale=5, size=3), point=rng.normal(size=3))]
     # the library's root is at its origin: everything in the axes of the foot
-    given = [Wrench(w.link, turn.T @ numeric(w.force), turn.T @ numeric(w.moment), w.point) for w in wrenches]
-    torques, own = library(robot, q, qd, qdd, given, turn.T @ machine.gravity_in_world)
+    rotated = [Wrench(w.link, turn.T @ numeric(w.force), turn.T @ numeric(w.moment), w.point) for w in wrenches]
+    torques, own = library(robot, q, qd, qdd, rotated, turn.T @ machine.gravity_in_world)
     force = turn @ own[3:]
     reaction = np.concatenate([turn @ own[:3] + np.cross(place, force), force])
     close(machine.zero_moment_point(q, qd, qdd, wrenches), pressure_point(reaction))
@@ -213,8 +213,8 @@ def test_the_rows_of_the_zmp_equation_equal_the_hand_form(seed: int, size: int) 
     rows = machine.zmp_rows(q, qd, point)
     close(rows.jacobian, J_m.ravel(), 1e-7)
     close(rows.right, C, 1e-7)
-    for found, plane in zip(rows.hessians, H_m, strict=True):
-        close(found, ((plane + plane.T) / 2).ravel(), 1e-7)
+    for result, plane in zip(rows.hessians, H_m, strict=True):
+        close(result, ((plane + plane.T) / 2).ravel(), 1e-7)
 
 
 @given(cases)
@@ -252,45 +252,45 @@ def test_a_sampled_motion_is_evaluated_point_by_point(case: Case) -> None:
     def external(time: Any, tip: Any) -> list[Wrench]:
         return [machine.tip_wrench(time * ca.DM(pull) - 2 * tip)]
 
-    found = standing_motion(machine, t, q, qd, qdd, external)
+    result = standing_motion(machine, t, q, qd, qdd, external)
     for k in range(4):
         push = t[k] * pull - 2 * flat(machine.tip_pose((), q[k]).position)
         motion = q[k], qd[k], qdd[k], [machine.tip_wrench(push)]
         reaction = flat(machine.ground_reaction(*motion))
         point = flat(center_of_pressure(reaction))
-        close(found.ground_force[k], reaction[3:], 1e-7)
-        close(found.zero_moment_point[k], point)
-        close(machine.stability_index(point), found.index[k], 1e-9, 0)
-        close(machine.joint_torques(*motion), found.joint_torques[k], 1e-7)
-        close(found.external_force[k], push, 1e-7, 1e-12)
+        close(result.ground_force[k], reaction[3:], 1e-7)
+        close(result.zero_moment_point[k], point)
+        close(machine.stability_index(point), result.index[k], 1e-9, 0)
+        close(machine.joint_torques(*motion), result.joint_torques[k], 1e-7)
+        close(result.external_force[k], push, 1e-7, 1e-12)
         inside = bool((point > 0).all() and point.sum() < 1)
-        assert (found.foot_margin[k] > 0) == inside
-    lifted = found.ground_force[:, 2] <= 0
-    assert found.stays_on_ground == (not lifted.any())
-    assert np.isinf(found.friction[lifted]).all()
-    level = np.linalg.norm(found.ground_force[~lifted, :2], axis=1)
-    np.testing.assert_allclose(found.friction[~lifted] * found.ground_force[~lifted, 2], level, rtol=1e-12)
-    assert found.summary()["stands"] == found.stands
-    assert ("DOES NOT STAND" in str(found)) == (not found.stands)
+        assert (result.foot_margin[k] > 0) == inside
+    lifted = result.ground_force[:, 2] <= 0
+    assert result.stays_on_ground == (not lifted.any())
+    assert np.isinf(result.friction[lifted]).all()
+    level = np.linalg.norm(result.ground_force[~lifted, :2], axis=1)
+    np.testing.assert_allclose(result.friction[~lifted] * result.ground_force[~lifted, 2], level, rtol=1e-12)
+    assert result.summary()["stands"] == result.stands
+    assert ("DOES NOT STAND" in str(result)) == (not result.stands)
 
 
 def test_the_joint_limit_index_and_excess_have_their_closed_forms() -> None:
     lower, upper = EXAMPLE.robot.lower, EXAMPLE.robot.upper
     beyond = upper + np.array([0, 0, 0.2, 0, 0])
     q = np.array([lower, upper, (lower + upper) / 2, beyond])
-    found = standing_motion(EXAMPLE, np.arange(4.0), q, 0 * q, 0 * q)
-    np.testing.assert_allclose(found.joint_limit_index[:3], [5 / 4, 5 / 4, 0], atol=1e-12)
-    np.testing.assert_allclose(found.joint_excess[[0, 1, 3]], [0, 0, 0.2], atol=1e-12)
-    assert found.joint_excess[2] < 0
-    assert not found.stays_in_limits
+    result = standing_motion(EXAMPLE, np.arange(4.0), q, 0 * q, 0 * q)
+    np.testing.assert_allclose(result.joint_limit_index[:3], [5 / 4, 5 / 4, 0], atol=1e-12)
+    np.testing.assert_allclose(result.joint_excess[[0, 1, 3]], [0, 0, 0.2], atol=1e-12)
+    assert result.joint_excess[2] < 0
+    assert not result.stays_in_limits
     assert standing_motion(EXAMPLE, np.arange(3.0), q[:3], 0 * q[:3], 0 * q[:3]).stays_in_limits
 
 
 def test_a_joint_without_limits_adds_nothing_to_the_index() -> None:
     free = Standing(planar_chain([1.0, 1.0], [1.0, 1.0]), support=FOOT)
-    found = standing_motion(free, [0.0], [[5.0, -9.0]], [[0.0, 0.0]], [[0.0, 0.0]])
-    assert found.joint_limit_index.tolist() == [0.0]
-    assert found.joint_excess.tolist() == [-np.inf]
+    result = standing_motion(free, [0.0], [[5.0, -9.0]], [[0.0, 0.0]], [[0.0, 0.0]])
+    assert result.joint_limit_index.tolist() == [0.0]
+    assert result.joint_excess.tolist() == [-np.inf]
 
 
 @pytest.mark.parametrize(

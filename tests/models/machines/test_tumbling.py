@@ -31,11 +31,11 @@ def motion(machine: FreeFloating, times: Array) -> Array:
     """Configurations (M, 7), integrated to 1e-12."""
     b = ca.SX.sym("b", 7)
     rate = ca.Function("rate", [b], [machine.base_rate(b, ca.DM(0, 1), ca.DM(0, 1))])
-    found = solve_ivp(
+    result = solve_ivp(
         lambda _, x: np.array(rate(x)).ravel(), (0.0, times[-1]), machine.base_home(), "DOP853", times, rtol=1e-12,
         atol=1e-13,
     )  # fmt: skip
-    return np.asarray(found.y.T)
+    return np.asarray(result.y.T)
 
 
 def test_a_symmetric_body_turns_about_its_momentum_and_its_axis() -> None:
@@ -51,13 +51,13 @@ def test_a_symmetric_body_turns_about_its_momentum_and_its_axis() -> None:
 
 
 def rotation_about(vector: Array | list[float]) -> Array:
-    found = np.zeros(9)
+    result = np.zeros(9)
     quaternion = np.zeros(4)
     angle = float(np.linalg.norm(vector))
     axis = np.asarray(vector, dtype=float) / angle if angle else np.array([1.0, 0.0, 0.0])
     mujoco.mju_axisAngle2Quat(quaternion, axis, angle)
-    mujoco.mju_quat2Mat(found, quaternion)
-    return found.reshape(3, 3)
+    mujoco.mju_quat2Mat(result, quaternion)
+    return result.reshape(3, 3)
 
 
 def test_spin_follows_euler_and_keeps_energy_and_momentum() -> None:
@@ -72,10 +72,10 @@ def test_spin_follows_euler_and_keeps_energy_and_momentum() -> None:
     for configuration, spin in zip(motion(machine, times), euler.y.T, strict=True):
         rate = np.array(ca.DM(machine.base_rate(configuration, (), ()))).ravel()
         turn = np.array(ca.DM(machine.world_from_base(configuration).rotation))
-        found = turn.T @ np.array(ca.DM(angular_velocity_from_quaternion(configuration[3:], rate[3:]))).ravel()
-        assert found == pytest.approx(spin, abs=1e-9)
-        assert turn @ INERTIA @ found == pytest.approx(momentum, abs=1e-9)
-        assert found @ INERTIA @ found == pytest.approx(SPIN @ INERTIA @ SPIN, abs=1e-9)
+        result = turn.T @ np.array(ca.DM(angular_velocity_from_quaternion(configuration[3:], rate[3:]))).ravel()
+        assert result == pytest.approx(spin, abs=1e-9)
+        assert turn @ INERTIA @ result == pytest.approx(momentum, abs=1e-9)
+        assert result @ INERTIA @ result == pytest.approx(SPIN @ INERTIA @ SPIN, abs=1e-9)
 
 
 def test_a_body_tumbles_as_in_mujoco() -> None:
@@ -95,7 +95,7 @@ def test_a_body_tumbles_as_in_mujoco() -> None:
     assert tip[:3] == pytest.approx(data.xmat[1].reshape(3, 3) @ data.qvel[3:], abs=1e-8)
 
 
-def test_what_has_no_joints_is_asked_for_none() -> None:
+def test_bodies_without_joints_need_no_joint_positions() -> None:
     machine = body()
     task = TipTask(position=(0.5, 0.0, 0.1))
     for ask in (

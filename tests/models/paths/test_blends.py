@@ -56,11 +56,11 @@ def test_lengths_over_the_remaining_distance_are_the_numbers_checked(
     assert corner(degrees, 0.15, "cubic", shape).blend(0).length / 0.15 == pytest.approx(length, abs=5e-5)
 
 
-def test_a_way_from_rest_to_rest_begins_and_ends_without_speed_and_acceleration() -> None:
+def test_a_blend_from_rest_to_rest_has_zero_end_velocity_and_acceleration() -> None:
     s = ca.SX.sym("s")
-    way = rest_to_rest(s)
-    speed = ca.jacobian(way, s)
-    function = ca.Function("f", [s], [way, speed, ca.jacobian(speed, s)])
+    path = rest_to_rest(s)
+    speed = ca.jacobian(path, s)
+    function = ca.Function("f", [s], [path, speed, ca.jacobian(speed, s)])
     assert [float(value) for value in function(0.0)] == [0.0, 0.0, 0.0]
     assert [float(value) for value in function(1.0)] == pytest.approx([1.0, 0.0, 0.0], abs=1e-14)
     assert rest_to_rest(np.array([0.0, 0.5, 1.0])) == pytest.approx([0.0, 0.5, 1.0])
@@ -97,11 +97,11 @@ def test_arc_length_and_its_inverse_agree_with_adaptive_quadrature(degrees: floa
 def test_a_step_towards_an_arc_length_cubes_the_error(
     degrees: float, kind: str, shape: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, found = corner(degrees, 0.3, kind, shape), list[Any]()
+    path, result = corner(degrees, 0.3, kind, shape), list[Any]()
     for steps in (0, 1, 4):
         monkeypatch.setattr("models.paths.blends.MAX_STEPS", steps)
-        found.append(path.parameter(path.sample_distances(40)))
-    before, after = (np.nanmax(np.abs(each - found[2])) for each in found[:2])
+        result.append(path.parameter(path.sample_distances(40)))
+    before, after = (np.nanmax(np.abs(each - result[2])) for each in result[:2])
     assert 1e-4 < before < 1e-2
     assert after < before**2.5
 
@@ -182,7 +182,7 @@ def test_derivatives_by_the_distance_are_those_of_the_position(seed: int, count:
 
 @few
 @given(seeds)
-def test_every_bound_of_a_long_path_belongs_to_the_piece_that_begins_there(seed: int) -> None:
+def test_at_segment_bounds_a_long_path_evaluates_the_following_segment(seed: int) -> None:
     smoothed = smooth(random_path(np.random.default_rng(seed), 25, arcs=0.2, helices=0.2), 0.01)
     at_bounds = smoothed.at(smoothed.bounds).position
     gaps = np.linalg.norm(np.diff(at_bounds, axis=0), axis=1)
@@ -195,12 +195,12 @@ def test_blends_that_overlap_are_shrunk_to_meet_or_refused() -> None:
     points = [(0, 0, 0), (1, 0, 0), (1, 0.3, 0), (2, 0.3, 0)]
     smoothed = smooth(Path.through(points), 0.2)
     assert smoothed.remaining == pytest.approx([0.15, 0.15], rel=1e-15)
-    with pytest.warns(ModelWarning, match=r"than requested at vertices 1, 2; at vertex 1 0\.15 of 0\.2 m") as said:
+    with pytest.warns(ModelWarning, match=r"than requested at vertices 1, 2; at vertex 1 0\.15 of 0\.2 m") as message:
         smooth(Path.through(points), 0.2)
-    assert [(each.message.name, each.message.value) for each in said] == [("vertex 1", (1, 2))]  # type: ignore[union-attr]
-    with pytest.warns(ModelWarning, match=r"at vertices 3, 4; at vertex 3 0.025 of 0.03 m") as said:
+    assert [(each.message.name, each.message.value) for each in message] == [("vertex 1", (1, 2))]  # type: ignore[union-attr]
+    with pytest.warns(ModelWarning, match=r"at vertices 3, 4; at vertex 3 0.025 of 0.03 m") as message:
         smooth(Path.through([*points, (2, 0.35, 0), (3, 0.35, 0)]), [0.05, 0.1, 0.03, 0.03])
-    assert said[0].message.value == (3, 4)  # type: ignore[union-attr]
+    assert message[0].message.value == (3, 4)  # type: ignore[union-attr]
     assert len(smoothed.piece_lengths) == 4  # nothing is left of the middle segment
     assert smooth(Path.through(points), [0.2, 0.1]).remaining == pytest.approx([0.2, 0.1], rel=1e-15)
     with pytest.raises(ModelError, match=r"segment 1, 0\.3 m long"):
@@ -234,7 +234,7 @@ CORNER = Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)])
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("requested", "message"),
     [
         ({}, "either"),
         ({"remaining": 0.1, "deviation": 0.1}, "either"),
@@ -252,13 +252,13 @@ CORNER = Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)])
         ({"remaining": 0.1, "shape": [1.0, 2.0]}, "each of the 1 vertices"),
     ],
 )
-def test_a_blend_that_cannot_be_is_a_named_error(asked: dict[str, Any], message: str) -> None:
+def test_a_blend_that_cannot_be_is_a_named_error(requested: dict[str, Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        smooth(CORNER, **asked)
+        smooth(CORNER, **requested)
 
 
 @pytest.mark.parametrize("bad", [(0.0, 1.0), (3.0, 0.0), (3.0, 4.0), (3.0, float("nan"))])
-def test_closed_forms_refuse_what_is_no_corner(bad: tuple[float, float]) -> None:
+def test_closed_forms_refuse_invalid_corners(bad: tuple[float, float]) -> None:
     with pytest.raises(ModelError, match=r"corner: .* (must be positive and finite|is above pi)"):
         gamma(*bad)
 

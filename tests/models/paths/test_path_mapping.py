@@ -55,10 +55,10 @@ def inside(blend: Blend, plan: SpeedProfile, period: float) -> NDArray[np.float6
 def test_the_papers_mapping_errs_as_checked(period: float, drift: float, true: float, chord: float) -> None:
     blend = right_angle(150 * MM)
     distances = np.arange(1, int(blend.length / period) + 1) * period
-    found = errors(predictor_corrector(), blend, distances, period)
-    assert abs(found[0]) == pytest.approx(drift, rel=5e-3)
-    assert found[1] == pytest.approx(true, abs=6e-3)
-    assert found[2] == pytest.approx(chord, abs=6e-3)
+    result = errors(predictor_corrector(), blend, distances, period)
+    assert abs(result[0]) == pytest.approx(drift, rel=5e-3)
+    assert result[1] == pytest.approx(true, abs=6e-3)
+    assert result[2] == pytest.approx(chord, abs=6e-3)
 
 
 def test_the_examples_worst_speed_error_is_that_printed_for_one_mapping_and_none_for_the_other() -> None:
@@ -158,8 +158,8 @@ def test_the_path_as_a_function_is_the_path(seed: int) -> None:
     s = np.concatenate([path.bounds, rng.uniform(0, path.length, 100)])
     for function, expected in ((path_function(path), path.at(s)), (turn_function(path), path.turn(s))):
         for value, known in zip(function.map(len(s))(s[None]), expected, strict=True):
-            found = np.array(value).T
-            assert found == pytest.approx(known, abs=1e-9 * (1 + np.abs(known).max()))
+            result = np.array(value).T
+            assert result == pytest.approx(known, abs=1e-9 * (1 + np.abs(known).max()))
     ends = path.at([0.0, path.length]).position
     for s_off, end in ((-1.0, ends[0]), (path.length + 1, ends[1])):
         assert np.array(path_function(path)(s_off)[0]).ravel() == pytest.approx(end, abs=1e-12)

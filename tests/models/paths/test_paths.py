@@ -54,7 +54,7 @@ def test_a_path_with_a_gap_is_a_named_error() -> None:
 
 
 @pytest.mark.parametrize("twice", [0, 1, 2])
-def test_a_point_given_twice_is_named_by_its_number(twice: int) -> None:
+def test_a_repeated_point_is_named_by_its_number(twice: int) -> None:
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0]])
     with pytest.raises(ModelError, match=rf"points\[{twice}\] to points\[{twice + 1}\]: .*length 0") as caught:
         Path.through(np.insert(points, twice, points[twice], axis=0))

@@ -197,6 +197,6 @@ TILTED = turned((1.0, 0, 0))
         (lambda: Path.through("points"), "not numeric"),
     ],
 )
-def test_what_is_no_path_is_a_named_error(make: Callable[[], Any], message: str) -> None:
+def test_invalid_paths_are_named_errors(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
         make()

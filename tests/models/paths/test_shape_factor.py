@@ -68,12 +68,12 @@ def test_a_tangent_joint_of_line_and_arc_permits_the_speed_of_the_arc(how: str, 
         back = Arc.about(arc.end, arc.center, -np.asarray(arc.axis), 1.8)
         segments = (back, Line((0, 0, 0), (-1, 0, 0)))
     remaining = radius * np.radians(degrees) / 2
-    asked: dict[str, Any] = {"remaining": remaining}
+    request: dict[str, Any] = {"remaining": remaining}
     if how == "deviation":
-        asked = {"deviation": remaining**2 / radius / 8}
-    path = smooth(Path(segments), **asked)
+        request = {"deviation": remaining**2 / radius / 8}
+    path = smooth(Path(segments), **request)
     assert (1 / radius / peaks(path)[0]) ** 0.5 >= 0.99
-    old = smooth(Path(segments), **asked, shape=1.5)
+    old = smooth(Path(segments), **request, shape=1.5)
     assert (1 / radius / peaks(old)[0]) ** 0.5 == pytest.approx(0.79, abs=5e-3)
 
 

@@ -56,7 +56,7 @@ def test_orientation_rate_and_acceleration_are_continuous_through_blends(seed: i
 
 
 @given(seeds)
-def test_a_segment_turns_the_tool_evenly_the_shorter_way(seed: int) -> None:
+def test_a_segment_rotates_the_tool_uniformly_by_the_smaller_angle(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first, vector = turned(rng.normal(size=3)), rng.normal(size=3)
     vector *= rng.uniform(0, 3) / np.linalg.norm(vector)
@@ -70,7 +70,7 @@ def test_a_segment_turns_the_tool_evenly_the_shorter_way(seed: int) -> None:
     assert rotation_vector(first, last) == pytest.approx(vector, abs=1e-12)
 
 
-def test_a_tool_that_does_not_turn_keeps_what_it_was_given() -> None:
+def test_a_tool_without_rotation_keeps_its_orientation() -> None:
     tool = turned((0.3, -0.2, 0.9))
     path = smooth(Path((Line((0, 0, 0), (1, 0, 0), tool), Line((1, 0, 0), (1, 1, 0)))), 0.1)
     turn = path.turn(np.linspace(0, path.length, 9))

@@ -31,11 +31,11 @@ CLEARLY = 0.05
 """Relative error above which a formula is wrong, not inaccurate."""
 
 
-def error(found: Any, expected: Any) -> float:
+def error(result: Any, expected: Any) -> float:
     """Greatest difference relative to the greatest entry expected."""
-    found, expected = np.asarray(found), np.asarray(expected)
-    assert found.shape == expected.shape
-    return float(np.abs(found - expected).max() / np.abs(expected).max())
+    result, expected = np.asarray(result), np.asarray(expected)
+    assert result.shape == expected.shape
+    return float(np.abs(result - expected).max() / np.abs(expected).max())
 
 
 def serial_robot(rng: np.random.Generator, size: int, base: Base = "spatial") -> Robot:
@@ -133,8 +133,8 @@ def make_case(machine: FreeFloating, rows: list[int], rng: np.random.Generator) 
     system = ca.vertcat(ca.horzcat(ca.MX.eye(size), G.T), ca.horzcat(G, ca.MX(len(rows), len(rows))))
     rates = ca.solve(system, ca.vertcat(-weight, v))[:size]
     least = ca.dot(rates, rates) / 2 + ca.dot(weight, rates)
-    given = ca.mtimes(Gamma, u) + Phi
-    at_control = ca.dot(given, given) / 2 + ca.dot(weight, given)
+    options = ca.mtimes(Gamma, u) + Phi
+    at_control = ca.dot(options, options) / 2 + ca.dot(weight, options)
     principle = ca.Function("principle", [xs, lam, v], [least, -weight, G, Gamma, Phi, rates])
     derivatives = ca.Function(
         "derivatives",

@@ -65,9 +65,9 @@ def mujoco_model(
         return " ".join(repr(float(value)) for value in np.ravel(values))
 
     def quaternion(matrix: Array) -> Array:
-        found = np.zeros(4)
-        mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix).ravel())
-        return found
+        result = np.zeros(4)
+        mujoco.mju_mat2Quat(result, np.ascontiguousarray(matrix).ravel())
+        return result
 
     def body(name: str, head: str) -> str:
         link = robot.link(name)
@@ -104,12 +104,12 @@ def mujoco_dynamics(
     needed = np.array(data.qfrc_inverse)
     poses = numeric_poses(robot, q)
     for wrench in wrenches:
-        given = np.zeros(model.nv)
+        options = np.zeros(model.nv)
         turn, position = poses[wrench.link]
         point = position + turn @ np.array(wrench.point).ravel()
         body = model.body(wrench.link).id
         mujoco.mj_applyFT(
-            model, data, np.array(wrench.force).ravel(), np.array(wrench.moment).ravel(), point, body, given
+            model, data, np.array(wrench.force).ravel(), np.array(wrench.moment).ravel(), point, body, options
         )
-        needed -= given
+        needed -= options
     return needed[order], np.concatenate([needed[3:6], needed[0:3]])

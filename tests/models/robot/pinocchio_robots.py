@@ -41,8 +41,8 @@ def collection() -> list[Path]:
 def urdf_file(package: str, ending: str) -> Path:
     """A file of an installed distribution."""
     owner = distribution(package)
-    (found,) = (file for file in owner.files or [] if file.as_posix().endswith("/" + ending) or str(file) == ending)
-    return Path(str(owner.locate_file(found)))
+    (result,) = (file for file in owner.files or [] if file.as_posix().endswith("/" + ending) or str(file) == ending)
+    return Path(str(owner.locate_file(result)))
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,11 @@ class Peer:
         return [joint.idx_v for joint in self._joints]
 
     def configuration(self, state: State) -> Array:
-        found = np.zeros(self.model.nq)
-        found[:7] = np.concatenate([state.position, Rotation.from_matrix(state.rotation).as_quat()])
+        result = np.zeros(self.model.nq)
+        result[:7] = np.concatenate([state.position, Rotation.from_matrix(state.rotation).as_quat()])
         for joint, value in zip(self._joints, state.q, strict=True):
-            found[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-        return found
+            result[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+        return result
 
     def base_columns(self, state: State) -> Array:
         """Base twist, ours, to the first six of Pinocchio's velocities, which are in the axes of the base."""
@@ -127,19 +127,19 @@ class Peer:
         return np.block([[zero, turn], [turn, zero]])
 
     def velocity(self, state: State) -> Array:
-        found = np.zeros(self.model.nv)
-        found[:6] = self.base_columns(state) @ state.base_twist
-        found[self.columns] = state.qd
-        return found
+        result = np.zeros(self.model.nv)
+        result[:6] = self.base_columns(state) @ state.base_twist
+        result[self.columns] = state.qd
+        return result
 
     def acceleration(self, state: State) -> Array:
         """That of Pinocchio is spatial: the derivative of the velocity of the point that passes the origin."""
         turning, moving = state.base_acceleration[:3], state.base_acceleration[3:]
         passing = moving - np.cross(state.base_twist[:3], state.base_twist[3:])
-        found = np.zeros(self.model.nv)
-        found[:6] = self.base_columns(state) @ np.concatenate([turning, passing])
-        found[self.columns] = state.qdd
-        return found
+        result = np.zeros(self.model.nv)
+        result[:6] = self.base_columns(state) @ np.concatenate([turning, passing])
+        result[self.columns] = state.qdd
+        return result
 
     def in_our_columns(self, matrix: Array, state: State) -> tuple[Array, Array]:
         """(per base twist, per joint rate) of a matrix that Pinocchio has per its own velocities."""

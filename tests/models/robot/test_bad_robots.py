@@ -254,7 +254,7 @@ CASES = [*PARTS, *REBUILT, *MOTIONS]
 
 
 @pytest.mark.parametrize("case", good_calls(CASES))
-def test_what_is_good_is_taken(case: Case) -> None:
+def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 

@@ -107,7 +107,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("case", good_calls([OPTIONS]))
-def test_what_is_good_is_taken(case: Case) -> None:
+def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 

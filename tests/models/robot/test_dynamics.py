@@ -70,8 +70,8 @@ def test_torques_and_reaction_equal_those_of_an_independent_library(
     np.testing.assert_allclose(
         numeric(inverse_dynamics(robot, q, qd, qdd, wrenches, gravity)).ravel(), torques, rtol=0, atol=LIBRARY
     )
-    found = numeric(base_reaction(robot, q, qd, qdd, wrenches, gravity)).ravel()
-    np.testing.assert_allclose(found, reaction, rtol=0, atol=LIBRARY)
+    result = numeric(base_reaction(robot, q, qd, qdd, wrenches, gravity)).ravel()
+    np.testing.assert_allclose(result, reaction, rtol=0, atol=LIBRARY)
 
 
 @given(seeds, st.integers(1, 6), bases)
@@ -95,8 +95,8 @@ def test_power_of_the_torques_and_wrenches_is_the_rate_of_energy(seed: int, size
     wrench = hand_wrench(rng, robot.tip_link)
     torques = inverse_dynamics(robot, q, qd, qdd, [wrench], gravity, placement)
     jacobian = frame_jacobian(robot, q, wrench.link, wrench.point, placement)
-    given = ca.dot(ca.vertcat(wrench.moment, wrench.force), ca.mtimes(jacobian, qd))
-    balance = ca.Function("balance", [q, qd, qdd], [along(energy, q, qd, qdd), ca.dot(qd, torques) + given])
+    power = ca.dot(ca.vertcat(wrench.moment, wrench.force), ca.mtimes(jacobian, qd))
+    balance = ca.Function("balance", [q, qd, qdd], [along(energy, q, qd, qdd), ca.dot(qd, torques) + power])
     rate, power = (float(value) for value in balance(*random_motion(rng, robot.dof)))
     assert rate == pytest.approx(power, rel=1e-9, abs=1e-8)
 
@@ -113,9 +113,9 @@ def test_momentum_its_rate_and_the_centre_of_mass_follow_from_the_frames(seed: i
     center = center_of_mass(robot, q, placement)
     expected = [truth, along(truth, q, qd, qdd), center, directional(center, q, qd)]
     expected.append(along(expected[3], q, qd, qdd))
-    found = [momentum(robot, q, qd, about, placement), momentum_rate(robot, q, qd, qdd, about, placement)]
-    found += center_of_mass_motion(robot, q, qd, qdd, placement)
-    function = ca.Function("both", [q, qd, qdd], [*expected, *found])
+    results = [momentum(robot, q, qd, about, placement), momentum_rate(robot, q, qd, qdd, about, placement)]
+    results += center_of_mass_motion(robot, q, qd, qdd, placement)
+    function = ca.Function("both", [q, qd, qdd], [*expected, *results])
     values = [numeric(value) for value in function(*random_motion(rng, robot.dof))]
     for truth_value, value in zip(values[:5], values[5:], strict=True):
         np.testing.assert_allclose(value, truth_value, rtol=1e-9, atol=1e-9)
@@ -143,8 +143,8 @@ def test_link_motions_are_the_derivatives_of_the_link_frames(seed: int, size: in
         pairs.append((motion.center, center))
     function = ca.Function("pairs", [q, qd, qdd], [ca.densify(part) for pair in pairs for part in pair])
     values = [numeric(value) for value in function(*random_motion(rng, robot.dof))]
-    for found, expected in zip(values[::2], values[1::2], strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    for result, expected in zip(values[::2], values[1::2], strict=True):
+        np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-9)
 
 
 @given(seeds, st.integers(1, 6))
@@ -158,8 +158,8 @@ def test_the_reaction_is_the_rate_of_momentum_less_weight_and_wrenches(seed: int
     weight = robot.total_mass * np.concatenate([np.cross(center, gravity), gravity])
     outside = numeric(external_wrench(robot, motion[0], [wrench], placement)).ravel()
     expected = numeric(momentum_rate(robot, *motion, world_from_base=placement)).ravel() - weight - outside
-    found = numeric(base_reaction(robot, *motion, [wrench], gravity, placement)).ravel()
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
+    result = numeric(base_reaction(robot, *motion, [wrench], gravity, placement)).ravel()
+    np.testing.assert_allclose(result, expected, rtol=1e-10, atol=1e-10)
 
 
 @given(seeds, st.integers(1, 6))
@@ -213,7 +213,7 @@ def test_a_planar_machine_keeps_its_structural_zeros() -> None:
         ({"base_acceleration": np.zeros(3)}, r"base_acceleration has shape \(3, 1\), expected \(6, 1\)"),
     ],
 )
-def test_what_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> None:
+def test_arguments_that_do_not_fit_are_refused(changes: dict[str, Any], message: str) -> None:
     arguments: dict[str, Any] = {"q": np.zeros(2), "qd": np.zeros(2), "qdd": np.zeros(2), **changes}
     for function in (inverse_dynamics, base_reaction):
         with refused(message):

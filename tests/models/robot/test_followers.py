@@ -69,8 +69,8 @@ def test_a_robot_with_followers_is_the_free_one_restricted_to_the_ties(seed: int
     about = rng.normal(size=3)
 
     def agree(function: Any, change: Any = lambda value: value) -> None:
-        found, expected = function(robot, *own), change(numeric(function(free, *all_of)))
-        np.testing.assert_allclose(numeric(found), expected, **NEAR)
+        result, expected = function(robot, *own), change(numeric(function(free, *all_of)))
+        np.testing.assert_allclose(numeric(result), expected, **NEAR)
 
     for columns in (tip_jacobian, momentum_matrix, center_of_mass_jacobian):
         agree(lambda r, q, *_, f=columns: f(r, q, place), lambda value: value @ A)
@@ -138,7 +138,7 @@ def test_followers_are_locked_where_the_joint_that_they_follow_is(seed: int, siz
 
 @few
 @given(seeds, sizes)
-def test_what_is_cut_off_leaves_the_others_tied_to_each_other(seed: int, size: int) -> None:
+def test_a_truncated_tree_keeps_its_remaining_couplings(seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, size, followers=True)
     other = robot.links[int(rng.integers(len(robot.links)))].name

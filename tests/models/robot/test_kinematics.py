@@ -80,15 +80,15 @@ def test_jacobian_of_any_link_point_is_the_derivative_of_its_frame(seed: int, si
     world_from_base, point = random_frame(rng), rng.normal(size=3)
     q, rates = ca.SX.sym("q", robot.dof), ca.SX.sym("rates", robot.dof)
     frames = link_frames(robot, q, world_from_base)
-    found, expected = [], []
+    result, expected = [], []
     for link in robot.links:
         frame = frames[link.name]
-        found.append(ca.mtimes(frame_jacobian(robot, q, link.name, point, world_from_base), rates))
+        result.append(ca.mtimes(frame_jacobian(robot, q, link.name, point, world_from_base), rates))
         expected.append(twist_by_differentiation(frame.rotation, frame.point(point), q, rates))
     tip = tip_pose(robot, q, world_from_base)
-    found.append(ca.mtimes(tip_jacobian(robot, q, world_from_base), rates))
+    result.append(ca.mtimes(tip_jacobian(robot, q, world_from_base), rates))
     expected.append(twist_by_differentiation(tip.rotation, tip.position, q, rates))
-    error = ca.Function("f", [q, rates], [ca.horzcat(*found) - ca.horzcat(*expected)])
+    error = ca.Function("f", [q, rates], [ca.horzcat(*result) - ca.horzcat(*expected)])
     np.testing.assert_allclose(numeric(error(rng.normal(size=robot.dof), rng.normal(size=robot.dof))), 0, atol=1e-12)
 
 
@@ -116,8 +116,8 @@ def test_momentum_matrix_is_the_sum_over_the_links(seed: int, size: int, base: B
     world_from_base = random_frame(rng)
     q, rates = ca.SX.sym("q", robot.dof), ca.SX.sym("rates", robot.dof)
     expected = momentum_by_differentiation(robot, link_frames(robot, q, world_from_base), q, rates)
-    found = ca.mtimes(momentum_matrix(robot, q, world_from_base), rates)
-    error = ca.Function("f", [q, rates], [found - expected])
+    result = ca.mtimes(momentum_matrix(robot, q, world_from_base), rates)
+    error = ca.Function("f", [q, rates], [result - expected])
     np.testing.assert_allclose(numeric(error(rng.normal(size=robot.dof), rng.normal(size=robot.dof))), 0, atol=1e-11)
 
 
@@ -132,9 +132,9 @@ def test_center_of_mass_is_the_weighted_mean_and_its_jacobian_its_derivative(see
     centers = centers_of_mass(robot, point, world_from_base)
     mean = sum(link.mass * numeric(centers[link.name]) for link in robot.links) / robot.total_mass
     np.testing.assert_allclose(numeric(center_of_mass(robot, point, world_from_base)), mean, atol=1e-13)
-    found = ca.mtimes(center_of_mass_jacobian(robot, q, world_from_base), rates)
+    result = ca.mtimes(center_of_mass_jacobian(robot, q, world_from_base), rates)
     expected = directional(center_of_mass(robot, q, world_from_base), q, rates)
-    error = ca.Function("f", [q, rates], [found - expected])
+    error = ca.Function("f", [q, rates], [result - expected])
     np.testing.assert_allclose(numeric(error(point, rng.normal(size=robot.dof))), 0, atol=1e-12)
 
 

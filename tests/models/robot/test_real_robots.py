@@ -57,16 +57,16 @@ def mapped(outputs: list[Any], inputs: list[Any], values: list[list[Any]]) -> li
     """The outputs at all states, by one call of a mapped function. One list for each state."""
     function = ca.Function("f", inputs, [ca.densify(each) for each in outputs])
     columns = [ca.DM(np.array(column).reshape(len(values), -1).T) for column in zip(*values, strict=True)]
-    found = [np.array(each) for each in function.map(len(values)).call(columns)]
-    split = [np.hsplit(each, len(values)) for each in found]
+    matches = [np.array(each) for each in function.map(len(values)).call(columns)]
+    split = [np.hsplit(each, len(values)) for each in matches]
     return [list(each) for each in zip(*split, strict=True)]
 
 
-def assert_close(found: Array, expected: Array) -> None:
+def assert_close(result: Array, expected: Array) -> None:
     """To 1e-10 of the greatest entry."""
     expected = np.asarray(expected)
     scale = float(np.abs(expected).max(initial=0.0))
-    np.testing.assert_allclose(found.reshape(expected.shape), expected, rtol=0, atol=RELATIVE * scale)
+    np.testing.assert_allclose(result.reshape(expected.shape), expected, rtol=0, atol=RELATIVE * scale)
 
 
 REFUSED = {
@@ -194,20 +194,20 @@ def test_centre_of_mass_and_centroidal_momentum(case: Case) -> None:
     locked, joints = machine.momentum_matrices(base, q)
     outputs = [locked, joints, center, center_of_mass_jacobian(robot, q, frame), momentum_matrix(robot, q, frame)]
     values = [[s.base, s.q] for s in case.states]
-    for state, found in zip(case.states, mapped(outputs, [base, q], values), strict=True):
+    for state, result in zip(case.states, mapped(outputs, [base, q], values), strict=True):
         configuration = peer.configuration(state)
         about = swapped(pinocchio.computeCentroidalMap(peer.model, peer.data, configuration))
         middle = pinocchio.centerOfMass(peer.model, peer.data, configuration)
         motion = pinocchio.jacobianCenterOfMass(peer.model, peer.data, configuration)
-        assert_close(found[2], middle)
-        assert_close(found[3], motion[:, peer.columns])
-        assert_close(found[4], found[1])
+        assert_close(result[2], middle)
+        assert_close(result[3], motion[:, peer.columns])
+        assert_close(result[4], result[1])
         to_center = np.eye(6)
         to_center[:3, 3:] = np.cross(np.eye(3), middle).T  # L_c = L - c x P
-        for ours, theirs in zip(found[:2], peer.in_our_columns(about, state), strict=True):
+        for ours, theirs in zip(result[:2], peer.in_our_columns(about, state), strict=True):
             assert_close(to_center @ ours, theirs)
         momentum = pinocchio.computeCentroidalMomentum(peer.model, peer.data, configuration, peer.velocity(state))
-        assert_close(to_center @ (found[0] @ state.base_twist + found[1] @ state.qd), swapped(momentum.vector))
+        assert_close(to_center @ (result[0] @ state.base_twist + result[1] @ state.qd), swapped(momentum.vector))
 
 
 @pytest.mark.parametrize("fewer", [False, True], ids=["as given", "simplified"])
@@ -219,7 +219,7 @@ def test_generalized_jacobian_from_the_joint_space_inertia(case: Case, fewer: bo
     outputs = [machine.tip_jacobian(base, q), machine.base_twist(base, q, rates), machine.tip_twist(base, q, rates)]
     values = [[s.base, s.q, s.qd] for s in case.states]
     tip = bodies(peer)[robot.tip_link]
-    for state, found in zip(case.states, mapped(outputs, [base, q, rates], values), strict=True):
+    for state, result in zip(case.states, mapped(outputs, [base, q, rates], values), strict=True):
         configuration = peer.configuration(state)
         inertia = pinocchio.crba(peer.model, peer.data, configuration)
         inertia = np.triu(inertia) + np.triu(inertia, 1).T
@@ -230,9 +230,9 @@ def test_generalized_jacobian_from_the_joint_space_inertia(case: Case, fewer: bo
         reaction = -np.linalg.solve(inertia[:6, :6], inertia[:6, peer.columns])
         expected = jacobian[:, peer.columns] + jacobian[:, :6] @ reaction
         turning = np.linalg.inv(peer.base_columns(state)) @ reaction @ state.qd
-        assert_close(found[0], expected)
-        assert_close(found[1], turning)
-        assert_close(found[2], expected @ state.qd)
+        assert_close(result[0], expected)
+        assert_close(result[1], turning)
+        assert_close(result[2], expected @ state.qd)
 
 
 def test_inverse_dynamics_on_a_fixed_and_on_a_moving_base(case: Case) -> None:
@@ -249,17 +249,17 @@ def test_inverse_dynamics_on_a_fixed_and_on_a_moving_base(case: Case) -> None:
     inputs = [q, qd, qdd, position, ca.vec(turn), twist, push]
     values = [[s.q, s.qd, s.qdd, s.position, s.rotation.T, s.base_twist, s.base_acceleration] for s in case.states]
     peer.model.gravity.linear = np.array([0.0, 0.0, -9.81])
-    for state, found in zip(case.states, mapped(outputs, inputs, values), strict=True):
+    for state, result in zip(case.states, mapped(outputs, inputs, values), strict=True):
         configuration, velocity = peer.configuration(state), peer.velocity(state)
         acceleration = peer.acceleration(state)
         efforts = pinocchio.rnea(peer.model, peer.data, configuration, velocity, acceleration).copy()
         drive = peer.base_columns(state).T @ efforts[:6]  # about the root frame's origin
         drive[:3] += np.cross(state.position, drive[3:])
-        assert_close(found[1], efforts[peer.columns])
-        assert_close(found[2], drive)
+        assert_close(result[1], efforts[peer.columns])
+        assert_close(result[2], drive)
         velocity[:6] = acceleration[:6] = 0.0
         efforts = pinocchio.rnea(peer.model, peer.data, configuration, velocity, acceleration)
-        assert_close(found[0], efforts[peer.columns])
+        assert_close(result[0], efforts[peer.columns])
 
 
 def test_single_frames_and_numbers_do_as_well_as_all_of_them(case: Case) -> None:

@@ -58,9 +58,9 @@ def real_robot(name: str) -> Robot:
 
 def matrix(pose: tuple[Any, Any]) -> Array:
     """Homogeneous transform of a pose."""
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = numeric(pose[0]), numeric(pose[1]).ravel()
-    return found
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = numeric(pose[0]), numeric(pose[1]).ravel()
+    return result
 
 
 def dynamics(robot: Robot, rng: np.random.Generator, place: Any) -> list[Array]:
@@ -68,21 +68,21 @@ def dynamics(robot: Robot, rng: np.random.Generator, place: Any) -> list[Array]:
     q, qd, qdd = (rng.normal(size=robot.dof) for _ in range(3))
     motion, push = rng.normal(size=6), rng.normal(size=6)
     moving: Any = {"world_from_base": place, "base_twist": motion, "base_acceleration": push}
-    found = [robot_inertia(robot, q, place), momentum_matrix(robot, q, place), *tip_pose(robot, q, place)]
-    found += [tip_jacobian(robot, q, place), inverse_dynamics(robot, q, qd, qdd, **moving)]
-    return [numeric(each) for each in (*found, base_reaction(robot, q, qd, qdd, **moving))]
+    results = [robot_inertia(robot, q, place), momentum_matrix(robot, q, place), *tip_pose(robot, q, place)]
+    results += [tip_jacobian(robot, q, place), inverse_dynamics(robot, q, qd, qdd, **moving)]
+    return [numeric(each) for each in (*results, base_reaction(robot, q, qd, qdd, **moving))]
 
 
 def assert_same_dynamics(robot: Robot, other: Robot, seed: int) -> None:
     place = random_frame(np.random.default_rng(seed))
     both = (dynamics(each, np.random.default_rng(seed), place) for each in (robot, other))
-    for found, expected in zip(*both, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10 * max(1.0, np.abs(expected).max(initial=0)))
+    for result, expected in zip(*both, strict=True):
+        np.testing.assert_allclose(result, expected, rtol=1e-10, atol=1e-10 * max(1.0, np.abs(expected).max(initial=0)))
 
 
 @given(seeds, st.integers(2, 9))
 @few
-def test_locked_joints_stand_where_they_are_told_and_the_others_feel_no_difference(seed: int, size: int) -> None:
+def test_locking_joints_preserves_the_dynamics_of_the_other_joints(seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, size)
     q, qd, qdd = (rng.normal(size=robot.dof) for _ in range(3))
@@ -94,8 +94,8 @@ def test_locked_joints_stand_where_they_are_told_and_the_others_feel_no_differen
     for name, pose in numeric_poses(robot, q).items():
         np.testing.assert_allclose(matrix(numeric_poses(fewer, q[~held])[name]), matrix(pose), **NEAR)
     torques = numeric(inverse_dynamics(robot, q, qd, qdd)).ravel()
-    found = numeric(inverse_dynamics(fewer, q[~held], qd[~held], qdd[~held])).ravel()
-    np.testing.assert_allclose(found, torques[~held], **NEAR)
+    result = numeric(inverse_dynamics(fewer, q[~held], qd[~held], qdd[~held])).ravel()
+    np.testing.assert_allclose(result, torques[~held], **NEAR)
 
 
 def test_a_reduced_robot_is_that_of_pinocchio() -> None:
@@ -130,9 +130,9 @@ def test_a_robot_hung_up_elsewhere_moves_the_same(seed: int, size: int) -> None:
         assert (again.kind, again.lower, again.upper) == (joint.kind, joint.lower, joint.upper)
     order = [robot.joint_names.index(name) for name in turned.joint_names]
     frames = numeric_poses(robot, q, place)
-    found = numeric_poses(turned, q[order], frames[root])
+    result = numeric_poses(turned, q[order], frames[root])
     for name, pose in frames.items():
-        np.testing.assert_allclose(matrix(found[name]), matrix(pose), **NEAR)
+        np.testing.assert_allclose(matrix(result[name]), matrix(pose), **NEAR)
 
     def base(pose: tuple[Array, Array]) -> Array:
         return np.concatenate([pose[1], np.roll(Rotation.from_matrix(pose[0]).as_quat(), 1)])
@@ -192,11 +192,11 @@ def test_an_attached_robot_moves_as_it_does_alone_on_a_moving_base(seed: int, si
     q, own = rng.normal(size=robot.dof), rng.normal(size=tool.dof)
     together = np.concatenate([q, own])
     assert whole.joint_names == (*robot.joint_names, *(f"tool_{name}" for name in tool.joint_names))
-    poses, found = numeric_poses(robot, q), numeric_poses(whole, together)
+    poses, result = numeric_poses(robot, q), numeric_poses(whole, together)
     carrier = matrix(poses[link]) @ matrix((turn, shift))
     alone = numeric_poses(tool, own, (carrier[:3, :3], carrier[:3, 3]))
     for name, pose in {**poses, **{f"tool_{name}": pose for name, pose in alone.items()}}.items():
-        np.testing.assert_allclose(matrix(found[name]), matrix(pose), **NEAR)
+        np.testing.assert_allclose(matrix(result[name]), matrix(pose), **NEAR)
     tip = tip_pose(tool, own, (carrier[:3, :3], carrier[:3, 3]))
     np.testing.assert_allclose(matrix(tip_pose(whole, together)), matrix(tip), **NEAR)
     inertia = numeric(robot_inertia(robot, q)) + numeric(robot_inertia(tool, own, (carrier[:3, :3], carrier[:3, 3])))
@@ -253,14 +253,14 @@ def test_two_arms_on_one_base_move_as_each_does_alone() -> None:
     assert (pair.root, pair.tip, pair.dof) == ("satellite", f"left_{arm.tip}", 14)
     assert pair.total_mass == pytest.approx(501.0 + arm.total_mass + other.total_mass)
     q = rng.normal(size=14)
-    found = numeric_poses(pair, q)
-    mast = matrix(found["mast"])
+    result = numeric_poses(pair, q)
+    mast = matrix(result["mast"])
     for prefix, robot, own, place in (
         ("left_", arm, q[1:8], (np.eye(3), shift)),
         ("right_", other, q[8:], (mast[:3, :3] @ turn, mast[:3, 3])),
     ):
         for name, pose in numeric_poses(robot, own, place).items():
-            np.testing.assert_allclose(matrix(found[prefix + name]), matrix(pose), **NEAR)
+            np.testing.assert_allclose(matrix(result[prefix + name]), matrix(pose), **NEAR)
         columns = [pair.joint_names.index(prefix + name) for name in robot.joint_names]
         np.testing.assert_allclose(
             numeric(momentum_matrix(pair, q))[:, columns], numeric(momentum_matrix(robot, own, place)), **NEAR
@@ -279,8 +279,8 @@ def test_branches_are_cut_and_taken_out(seed: int, size: int) -> None:
     poses = numeric_poses(robot, q)
     other = robot.links[int(rng.integers(len(robot.links)))].name
     cut = prune(robot, other)
-    ways = {robot.root, *(j.child for name in (robot.tip_link, other) for j in robot.path_to(name))}
-    assert {link.name for link in cut.links} == ways
+    paths = {robot.root, *(j.child for name in (robot.tip_link, other) for j in robot.path_to(name))}
+    assert {link.name for link in cut.links} == paths
     chosen = q[[robot.joint_names.index(name) for name in cut.joint_names]]
     for name, pose in numeric_poses(cut, chosen).items():
         np.testing.assert_allclose(matrix(pose), matrix(poses[name]), **NEAR)
@@ -337,6 +337,6 @@ PAIR: Any = {"joint1": [0.0, 1.0]}
         (lambda: simplify(ARM, ["link3"]), "link 'link3' does not exist"),
     ],
 )
-def test_what_cannot_be_rebuilt_is_refused(build: Any, message: str) -> None:
+def test_impossible_rebuildings_are_refused(build: Any, message: str) -> None:
     with refused(message):
         build()

@@ -67,7 +67,7 @@ def chain(kinds: str = "rrr", extra: dict[int, str] | None = None) -> str:
 
 @given(seeds, st.integers(1, 8))
 @few
-def test_a_robot_that_is_written_is_to_pinocchio_what_it_is_here(seed: int, size: int) -> None:
+def test_pinocchio_reads_a_written_robot_with_equal_kinematics(seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, size)
     limits: Any = {"velocity": 1.0, "effort": 1.0}  # of every joint, as Pinocchio wants them
@@ -103,10 +103,10 @@ def test_a_robot_that_is_written_is_read_again_with_the_same_functions(seed: int
         assert [getattr(joint, part) for part in parts] == [getattr(read, part) for part in parts]
     for link in robot.links:
         assert again.link(link.name).mass == link.mass
-        for shape, found in zip(link.collisions, again.link(link.name).collisions, strict=True):
-            assert (shape.kind, shape.file) == (found.kind, found.file)
+        for shape, result in zip(link.collisions, again.link(link.name).collisions, strict=True):
+            assert (shape.kind, shape.file) == (result.kind, result.file)
             for part in ("size", "translation", "rotation"):
-                np.testing.assert_allclose(getattr(found, part), getattr(shape, part), rtol=0, atol=1e-15)
+                np.testing.assert_allclose(getattr(result, part), getattr(shape, part), rtol=0, atol=1e-15)
 
 
 def with_limits_and_shapes(robot: Robot, rng: np.random.Generator) -> Robot:
@@ -176,7 +176,7 @@ def test_names_of_any_kind_are_written_and_the_tip_link_takes_a_name_that_is_fre
     assert again.tip == f"{odd}_tip2"
 
 
-def test_what_links_look_like_is_read_and_written_and_never_refuses_a_robot() -> None:
+def test_visuals_of_links_are_read_and_written_and_never_refuse_a_robot() -> None:
     seen = [
         '<visual><origin xyz="1 2 3" rpy="0 0 1"/><geometry><mesh filename="a.dae" scale="2 2 -2"/></geometry>'
         '<material name="red"/></visual>',
@@ -211,9 +211,9 @@ def test_collision_shapes_are_read_with_their_places() -> None:
     }
     place = '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>'
     body = "".join(f"<collision>{place}<geometry>{shape}</geometry></collision>" for shape in shapes)
-    found = Robot.from_urdf(f'<robot name="r"><link name="a">{body}</link></robot>').link("a").collisions
-    assert [(each.kind, list(each.size), each.file) for each in found] == list(shapes.values())
-    for each in found:
+    result = Robot.from_urdf(f'<robot name="r"><link name="a">{body}</link></robot>').link("a").collisions
+    assert [(each.kind, list(each.size), each.file) for each in result] == list(shapes.values())
+    for each in result:
         np.testing.assert_array_equal(each.translation, [1, 2, 3])
         np.testing.assert_allclose(each.rotation, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
     assert Robot.from_urdf(text()).link("a").collisions == ()
@@ -223,12 +223,12 @@ def test_a_text_a_string_path_and_a_path_give_the_same_robot(tmp_path: Path) -> 
     file = tmp_path / "arm.urdf"
     file.write_text('<?xml version="1.0" encoding="utf-8"?>\n' + chain(), encoding="utf-8")
     content = file.read_text(encoding="utf-8")
-    found = {str(Robot.from_urdf(source)) for source in (content, "\ufeff\n  " + content, file, str(file))}
-    assert len(found) == 1
-    assert found.pop().startswith("chain of 4 links, 3 degrees of freedom, 8 kg, tip on l3")
+    distinct = {str(Robot.from_urdf(source)) for source in (content, "\ufeff\n  " + content, file, str(file))}
+    assert len(distinct) == 1
+    assert distinct.pop().startswith("chain of 4 links, 3 degrees of freedom, 8 kg, tip on l3")
 
 
-def test_what_is_left_out_has_the_meaning_of_the_format() -> None:
+def test_omitted_entries_have_the_default_of_the_format() -> None:
     robot = Robot.from_urdf(text(moving()))
     joint = robot.joints[0]
     np.testing.assert_array_equal(joint.axis, [1, 0, 0])
@@ -415,7 +415,7 @@ def test_a_chain_of_a_thousand_links_is_read_and_printed() -> None:
         ),
     ],
 )
-def test_what_is_no_robot_is_refused(source: Any, message: str) -> None:
+def test_invalid_robots_are_refused(source: Any, message: str) -> None:
     with refused(message):
         Robot.from_urdf(source)
 
@@ -435,18 +435,18 @@ def test_what_is_no_robot_is_refused(source: Any, message: str) -> None:
         ({"tip_rotation": np.ones((3, 3))}, "tip_rotation .* not a rotation"),
     ],
 )
-def test_what_does_not_fit_the_robot_is_refused(options: dict[str, Any], message: str) -> None:
+def test_arguments_that_do_not_fit_the_robot_are_refused(options: dict[str, Any], message: str) -> None:
     with refused(message):
         Robot.from_urdf(chain("rrf"), **options)
 
 
-def test_every_impossible_inertia_is_named_in_one_warning_and_can_be_taken_as_given() -> None:
+def test_impossible_inertias_are_named_in_one_warning_and_can_be_accepted() -> None:
     path = urdf_file(*ROBOTS["tiago"][:2])
     with pytest.warns(
         ModelWarning, match=r"base_antenna_left_link.*negative.*base_antenna_right_link.*as_given"
-    ) as said:
+    ) as message:
         robot = Robot.from_urdf(path)
-    assert (len(said), said[0].filename) == (1, __file__)
+    assert (len(message), message[0].filename) == (1, __file__)
     doubtful = [link.name for link in robot.links if link.any_inertia]
     assert doubtful == ["base_antenna_left_link", "base_antenna_right_link"]
     assert str(Robot.from_urdf(path, inertia="as_given")) == str(robot)
@@ -454,9 +454,9 @@ def test_every_impossible_inertia_is_named_in_one_warning_and_can_be_taken_as_gi
 
 def test_an_attribute_that_may_stand_for_one_that_is_lacking_is_named_and_an_extension_is_not() -> None:
     strange = moving('<origin xyz="1 2 3" turn="0 0 1"/>')
-    with pytest.warns(ModelWarning, match=r"joint 'j': turn='0 0 1' of <origin>") as said:
+    with pytest.warns(ModelWarning, match=r"joint 'j': turn='0 0 1' of <origin>") as message:
         Robot.from_urdf(text(strange))
-    assert (len(said), said[0].filename) == (1, __file__)
+    assert (len(message), message[0].filename) == (1, __file__)
     whole = '<limit lower="-1" upper="1" effort="2" velocity="3" current="4" x:uper="5" xmlns:x="y"/>'
     assert Robot.from_urdf(text(moving(whole))).upper == 1.0
 
@@ -464,9 +464,9 @@ def test_an_attribute_that_may_stand_for_one_that_is_lacking_is_named_and_an_ext
 def test_a_joint_whose_followers_leave_it_one_position_is_named() -> None:
     limit = '<limit lower="0" upper="1" effort="1" velocity="1"/>'
     source = chain("rr", {1: limit, 2: limit + '<mimic joint="j1" multiplier="-1"/>'})
-    with pytest.warns(ModelWarning, match=r"joints \['j1'\] cannot move") as said:
+    with pytest.warns(ModelWarning, match=r"joints \['j1'\] cannot move") as message:
         assert Robot.from_urdf(source).upper == 0.0
-    assert said[0].filename == __file__
+    assert message[0].filename == __file__
 
 
 def test_a_configuration_of_a_wrong_length_names_the_joints() -> None:

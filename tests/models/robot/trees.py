@@ -151,8 +151,8 @@ def assert_same_robot(robot: Robot, other: Robot, rng: np.random.Generator) -> N
         np.testing.assert_array_equal(getattr(other, limit), getattr(robot, limit))
     motion = rng.normal(size=(3, robot.dof))
     pairs = zip(everything(robot)(*motion), everything(other)(*motion), strict=True)
-    for expected, found in ((numeric(one), numeric(two)) for one, two in pairs):
-        known = found[: len(expected)]  # the frame of a tip's own link may have come after the others
+    for expected, result in ((numeric(one), numeric(two)) for one, two in pairs):
+        known = result[: len(expected)]  # the frame of a tip's own link may have come after the others
         np.testing.assert_allclose(known, expected, rtol=0, atol=1e-12 * np.abs(expected).max(initial=1e-300))
     if robot.tip is not None:
         tips = [np.c_[tuple(map(numeric, tip_pose(each, motion[0])))] for each in (robot, other)]

@@ -92,5 +92,5 @@ def moved_distance(one: Shape, other: Shape, rounding: float = 0.0) -> tuple[Cal
     skewed = skew(x[:3])
     turn = ca.DM.eye(3) + ca.sin(angle) / angle * skewed + (1 - ca.cos(angle)) / angle**2 * ca.mtimes(skewed, skewed)
     gap = distance(one, other, Frame(turn, x[3:]), rounding=rounding)
-    bent, slope = ca.hessian(gap, x)
-    return ca.Function("gap", [x], [gap, slope]), ca.Function("bent", [x], [bent])
+    perturbed, slope = ca.hessian(gap, x)
+    return ca.Function("gap", [x], [gap, slope]), ca.Function("bent", [x], [perturbed])

@@ -135,7 +135,7 @@ GOOD = [case for case in CASES if case.what != "Mesh of a file"]
 
 
 @pytest.mark.parametrize("case", good_calls(GOOD))
-def test_what_is_good_is_taken(case: Case) -> None:
+def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 

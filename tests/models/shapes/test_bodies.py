@@ -30,7 +30,7 @@ def shape(kind: Any, size: Any, **more: Any) -> CollisionShape:
     return CollisionShape(kind, size, translation=PLACE, rotation=TURN, **more)
 
 
-def test_simple_shapes_are_what_they_are() -> None:
+def test_simple_shapes_have_their_known_supports() -> None:
     robot = one_link(shape("box", (0.1, 0.2, 0.3)), shape("sphere", (0.1,)), shape("capsule", (0.1, 0.4)))
     box, ball, rod = (body.shape for body in collision_bodies(robot))
     assert isinstance(box, Box)
@@ -45,7 +45,7 @@ def test_simple_shapes_are_what_they_are() -> None:
 
 
 @pytest.mark.parametrize(("radius", "length"), [(0.05, 0.6), (0.05, 0.11), (0.1, 0.02), (0.03, 0.06), (0.01, 1.0)])
-def test_a_cylinder_lies_in_what_stands_for_it(radius: float, length: float) -> None:
+def test_a_cylinder_lies_inside_its_hull(radius: float, length: float) -> None:
     (body,) = collision_bodies(one_link(shape("cylinder", (radius, length))))
     angles = np.linspace(0, 2 * np.pi, 500)
     rim = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.full(500, length / 2)])
@@ -92,15 +92,15 @@ def mesh_robot(tmp_path: Path) -> Path:
 
 def mesh_points(robot: Robot) -> dict[str, list[Array]]:
     """Vertices of the meshes of each link, scaled and placed, by an own way."""
-    found: dict[str, list[Array]] = {}
+    by_name: dict[str, list[Array]] = {}
     for link in robot.links:
         for each in link.collisions:
             if each.kind == "mesh":
                 path = find_mesh(each.file, each.folder)
                 assert path is not None
                 points = read_mesh(path)[0] @ np.diag(each.size) @ np.asarray(each.rotation).T + each.translation
-                found.setdefault(link.name, []).append(points)
-    return found
+                by_name.setdefault(link.name, []).append(points)
+    return by_name
 
 
 def outside(bodies: tuple[Body, ...], link: str, points: Array) -> float:
@@ -125,7 +125,7 @@ def test_a_mesh_is_found_scaled_mirrored_and_placed(mesh_robot: Path, monkeypatc
 
 
 @pytest.mark.parametrize("flat", [(1, 1, 0), (0, 0, 1)], ids=["plate", "line"])
-def test_meshes_in_a_plane_are_looked_at_as_plates_of_a_micrometre(tmp_path: Path, flat: tuple[float, ...]) -> None:
+def test_planar_meshes_are_checked_as_plates_of_a_micrometre(tmp_path: Path, flat: tuple[float, ...]) -> None:
     """Of two links two joints apart, which are seen as hulls: of what has none, with next to no thickness."""
     corners = np.array(np.meshgrid(*[(-0.3, 0.3)] * 3)).reshape(3, -1).T * flat
     text = "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3\nf 2 4 5\nf 6 7 8\n"
@@ -142,7 +142,7 @@ def test_meshes_in_a_plane_are_looked_at_as_plates_of_a_micrometre(tmp_path: Pat
     assert np.isfinite(float(around.distances((), [1.5, -1.5])))
 
 
-def test_a_missing_mesh_is_named_and_skipped_only_if_told(mesh_robot: Path) -> None:
+def test_a_missing_mesh_is_named_and_skipped_only_on_request(mesh_robot: Path) -> None:
     (mesh_robot.parents[1] / "meshes" / "upper.stl").unlink()
     robot = Robot.from_urdf(mesh_robot)
     with pytest.raises(ModelError, match=r"'upper'.*upper\.stl") as caught:
@@ -200,8 +200,8 @@ BALL = Sphere(1.0, (0, 0, 0))
 BAD = [(("", BALL), "link"), (("a", "b"), "shape"), (("a", HalfSpace((0, 0, 1), (0, 0, 0))), "shape")]
 
 
-@pytest.mark.parametrize(("given", "name"), [*BAD, (("a", BALL, -1.0), "overhang")])
-def test_bad_bodies_are_named(given: tuple[Any, ...], name: str) -> None:
+@pytest.mark.parametrize(("options", "name"), [*BAD, (("a", BALL, -1.0), "overhang")])
+def test_bad_bodies_are_named(options: tuple[Any, ...], name: str) -> None:
     with pytest.raises(ModelError) as caught:
-        Body(*given)
+        Body(*options)
     assert caught.value.name == name

@@ -85,7 +85,7 @@ def test_no_point_of_the_surface_is_outside(mesh: str) -> None:
         assert np.min([exceedance(each.shape, points) for each in covers], axis=0).max() <= 0
 
 
-def test_what_a_closed_surface_encloses_is_covered() -> None:
+def test_the_interior_of_a_closed_surface_is_covered() -> None:
     """Also where the surface itself is covered in parts: random points inside the dumbbell's rod and discs."""
     vertices, faces = dumbbell()
     covers = fit_cover(vertices[faces])
@@ -161,13 +161,13 @@ def test_the_overhang_is_the_farthest_point_from_the_hull() -> None:
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (3.0, -2.0, 5.0), (-4.0, -4.0, -4.0)])
-def test_what_lies_within_the_hull_does_not_stand_out_of_it(shift: tuple[float, float, float]) -> None:
+def test_covers_of_interior_points_stay_within_the_hull(shift: tuple[float, float, float]) -> None:
     """Of capsules from the middle of a cube of 2 m on, one that ends in it, and two beyond a face by 0.1 m and 3 m."""
     cube = convex_hull(np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T + shift)
     for beyond, out in ((0.3, 0.0), (0.8, 0.1), (3.7, 3.0)):
         for axis in np.vstack([np.eye(3), -np.eye(3)]):
-            found = covering._overhang(Capsule(0.3, shift, shift + beyond * axis), cube.vertices)
-            assert 0.9 * out <= found <= out + 1e-12
+            result = covering._overhang(Capsule(0.3, shift, shift + beyond * axis), cube.vertices)
+            assert 0.9 * out <= result <= out + 1e-12
 
 
 @pytest.mark.long
@@ -209,7 +209,7 @@ def same(one: tuple[Cover, ...], other: tuple[Cover, ...]) -> bool:
     return [covering._to_json(each) for each in one] == [covering._to_json(each) for each in other]
 
 
-def test_what_is_kept_is_what_was_fitted(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cached_cover_is_the_fitted_one(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = dumbbell()
     first = cover(vertices, faces)
     assert len(list(own_cache.iterdir())) == 1
@@ -257,7 +257,7 @@ def test_an_unwritable_cache_is_no_error(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(cover(vertices, faces)) == 1
 
 
-def test_what_cannot_be_written_leaves_nothing_behind(own_cache: Path) -> None:
+def test_a_failed_write_leaves_no_file(own_cache: Path) -> None:
     cache.store_value("a", {"x": [1.5, "y"]})
     assert cache.load_value("a") == {"x": [1.5, "y"]}
     (own_cache / "b.json").mkdir()
@@ -294,13 +294,13 @@ def test_a_version_changes_with_a_module_and_all_that_it_imports(
     }
     for name, text in texts.items():
         (package / f"{name}.py").write_text(text, encoding="utf-8")
-    found = [cache.source_version("whole.a")]
+    results = [cache.source_version("whole.a")]
     for name in "abcd":
         (package / f"{name}.py").write_text(texts[name] + "\n", encoding="utf-8")
         cache.source_version.cache_clear()
-        found.append(cache.source_version("whole.a"))
-    assert len(set(found)) == 4
-    assert found[3] == found[4]
+        results.append(cache.source_version("whole.a"))
+    assert len(set(results)) == 4
+    assert results[3] == results[4]
     kinds = [cache.source_version(f"models.shapes.{name}") for name in ("hull", "covering", "pairs")]
     assert len(set(kinds)) == 3
 

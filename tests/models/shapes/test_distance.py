@@ -60,13 +60,13 @@ def in_bulk(pairs: list[tuple[Any, Any]], rounding: float = 0.0) -> Any:
 def test_distances_of_many_random_pairs_are_those_of_coal(pair: tuple[type, type], count: int) -> None:
     """1e5 in all. Of deep boxes coal's search for the depth ends short of it now and then: there it is a bound."""
     pairs = random_pairs(pair, count, seed=1)
-    found, known = in_bulk(pairs), np.array([by_coal(*both) for both in pairs])
+    result, known = in_bulk(pairs), np.array([by_coal(*both) for both in pairs])
     assert (known < 0).mean() > 0.15
     assert (known > 0).mean() > 0.15
-    assert (found - known).max() <= 1e-6
+    assert (result - known).max() <= 1e-6
     apart = known > 0 if Box in pair else np.full(len(known), True)
-    np.testing.assert_allclose(found[apart], known[apart], atol=1e-6, rtol=0)
-    assert np.mean(np.abs(found - known) < 1e-6) > 0.995
+    np.testing.assert_allclose(result[apart], known[apart], atol=1e-6, rtol=0)
+    assert np.mean(np.abs(result - known) < 1e-6) > 0.995
 
 
 @pytest.mark.parametrize("pair", [(Sphere, Box), (Capsule, Box), (Box, Box)], ids=names)
@@ -86,18 +86,18 @@ def special_poses(rng: np.random.Generator) -> tuple[Any, Any]:
     return Capsule(0.125, start, end), Box(rng.choice([0.5, 1.0], 3), rng.choice(grid, 3), turn)
 
 
-def test_aligned_touching_and_crossing_shapes_are_no_exception() -> None:
+def test_aligned_adjacent_and_crossing_shapes_have_exact_distances() -> None:
     rng = np.random.default_rng(3)
     cases = [special_poses(rng) for _ in range(1500)]
     rods, boxes = zip(*cases, strict=True)
     for pairs in (cases, list(pairwise(rods)), list(pairwise(boxes))):
         known = np.array([by_coal(*both) if _has_length(both) else np.nan for both in pairs])
-        found = in_bulk(pairs)
-        assert np.isfinite(found).all()
+        result = in_bulk(pairs)
+        assert np.isfinite(result).all()
         apart = known > 1e-9
-        np.testing.assert_allclose(found[apart], known[apart], atol=1e-6, rtol=0)
-        assert (found[known < -1e-6] < 0).all()
-        assert np.nanmax(found - known) < 1e-6
+        np.testing.assert_allclose(result[apart], known[apart], atol=1e-6, rtol=0)
+        assert (result[known < -1e-6] < 0).all()
+        assert np.nanmax(result - known) < 1e-6
 
 
 def _has_length(shapes: tuple[Any, ...]) -> bool:
@@ -114,14 +114,14 @@ def test_a_capsule_nearly_along_an_edge_is_as_near_as_its_nearest_point(scale: f
         rng.random((count, 1)) < 0.7, rng.uniform(-15, -12, size=(count, 1)), rng.uniform(-12, -1, size=(count, 1))
     )
     middles = scale * rng.normal(size=(count, 3))
-    ways = scale * (np.eye(3)[rng.integers(3, size=count)] * rng.uniform(0.1, 2.0, size=(count, 1)) + tilts)
+    paths = scale * (np.eye(3)[rng.integers(3, size=count)] * rng.uniform(0.1, 2.0, size=(count, 1)) + tilts)
     s = np.linspace(-0.5, 0.5, 1001)
-    over = np.maximum(np.abs(middles[:, None] + s[:, None] * ways[:, None]) - box.size / 2, 0.0)
+    over = np.maximum(np.abs(middles[:, None] + s[:, None] * paths[:, None]) - box.size / 2, 0.0)
     known = np.linalg.norm(over, axis=2).min(axis=1)
-    found = in_bulk([(Capsule(0.1 * scale, m - w / 2, m + w / 2), box) for m, w in zip(middles, ways, strict=True)])
+    result = in_bulk([(Capsule(0.1 * scale, m - w / 2, m + w / 2), box) for m, w in zip(middles, paths, strict=True)])
     apart = known > 1e-3 * scale
     assert apart.sum() > count / 2
-    missed = (known - 0.1 * scale - found)[apart] / scale
+    missed = (known - 0.1 * scale - result)[apart] / scale
     assert missed.min() > -1e-9
     assert missed.max() < 2.0 / 1000
 
@@ -154,10 +154,10 @@ def test_beside_a_mesh_or_a_cylinder_it_is_a_bound_from_below(kind: type, other:
     gaps = []
     for _ in range(draws((kind, other), 50)):
         one, two = random_shape(kind, rng, 0.1), random_shape(other, rng, 1.2)
-        found, known, true = number(distance(one, two)), by_differences(one, two), by_coal(one, two)
-        assert found <= known + 1e-7
-        assert true < 0 or found <= true + 1e-6
-        gaps.append(found - known)
+        result, known, true = number(distance(one, two)), by_differences(one, two), by_coal(one, two)
+        assert result <= known + 1e-7
+        assert true < 0 or result <= true + 1e-6
+        gaps.append(result - known)
     assert np.median(gaps) > -0.2
     assert max(gaps) > -1e-3
 
@@ -239,15 +239,15 @@ def test_numbers_and_both_kinds_of_symbols_agree(pair: tuple[type, type]) -> Non
     assert known.shape == (1, 1)
     for kind in (ca.SX, ca.MX):
         parts = [kind.sym("turn", 3, 3), kind.sym("place", 3), kind.sym("turn", 3, 3), kind.sym("place", 3)]
-        found = distance(one, other, Frame(*parts[:2]), Frame(*parts[2:]), rounding=0.02)
-        assert number(ca.Function("gap", parts, [found])(*frame, *other_frame)) == pytest.approx(
+        result = distance(one, other, Frame(*parts[:2]), Frame(*parts[2:]), rounding=0.02)
+        assert number(ca.Function("gap", parts, [result])(*frame, *other_frame)) == pytest.approx(
             number(known), abs=1e-10
         )
     half = distance(one, other, Frame(parts[0], parts[1]), other_frame, rounding=0.02)
     assert number(ca.Function("gap", parts[:2], [half])(*frame)) == pytest.approx(number(known), abs=1e-10)
 
 
-def test_what_is_small_is_as_exact() -> None:
+def test_small_shapes_have_equally_exact_distances() -> None:
     rng = np.random.default_rng(17)
     for pair in EXACT_PAIRS:
         one, other = (random_shape(kind, rng) for kind in pair)
@@ -262,7 +262,7 @@ def test_what_is_small_is_as_exact() -> None:
 
 @pytest.mark.parametrize("angle", [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0.0])
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.7, 1.0])
-def test_rods_that_cross_at_any_angle_are_no_farther_apart_than_is_said(angle: float, share: float) -> None:
+def test_distances_of_crossing_rods_are_no_upper_estimates(angle: float, share: float) -> None:
     """Two of 2 m that meet in a point, a share of their length on: missed by at most 3e-7 of it."""
     along, turned = np.array([1.0, 0, 0]), np.array([np.cos(angle), np.sin(angle), 0.0])
     rods = [Capsule(0.25, -2 * share * each, 2 * (1 - share) * each) for each in (along, turned)]
@@ -278,8 +278,8 @@ def test_a_rod_across_an_edge_is_as_deep_as_it_is_at_any_size(scale: float, slop
     middle = np.array([0.1, 0.1, 0.05]) - 0.01 * out
     rod = Capsule(0.02, middle - 0.1 * across, middle + 0.08 * across)
     for one, other in ((Box((0.2, 0.2, 0.6)), rod), (rod, Box((0.2, 0.2, 0.6)))):
-        found = number(distance(scaled(one, scale), scaled(other, scale)))
-        assert found == pytest.approx(-0.03 * scale, rel=1e-9, abs=2e-12)
+        result = number(distance(scaled(one, scale), scaled(other, scale)))
+        assert result == pytest.approx(-0.03 * scale, rel=1e-9, abs=2e-12)
 
 
 # ---- rounding -----------------------------------------------------------------------------------------------------
@@ -298,33 +298,33 @@ def between_boxes(one: Box, other: Box) -> float:
 
 @pytest.mark.parametrize("rounding", ROUNDINGS)
 @pytest.mark.parametrize("pair", EXACT_PAIRS, ids=names)
-def test_rounded_distances_are_short_by_as_much_as_is_said(pair: tuple[type, type], rounding: float) -> None:
+def test_rounded_distances_underestimate_by_the_stated_bound(pair: tuple[type, type], rounding: float) -> None:
     pairs = random_pairs(pair, 2000, seed=12)
-    known, found = in_bulk(pairs), in_bulk(pairs, rounding)
+    known, result = in_bulk(pairs), in_bulk(pairs, rounding)
     apart = known + [one.swept_radius + other.swept_radius for one, other in pairs]
-    assert (found <= known + 1e-9).all()
+    assert (result <= known + 1e-9).all()
     if pair == (Box, Box):
         seen = np.array([between_boxes(*both) for both in pairs])
-        assert (found >= seen - 4 * rounding).all()
+        assert (result >= seen - 4 * rounding).all()
         missed = (known - seen) / np.maximum(known, 1e-9)
         assert missed.max() < 0.3
         assert np.percentile(missed[known > 1e-6], 75) < 0.02
     else:
-        assert (found >= known - 0.84 * rounding).all()
+        assert (result >= known - 0.84 * rounding).all()
     if Sphere in pair:
-        np.testing.assert_array_equal(found, known)
+        np.testing.assert_array_equal(result, known)
     elif Capsule in pair:
-        assert (found >= known - rounding**2 / np.maximum(apart, 1e-12)).all()
+        assert (result >= known - rounding**2 / np.maximum(apart, 1e-12)).all()
 
 
 @pytest.mark.parametrize("rounding", ROUNDINGS)
 @pytest.mark.parametrize("pair", [pair for pair in PAIRS if pair not in EXACT_PAIRS], ids=names)
-def test_rounded_bounds_are_lower_by_no_more_than_is_said(pair: tuple[type, type], rounding: float) -> None:
+def test_rounded_bounds_are_lower_by_at_most_the_stated_bound(pair: tuple[type, type], rounding: float) -> None:
     rng = np.random.default_rng(13)
     for _ in range(draws(pair, 4)):
         one, other = (random_shape(kind, rng) for kind in pair)
-        known, found = number(distance(one, other)), number(distance(one, other, rounding=rounding))
-        assert known - 3 * rounding <= found <= known + 1e-9
+        known, result = number(distance(one, other)), number(distance(one, other, rounding=rounding))
+        assert known - 3 * rounding <= result <= known + 1e-9
 
 
 def test_the_bound_is_attained_within_a_fifth_where_segments_cross() -> None:
@@ -363,21 +363,21 @@ def test_second_derivatives_are_those_of_finite_differences(pair: tuple[type, ty
     kept, worst = 0, 0.0
     for _ in range(6):
         one, other = random_shape(pair[0], rng), random_shape(pair[1], rng, 0.8)
-        function, bent = moved_distance(one, other, rounding)
+        function, perturbed = moved_distance(one, other, rounding)
         for x in rng.normal(size=(6, 6)) * [1.0, 1.0, 1.0, 0.4, 0.4, 0.4]:
-            found = np.array(bent(x))
-            assert np.isfinite(found).all()
+            values = np.array(perturbed(x))
+            assert np.isfinite(values).all()
             rough, fine = (_differences(lambda at, f=function: np.array(f(at)[1]).ravel(), x, h) for h in (2e-5, 1e-5))
             if np.abs(rough - fine).max() < 1e-5 * (1 + np.abs(fine).max()):
                 kept += 1
-                worst = max(worst, float(np.abs(found - fine).max() / (1 + np.abs(fine).max())))
+                worst = max(worst, float(np.abs(values - fine).max() / (1 + np.abs(fine).max())))
     assert kept > 18
     assert worst < 1e-4
 
 
 @pytest.mark.parametrize("rounding", [0.0, 0.05])
 @pytest.mark.parametrize("pair", [pair for pair in PAIRS if set(pair) <= COLUMNS.keys()], ids=names)
-def test_wrenches_tell_at_what_rate_distances_grow(pair: tuple[type, type], rounding: float) -> None:
+def test_wrenches_are_the_rates_of_distances(pair: tuple[type, type], rounding: float) -> None:
     """By a twist of the first shape, in either order, side by side; away from kinks."""
     rng = np.random.default_rng(18)
     for kinds in {pair, pair[::-1]}:
@@ -389,9 +389,9 @@ def test_wrenches_tell_at_what_rate_distances_grow(pair: tuple[type, type], roun
 
         def moved(step: float, shapes: Any = shapes, twists: Any = twists) -> Any:
             turns = [Rotation.from_rotvec(step * twist[:3]).as_matrix() for twist in twists]
-            ways = zip(shapes, turns, twists, strict=True)
+            paths = zip(shapes, turns, twists, strict=True)
             return in_bulk(
-                [(one.placed(turn, step * twist[3:]), other) for (one, other), turn, twist in ways], rounding
+                [(one.placed(turn, step * twist[3:]), other) for (one, other), turn, twist in paths], rounding
             )
 
         rough, fine = ((moved(h) - moved(-h)) / (2 * h) for h in (2e-5, 1e-5))
@@ -438,9 +438,9 @@ def test_no_derivative_is_ever_spoilt(rounding: float) -> None:
     for one, other in combinations_with_replacement(shapes, 2):
         if isinstance(one, HalfSpace) and isinstance(other, HalfSpace):
             continue
-        function, bent = moved_distance(one, other, rounding)
+        function, perturbed = moved_distance(one, other, rounding)
         for x in (np.zeros(6), np.array([0, 0, 0, 0.5, 0, 0]), np.array([0, 0, 0, 0, 0, 1.0])):
-            assert all(np.isfinite(np.array(part)).all() for part in (*function(x), bent(x))), (one, other, x)
+            assert all(np.isfinite(np.array(part)).all() for part in (*function(x), perturbed(x))), (one, other, x)
 
 
 @pytest.mark.parametrize("rounding", [0.0, 0.02])
@@ -484,10 +484,10 @@ def test_a_mesh_is_seen_past_its_edges_and_corners() -> None:
     """A cube of corners beside a ball: exact across faces, edges and corners, never nearer than 0.8 of the box's."""
     cube = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
     mesh, box = Mesh(cube), Box((0.2, 0.2, 0.2))
-    for way in ((1, 0, 0), (0, -1, 1), (1, 1, -1)):
-        ball = Sphere(0.05, np.abs(way) * 0.1 * np.sign(way) + 0.3 * np.array(way) / np.linalg.norm(way))
+    for path in ((1, 0, 0), (0, -1, 1), (1, 1, -1)):
+        ball = Sphere(0.05, np.abs(path) * 0.1 * np.sign(path) + 0.3 * np.array(path) / np.linalg.norm(path))
         assert float(ca.DM(distance(mesh, ball))) == pytest.approx(0.25, abs=1e-9)
-    for way in np.random.default_rng(0).normal(size=(50, 3)):
-        ball = Sphere(1e-3, 0.5 * way / np.linalg.norm(way))
-        told, true = (float(ca.DM(distance(body, ball))) for body in (mesh, box))
-        assert 0.8 * true <= told <= true + 1e-9
+    for path in np.random.default_rng(0).normal(size=(50, 3)):
+        ball = Sphere(1e-3, 0.5 * path / np.linalg.norm(path))
+        report, true = (float(ca.DM(distance(body, ball))) for body in (mesh, box))
+        assert 0.8 * true <= report <= true + 1e-9

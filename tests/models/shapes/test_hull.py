@@ -25,7 +25,7 @@ def cloud(seed: int, count: int = 40) -> np.ndarray:
 
 @settings(max_examples=30)
 @given(seeds, st.floats(1e-6, 1e6), st.floats(-1e3, 1e3))
-def test_the_half_spaces_hold_all_points_and_each_touches_three(seed: int, size: float, shift: float) -> None:
+def test_the_half_spaces_contain_all_points_and_each_supports_three(seed: int, size: float, shift: float) -> None:
     points = size * (cloud(seed) + shift)
     hull = convex_hull(points)
     heights = points @ hull.normals.T - hull.offsets
@@ -52,7 +52,7 @@ def test_faces_close_around_the_points_counter_clockwise(seed: int) -> None:
 
 @settings(max_examples=30)
 @given(seeds)
-def test_what_lies_within_a_hull_changes_nothing(seed: int) -> None:
+def test_interior_points_do_not_change_a_hull(seed: int) -> None:
     rng, points = np.random.default_rng(seed), cloud(seed)
     shares = rng.dirichlet(np.ones(len(points)), 200)
     more = convex_hull(rng.permutation(np.concatenate([points, shares @ points, points])))

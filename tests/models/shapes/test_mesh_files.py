@@ -62,7 +62,7 @@ def written(folder: Path, name: str, contents: str | bytes) -> Path:
 
 
 @pytest.mark.parametrize("ending", ["stl", "stl_ascii", "obj", "dae"])
-def test_what_trimesh_writes_is_read(tmp_path: Path, ending: str) -> None:
+def test_files_of_trimesh_are_read(tmp_path: Path, ending: str) -> None:
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
     mesh.apply_translation([0.1, -0.2, 0.3])
     file = tmp_path / f"mesh.{ending[:3].upper()}"
@@ -72,8 +72,8 @@ def test_what_trimesh_writes_is_read(tmp_path: Path, ending: str) -> None:
 
 
 def _bytes(mesh: trimesh.Trimesh, ending: str) -> bytes:
-    found = mesh.export(file_type=ending)
-    return found if isinstance(found, bytes) else str(found).encode()
+    result = mesh.export(file_type=ending)
+    return result if isinstance(result, bytes) else str(result).encode()
 
 
 def test_all_formats_of_one_body_are_one_mesh(tmp_path: Path) -> None:
@@ -224,10 +224,10 @@ BROKEN: list[tuple[str, str | bytes, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "contents", "said"), BROKEN, ids=range(len(BROKEN)))
-def test_a_broken_file_is_named_with_the_place(tmp_path: Path, name: str, contents: str | bytes, said: str) -> None:
+@pytest.mark.parametrize(("name", "contents", "message"), BROKEN, ids=range(len(BROKEN)))
+def test_a_broken_file_is_named_with_the_place(tmp_path: Path, name: str, contents: str | bytes, message: str) -> None:
     file = written(tmp_path, name, contents)
-    with pytest.raises(ModelError, match=said) as caught:
+    with pytest.raises(ModelError, match=message) as caught:
         read_mesh(file)
     assert str(file) in str(caught.value)
     assert caught.value.name == str(file)
@@ -261,7 +261,7 @@ def test_too_many_triangles_are_refused(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("path", ["absent.stl", "nul\0.stl", 3, None, ".stl"])
-def test_what_is_no_file_is_refused(path: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_files_are_refused(path: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ModelError, match="mesh"):
         read_mesh(path)  # type: ignore[arg-type]
@@ -270,7 +270,7 @@ def test_what_is_no_file_is_refused(path: object, tmp_path: Path, monkeypatch: p
         read_mesh(tmp_path / "folder.stl")
 
 
-def test_without_its_reader_a_collada_file_is_refused_with_what_to_install(
+def test_without_its_reader_a_collada_file_is_refused_with_the_package_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "collada", None)

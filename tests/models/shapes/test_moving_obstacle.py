@@ -23,22 +23,22 @@ def test_a_table_that_is_written_out_is_the_table(kind: str, count: int, entries
     knots = np.sort(rng.uniform(-3, 3, count))
     table = ca.interpolant("table", kind, [knots.tolist()], rng.normal(size=count * entries).tolist())
     t = ca.SX.sym("t")
-    found = ca.Function("found", [t], [expand_tables(table(2 * t + 1))])
-    assert ca.OP_CALL not in {found.instruction_id(k) for k in range(found.n_instructions())}
+    result = ca.Function("found", [t], [expand_tables(table(2 * t + 1))])
+    assert ca.OP_CALL not in {result.instruction_id(k) for k in range(result.n_instructions())}
     times = np.concatenate([(knots[1:-1] - 1) / 2, rng.uniform(-2.5, 1.5, 500)])[None]
     known = np.array(table(2 * times + 1))
-    np.testing.assert_allclose(np.array(found(times)), known, rtol=0, atol=1e-9 * np.abs(known).max())
+    np.testing.assert_allclose(np.array(result(times)), known, rtol=0, atol=1e-9 * np.abs(known).max())
 
 
 def test_a_table_inside_a_function_of_either_kind_of_symbols_is_found() -> None:
     table = ca.interpolant("table", "linear", [[0.0, 1.0, 2.0]], [0.0, 1.0, 0.0])
     t = ca.MX.sym("t")
-    way = ca.Function("way", [t], [ca.vertcat(table(t), 2 * table(t + 1), 0)])
-    moving = MovingObstacle(BALL, lambda time: way(time))
+    path = ca.Function("way", [t], [ca.vertcat(table(t), 2 * table(t + 1), 0)])
+    moving = MovingObstacle(BALL, lambda time: path(time))
     np.testing.assert_allclose(np.array(moving.frame(0.5).position).ravel(), [0.5, 1.0, 0.0])
 
 
-def test_what_is_no_table_of_one_argument_is_named() -> None:
+def test_tables_of_several_arguments_are_refused_by_name() -> None:
     plane: Any = ca.interpolant("plane", "linear", [[0.0, 1.0], [0.0, 1.0]], [0.0, 1.0, 2.0, 3.0])
     with pytest.raises(ModelError, match=r"'plane'.* is no table of one argument"):
         MovingObstacle(BALL, lambda t: (plane(ca.vertcat(t, t)), 0, 0))

@@ -70,7 +70,7 @@ def test_neighbours_are_left_and_the_others_checked() -> None:
     assert pairs.left == {(f"link{k}", f"link{k + 1}"): NEIGHBOURS for k in range(3)}
 
 
-def test_limits_prove_that_bodies_never_touch() -> None:
+def test_limits_prove_that_bodies_never_collide() -> None:
     """Folded by less than needed: with the middle link of 0.3 and joints of at most 60 degrees nothing comes back."""
     robot, bodies = chain(0.3, 0.3, 0.3, limit=np.deg2rad(60))
     assert checked_pairs(robot, bodies).left["link0", "link2"] == NEVER
@@ -78,7 +78,7 @@ def test_limits_prove_that_bodies_never_touch() -> None:
     assert checked_pairs(robot, bodies, clearance=0.5).checked == ((0, 2),)
 
 
-def test_what_cannot_be_proven_is_checked() -> None:
+def test_unproven_pairs_are_checked() -> None:
     """Joints that move without limits, so far that no box of postures is finite."""
     links = (Link("a"), Link("b"), Link("c"))
     joints = (Joint("one", "prismatic", "a", "b"), Joint("two", "prismatic", "b", "c", axis=(0, 1, 0)))
@@ -133,8 +133,8 @@ def gaps(robot: Robot, bodies: tuple[Body, ...], pairs: list[tuple[int, int]], c
     q = ca.SX.sym("q", robot.dof)
     frames = link_frames(robot, q)
     each = ca.vertcat(*[expression(bodies, frames, i, j) for i, j in pairs])
-    postures = np.random.default_rng(1).uniform(robot.lower, robot.upper, (count, robot.dof)).T
-    return np.array(ca.Function("gaps", [q], [each])(postures))
+    configurations = np.random.default_rng(1).uniform(robot.lower, robot.upper, (count, robot.dof)).T
+    return np.array(ca.Function("gaps", [q], [each])(configurations))
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -142,19 +142,19 @@ def test_bodies_are_where_the_kinematics_have_them(seed: int) -> None:
     """Of random trees the distances in random postures, slides and followers among the joints."""
     robot, bodies = random_robot(np.random.default_rng(seed))
     parts = RigidParts.of(robot)
-    postures = np.random.default_rng(1).uniform(robot.lower, robot.upper, (10, robot.dof))
+    configurations = np.random.default_rng(1).uniform(robot.lower, robot.upper, (10, robot.dof))
     every = [(i, j) for i, j in combinations(range(len(bodies)), 2) if i % 3 or j % 3]  # but boxes beside boxes
     known = gaps(robot, bodies, every, 10)
     for (i, j), row in zip(every, known, strict=True):
         one, other = bodies[i].shape, bodies[j].shape
         placed = _PlacedBody(one), _PlacedBody(other)
         between = _BodyPair(robot, *placed, *parts.path(bodies[i].link, bodies[j].link))
-        turn, shift = between._relative(postures)
+        turn, shift = between._relative(configurations)
         np.testing.assert_allclose(exact_distances(one, other, turn, shift), row, atol=1e-9)
-        assert (between.bounds(postures)[0] <= row + 1e-9).all()
+        assert (between.bounds(configurations)[0] <= row + 1e-9).all()
 
 
-def test_of_several_bodies_the_reason_that_matters_most_is_told() -> None:
+def test_the_most_important_reason_of_several_is_reported() -> None:
     """Whatever their order: always touching before never touching, and before it what only covers may do."""
     robot, _ = chain(0.1, 0.001, 0.1)
     ball, between = Sphere(0.05, (0.0, 0.0, 0.0)), Body("link1", Sphere(0.05, (0.0, 0.0, 0.0)))
@@ -167,19 +167,19 @@ def test_of_several_bodies_the_reason_that_matters_most_is_told() -> None:
             assert pairs.checked == ()
 
 
-def test_pairs_that_are_checked_touch_somewhere_or_nearly() -> None:
+def test_checked_pairs_collide_somewhere_or_nearly() -> None:
     """The proof is no blanket: of the checked pairs of random trees half and more do touch in random postures."""
-    touching = total = 0
+    colliding = total = 0
     for seed in range(4):
         robot, bodies = random_robot(np.random.default_rng(seed))
         checked = list(checked_pairs(robot, bodies).checked)
         if checked:
             least = gaps(robot, bodies, checked, 1000).min(axis=1)
-            touching, total = touching + int((least < 0.03).sum()), total + len(checked)
-    assert touching > 0.5 * total
+            colliding, total = colliding + int((least < 0.03).sum()), total + len(checked)
+    assert colliding > 0.5 * total
 
 
-def test_bodies_that_always_touch_are_named() -> None:
+def test_bodies_that_always_collide_are_named() -> None:
     robot, _ = chain(0.1, 0.001, 0.1)
     bodies = tuple(Body(f"link{k}", Sphere(0.05, (0.0, 0.0, 0.0))) for k in (1, 2))
     pairs = checked_pairs(robot, (Body("link0", Sphere(0.05, (0.1, 0, 0))), *bodies))
@@ -262,9 +262,9 @@ def test_the_bound_is_no_more_than_the_distance(one: Shape, other: Shape) -> Non
     shift = np.concatenate(
         [np.array([(0, 0, 0), (0, 0, 0.1), (0.3, 0, 0), (0.3, 0.3, 0)]), rng.normal(size=(60, 3)) / 3]
     )
-    found, exact = bound(one, other, turn, shift), exact_distances(one, other, turn, shift)
-    assert (found <= exact + 1e-9).all()
-    assert (found > -1).all()
+    result, exact = bound(one, other, turn, shift), exact_distances(one, other, turn, shift)
+    assert (result <= exact + 1e-9).all()
+    assert (result > -1).all()
 
 
 def test_the_bound_of_spheres_is_exact_and_that_of_boxes_beside_a_face() -> None:
@@ -273,7 +273,7 @@ def test_the_bound_of_spheres_is_exact_and_that_of_boxes_beside_a_face() -> None
     assert bound(Box((2, 2, 2)), Box((1, 9, 1)), turn, shift) == pytest.approx([2.5], abs=1e-12)
 
 
-def test_random_postures_fill_the_limits_or_a_turn_or_a_metre_either_way() -> None:
+def test_random_configurations_fill_the_limits_or_a_turn_or_a_metre_in_both_directions() -> None:
     """Of a turn and a slide, each with both limits, the lower one, the upper one, none."""
     ends = [(-0.3, 0.4), (1.0, np.inf), (-np.inf, 1.0), (-np.inf, np.inf)]
     links, joints = [Link("link0")], []
@@ -282,16 +282,16 @@ def test_random_postures_fill_the_limits_or_a_turn_or_a_metre_either_way() -> No
         joints.append(Joint(f"joint{k}", kind, f"link{k}", f"link{k + 1}"))
         links.append(Link(f"link{k + 1}"))
     low, high = np.tile(np.array(ends).T, 2)
-    found = _random_configurations(Robot(tuple(links), tuple(joints)), low, high, 4000, np.random.default_rng(1))
+    result = _random_configurations(Robot(tuple(links), tuple(joints)), low, high, 4000, np.random.default_rng(1))
     for first, room in ((0, np.pi), (4, 1.0)):
         spans = [(-0.3, 0.4), (1.0, 1.0 + 2 * room), (1.0 - 2 * room, 1.0), (-room, room)]
         for k, (least, most) in enumerate(spans):
-            values = found[:, first + k]
+            values = result[:, first + k]
             assert least <= values.min() < least + 0.01 * (most - least)
             assert most >= values.max() > most - 0.01 * (most - least)
 
 
-def test_a_clearance_larger_than_what_balls_leave_is_proven_by_the_bodies() -> None:
+def test_a_clearance_larger_than_that_of_bounding_balls_is_proven_by_the_bodies() -> None:
     """Plates one above the other, 0.98 m apart; the balls around them are 0.2 m apart and less."""
     links, limit = tuple(Link(f"link{k}") for k in range(3)), 0.1
     turn: dict[str, Any] = {"axis": (0, 0, 1), "lower": -limit, "upper": limit}
@@ -319,7 +319,7 @@ def test_a_proof_leaves_room_for_rounding(short: float, reason: str | None) -> N
     [((1.0, 1.0), None), ((-1.0, 1.0), None), ((0.313, -0.477), None), ((0.0, 0.0), None), ((1.1, 0.2), NEVER)],
     ids=["corner", "other corner", "between", "middle", "beyond a limit"],
 )
-def test_hulls_that_meet_in_few_postures_are_checked(place: tuple[float, float], reason: str | None) -> None:
+def test_hulls_that_meet_in_few_configurations_are_checked(place: tuple[float, float], reason: str | None) -> None:
     """Cubes of 0.016 m on slides of -1 to 1 m, of which one passes by this place alone; their covers always touch."""
     links = tuple(Link(f"link{k}") for k in range(3))
     slide: dict[str, Any] = {"lower": -1.0, "upper": 1.0}
@@ -398,8 +398,8 @@ def test_the_benchmark_of_redundant_arms(name: str) -> None:
     low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
     high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
     for _ in range(100):
-        found, placed = map(np.array, both(rng.uniform(low, high)))
-        for gap, (i, j) in zip(found.ravel(), every, strict=True):
+        result, placed = map(np.array, both(rng.uniform(low, high)))
+        for gap, (i, j) in zip(result.ravel(), every, strict=True):
             sides = [(placed[:, 4 * k : 4 * k + 3], placed[:, 4 * k + 3]) for k in (i, j)]
             ends = [bodies[k].shape.core @ turn.T + shift for k, (turn, shift) in zip((i, j), sides, strict=True)]
             assert gap == pytest.approx(segments_apart(*ends) - radius(bodies[i]) - radius(bodies[j]), abs=1e-9)
@@ -419,14 +419,14 @@ def segments_apart(one: Array, other: Array) -> float:
         share = np.clip((point - ends[0]) @ along / max(float(along @ along), 1e-300), 0, 1)
         return float(np.linalg.norm(point - ends[0] - share * along))
 
-    found = [to_segment(point, b) for a, b in ((one, other), (other, one)) for point in a]
+    matches = [to_segment(point, b) for a, b in ((one, other), (other, one)) for point in a]
     u, v = one[1] - one[0], other[1] - other[0]
     matrix = np.column_stack([u, -v])
     if np.linalg.matrix_rank(matrix, 1e-9) == 2:
         s, t = np.linalg.lstsq(matrix, other[0] - one[0], rcond=None)[0]
         if 0 <= s <= 1 and 0 <= t <= 1:
-            found.append(float(np.linalg.norm(one[0] + s * u - other[0] - t * v)))
-    return min(found)
+            matches.append(float(np.linalg.norm(one[0] + s * u - other[0] - t * v)))
+    return min(matches)
 
 
 def by_coal(one: Body, other: Body, ends: list[Array]) -> float:
@@ -490,9 +490,9 @@ BAD: list[tuple[dict[str, Any], str]] = [
 @pytest.mark.parametrize(("options", "name"), BAD, ids=range(len(BAD)))
 def test_bad_requests_are_named(options: dict[str, Any], name: str) -> None:
     robot, bodies = chain(0.3, 0.3, 0.3)
-    given: dict[str, Any] = {"robot": robot, "bodies": bodies} | options
+    arguments: dict[str, Any] = {"robot": robot, "bodies": bodies} | options
     with pytest.raises(ModelError) as caught:
-        checked_pairs(given.pop("robot"), given.pop("bodies"), **given)
+        checked_pairs(arguments.pop("robot"), arguments.pop("bodies"), **arguments)
     assert caught.value.name == name
 
 
@@ -522,15 +522,15 @@ def far_meshes(gap: float) -> tuple[Robot, tuple[Body, ...]]:
     )
 
 
-def test_meshes_are_checked_where_their_covers_always_touch_and_their_hulls_do_not() -> None:
+def test_meshes_are_checked_where_their_covers_always_overlap_and_their_hulls_do_not() -> None:
     robot, bodies = far_meshes(0.02)
     assert (0, 3) in checked_pairs(robot, bodies).checked
     beside = Body("link3", Sphere(0.05, (0.0, 0.0, 0.12)))  # beside a mesh, 0.02 m from its hull
     assert (0, 3) in checked_pairs(robot, (*bodies[:3], beside)).checked
     robot, bodies = far_meshes(-0.02)
-    found = checked_pairs(robot, bodies)
-    assert (0, 3) not in found.checked
-    assert found.left["link0", "link3"] in ASSUMED
+    result = checked_pairs(robot, bodies)
+    assert (0, 3) not in result.checked
+    assert result.left["link0", "link3"] in ASSUMED
 
 
 def test_a_joint_whose_limits_are_equal_but_for_the_sign_of_zero_is_no_error() -> None:

@@ -17,12 +17,12 @@ from models.shapes.shapes import Box, Capsule, Shape, Sphere
 def chain_of(joints: list[dict[str, Any]]) -> tuple[Robot, list[JointStep]]:
     """Links on joints one after the other, and the steps from the first to the last."""
     links = tuple(Link(f"link{k}") for k in range(len(joints) + 1))
-    made = [Joint(f"joint{k}", parent=f"link{k}", child=f"link{k + 1}", **each) for k, each in enumerate(joints)]
-    robot = Robot(links, tuple(made))
+    matches = [Joint(f"joint{k}", parent=f"link{k}", child=f"link{k + 1}", **each) for k, each in enumerate(joints)]
+    robot = Robot(links, tuple(matches))
     return robot, RigidParts.of(robot).path("link0", f"link{len(joints)}")[1]
 
 
-def test_a_chain_that_is_stretched_out_reaches_as_far_as_is_said() -> None:
+def test_the_reach_of_a_stretched_chain_is_exact() -> None:
     """0.2 m along x to a turn, 0.3 m to a slide of -0.1 to 0.5 m, 0.4 m to a turn, and there a rod of 0.6 m."""
     rotation, slide = {"kind": "revolute", "axis": (0, 0, 1), "lower": -2, "upper": 2}, {"kind": "prismatic"}
     robot, steps = chain_of(
@@ -77,7 +77,7 @@ def test_a_slide_that_follows_goes_as_far_as_it_follows() -> None:
     assert own == pytest.approx([0.6 + 0.4 + 0.1, 0.4 + 0.1, 0.1])
 
 
-def test_an_axis_along_the_way_has_no_arm_and_one_across_all_of_it() -> None:
+def test_lever_arms_are_zero_along_the_axis_and_full_across_it() -> None:
     joint = {"kind": "revolute", "lower": -2, "upper": 2}
     robot, steps = chain_of(
         [
@@ -92,7 +92,7 @@ def test_an_axis_along_the_way_has_no_arm_and_one_across_all_of_it() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_point_is_farther_from_an_axis_in_any_posture(seed: int) -> None:
+def test_no_configuration_exceeds_the_distance_bounds_from_an_axis(seed: int) -> None:
     """Up from one link of a random tree, down to another: of points of the body in 300 postures."""
     rng = np.random.default_rng(seed)
     links, joints = tuple(Link(f"link{k}") for k in range(6)), []
@@ -116,10 +116,10 @@ def test_no_point_is_farther_from_an_axis_in_any_posture(seed: int) -> None:
     end = Box(rng.uniform(0.1, 1, 3), rng.normal(size=3)) if seed % 2 else Capsule(0.2, *rng.normal(size=(2, 3)))
     own, _ = lever_arms(robot, chain, end, robot.lower, robot.upper)
     assert len(own) == 5
-    found = farthest(robot, [step for step, _ in chain], "link5", end, rng)
-    assert (found <= np.array(own) + 1e-9).all()
-    assert found[-1] == pytest.approx(own[-1], rel=1e-9)
-    assert (found > 0.2 * np.array(own)).all()
+    result = farthest(robot, [step for step, _ in chain], "link5", end, rng)
+    assert (result <= np.array(own) + 1e-9).all()
+    assert result[-1] == pytest.approx(own[-1], rel=1e-9)
+    assert (result > 0.2 * np.array(own)).all()
 
 
 def farthest(robot: Robot, steps: list[JointStep], link: str, body: Shape, rng: np.random.Generator) -> Array:
@@ -133,5 +133,5 @@ def farthest(robot: Robot, steps: list[JointStep], link: str, body: Shape, rng: 
         axis = ca.mtimes(frame.rotation, ca.DM(step.joint.axis))
         away = [ca.norm_2(ca.cross(axis, points[:, k] - frame.position)) for k in range(len(body.core))]
         each.append(ca.mmax(ca.vertcat(*away)) + body.swept_radius)
-    postures = rng.uniform(robot.lower, robot.upper, (300, robot.dof)).T
-    return np.asarray(np.array(ca.Function("away", [q], [ca.vertcat(*each)])(postures)).max(axis=1))
+    configurations = rng.uniform(robot.lower, robot.upper, (300, robot.dof)).T
+    return np.asarray(np.array(ca.Function("away", [q], [ca.vertcat(*each)])(configurations)).max(axis=1))

@@ -39,8 +39,8 @@ def test_reach_is_the_distance_of_the_farthest_point(kind: type) -> None:
     shape, point = random_shape(kind, rng), rng.normal(size=3)
     shares = rng.dirichlet(np.full(len(shape.core), 0.05), 4000)
     away = rng.normal(size=(4000, 3))
-    drawn = shares @ shape.core + shape.swept_radius * away / np.linalg.norm(away, axis=1, keepdims=True)
-    farthest = np.linalg.norm(drawn - point, axis=1).max()
+    inside = shares @ shape.core + shape.swept_radius * away / np.linalg.norm(away, axis=1, keepdims=True)
+    farthest = np.linalg.norm(inside - point, axis=1).max()
     assert farthest <= shape.reach(point) + 1e-9
     assert farthest >= 0.95 * shape.reach(point)
 
@@ -68,7 +68,7 @@ def test_the_corners_of_a_box_are_listed_along_z_first_then_y_then_x() -> None:
     np.testing.assert_allclose(core, corners @ turn.T + (10, 20, 30), atol=1e-12)
 
 
-def test_what_has_no_end_is_out_of_reach() -> None:
+def test_unbounded_shapes_have_no_reach() -> None:
     assert HalfSpace((0, 0, 1), (0, 0, 0)).reach((0, 0, 0)) == np.inf
     assert Box((np.inf, 1, 1)).reach((0, 0, 0)) == np.inf
     assert Box((2, 2, 1)).reach((0, 0, 0)) == pytest.approx(1.5)

@@ -20,7 +20,7 @@ ROUNDING, CLEARANCE = 0.02, 0.02
 ROD = Capsule(0.1, (-0.4, 0, 0), (0.4, 0, 0))
 CUBE = Box((1, 1, 1))
 ALONG_X = Capsule(0.1, (-0.5, 0, 0), (0.5, 0, 0))
-TOUCHING: dict[str, tuple[Shape, Shape, list[float]]] = {
+CONTACTS: dict[str, tuple[Shape, Shape, list[float]]] = {
     "a rod flush with a face": (ROD, CUBE, [0, 0, 0, 0, 0, 0.5]),
     "a tilted rod on a face": (ROD, CUBE, [0, 0.2, 0, 0, 0, 0.5]),
     "a rod over the rim of a face": (ROD, CUBE, [0, 0, 0.3, 0.5, 0.1, 0.45]),
@@ -50,14 +50,14 @@ def placed(one: Shape, other: Shape, target: list[float], start: list[float], ro
     x, cost, gap = program(one, other, target, rounding)
     quiet = {"print_time": 0, "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 100, "tol": 1e-9}}
     solver = ca.nlpsol("solver", "ipopt", {"x": x, "f": cost, "g": gap}, quiet)
-    found = solver(x0=start, lbg=CLEARANCE, ubg=ca.inf)
-    return np.array(found["x"]).ravel(), float(found["lam_g"]), solver.stats()
+    result = solver(x0=start, lbg=CLEARANCE, ubg=ca.inf)
+    return np.array(result["x"]).ravel(), float(result["lam_g"]), solver.stats()
 
 
 @pytest.mark.parametrize("start", STARTS, ids=("one side", "the other"))
-@pytest.mark.parametrize("what", TOUCHING)
+@pytest.mark.parametrize("what", CONTACTS)
 def test_ipopt_converges_where_bodies_lie_flush(what: str, start: list[float]) -> None:
-    one, other, target = TOUCHING[what]
+    one, other, target = CONTACTS[what]
     x, _, stats = placed(one, other, target, start, ROUNDING)
     assert stats["success"]
     assert stats["iter_count"] <= 40
@@ -67,10 +67,10 @@ def test_ipopt_converges_where_bodies_lie_flush(what: str, start: list[float]) -
     assert CLEARANCE - 1e-7 <= exact <= CLEARANCE + 3 * ROUNDING
 
 
-@pytest.mark.parametrize("what", TOUCHING)
+@pytest.mark.parametrize("what", CONTACTS)
 def test_newtons_method_has_order_two_where_bodies_lie_flush(what: str) -> None:
     """On the conditions of the optimum: each error is at most a constant times the square of the one before."""
-    one, other, target = TOUCHING[what]
+    one, other, target = CONTACTS[what]
     known, multiplier, _ = placed(one, other, target, STARTS[0], ROUNDING)
     x, cost, gap = program(one, other, target, ROUNDING)
     price = ca.SX.sym("price")
@@ -81,11 +81,11 @@ def test_newtons_method_has_order_two_where_bodies_lie_flush(what: str) -> None:
     errors = []
     for _ in range(4):
         at = np.append(known, multiplier) + 1e-5 * rng.normal(size=7)
-        way = [at]
+        path = [at]
         for _ in range(7):
-            value, slope = (np.array(part) for part in step(way[-1]))
-            way.append(way[-1] - np.linalg.solve(slope, value).ravel())
-        errors.append(np.linalg.norm(np.array(way[:-1]) - way[-1], axis=1))
+            value, slope = (np.array(part) for part in step(path[-1]))
+            path.append(path[-1] - np.linalg.solve(slope, value).ravel())
+        errors.append(np.linalg.norm(np.array(path[:-1]) - path[-1], axis=1))
     for first in errors:
         assert first[-1] < 1e-11
         large = first[first > 1e-8]
@@ -94,7 +94,7 @@ def test_newtons_method_has_order_two_where_bodies_lie_flush(what: str) -> None:
 
 
 def test_without_rounding_it_goes_back_and_forth() -> None:
-    one, other, target = TOUCHING["parallel rods"]
+    one, other, target = CONTACTS["parallel rods"]
     assert not placed(one, other, target, STARTS[0], 0.0)[2]["success"]
 
 

@@ -28,9 +28,9 @@ def checked(folder: Path, t: Any, q: Any, v: Any = None, a: Any = None, **option
 
 def the(check: Check, kind: str, name: str) -> Fault:
     """The one fault of a kind and a name."""
-    found = [fault for fault in check.faults if fault.kind == kind and fault.name == name]
-    assert len(found) == 1, check
-    return found[0]
+    matches = [fault for fault in check.faults if fault.kind == kind and fault.name == name]
+    assert len(matches) == 1, check
+    return matches[0]
 
 
 def near(fault: Fault, time: float, within: float = 0.02) -> None:
@@ -44,10 +44,10 @@ def near(fault: Fault, time: float, within: float = 0.02) -> None:
 @pytest.mark.parametrize("with_rates", [1, 2, 3])
 def test_a_sound_motion_is_not_accused(tmp_path: Path, with_rates: int) -> None:
     t, *values = smooth()
-    found = checked(tmp_path, t, *values[:with_rates], acceleration=8.0, jerk=40.0)
-    assert found.passed, found
-    assert found.rule == ("linear", "cubic", "quintic")[with_rates - 1]
-    assert {row.verdict for row in found.rows} == {"ok"}
+    check = checked(tmp_path, t, *values[:with_rates], acceleration=8.0, jerk=40.0)
+    assert check.passed, check
+    assert check.rule == ("linear", "cubic", "quintic")[with_rates - 1]
+    assert {row.verdict for row in check.rows} == {"ok"}
 
 
 def test_a_position_limit_passed_between_two_samples(tmp_path: Path) -> None:
@@ -55,8 +55,8 @@ def test_a_position_limit_passed_between_two_samples(tmp_path: Path) -> None:
     t = np.array([0.0, 1.0, 1.2, 2.2])
     q, v = np.zeros((4, 4)), np.zeros((4, 4))
     q[:, 0], v[:, 0] = [0.95, 1.95, 1.95, 0.95], [0.0, 2.0, -2.0, 0.0]
-    found = checked(tmp_path, t, q, v)
-    fault = the(found, "position", "shoulder")
+    check = checked(tmp_path, t, q, v)
+    fault = the(check, "position", "shoulder")
     assert fault.time == pytest.approx(1.1)
     assert fault.value == pytest.approx(1.95 + 2.0 * 0.2 / 4)
     assert "between two samples" in fault.text
@@ -84,11 +84,11 @@ def test_wrong_units(tmp_path: Path, column: int, factor: float, words: str) -> 
     columns = [0, 1, 2] if column == 0 else [3]
     for values in (q, v, a):
         values[:, columns] *= factor
-    found = checked(tmp_path, t, q, v, a)
-    fault = next(fault for fault in found.faults)
+    check = checked(tmp_path, t, q, v, a)
+    fault = next(fault for fault in check.faults)
     assert fault.kind == "units"
     assert words in fault.text
-    assert [fault.kind for fault in found.faults] == ["units"], "converted, the motion is sound"
+    assert [fault.kind for fault in check.faults] == ["units"], "converted, the motion is sound"
     assert fault.time is not None
     k = int(np.abs(t - fault.time).argmin())
     assert fault.value == pytest.approx(q[k, NAMES.index(fault.name)])
@@ -99,30 +99,30 @@ def test_velocities_in_degrees_and_times_in_milliseconds(tmp_path: Path) -> None
     wrong = v.copy()
     wrong[:, 1] *= 180 / np.pi
     assert "degrees per second" in the(checked(tmp_path, t, q, wrong), "units", "elbow").text
-    found = checked(tmp_path, 1000 * t, q, v)
-    assert "milliseconds" in the(found, "units", "time").text
-    assert len(found.faults) == 1
-    assert found.duration == pytest.approx(4.0)
+    check = checked(tmp_path, 1000 * t, q, v)
+    assert "milliseconds" in the(check, "units", "time").text
+    assert len(check.faults) == 1
+    assert check.duration == pytest.approx(4.0)
 
 
 def test_a_value_that_is_no_number(tmp_path: Path) -> None:
     t, q, v, _ = smooth()
     q[170, 1] = np.nan
     v[300, 2] = np.inf
-    found = checked(tmp_path, t, q, v)
-    near(the(found, "not a number", "elbow"), t[170], 0.0)
-    near(the(found, "not a number", "wrist"), t[300], 0.0)
-    assert the(found, "not a number", "elbow").line == 172
-    assert len(found.faults) == 2
-    assert any("2 of 401" in note for note in found.notes)
+    check = checked(tmp_path, t, q, v)
+    near(the(check, "not a number", "elbow"), t[170], 0.0)
+    near(the(check, "not a number", "wrist"), t[300], 0.0)
+    assert the(check, "not a number", "elbow").line == 172
+    assert len(check.faults) == 2
+    assert any("2 of 401" in note for note in check.notes)
 
 
 def test_times_that_go_back_and_times_that_repeat(tmp_path: Path) -> None:
     t, q, *_ = smooth()
     t[[170, 171]] = t[[171, 170]]
     q[[170, 171]] = q[[171, 170]]
-    found = checked(tmp_path, t, q)
-    (fault,) = found.faults
+    check = checked(tmp_path, t, q)
+    (fault,) = check.faults
     assert fault.kind == "times"
     near(fault, 1.7, 1e-9)
     assert fault.line == 173
@@ -135,13 +135,13 @@ def test_times_that_go_back_and_times_that_repeat(tmp_path: Path) -> None:
 
 def test_a_joint_that_is_missing_and_one_that_nobody_has(tmp_path: Path) -> None:
     t, q, *_ = smooth()
-    found = checked(tmp_path, t, q, names=("shoulder", "elbow", "wrst", "slide"))
-    assert {(fault.kind, fault.name) for fault in found.faults} == {
+    check = checked(tmp_path, t, q, names=("shoulder", "elbow", "wrst", "slide"))
+    assert {(fault.kind, fault.name) for fault in check.faults} == {
         ("unknown joint", "wrst"),
         ("missing joint", "wrist"),
     }
-    assert "is it wrist?" in the(found, "unknown joint", "wrst").text
-    assert any("clearance" in one for one in found.unchecked)
+    assert "is it wrist?" in the(check, "unknown joint", "wrst").text
+    assert any("clearance" in one for one in check.unchecked)
 
 
 def test_a_collision_between_two_samples(tmp_path: Path) -> None:
@@ -153,34 +153,34 @@ def test_a_collision_between_two_samples(tmp_path: Path) -> None:
     tip = np.array(arm.tip_pose((), exact).position, dtype=float).ravel()
     turn = np.array(arm.tip_pose((), exact).rotation, dtype=float)
     ball = Sphere(radius=1e-3, position=tip + turn @ [0.1, 0.0, 0.0] + 0.4e-3 * turn[:, 0])
-    found = checked(tmp_path, t, q, v, a, obstacles=[ball])
-    fault = the(found, "clearance", "finger and obstacle 0")
+    check = checked(tmp_path, t, q, v, a, obstacles=[ball])
+    fault = the(check, "clearance", "finger and obstacle 0")
     assert t[17] < (fault.time or 0.0) < t[18]
     assert "between two samples" in fault.text
-    assert {one.kind for one in found.faults} == {"clearance"}
+    assert {one.kind for one in check.faults} == {"clearance"}
 
 
 def test_the_arm_in_itself(tmp_path: Path) -> None:
     t = np.linspace(0.0, 4.0, 201)
     q = np.zeros((201, 4))
     q[:, 1] = 3.09 * np.sin(np.pi * t / 4) ** 2
-    found = checked(tmp_path, t, q)
-    names = {fault.name for fault in found.faults if fault.kind == "clearance"}
-    assert names & {"upper and hand", "upper and finger"}, found
-    touching = next(fault for fault in found.faults if fault.kind == "clearance")
-    assert touching.first is not None
-    assert 1.5 < touching.first < (touching.time or 0.0) < 2.5
+    check = checked(tmp_path, t, q)
+    names = {fault.name for fault in check.faults if fault.kind == "clearance"}
+    assert names & {"upper and hand", "upper and finger"}, check
+    colliding = next(fault for fault in check.faults if fault.kind == "clearance")
+    assert colliding.first is not None
+    assert 1.5 < colliding.first < (colliding.time or 0.0) < 2.5
     assert checked(tmp_path, t, q, ignored=[("upper", "hand"), ("upper", "finger")]).passed
 
 
-def test_an_arm_beyond_its_limits_is_looked_at_there(tmp_path: Path) -> None:
+def test_collisions_are_checked_beyond_the_joint_limits(tmp_path: Path) -> None:
     t = np.linspace(0.0, 2.0, 101)
     q = np.zeros((101, 4))
     q[:, 3] = 0.6 * t / 2
     wall = Sphere(radius=0.05, position=(1.75, 0.0, 0.0))
-    found = checked(tmp_path, t, q, obstacles=[wall])
-    assert {fault.kind for fault in found.faults} == {"position", "clearance"}
-    fault = the(found, "clearance", "finger and obstacle 0")
+    check = checked(tmp_path, t, q, obstacles=[wall])
+    assert {fault.kind for fault in check.faults} == {"position", "clearance"}
+    fault = the(check, "clearance", "finger and obstacle 0")
     assert fault.first == pytest.approx((1.75 - 0.05 - 1.2) / 0.6 * 2, abs=0.03)
     endless = URDF.replace('lower="0" upper="0.3" velocity="0.5"', 'lower="-inf" upper="inf" velocity="0.5"')
     robot = Robot.from_urdf(endless, tip="finger")
@@ -203,8 +203,8 @@ def test_a_tip_off_its_path(tmp_path: Path) -> None:
     bump = 0.01 * np.exp(-(((t - AT) / 0.1) ** 2))
     q[:, 3] += bump
     v[:, 3] += bump * -2 * (t - AT) / 0.1**2
-    found = checked(tmp_path, t, q, v, path=path)
-    fault = the(found, "path", "finger")
+    check = checked(tmp_path, t, q, v, path=path)
+    fault = the(check, "path", "finger")
     near(fault, AT, 0.06)
     assert 0.003 < (fault.value or 0.0) <= 0.0101
     short = checked(tmp_path, t[:200], q[:200], v[:200], path=path)
@@ -245,16 +245,16 @@ def test_a_bump_beyond_a_limit(tmp_path: Path, what: str, order: int, with_rates
     calm = {name: limit for name in NAMES if name != "elbow"}
     for values, part in zip((q, v, a), parts, strict=False):
         values[:, 1] = 0.8 + part if values is q else part
-    found = checked(tmp_path, t, *(q, v, a)[:with_rates], **{what: {"elbow": limit, **dict.fromkeys(calm, np.inf)}})
-    fault = the(found, what, "elbow")
+    check = checked(tmp_path, t, *(q, v, a)[:with_rates], **{what: {"elbow": limit, **dict.fromkeys(calm, np.inf)}})
+    fault = the(check, what, "elbow")
     peak = t[np.abs(np.abs(parts[order]) - np.abs(parts[order]).max()) < 2e-2 * limit]
     assert np.abs(peak - (fault.time or 0.0)).min() < 0.01
     assert abs(fault.value or 0.0) == pytest.approx(limit / 0.9, rel=2e-2)
     assert fault.limit == pytest.approx(np.copysign(limit, fault.value or 0.0))
-    assert [one.kind for one in found.faults] == [what]
+    assert [one.kind for one in check.faults] == [what]
 
 
-def test_a_controller_that_joins_samples_otherwise_is_told(tmp_path: Path) -> None:
+def test_the_interpolation_rule_of_the_controller_counts(tmp_path: Path) -> None:
     """Accelerations that jump in the middle between two samples: a quintic makes 16 % more, the motion has no more."""
     h, most = 0.1, 2.0
     t = h * (np.arange(21) - 0.5)
@@ -269,22 +269,22 @@ def test_a_controller_that_joins_samples_otherwise_is_told(tmp_path: Path) -> No
     near(fault, 10 * h, h / 2)
     assert checked(tmp_path, t, q, v, a, acceleration=most, share=1e-2, rule="linear").passed
     for values in ([q, v], [q, v, a]):
-        found = checked(tmp_path, t, *values, acceleration=most)
-        assert found.passed, found
-        row = next(row for row in found.rows if row.name == "acceleration of elbow")
+        check = checked(tmp_path, t, *values, acceleration=most)
+        assert check.passed, check
+        row = next(row for row in check.rows if row.name == "acceleration of elbow")
         assert row.value == pytest.approx(np.copysign(most, row.value), rel=1e-6)
         assert "not every motion through the samples" in row.note
     with pytest.raises(ProblemError, match="needs accelerations"):
         checked(tmp_path, t, q, v, rule="quintic")
 
 
-def test_what_is_beyond_a_limit_by_less_than_a_share_is_told(tmp_path: Path) -> None:
+def test_values_beyond_a_limit_within_the_tolerance_are_noted(tmp_path: Path) -> None:
     t, q, v, a = smooth()
     peak = float(np.abs(v[:, 1]).max())
     limit = {"elbow": peak / (1 + 5e-4)}
-    found = checked(tmp_path, t, q, v, a, velocity=limit)
-    assert found.passed
-    row = next(row for row in found.rows if row.name == "velocity of elbow")
+    check = checked(tmp_path, t, q, v, a, velocity=limit)
+    assert check.passed
+    row = next(row for row in check.rows if row.name == "velocity of elbow")
     assert (row.verdict, row.note) == ("ok", "beyond, by less than the 0.1 % allowed")
     the(checked(tmp_path, t, q, v, a, velocity=limit, share=0.0), "velocity", "elbow")
     assert checked(tmp_path, t, q, v, a, velocity={"elbow": peak * (1 + 1e-9)}, share=0.0).passed
@@ -299,11 +299,11 @@ def test_a_torque(tmp_path: Path, with_rates: int) -> None:
         ca.Function("torque", symbols, [inverse_dynamics(robot, *symbols)])(*(part.T for part in values))
     ).T
     limit = 0.95 * np.abs(exact[:, 0]).max()
-    found = checked(tmp_path, t, *values[:with_rates], torque={"shoulder": limit})
-    fault = the(found, "torque", "shoulder")
+    check = checked(tmp_path, t, *values[:with_rates], torque={"shoulder": limit})
+    fault = the(check, "torque", "shoulder")
     near(fault, t[np.abs(exact[:, 0]).argmax()])
     assert abs(fault.value or 0.0) == pytest.approx(limit / 0.95, rel=1e-3)
-    assert [one.kind for one in found.faults] == ["torque"]
+    assert [one.kind for one in check.faults] == ["torque"]
 
 
 # ---- plans of the gallery, exported and read back --------------------------------------------------------------------
@@ -323,6 +323,6 @@ def test_plans_of_the_gallery_are_not_accused(name: str, tmp_path: Path) -> None
     plan = Plan.load(GALLERY / f"{name}.npz")
     robot, file = plan.machine.robot, tmp_path / "plan.csv"
     plan.write_csv(file)
-    found = check_trajectory(plan.machine, read_trajectory(file, joints=robot.joint_names))
-    assert found.passed, found
-    assert found.faults == ()
+    check = check_trajectory(plan.machine, read_trajectory(file, joints=robot.joint_names))
+    assert check.passed, check
+    assert check.faults == ()

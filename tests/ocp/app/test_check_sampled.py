@@ -45,7 +45,7 @@ def least(motion: Motion, order: int) -> float:
     matrix = np.column_stack([*columns[::-1], np.zeros(order)])
     sizes = np.column_stack([np.vstack([np.eye(count), -np.eye(count)]), -np.ones(2 * count)])
     scale = np.abs(matrix).max(axis=1)
-    found = linprog(
+    result = linprog(
         [*np.zeros(count), 1.0],
         sizes,
         np.zeros(2 * count),
@@ -53,8 +53,8 @@ def least(motion: Motion, order: int) -> float:
         (end - whole @ start) / scale,
         bounds=[(None, None)] * (count + 1),
     )
-    assert found.success
-    return float(found.fun)
+    assert result.success
+    return float(result.fun)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -119,14 +119,14 @@ def of_ruckig(seed: int, dof: int) -> Sampled:
     rng = np.random.default_rng(seed)
     limits = {"velocity": (1.5, 3.5), "acceleration": (5.0, 15.0), "jerk": (50.0, 400.0)}
     most = {what: rng.uniform(*ends, dof) for what, ends in limits.items()}
-    postures = rng.uniform(-1.5, 1.5, (5, dof))
+    configurations = rng.uniform(-1.5, 1.5, (5, dof))
     motions, starts = [], [0.0]
-    for begin, end in pairwise(postures):
-        asked = ruckig.InputParameter(dof)
-        asked.current_position, asked.target_position = begin.tolist(), end.tolist()
-        asked.max_velocity, asked.max_acceleration, asked.max_jerk = (one.tolist() for one in most.values())
+    for begin, end in pairwise(configurations):
+        request = ruckig.InputParameter(dof)
+        request.current_position, request.target_position = begin.tolist(), end.tolist()
+        request.max_velocity, request.max_acceleration, request.max_jerk = (one.tolist() for one in most.values())
         motions.append(ruckig.Trajectory(dof))
-        ruckig.Ruckig(dof).calculate(asked, motions[-1])
+        ruckig.Ruckig(dof).calculate(request, motions[-1])
         starts.append(starts[-1] + motions[-1].duration)
 
     def at(t: Any) -> tuple[Any, ...]:
@@ -156,11 +156,11 @@ def checked(sampled: Sampled, period: float, rates: int, faster: float = 1.0, **
     ("seed", "periods"),
     [(0, SOME), (1, SOME), *(pytest.param(seed, PERIODS, marks=pytest.mark.long) for seed in range(12))],
 )
-@pytest.mark.parametrize("made", [of_toppra, of_ruckig])
+@pytest.mark.parametrize("result", [of_toppra, of_ruckig])
 def test_sampled_motions_pass_and_faster_ones_do_not(
-    made: Callable[[int, int], Sampled], seed: int, periods: tuple[float, ...], rates: int
+    result: Callable[[int, int], Sampled], seed: int, periods: tuple[float, ...], rates: int
 ) -> None:
-    sampled = made(seed, 6 + seed % 2)
+    sampled = result(seed, 6 + seed % 2)
     for period in periods:
         sound = checked(sampled, period, rates)
         assert sound.passed, sound
@@ -168,19 +168,19 @@ def test_sampled_motions_pass_and_faster_ones_do_not(
         assert {fault.kind for fault in fast.faults} & {"velocity", "acceleration", "jerk"}, fast
 
 
-def test_a_stated_controller_is_held_to_what_it_makes() -> None:
+def test_a_stated_rule_is_checked_by_its_interpolant() -> None:
     sampled = of_toppra(0, 6)
-    found = checked(sampled, 0.01, 2, rule="cubic")
-    assert {fault.kind for fault in found.faults} >= {"acceleration"}
+    check = checked(sampled, 0.01, 2, rule="cubic")
+    assert {fault.kind for fault in check.faults} >= {"acceleration"}
 
 
-def test_far_waypoints_are_still_held_to_their_cubics() -> None:
+def test_distant_waypoints_are_checked_by_their_cubics() -> None:
     """From rest to rest in 1 s a cubic is 1.5 times as fast as the mean; 1.2 times are allowed."""
     t = np.arange(4.0)
     q = np.array([0.0, 1.0, 0.0, 1.0])[:, None] * np.ones(6)
     robot = arm(np.full(6, 1.2))
     lines = np.arange(1, 5)
     raw = RawTrajectory(robot.joint_names, t, q, 0 * q, None, None, lines, True, (), "far")
-    found = check_motion(robot, raw, scene=False, time_unit="s")
-    assert {fault.kind for fault in found.faults} == {"velocity"}
-    assert [abs(fault.value or 0.0) for fault in found.faults] == pytest.approx([1.5] * 6)
+    check = check_motion(robot, raw, scene=False, time_unit="s")
+    assert {fault.kind for fault in check.faults} == {"velocity"}
+    assert [abs(fault.value or 0.0) for fault in check.faults] == pytest.approx([1.5] * 6)

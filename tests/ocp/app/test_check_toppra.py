@@ -19,7 +19,7 @@ from models import Robot
 from ocp.app.files import read_trajectory
 from tests.ocp.app.motions import check_motion, joint, link, write_table
 
-SEED, DOF, POSTURES = 9, 7, 5
+SEED, DOF, WAYPOINTS = 9, 7, 5
 SHARE = 1e-3
 PERIOD = 1e-3
 """s, between samples: what joins them overshoots the kinks of these accelerations, at twice as much by 2 %."""
@@ -28,10 +28,10 @@ PERIOD = 1e-3
 def example() -> tuple[Any, Any, Any]:
     """toppra's trajectory, and its limits of velocity and acceleration, shape (7,)."""
     rng = np.random.RandomState(SEED)
-    postures = rng.randn(POSTURES, DOF)
+    configurations = rng.randn(WAYPOINTS, DOF)
     velocity, acceleration = 10 + rng.rand(DOF) * 20, 10 + rng.rand(DOF) * 2
     toppra.setup_logging("ERROR")
-    path = toppra.SplineInterpolator(np.linspace(0, 1, POSTURES), postures)
+    path = toppra.SplineInterpolator(np.linspace(0, 1, WAYPOINTS), configurations)
     limits = [
         JointVelocityConstraint(np.stack([-velocity, velocity], axis=1)),
         JointAccelerationConstraint(np.stack([-acceleration, acceleration], axis=1)),
@@ -50,15 +50,15 @@ def arm(velocity: Any) -> Robot:
 
 
 @pytest.mark.parametrize("with_rates", [2, 3])
-def test_what_toppra_breaks_is_found(with_rates: int, tmp_path: Path) -> None:
+def test_limits_that_toppra_violates_are_reported(with_rates: int, tmp_path: Path) -> None:
     motion, velocity, acceleration = example()
     robot = arm(velocity)
     t = np.append(np.arange(0.0, motion.duration, PERIOD), motion.duration)
     file = write_table(tmp_path / "motion.csv", t, *[motion(t, k) for k in range(with_rates)], names=robot.joint_names)
     limit = dict(zip(robot.joint_names, acceleration.tolist(), strict=True))
     read = read_trajectory(file, joints=robot.joint_names)
-    found = check_motion(robot, read, acceleration=limit, scene=False, share=SHARE)
-    told = {(fault.kind, fault.name): fault for fault in found.faults}
+    check = check_motion(robot, read, acceleration=limit, scene=False, share=SHARE)
+    by_name = {(fault.kind, fault.name): fault for fault in check.faults}
     fine = np.linspace(0.0, motion.duration, 50_001)
     broken = set()
     for kind, order, most in (("velocity", 1, velocity), ("acceleration", 2, acceleration)):
@@ -66,8 +66,8 @@ def test_what_toppra_breaks_is_found(with_rates: int, tmp_path: Path) -> None:
         for name, of_joint in zip(robot.joint_names, used.T, strict=True):
             if of_joint.max() > 1 + SHARE:
                 broken.add((kind, name))
-                fault = told[kind, name]
+                fault = by_name[kind, name]
                 assert of_joint[np.abs(fine - (fault.time or 0.0)) <= PERIOD].max() > 0.99 * of_joint.max()
                 assert abs(fault.value or 0.0) == pytest.approx(of_joint.max() * abs(fault.limit or 0.0), rel=1e-2)
-    assert told.keys() == broken
+    assert by_name.keys() == broken
     assert broken

@@ -63,8 +63,8 @@ def run(capsys: Any, *words: Any) -> tuple[int, str, str]:
         status = main([str(word) for word in words])
     except SystemExit as error:
         status = int(error.code or 0)
-    found = capsys.readouterr()
-    return status, found.out, found.err
+    result = capsys.readouterr()
+    return status, result.out, result.err
 
 
 @cache
@@ -80,12 +80,12 @@ def planned() -> Path:
 # ---- plan, export, report ------------------------------------------------------------------------------------------
 
 
-def test_a_task_is_planned_and_what_is_written_is_the_plan(capsys: Any) -> None:
+def test_a_task_is_planned_and_all_outputs_equal_the_plan(capsys: Any) -> None:
     folder = planned()
-    made = Plan.load(folder / "seam.npz")
-    assert made.audit().passed
-    assert made.horizon == pytest.approx(2.0)
-    tips = made.sample(0.01).tip[:, :3]
+    loaded = Plan.load(folder / "seam.npz")
+    assert loaded.audit().passed
+    assert loaded.horizon == pytest.approx(2.0)
+    tips = loaded.sample(0.01).tip[:, :3]
     np.testing.assert_allclose(tips[[0, -1]], [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]], atol=1e-6)
     assert {file.suffix for file in folder.iterdir()} >= {".npz", ".csv", ".json", ".yaml", ".mcap", ".urdf", ".html"}
 
@@ -94,15 +94,15 @@ def test_a_task_is_planned_and_what_is_written_is_the_plan(capsys: Any) -> None:
 def test_a_plan_written_and_read_back_is_not_accused(capsys: Any, kind: str) -> None:
     folder = planned()
     status, out, _ = run(capsys, "check", folder / "seam.urdf", folder / f"seam.{kind}", "--json")
-    told = json.loads(out)
-    assert (status, told["faults"], told["passed"]) == (0, [], True)
-    assert told["rule"] == ("cubic" if kind == "mcap" else "quintic")
+    data = json.loads(out)
+    assert (status, data["faults"], data["passed"]) == (0, [], True)
+    assert data["rule"] == ("cubic" if kind == "mcap" else "quintic")
     status, out, _ = run(capsys, "export", folder / "seam.npz", folder / f"again.{kind}")
     assert status == 0
     assert (folder / f"again.{kind}").read_bytes() == (folder / f"seam.{kind}").read_bytes()
 
 
-def test_a_plan_keeps_to_the_path_it_was_made_for(capsys: Any) -> None:
+def test_a_plan_follows_the_path_of_its_task(capsys: Any) -> None:
     folder = planned()
     (folder / "path.csv").write_text("x,y,z\n0.75,0.1,0.3\n0.75,0.3,0.3\n")
     words = "check", folder / "seam.urdf", folder / "seam.csv", "--path", folder / "path.csv", "--json"
@@ -119,11 +119,11 @@ class Page(HTMLParser):
 
     def __init__(self) -> None:
         super().__init__()
-        self.asked: list[str] = []
+        self.requests: list[str] = []
         self.open: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: Any) -> None:
-        self.asked += [value for name, value in attrs if name in ("src", "href", "action", "srcset") and value]
+        self.requests += [value for name, value in attrs if name in ("src", "href", "action", "srcset") and value]
         if tag in ("table", "figure", "ul", "ol", "div", "svg", "body", "html"):
             self.open.append(tag)
 
@@ -140,7 +140,7 @@ def test_a_report_stands_alone(capsys: Any) -> None:
     page = Page()
     page.feed(text)
     assert page.open == []
-    assert all(one.startswith(("data:", "#")) for one in page.asked), page.asked
+    assert all(one.startswith(("data:", "#")) for one in page.requests), page.requests
     assert "url(http" not in text
     assert "@import" not in text
     assert "Seam &lt;4&gt;" in text
@@ -195,7 +195,7 @@ def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> No
         ('plan = "seam.npz"', 'plan = "no/where/seam.npz"', 20, "no folder"),
     ],
 )
-def test_what_is_wrong_in_a_task_file_is_said_by_line(
+def test_errors_in_a_task_file_name_the_line(
     tmp_path: Path, capsys: Any, old: str, new: str, line: int, expected: str
 ) -> None:
     assert old in TASK
@@ -243,7 +243,7 @@ LIFTED = """<robot name="lifted"><link name="ground"/><link name="column"/><link
 """The shoulder limited: on either side of a line across the elbow has to be on the other one."""
 
 
-def test_what_no_one_motion_does_is_written_with_the_ways_between_its_pieces_and_fails_where_one_is_missing(
+def test_segmented_plans_are_written_with_reconfigurations_and_fail_where_one_is_missing(
     tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "robot.urdf").write_text(LIFTED)
@@ -254,28 +254,28 @@ def test_what_no_one_motion_does_is_written_with_the_ways_between_its_pieces_and
     )
     status, out, err = run(capsys, "plan", tmp_path / "line.toml", "-o", tmp_path / "line.npz", "--json")
     assert status == 0, err
-    told = json.loads(out)
-    assert len(told["reconfigurations"]) == told["fewest"] == 1
-    assert told["written"] == {"csv": str(tmp_path / "line.csv"), "plan": str(tmp_path / "line.npz")}
-    made = Plan.load(tmp_path / "line.npz")
-    assert isinstance(made, SegmentedPlan)
-    first, last = made.segments
-    (change,) = made.reconfigurations
-    assert told["duration"] == pytest.approx(first.horizon + change.duration + last.horizon)
-    assert made.task_horizon == first.horizon + last.horizon == pytest.approx(2.0)
-    assert told["cost"] == pytest.approx(first.cost + last.cost)
+    data = json.loads(out)
+    assert len(data["reconfigurations"]) == data["fewest"] == 1
+    assert data["written"] == {"csv": str(tmp_path / "line.csv"), "plan": str(tmp_path / "line.npz")}
+    loaded = Plan.load(tmp_path / "line.npz")
+    assert isinstance(loaded, SegmentedPlan)
+    first, last = loaded.segments
+    (change,) = loaded.reconfigurations
+    assert data["duration"] == pytest.approx(first.horizon + change.duration + last.horizon)
+    assert loaded.task_horizon == first.horizon + last.horizon == pytest.approx(2.0)
+    assert data["cost"] == pytest.approx(first.cost + last.cost)
     assert first.at(0.0)["joints"][2] * last.at(last.horizon)["joints"][2] < 0  # the elbow has changed its side
     rows = np.loadtxt(tmp_path / "line.csv", delimiter=",", skiprows=1)
-    assert rows[-1, 0] == told["duration"]
+    assert rows[-1, 0] == data["duration"]
     assert np.abs(np.diff(rows[:, 1:4], axis=0)).max() < 3.0 * 0.004 * 1.01  # it goes on where each piece ends
     barred = [replace(change, motion=None, failure="the way is barred")]
-    monkeypatch.setattr("ocp.app.subcommands.plan", lambda *_, **__: replace(made, reconfigurations=tuple(barred)))
+    monkeypatch.setattr("ocp.app.subcommands.plan", lambda *_, **__: replace(loaded, reconfigurations=tuple(barred)))
     status, out, _ = run(capsys, "plan", tmp_path / "line.toml", "--json", "--force")
     assert status == 1  # the pieces are there, and pass
-    told = json.loads(out)
-    assert (told["passed"], told["duration"]) == (False, pytest.approx(2.0))
-    assert told["reconfigurations"][0]["failure"] == "the way is barred"
-    assert told["verdict"].startswith("must not be run: reconfigurations without a motion")
+    data = json.loads(out)
+    assert (data["passed"], data["duration"]) == (False, pytest.approx(2.0))
+    assert data["reconfigurations"][0]["failure"] == "the way is barred"
+    assert data["verdict"].startswith("must not be run: reconfigurations without a motion")
 
 
 def test_a_dead_end_names_the_key_of_the_task_file_that_may_help(tmp_path: Path, capsys: Any) -> None:
@@ -359,9 +359,9 @@ def test_the_cache_is_shown_and_cleared(tmp_path: Path, capsys: Any, monkeypatch
     (tmp_path / "selfmotion" / "mine.txt").write_text("not of the cache")
     kept.store_value("a" * 64, {"a": 1})
     kept.store_library("b" * 64, b"compiled")
-    told = json.loads(run(capsys, "cache", "--json")[1])
-    assert (told["folder"], told["files"], told["cleared"]) == (str(tmp_path / "selfmotion"), 2, False)
-    assert (told["libraries"], told["bytes"]) == (1, 64 + len('\n{"a": 1}') + len(b"compiled"))
+    data = json.loads(run(capsys, "cache", "--json")[1])
+    assert (data["folder"], data["files"], data["cleared"]) == (str(tmp_path / "selfmotion"), 2, False)
+    assert (data["libraries"], data["bytes"]) == (1, 64 + len('\n{"a": 1}') + len(b"compiled"))
     assert kept.load_value("a" * 64) == {"a": 1}
     assert run(capsys, "cache", "clear")[0] == 0
     assert kept.load_value("a" * 64) is None

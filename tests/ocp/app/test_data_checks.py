@@ -90,10 +90,10 @@ def test_a_rule_gives_back_polynomials_of_its_degree(degree: int) -> None:
 def test_divided_differences_are_exact_for_polynomials_of_their_order() -> None:
     f = np.polynomial.Polynomial([0.3, -1.0, 0.7, 0.25])
     t = np.sort(np.random.default_rng(1).uniform(0.0, 2.0, 9))
-    found = Motion(t, f(t)[:, None]).quantity("jerk")
-    assert found is not None
-    assert not found.closed
-    np.testing.assert_allclose(found.pieces.coefficients[:, 0, 0], f.deriv(3)(0.0), rtol=1e-6)
+    result = Motion(t, f(t)[:, None]).quantity("jerk")
+    assert result is not None
+    assert not result.closed
+    np.testing.assert_allclose(result.pieces.coefficients[:, 0, 0], f.deriv(3)(0.0), rtol=1e-6)
 
 
 @pytest.mark.parametrize("rates", [1, 2, 3])
@@ -109,17 +109,17 @@ def test_proven_distances_lie_below_a_fine_sampling_and_near_it(rates: int, coun
     arm = FixedBase(Robot.from_urdf(URDF, tip="finger"))
     ball = Sphere(radius=0.1, position=rng.uniform([0.3, -0.2, 0.3], [0.9, 0.6, 0.6]))
     around = CollisionScene(with_wide_limits(arm, motion), [ball], 0.05)
-    found = prove_clearance(around, motion)
-    assert found.settled
+    result = prove_clearance(around, motion)
+    assert result.settled
     fine = np.unique(np.concatenate([a + (b - a) * np.linspace(0.0, 1.0, 21) for a, b in pairwise(t)]))
     apart = distances_along(around, np.zeros(0), motion.position.at(fine), fine)
     least = dict(zip(around.labels, apart.min(axis=0), strict=True))
-    for near in found.pairs:
+    for near in result.pairs:
         assert near.least <= least[near.bodies] + 1e-12
-    worst = min(found.pairs, key=lambda near: near.distance)
+    worst = min(result.pairs, key=lambda near: near.distance)
     nearest = min(least.values())
     assert worst.distance <= nearest + 1e-3
-    assert min(near.least for near in found.pairs) >= nearest - max(0.03 * abs(nearest - 0.05), 1e-3)
+    assert min(near.least for near in result.pairs) >= nearest - max(0.03 * abs(nearest - 0.05), 1e-3)
 
 
 # ---- what only looks odd -------------------------------------------------------------------------------------------
@@ -128,9 +128,9 @@ def test_proven_distances_lie_below_a_fine_sampling_and_near_it(rates: int, coun
 @pytest.mark.parametrize("digits", [3, 4, 6])
 def test_digits_that_a_file_has_not_are_no_fault(tmp_path: Path, digits: int) -> None:
     t, q, *_ = smooth(2001)
-    found = checked(tmp_path, URDF, NAMES, t, np.round(q, digits), acceleration=8.0, jerk=60.0)
-    assert found.passed, found
-    assert "undetermined" in found.sentence
+    check = checked(tmp_path, URDF, NAMES, t, np.round(q, digits), acceleration=8.0, jerk=60.0)
+    assert check.passed, check
+    assert "undetermined" in check.sentence
     t, q, v, _ = smooth(2001)
     single = q.astype(np.float32).astype(float), v.astype(np.float32).astype(float)
     assert checked(tmp_path, URDF, NAMES, t, *single, acceleration=8.0, jerk=60.0).passed
@@ -149,10 +149,10 @@ def test_a_joint_without_end_may_turn_on_and_be_wrapped(tmp_path: Path) -> None:
     for spin, notes in ((2 * t, 0), (wrapped, 1)):
         q, v = np.column_stack([spin, left]), np.column_stack([0 * t + 2, still])
         for values in ([q], [q, v]):
-            found = checked(tmp_path, SPINNING, ("spin", "left"), t, *values, scene=False)
-            assert found.passed, found
-            assert len(found.notes) == notes, found
-            row = next(row for row in found.rows if row.name == "velocity of spin")
+            check = checked(tmp_path, SPINNING, ("spin", "left"), t, *values, scene=False)
+            assert check.passed, check
+            assert len(check.notes) == notes, check
+            row = next(row for row in check.rows if row.name == "velocity of spin")
             assert row.value == pytest.approx(2.0, abs=1e-6)
     fast = checked(tmp_path, SPINNING, ("spin", "left"), t, np.column_stack([np.degrees(2 * t), left]), scene=False)
     assert [one.kind for one in fast.faults] == ["units"]
@@ -161,8 +161,8 @@ def test_a_joint_without_end_may_turn_on_and_be_wrapped(tmp_path: Path) -> None:
 def test_a_joint_with_limits_that_was_wrapped_jumps(tmp_path: Path) -> None:
     t, q, *_ = smooth()
     q[:, 1] = (2.5 + 0.3 * t + np.pi) % (2 * np.pi) - np.pi
-    found = checked(tmp_path, URDF, NAMES, t, q, scene=False)
-    fault = next(one for one in found.faults if one.kind == "jump")
+    check = checked(tmp_path, URDF, NAMES, t, q, scene=False)
+    fault = next(one for one in check.faults if one.kind == "jump")
     assert fault.name == "elbow"
     assert "a whole turn" in fault.text
     assert fault.time == pytest.approx((np.pi - 2.5) / 0.3, abs=0.02)
@@ -178,24 +178,24 @@ def test_followers_follow(tmp_path: Path) -> None:
     (fault,) = checked(tmp_path, SPINNING, names, t, wrong, scene=False).faults
     assert (fault.kind, fault.name) == ("follower", "right")
     assert (fault.time or 0.0) > 1.2
-    found = checked(tmp_path, SPINNING, ("spin", "right"), t, np.column_stack([t, 2 * left]), scene=False)
-    assert "its follower right is given" in found.faults[0].text
+    check = checked(tmp_path, SPINNING, ("spin", "right"), t, np.column_stack([t, 2 * left]), scene=False)
+    assert "its follower right is given" in check.faults[0].text
 
 
 def test_times_in_nanoseconds(tmp_path: Path) -> None:
     t, q, *_ = smooth()
-    found = checked(tmp_path, URDF, NAMES, np.rint(1e9 * t), q)
-    assert [(one.kind, one.name) for one in found.faults] == [("units", "time")]
-    assert found.duration == pytest.approx(4.0)
+    check = checked(tmp_path, URDF, NAMES, np.rint(1e9 * t), q)
+    assert [(one.kind, one.name) for one in check.faults] == [("units", "time")]
+    assert check.duration == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_few_samples(tmp_path: Path, count: int) -> None:
     t, q, v, a = smooth(11)
     for values in ([q], [q, v], [q, v, a]):
-        found = checked(tmp_path, URDF, NAMES, t[:count], *(one[:count] for one in values), acceleration=50.0)
-        assert {one.kind for one in found.faults} <= {"velocity", "acceleration", "torque"}
-        assert found.samples == count
+        check = checked(tmp_path, URDF, NAMES, t[:count], *(one[:count] for one in values), acceleration=50.0)
+        assert {one.kind for one in check.faults} <= {"velocity", "acceleration", "torque"}
+        assert check.samples == count
 
 
 def test_where_a_file_begins_changes_no_verdict(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_where_a_file_begins_changes_no_verdict(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("planar", [False, True])
-def test_a_floating_base_keeps_its_momentum_or_is_told_wrong(tmp_path: Path, planar: bool) -> None:
+def test_a_floating_base_that_violates_momentum_is_a_fault(tmp_path: Path, planar: bool) -> None:
     text = URDF if not planar else URDF.replace('axis xyz="0 -1 0"', 'axis xyz="0 0 1"')
     t, q, v, a = smooth()
     kind: Literal["planar", "spatial"] = "planar" if planar else "spatial"
@@ -222,8 +222,8 @@ def test_a_floating_base_keeps_its_momentum_or_is_told_wrong(tmp_path: Path, pla
     names = (*NAMES, *BASES[1 if planar else 0])
     assert checked(tmp_path, text, names, t, np.column_stack([q, base]), base=partial(FreeFloating, base=kind)).passed
     base[:, 0] += 0.02 * np.sin(t) ** 2
-    found = checked(tmp_path, text, names, t, np.column_stack([q, base]), base=partial(FreeFloating, base=kind))
-    assert {one.kind for one in found.faults} == {"momentum"}
+    check = checked(tmp_path, text, names, t, np.column_stack([q, base]), base=partial(FreeFloating, base=kind))
+    assert {one.kind for one in check.faults} == {"momentum"}
     assert checked(tmp_path, text, NAMES, t, q, v, base=partial(FreeFloating, base=kind)).passed
 
 
@@ -239,8 +239,8 @@ def test_torques_of_a_floating_arm_are_the_power_that_goes_into_its_motion(plana
     twist = machine.base_twist(base, q, v)
     energy = (ca.bilin(held, v, v) + ca.bilin(inertia, twist, twist)) / 2 + ca.dot(twist, ca.mtimes(joints, v))
     power = ca.jtimes(energy, ca.vertcat(q, v), ca.vertcat(v, a))
-    given = ca.dot(floating_torques(machine, q, v, a), v)
-    function = ca.Function("power", [q, v, a], [power, given])
+    options = ca.dot(floating_torques(machine, q, v, a), v)
+    function = ca.Function("power", [q, v, a], [power, options])
     rng = np.random.default_rng(3)
     for _ in range(5):
         one, other = function(*rng.normal(size=(3, 4)))
@@ -250,8 +250,8 @@ def test_torques_of_a_floating_arm_are_the_power_that_goes_into_its_motion(plana
 def test_a_floating_base_beside_an_obstacle(tmp_path: Path) -> None:
     t, q, v, a = smooth()
     ball = Sphere(radius=0.2, position=(0.9, 0.3, 0.4))
-    found = checked(tmp_path, URDF, NAMES, t, q, v, a, base=FreeFloating, obstacles=[ball])
-    assert {one.kind for one in found.faults} == {"clearance"}
+    check = checked(tmp_path, URDF, NAMES, t, q, v, a, base=FreeFloating, obstacles=[ball])
+    assert {one.kind for one in check.faults} == {"clearance"}
     far = Sphere(radius=0.2, position=(9.0, 0.0, 0.0))
     assert checked(tmp_path, URDF, NAMES, t, q, v, a, base=FreeFloating, obstacles=[far]).passed
 
@@ -266,8 +266,8 @@ def test_the_zero_moment_point_is_that_of_the_standing_machine(tmp_path: Path) -
     zmp = ca.Function("zmp", symbols, [machine.zero_moment_point(*symbols)])
     points = np.array(zmp(q.T, v.T, a.T)).T
     narrow = rectangle((-1.0, float(points[:, 0].max()) - 0.01), (-1.0, 1.0))
-    found = checked(tmp_path, URDF, NAMES, t, q, v, a, base=partial(Standing, support=narrow))
-    (fault,) = found.faults
+    check = checked(tmp_path, URDF, NAMES, t, q, v, a, base=partial(Standing, support=narrow))
+    (fault,) = check.faults
     assert fault.kind == "zero moment point"
     assert fault.time == pytest.approx(t[points[:, 0].argmax()], abs=0.02)
     assert fault.value == pytest.approx(-0.01, abs=1e-4)
@@ -282,17 +282,17 @@ def test_the_zero_moment_point_is_that_of_the_standing_machine(tmp_path: Path) -
 )
 @pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")
 def test_the_plans_of_the_gallery_are_not_accused(tmp_path: Path, name: str, self_collision: bool) -> None:
-    made = Plan.load(GALLERY / f"{name}.npz")
-    assert isinstance(made, SolvedPlan)
-    machine, robot = made.machine, made.machine.robot
-    sample = made.sampled(np.linspace(0.0, made.horizon, round(made.horizon / 0.01) + 1))
-    more = [sample.accelerations] if made.rate_name == "velocities" else []
+    loaded = Plan.load(GALLERY / f"{name}.npz")
+    assert isinstance(loaded, SolvedPlan)
+    machine, robot = loaded.machine, loaded.machine.robot
+    sample = loaded.sampled(np.linspace(0.0, loaded.horizon, round(loaded.horizon / 0.01) + 1))
+    more = [sample.accelerations] if loaded.rate_name == "velocities" else []
     base = machine if machine.base_size else FixedBase(robot, machine.translation, machine.rotation)  # type: ignore[attr-defined]
     for values in ([sample.joints], [sample.joints, sample.rates], [sample.joints, sample.rates, *more]):
-        file = write_table(tmp_path / "m.csv", sample.t, *values, names=made.names)
+        file = write_table(tmp_path / "m.csv", sample.t, *values, names=loaded.names)
         raw = read_trajectory(file, joints=robot.joint_names)
-        found = check_trajectory(base, raw, scene=None if self_collision else False)
-        assert found.passed, found
+        check = check_trajectory(base, raw, scene=None if self_collision else False)
+        assert check.passed, check
 
 
 # ---- what is asked ---------------------------------------------------------------------------------------------------
@@ -313,7 +313,7 @@ def test_the_plans_of_the_gallery_are_not_accused(tmp_path: Path, name: str, sel
         ({"friction": 0.0}, "friction"),
     ],
 )
-def test_what_is_asked_wrongly_is_refused_by_name(tmp_path: Path, options: dict[str, Any], name: str) -> None:
+def test_invalid_options_are_refused_by_name(tmp_path: Path, options: dict[str, Any], name: str) -> None:
     t, q, *_ = smooth(11)
     with pytest.raises(ProblemError) as caught:
         checked(tmp_path, URDF, NAMES, t, q, **options)

@@ -202,15 +202,15 @@ def test_names_in_a_head_mean_nothing_to_spreadsheets_and_shells(names: list[str
 def test_tables_are_read_back_with_their_names(names: list[str], tmp_path_factory: pytest.TempPathFactory) -> None:
     file = tmp_path_factory.getbasetemp() / "named.csv"
     values = np.arange(2.0 * len(names)).reshape(2, -1)
-    made = JointTrajectory(tuple(names), np.array([0.0, 1.0]), values, values, values)
-    made.write_csv(file)
+    result = JointTrajectory(tuple(names), np.array([0.0, 1.0]), values, values, values)
+    result.write_csv(file)
     assert JointTrajectory.read_csv(file).names == tuple(names)
-    rows = np.column_stack([made.t, values, values, values])
+    rows = np.column_stack([result.t, values, values, values])
     file.write_text("\n".join([",".join(table_head(names)), *(",".join(map(repr, row)) for row in rows.tolist())]))
-    found = read_trajectory(file)
-    assert found.names == tuple(names)
-    np.testing.assert_array_equal(found.positions, values)
-    assert found.accelerations is not None
+    trajectory = read_trajectory(file)
+    assert trajectory.names == tuple(names)
+    np.testing.assert_array_equal(trajectory.positions, values)
+    assert trajectory.accelerations is not None
 
 
 EVIL = ["$(touch PWNED)", "`touch PWNED`", "=cmd|'/C calc'!A0", "$\\frac{$", "</title><script>alert(1)</script>"]
@@ -230,14 +230,14 @@ def test_a_stranger_s_names_do_nothing(tmp_path: Path, capsys: Any, monkeypatch:
     status, _, err = run(capsys, "plan", tmp_path / "seam.toml", "--quiet")
     assert status == 0, err
     assert run(capsys, "view", tmp_path / "seam.npz", "--page", tmp_path / "page.html", "--quiet")[0] == 0
-    made = Plan.load(tmp_path / "seam.npz")
-    assert set(EVIL[: len(made.names)]) == set(made.names)
+    loaded = Plan.load(tmp_path / "seam.npz")
+    assert set(EVIL[: len(loaded.names)]) == set(loaded.names)
     subprocess.run(["sh", "./seam.csv"], capture_output=True, check=False)
     assert not (tmp_path / "PWNED").exists()
     assert not re.search(r"[$`=;'\"]", (tmp_path / "seam.csv").read_text())
     for ending in ("csv", "json", "yaml", "mcap"):
-        assert read_trajectory(tmp_path / f"seam.{ending}").names == made.names
-    assert Robot.from_urdf(tmp_path / "seam.urdf").joint_names == made.names
+        assert read_trajectory(tmp_path / f"seam.{ending}").names == loaded.names
+    assert Robot.from_urdf(tmp_path / "seam.urdf").joint_names == loaded.names
     assert "<script>alert" not in (tmp_path / "seam.html").read_text() + (tmp_path / "page.html").read_text()
 
 
@@ -245,12 +245,12 @@ def test_a_stranger_s_names_do_nothing(tmp_path: Path, capsys: Any, monkeypatch:
     "name", ["a\nb", "a\rb", "a\tb", "\x1b[2J", "a\0", "a\x7f", "a\u2028b", "\u202ea", "a\ud800", "a" * 501]
 )
 def test_names_that_are_not_printed_are_refused(name: str) -> None:
-    for made in (lambda: Link(name), lambda: Joint(name, "fixed", "a", "b"), lambda: Robot((Link("a"),), name=name)):
+    for result in (lambda: Link(name), lambda: Joint(name, "fixed", "a", "b"), lambda: Robot((Link("a"),), name=name)):
         with pytest.raises(ModelError, match="printable"):
-            made()
+            result()
 
 
-def test_what_a_file_says_does_not_reach_the_terminal_as_it_is(tmp_path: Path, capsys: Any) -> None:
+def test_control_characters_of_files_do_not_reach_the_terminal(tmp_path: Path, capsys: Any) -> None:
     t, q, *_ = smooth()
     robot, file = write_robot(tmp_path), write_table(tmp_path / "m.csv", t, q)
     head, _, rows = file.read_text().partition("\n")
@@ -267,9 +267,9 @@ def test_reports_and_pages_ask_nobody_and_run_nothing_of_others(tmp_path: Path, 
     assert run(capsys, "view", planned() / "seam.npz", "--page", tmp_path / "page.html", "--quiet")[0] == 0
     for file in (planned() / "seam.html", tmp_path / "page.html"):
         text = file.read_text()
-        (told,) = re.findall(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
+        (report,) = re.findall(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
         assert text.index("Content-Security-Policy") < text.index("<title>")
-        allowed = dict(part.strip().split(" ", 1) for part in told.split(";"))
+        allowed = dict(part.strip().split(" ", 1) for part in report.split(";"))
         assert allowed.pop("default-src") == "'none'"
         assert set(allowed.items()) <= {
             ("script-src", "'unsafe-inline'"),

@@ -14,7 +14,7 @@ from ocp.app.view.animation import animate_plan
 from ocp.app.view.report import report_of_plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from tests.ocp.motion.plan.test_path_plan import path
-from tests.ocp.motion.plan.test_segmented_plan import made
+from tests.ocp.motion.plan.test_segmented_plan import segmented_plan
 
 pytestmark = pytest.mark.xdist_group("segmented plan")
 
@@ -38,42 +38,50 @@ def with_machine(plan: SegmentedPlan, machine: FixedBase) -> SegmentedPlan:
 
 @pytest.mark.parametrize("period", PERIODS)
 def test_rates_that_jump_at_their_limit_between_motions_are_no_fault(period: float) -> None:
-    rates = made().at(made().segments[0].horizon + np.array([-1e-6, 1e-6]))["rates"]
+    rates = segmented_plan().at(segmented_plan().segments[0].horizon + np.array([-1e-6, 1e-6]))["rates"]
     assert np.abs(np.diff(rates, axis=0)).max() > 1.0
-    verdict = verdict_of(made(), made().sample(period), "line")
+    verdict = verdict_of(segmented_plan(), segmented_plan().sample(period), "line")
     assert verdict.passed, verdict.sentence
-    assert verdict.sentence == made().audit().sentence
+    assert verdict.sentence == segmented_plan().audit().sentence
     fastest = next(row for row in verdict.check.rows if row.name == "velocity of joint1")
     assert abs(fastest.value) == pytest.approx(3.0, rel=1e-3)
-    assert verdict.check.duration == pytest.approx(made().horizon)
+    assert verdict.check.duration == pytest.approx(segmented_plan().horizon)
 
 
 def test_each_motion_is_held_against_the_limits_of_its_machine() -> None:
-    slow = verdict_of(with_machine(made(), limited(made().machine, velocity=2.5)), made().sample(0.01), "line")
+    slow = verdict_of(
+        with_machine(segmented_plan(), limited(segmented_plan().machine, velocity=2.5)),
+        segmented_plan().sample(0.01),
+        "line",
+    )
     assert not slow.passed
-    change = made().reconfigurations[0]
+    change = segmented_plan().reconfigurations[0]
     assert {fault.kind for fault in slow.check.faults} == {"velocity"}
     times = [fault.time for fault in slow.check.faults if fault.time is not None]
     assert times
     assert all(change.time <= time <= change.time + change.duration for time in times)
-    narrow = verdict_of(with_machine(made(), limited(made().machine, upper=1.6)), made().sample(0.01), "line")
+    narrow = verdict_of(
+        with_machine(segmented_plan(), limited(segmented_plan().machine, upper=1.6)),
+        segmented_plan().sample(0.01),
+        "line",
+    )
     assert {fault.kind for fault in narrow.check.faults} == {"position"}
     assert min(fault.time or 0.0 for fault in narrow.check.faults) > change.time
 
 
 @pytest.mark.parametrize("period", PERIODS)
 def test_a_path_passes_at_its_velocity_limits_and_not_beyond(period: float) -> None:
-    found = path()
-    verdict = verdict_of(found, found.sample(period), "path")
+    result = path()
+    verdict = verdict_of(result, result.sample(period), "path")
     assert verdict.check.passed, verdict.sentence
-    assert verdict.sentence == found.audit().sentence
-    slow = replace(found, machine=limited(found.machine, velocity=1.0), constraints=None)
+    assert verdict.sentence == result.audit().sentence
+    slow = replace(result, machine=limited(result.machine, velocity=1.0), constraints=None)
     timed = replace(slow, limits=replace(slow.limits, velocity=3.0))
     assert {fault.kind for fault in verdict_of(timed, timed.sample(period), "path").check.faults} == {"velocity"}
     assert verdict_of(slow, slow.sample(period), "path").check.passed
 
 
-@pytest.mark.parametrize("plan", [made, path], ids=["segments", "path"])
+@pytest.mark.parametrize("plan", [segmented_plan, path], ids=["segments", "path"])
 def test_it_is_reported_and_shown_with_that_verdict(plan: Any) -> None:
     report, shown = report_of_plan(plan(), 0.01, "a motion"), animate_plan(plan())
     for verdict in (report.verdict, shown.verdict):

@@ -170,13 +170,13 @@ def turned(quaternion: Array) -> Array:
     )
 
 
-def surfaces(told: Any, arrays: Any, robot: int = 0) -> dict[tuple[str, tuple[float, ...]], Array]:
+def surfaces(report: Any, arrays: Any, robot: int = 0) -> dict[tuple[str, tuple[float, ...]], Array]:
     """Corners of what is shown, in the frame of the link that moves it, by the link's name and the colour."""
-    found = {}
-    for part in told["robots"][robot]["parts"]:
+    by_name = {}
+    for part in report["robots"][robot]["parts"]:
         corners = np.array(part["low"]) + np.array(part["step"]) * arrays[part["vertices"]["at"]][:, :3]
-        found[part["link"], tuple(part["color"])] = corners
-    return found
+        by_name[part["link"], tuple(part["color"])] = corners
+    return by_name
 
 
 @pytest.mark.parametrize("kind", ["fixed", "floating"])
@@ -184,8 +184,8 @@ def test_every_frame_and_the_tip_stand_where_the_model_has_them(
     plans: dict[str, Plan], machines: dict[str, Machine], kind: str
 ) -> None:
     machine, plan = machines[kind], plans[kind]
-    told, arrays = unpack_page(build_page([animate_plan(plan)]).text)
-    motion, movers = told["motions"][0], told["robots"][0]["movers"]
+    report, arrays = unpack_page(build_page([animate_plan(plan)]).text)
+    motion, movers = report["motions"][0], report["robots"][0]["movers"]
     t, poses = arrays[motion["t"]["at"]], arrays[motion["poses"]["at"]]
     assert movers == ["hull", "upper/arm", "fore", "hand"]
     for k in (0, len(t) // 3, len(t) - 1):
@@ -204,7 +204,7 @@ def test_every_frame_and_the_tip_stand_where_the_model_has_them(
     assert steps.min() > 0.9  # between two times the turn is the short way round
 
 
-def test_links_look_as_they_are_described_and_else_as_they_touch(folder: Path, robot: Robot) -> None:
+def test_links_are_drawn_by_visuals_or_else_by_collision_shapes(folder: Path, robot: Robot) -> None:
     looks = appearance_of(robot, [folder / "share"])
     assert not looks.missing
     by = {part.link: part for part in looks.parts}
@@ -289,7 +289,7 @@ def test_meshes_of_many_faces_become_coarse_and_stay_where_they_are(monkeypatch:
     np.testing.assert_allclose(np.linalg.norm(coarse.vertices, axis=1), 0.2, atol=0.01)
 
 
-def test_what_is_asked_for_is_told_in_the_world(robot: Robot, tmp_path: Path) -> None:
+def test_targets_are_given_in_world(robot: Robot, tmp_path: Path) -> None:
     """In the axes of a link that moves, of some coordinates alone, from the beginning of the task to its end."""
     machine = FixedBase(robot, (0.1, -0.2, 0.7), TURN)
     times, joints = np.linspace(0.0, 2.0, 21), START + np.linspace(0.0, 0.3, 21)[:, None]
@@ -309,14 +309,14 @@ def test_what_is_asked_for_is_told_in_the_world(robot: Robot, tmp_path: Path) ->
     turn, place = frames.rotations["upper/arm"], frames.positions["upper/arm"]
     np.testing.assert_allclose(second.position, turn @ [0.1, 0.2, 0.3] + place, atol=1e-12)
     np.testing.assert_allclose(second.rotation, turn, atol=1e-12)
-    made = planned(machine).with_targets(tasks[:2])
-    made.save(tmp_path / "plan.npz")
+    result = planned(machine).with_targets(tasks[:2])
+    result.save(tmp_path / "plan.npz")
     again = Plan.load(tmp_path / "plan.npz")
-    for one, other in zip(made.targets, again.targets, strict=True):
+    for one, other in zip(result.targets, again.targets, strict=True):
         for part, stored in zip(one, other, strict=True):
             np.testing.assert_array_equal(part, stored)
-    told, _ = unpack_page(build_page([animate_plan(again)]).text)
-    assert len(told["motions"][0]["targets"]) == 2
+    report, _ = unpack_page(build_page([animate_plan(again)]).text)
+    assert len(report["motions"][0]["targets"]) == 2
     looks = [[(s.kind, s.file) for link in m.robot.links for s in link.visuals] for m in (machine, again.machine)]
     assert looks[0] == looks[1] != []
 
@@ -328,14 +328,14 @@ def curves_of(shown: Any) -> dict[tuple[str, str], Curve]:
 def test_costs_end_at_that_of_the_plan_and_torques_do_the_work_that_energy_shows(plans: dict[str, Plan]) -> None:
     plan = plans["fixed"]
     shown = animate_plan(plan)
-    found = curves_of(shown)
-    assert {group for group, _ in found} >= GROUPS | {"Torques"}
-    assert found["Cost", "integral of half the squared joint velocities"].values[-1] == pytest.approx(
+    result = curves_of(shown)
+    assert {group for group, _ in result} >= GROUPS | {"Torques"}
+    assert result["Cost", "integral of half the squared joint velocities"].values[-1] == pytest.approx(
         plan.cost, rel=1e-4
     )
-    assert ("Cost", "the problem's own cost, integrated") not in found  # the same
-    assert found["Joints", "shoulder"].upper == 3.0
-    assert found["Joints", "elbow"].upper == np.inf
+    assert ("Cost", "the problem's own cost, integrated") not in result  # the same
+    assert result["Joints", "shoulder"].upper == 3.0
+    assert result["Joints", "elbow"].upper == np.inf
     robot, q = plan.machine.robot, ca.SX.sym("q", 3)
     v = ca.SX.sym("v", 3)
     frame = plan.machine.world_from_base(())
@@ -345,15 +345,15 @@ def test_costs_end_at_that_of_the_plan_and_torques_do_the_work_that_energy_shows
     energy = ca.Function("energy", [q, v], [ca.mtimes([v.T, mass_matrix(robot, q), v]) / 2 + sum(heights)])
     sample = plan.sampled(shown.t)
     values = np.array([float(energy(*each)) for each in zip(sample.joints, sample.rates, strict=True)])
-    torques = np.column_stack([found["Torques", name].values for name in plan.names])
+    torques = np.column_stack([result["Torques", name].values for name in plan.names])
     power = (torques * sample.rates).sum(axis=1)
     work = np.sum(np.diff(shown.t) * (power[1:] + power[:-1]) / 2)
     assert work == pytest.approx(values[-1] - values[0], rel=2e-3)
 
 
 def test_the_momentum_of_the_whole_is_that_of_a_floating_plan(plans: dict[str, Plan]) -> None:
-    found = curves_of(animate_plan(plans["floating"]))
-    whole, own = (found["Momentum", f"momentum, {which}"].values for which in ("total", "of the joints alone"))
+    result = curves_of(animate_plan(plans["floating"]))
+    whole, own = (result["Momentum", f"momentum, {which}"].values for which in ("total", "of the joints alone"))
     assert own.max() > 0.1
     assert whole.max() < 1e-3 * own.max()
 
@@ -378,9 +378,9 @@ def test_the_nearest_bodies_are_those_of_the_plan_at_every_time(tmp_path: Path) 
     best = apart.argmin(axis=1)
     labels = clearance_constraints.scene.labels
     assert [tuple(labels[k]) for k in best] == [tuple(pair) for pair in near.bodies]
-    told, arrays = unpack_page(build_page([animate_plan(plan)]).text)
-    assert len(told["motions"][0]["around"]) == 1  # the ball
-    ball = told["motions"][0]["around"][0]
+    report, arrays = unpack_page(build_page([animate_plan(plan)]).text)
+    assert len(report["motions"][0]["around"]) == 1  # the ball
+    ball = report["motions"][0]["around"][0]
     corners = np.array(ball["low"]) + np.array(ball["step"]) * arrays[ball["vertices"]["at"]][:, :3]
     np.testing.assert_allclose(np.linalg.norm(corners - [0.9, 0.4, 0.2], axis=1), 0.05, atol=1e-4)
 
@@ -417,8 +417,8 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
     np.testing.assert_allclose(moved.rotations, [np.array(turn(t)) for t in shown.t], atol=1e-12)
     corners, _ = plane.solid(np.random.default_rng(0).normal(size=(20, 3)))
     np.testing.assert_allclose((corners - [0.0, 0.0, -1.5]) @ [0.6, 0.0, 0.8], 0.0, atol=1e-12)
-    told, arrays = unpack_page(build_page([shown]).text)
-    motion = told["motions"][0]
+    report, arrays = unpack_page(build_page([shown]).text)
+    motion = report["motions"][0]
     still, box = motion["around"]
     assert still["mover"] is None
     t, poses = arrays[motion["t"]["at"]], arrays[motion["poses"]["at"]]
@@ -428,7 +428,7 @@ def test_obstacles_that_move_are_shown_where_they_are_at_every_time_and_half_spa
     np.testing.assert_allclose(poses[:, -1, :3], plan.sampled(t.astype(float)).tip[:, :3], atol=1e-6)  # the tip is last
 
 
-def test_where_the_ground_pushes_is_found_from_the_rows_of_the_problem(robot: Robot) -> None:
+def test_the_zero_moment_point_follows_from_the_rows_of_the_problem(robot: Robot) -> None:
     """Which know of forces from outside, up to a margin; without rows, and at rest, it is below the centre of mass."""
     machine = Standing(robot, support=rectangle((-0.5, 0.9), (-0.4, 0.6)))
     joints, still = np.tile(START, (5, 1)), np.zeros((5, 3))
@@ -437,10 +437,10 @@ def test_where_the_ground_pushes_is_found_from_the_rows_of_the_problem(robot: Ro
     rows = points @ machine.support.normals.T - offsets - 0.02
     inside = [Curve("zero moment point", str(k), "m", row, 0.0) for k, row in enumerate(rows.T)]
     samples = MotionSamples(np.arange(5.0), joints, still, still, np.zeros((5, 0)), None)
-    found, (margin,) = ground_contact(machine, samples, inside)
-    np.testing.assert_allclose(found.points, points, atol=1e-12)
+    result, (margin,) = ground_contact(machine, samples, inside)
+    np.testing.assert_allclose(result.points, points, atol=1e-12)
     np.testing.assert_allclose(margin.values, rows.min(axis=1) + 0.02, atol=1e-12)
-    assert found.forces
+    assert result.forces
     rest, _ = ground_contact(machine, samples)
     centers = centers_of_mass(robot, ca.DM(START))
     weighed = np.array([robot.link(name).mass * np.array(ca.DM(c)).ravel() for name, c in centers.items()])
@@ -466,9 +466,9 @@ def test_solutions_and_files_are_shown_as_plans_are(
         assert shown[0].verdict == wanted.verdict
         assert shown[0].passed is wanted.passed is True
         assert shown[1].passed is None
-        told, _ = unpack_page(build_page([wanted, *shown], title="three").text)
-        assert len(told["robots"]) == 1  # the same robot is held once
-        assert [motion["robot"] for motion in told["motions"]] == [0, 0, 0]
+        report, _ = unpack_page(build_page([wanted, *shown], title="three").text)
+        assert len(report["robots"]) == 1  # the same robot is held once
+        assert [motion["robot"] for motion in report["motions"]] == [0, 0, 0]
     with pytest.raises(ProblemError, match="elbows"):
         animate_solution(plans["fixed"].solution, machines["fixed"], joints="elbows")
     with pytest.raises(ProblemError, match="base"):
@@ -485,11 +485,11 @@ def test_a_page_is_whole_small_the_same_again_and_asks_nobody(plans: dict[str, P
     assert not re.findall(r"\b(?:src|href)=(?!\"data:)", text)
     assert "<title>&lt;b&gt;one" in text
     assert "<b>one</b>" not in text
-    told, arrays = unpack_page(text)
-    assert told["motions"][0]["name"] == "<b>one</b> & 'two'"
+    report, arrays = unpack_page(text)
+    assert report["motions"][0]["name"] == "<b>one</b> & 'two'"
     assert all(np.isfinite(values).all() for values in arrays.values() if values.dtype.kind == "f")
-    assert {name for name, _ in surfaces(told, arrays)} == {"hull", "upper/arm", "fore", "hand", "finger"}
-    rows = told["motions"][0]["rows"]
+    assert {name for name, _ in surfaces(report, arrays)} == {"hull", "upper/arm", "fore", "hand", "finger"}
+    rows = report["motions"][0]["rows"]
     assert {row[5] for row in rows} <= {"ok", "info"}
 
 
@@ -525,9 +525,9 @@ def test_the_command_writes_a_page_or_serves_it(
     target = tmp_path / "out.html"
     more = ["--page", str(target), "--name", "optimum", "--folder", str(folder / "share"), "--json"]
     assert main(["view", *words, *more]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["passed"] is True
-    assert told["bytes"] == target.stat().st_size
+    data = json.loads(capsys.readouterr().out)
+    assert data["passed"] is True
+    assert data["bytes"] == target.stat().st_size
     assert [one["name"] for one in unpack_page(target.read_text(encoding="utf-8"))[0]["motions"]] == [
         "optimum",
         "same.csv",

@@ -52,9 +52,9 @@ def arm() -> FixedBase:
 
 @cache
 def motion() -> SolvedPlan:
-    found = plan(arm(), TASK, 1.0, start=START)
-    assert isinstance(found, SolvedPlan)
-    return found
+    result = plan(arm(), TASK, 1.0, start=START)
+    assert isinstance(result, SolvedPlan)
+    return result
 
 
 @cache
@@ -94,17 +94,19 @@ def test_the_curves_of_a_plan_are_its_joints_and_their_derivatives() -> None:
 
 def test_near_limits_are_lines_and_far_ones_words_and_both_the_robots() -> None:
     for number, ax in enumerate(motion().plot().axes):
-        told = [text.get_text() for text in ax.texts]
+        matches = [text.get_text() for text in ax.texts]
         at = sorted(line.get_ydata()[0] for line in curves(ax, LIMIT))
         if number % 3 == 0:
             assert not at
-            assert told == ["limits -6, 6"]
+            assert matches == ["limits -6, 6"]
         elif number % 3 == 2:
             assert not at
-            assert not told  # the robot tells none of accelerations
+            assert not matches  # the robot tells none of accelerations
         else:
             far = [
-                float(word) for text in told for word in text.removeprefix("limits ").removeprefix("limit ").split(", ")
+                float(word)
+                for text in matches
+                for word in text.removeprefix("limits ").removeprefix("limit ").split(", ")
             ]
             assert sorted([*at, *far]) == [-0.6, 0.6]
             low, high = ax.get_ylim()
@@ -112,7 +114,7 @@ def test_near_limits_are_lines_and_far_ones_words_and_both_the_robots() -> None:
             assert all(not low < one < high for one in far)
 
 
-def test_what_a_plan_is_compared_with_is_orange_and_costs_more() -> None:
+def test_the_compared_motion_is_orange_and_costs_more() -> None:
     figure = motion().plot({"pseudo-inverse": local()})
     for joint, ax in enumerate(figure.axes[::3]):
         (line,) = curves(ax, COMPARED)
@@ -131,7 +133,7 @@ def test_everything_that_moves_the_same_joints_is_compared() -> None:
         assert len(curves(ax, COMPARED)) == len(others)
 
 
-def test_a_plan_is_drawn_into_a_figure_that_is_given() -> None:
+def test_a_plan_is_drawn_into_a_passed_figure() -> None:
     mine = Figure()
     assert motion().plot(figure=mine) is mine
     assert len(mine.axes) == 9
@@ -150,7 +152,7 @@ def test_the_curves_of_a_solution_are_its_states_and_controls_with_their_bounds(
         assert at == ([-10.0, 6.5] if name == "u" else [])  # u goes from 6 to -6
 
 
-def test_what_a_phase_does_is_drawn_when_it_does_it() -> None:
+def test_phases_are_drawn_at_their_times() -> None:
     def leg(**place: Any) -> Problem:
         problem = Problem("leg")
         x, u = problem.state("x", **place), problem.control("u")
@@ -164,9 +166,9 @@ def test_what_a_phase_does_is_drawn_when_it_does_it() -> None:
     axes = {ax.get_title(): ax for ax in solve(both, Collocation(intervals=3, degree=2)).plot().axes}
     for name, ends, values in (("there.x", (0.0, 2.0), (0.0, 1.0)), ("back.x", (2.0, 4.0), (1.0, 0.0))):
         (line,) = curves(axes[name], PLAN)
-        times, found = line.get_data()
+        times, result = line.get_data()
         np.testing.assert_allclose((times[0], times[-1]), ends)
-        np.testing.assert_allclose((found[0], found[-1]), values, atol=1e-7)
+        np.testing.assert_allclose((result[0], result[-1]), values, atol=1e-7)
 
 
 def test_a_solution_without_its_problem_is_drawn_without_bounds_and_beside_another() -> None:
@@ -176,7 +178,7 @@ def test_a_solution_without_its_problem_is_drawn_without_bounds_and_beside_anoth
         assert len(curves(ax, COMPARED)) == 2
 
 
-def test_a_solution_is_compared_with_the_pseudo_inverse_in_what_both_have() -> None:
+def test_a_solution_is_compared_with_the_pseudo_inverse_in_common_quantities() -> None:
     problem = minimum_velocity_problem(arm(), tasks=TASK, start=START, horizon=1.0)
     solution = solve(problem, Collocation(intervals=8, degree=3))
     figure = solution.plot(local())
@@ -191,7 +193,7 @@ def test_a_solution_is_compared_with_the_pseudo_inverse_in_what_both_have() -> N
 
 
 @pytest.mark.parametrize("wrong", [3, "plan", object(), [None], {"one": 2.0}])
-def test_what_cannot_be_compared_is_refused_by_name(wrong: Any) -> None:
+def test_incomparable_motions_are_refused_by_name(wrong: Any) -> None:
     for one in (motion(), sprint()):
         with pytest.raises(ProblemError) as caught:
             one.plot(wrong)
@@ -217,12 +219,12 @@ def test_only_an_empty_figure_is_drawn_into(wrong: Any) -> None:
             motion().plot(figure=figure)
 
 
-def test_what_a_notebook_shows_is_one_sound_element_that_asks_no_host() -> None:
+def test_notebook_output_is_one_valid_element_without_requests() -> None:
     for shown in (motion()._repr_html_(), sprint()._repr_html_(), sprint().plot()._repr_svg_()):
         root = ElementTree.fromstring(shown)
         assert "svg" in shown
-        asked = [value for one in root.iter() for key, value in one.attrib.items() if key.endswith(("href", "src"))]
-        assert all(value.startswith("#") for value in asked)
+        request = [value for one in root.iter() for key, value in one.attrib.items() if key.endswith(("href", "src"))]
+        assert all(value.startswith("#") for value in request)
     assert motion().audit().sentence in "".join(ElementTree.fromstring(motion()._repr_html_()).itertext())
 
 
@@ -233,35 +235,42 @@ def test_a_plan_of_many_candidates_is_printed_in_fifteen_lines_that_count_every_
     kept = motion().candidates[0]
     for reasons in (1, 12, 13, 14, 60):
         others = [Candidate(START, 2.0 + k, Reason(Rejection.AUDIT, f"row {k % reasons}")) for k in range(180)]
-        told = str(replace(motion(), candidates=(kept, *others))).splitlines()
-        assert len(told) == min(2 + reasons, 15)
-        assert told[0].endswith("1 of 181 motions solved")
-        counts = [int(line.split(" motions: ")[0].split()[-1]) for line in told if " motions: " in line]
-        more = [int(line.split()[0]) for line in told if "more" in line]
-        alone = [line for line in told[1:] if " motions: " not in line and "more" not in line]
+        report = str(replace(motion(), candidates=(kept, *others))).splitlines()
+        assert len(report) == min(2 + reasons, 15)
+        assert report[0].endswith("1 of 181 motions solved")
+        counts = [int(line.split(" motions: ")[0].split()[-1]) for line in report if " motions: " in line]
+        more = [int(line.split()[0]) for line in report if "more" in line]
+        alone = [line for line in report[1:] if " motions: " not in line and "more" not in line]
         assert sum(counts) + sum(more) + len(alone) == 181
 
 
-def test_what_was_not_found_has_no_cost_in_print() -> None:
+def test_failed_solutions_are_printed_without_cost() -> None:
     lost = [Candidate(START, cost, Reason(Rejection.INFEASIBLE, "lost")) for cost in (np.nan, 3.0, np.nan, 4.5)]
-    told = str(replace(motion(), candidates=(motion().candidates[0], *lost)))
-    assert "3 to 4.5" in told
-    assert "4 motions: the solver found no motion: lost" in told
+    report = str(replace(motion(), candidates=(motion().candidates[0], *lost)))
+    assert "3 to 4.5" in report
+    assert "4 motions: the solver found no motion: lost" in report
     assert "nan" in str(replace(motion(), candidates=tuple(lost[:1])))
 
 
-def test_what_is_typed_at_a_prompt_is_told_in_a_line() -> None:
-    way = PathPlan(arm(), np.zeros((400, 3)), Limits(), 2.0, bound=1.9)
+def test_errors_at_a_prompt_take_one_line() -> None:
+    path = PathPlan(arm(), np.zeros((400, 3)), Limits(), 2.0, bound=1.9)
     audit = sprint().audit()
-    told: list[Any] = [motion(), motion().candidates[0], motion().sample(0.1), local(), way, motion().trajectory(0.1)]
-    told += [
+    results: list[Any] = [
+        motion(),
+        motion().candidates[0],
+        motion().sample(0.1),
+        local(),
+        path,
+        motion().trajectory(0.1),
+    ]
+    results += [
         sprint(),
         sprint().state_interpolant,
         audit,
         certificate(sprint().problem, [sprint(), sprint()]),
         arm().robot,
     ]
-    for one in told:
+    for one in results:
         assert len(repr(one).splitlines()) == 1, one
         assert len(repr(one)) < 250, one
     assert len(str(sprint()).splitlines()) == 4

@@ -49,7 +49,7 @@ def test_the_nearest_camera_sees_all_points_and_no_nearer_one_does(seed: int) ->
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_what_is_seen_is_what_rays_from_the_eye_meet_first(seed: int) -> None:
+def test_visible_surfaces_are_the_first_along_rays_from_the_eye(seed: int) -> None:
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-1, 1, size=(40, 3, 3))
     tint = rng.integers(0, 3, size=40)
@@ -105,15 +105,15 @@ def test_the_shadow_of_a_plate_lies_where_the_sun_puts_it() -> None:
     for x in (-0.2, 0.0, 0.2):
         for y in (-0.2, 0.0, 0.2):
             assert tone(x + shift[0], y + shift[1]) < 210
-    looked = 0
-    for way in range(8):
-        spot = np.append(shift + 0.55 * np.array([np.cos(way * np.pi / 4), np.sin(way * np.pi / 4)]), 0.0)
+    checked = 0
+    for path in range(8):
+        spot = np.append(shift + 0.55 * np.array([np.cos(path * np.pi / 4), np.sin(path * np.pi / 4)]), 0.0)
         ray = spot - camera.eye
         through = camera.eye + ray * (height - camera.eye[2]) / ray[2]
         if np.abs(through[:2]).max() > 0.6 * size:  # not behind the plate
             assert tone(*spot[:2]) > 235
-            looked += 1
-    assert looked > 4
+            checked += 1
+    assert checked > 4
 
 
 def test_shading_is_that_of_the_smooth_surface_which_triangles_stand_for() -> None:
@@ -127,7 +127,7 @@ def test_shading_is_that_of_the_smooth_surface_which_triangles_stand_for() -> No
     assert np.ptp(fine[inner].astype(int)) > 60
 
 
-def test_a_veil_takes_the_colour_away_that_its_opacity_says_and_never_covers_what_is_solid() -> None:
+def test_transparent_layers_blend_by_their_opacity_and_never_cover_solid_ones() -> None:
     veil, solid = ball(0.5, sides=20), ball(0.2, (1.0, 0.0, 0.0), sides=20)
     camera = Camera.around(veil.vertices, (80, 80))
     thin, thick = (255.0 - render([Layer([]), Layer([veil], share)], camera, side_samples=1) for share in (0.2, 0.6))
@@ -150,10 +150,10 @@ def test_pictures_do_not_change_with_the_order_of_parts() -> None:
 def test_a_tube_keeps_its_radius_from_its_line_all_along(closed: bool) -> None:
     s = np.linspace(0, 2 * np.pi, 200)
     line: Array = np.stack([np.cos(s), np.sin(s), 0.2 * np.sin(3 * s) if closed else 0.3 * s], axis=1)
-    made = tube(line, 0.01, PURE[2])
-    far = np.linalg.norm(made.vertices[:, None] - line[None], axis=2).min(axis=1)
+    result = tube(line, 0.01, PURE[2])
+    far = np.linalg.norm(result.vertices[:, None] - line[None], axis=2).min(axis=1)
     np.testing.assert_allclose(far, 0.01, rtol=1e-6)
-    corners = made.vertices[made.faces]
+    corners = result.vertices[result.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
     length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
     assert area == pytest.approx(2 * 10 * np.sin(np.pi / 10) * 0.01 * length, rel=1e-3)  # of ten sides

@@ -25,8 +25,8 @@ SWINGS = [6, 5, 6, 4, 5, 6]
 
 
 def robot(name: str = "ur5_robot.urdf", tip: str = "tool0") -> Robot:
-    found = next(file.locate() for file in files("example-robot-data") or () if file.name == name)
-    return Robot.from_urdf(Path(str(found)), tip=tip)
+    result = next(file.locate() for file in files("example-robot-data") or () if file.name == name)
+    return Robot.from_urdf(Path(str(result)), tip=tip)
 
 
 @pytest.fixture(scope="module")
@@ -58,33 +58,33 @@ def swings(size: float = 0.8, step: float = 0.02, duration: float = 3.0) -> tupl
 def test_times_in_another_unit_are_not_passed(ur5: Robot, size: float, factor: float, unit: Any, words: str) -> None:
     t, q, _ = swings(size)
     wrong = np.rint(factor * t)
-    found = checked(ur5, wrong, q)
-    assert not found.passed
-    assert words in " ".join(one.text for one in (*found.suspicions, *found.faults) if one.name == "time")
-    if found.suspicions:
-        assert found.sentence.startswith("is undetermined: times look like")
-        assert "--time-unit" in found.sentence
-        assert found.to_dict()["passed"] is False
+    check = checked(ur5, wrong, q)
+    assert not check.passed
+    assert words in " ".join(one.text for one in (*check.suspicions, *check.faults) if one.name == "time")
+    if check.suspicions:
+        assert check.sentence.startswith("is undetermined: times look like")
+        assert "--time-unit" in check.sentence
+        assert check.to_dict()["passed"] is False
     truth = checked(ur5, t, q)
-    told = checked(ur5, wrong, q, time_unit=unit)
-    assert told.passed == truth.passed == (size < 0.8)
-    assert told.suspicions == ()
-    assert [one.kind for one in told.faults] == [one.kind for one in truth.faults]
+    report = checked(ur5, wrong, q, time_unit=unit)
+    assert report.passed == truth.passed == (size < 0.8)
+    assert report.suspicions == ()
+    assert [one.kind for one in report.faults] == [one.kind for one in truth.faults]
     assert checked(ur5, wrong, q, time_unit="s").passed
 
 
 def test_milliseconds_that_are_not_whole_are_suspected(ur5: Robot) -> None:
     t = np.linspace(0.0, 4.237, 301)
-    found = checked(ur5, 1e3 * t, HOME + 0.3 * np.sin(np.outer(t, SWINGS)))
-    assert ["milliseconds" in one.text for one in found.suspicions] == [True]
-    assert found.faults == ()
+    check = checked(ur5, 1e3 * t, HOME + 0.3 * np.sin(np.outer(t, SWINGS)))
+    assert ["milliseconds" in one.text for one in check.suspicions] == [True]
+    assert check.faults == ()
 
 
 def test_velocities_tell_the_unit_by_themselves(ur5: Robot) -> None:
     t, q, v = swings(0.3)
-    found = checked(ur5, np.rint(1e3 * t), q, v)
-    assert [(one.kind, one.name) for one in found.faults] == [("units", "time")]
-    assert found.suspicions == ()
+    check = checked(ur5, np.rint(1e3 * t), q, v)
+    assert [(one.kind, one.name) for one in check.faults] == [("units", "time")]
+    assert check.suspicions == ()
 
 
 @pytest.mark.parametrize(
@@ -137,20 +137,20 @@ def straight(of: Robot, start: Any, way: Any, count: int = 101) -> tuple[Any, An
     return t, np.array(joints)
 
 
-@pytest.mark.parametrize("way", [(0.2, 0.2, 0.0), (0.0, 0.3, 0.1), (-0.1, 0.1, 0.2)])
-def test_exchanged_joints_of_a_straight_line_are_named(ur5: Robot, way: tuple[float, ...]) -> None:
-    t, q = straight(ur5, HOME, way)
+@pytest.mark.parametrize("path", [(0.2, 0.2, 0.0), (0.0, 0.3, 0.1), (-0.1, 0.1, 0.2)])
+def test_exchanged_joints_of_a_straight_line_are_named(ur5: Robot, path: tuple[float, ...]) -> None:
+    t, q = straight(ur5, HOME, path)
     assert exchanged_joints(Motion(t, q), ur5, np.arange(6)) == []
     moving = np.flatnonzero(np.ptp(q, axis=0) > 0.05)
     for i, j in [(0, 1), (1, 2), (0, 2), (1, 3)]:
         assert {i, j} <= set(moving)
         wrong = q.copy()
         wrong[:, [i, j]] = q[:, [j, i]]
-        found = checked(ur5, t, wrong)
-        assert found.faults == ()
-        assert not found.passed
-        assert "look exchanged" in found.sentence
-        assert found.suspicions[0].name == f"{ur5.joint_names[i]} and {ur5.joint_names[j]}"
+        check = checked(ur5, t, wrong)
+        assert check.faults == ()
+        assert not check.passed
+        assert "look exchanged" in check.sentence
+        assert check.suspicions[0].name == f"{ur5.joint_names[i]} and {ur5.joint_names[j]}"
         assert checked(ur5, t, wrong, names_confirmed=True).passed
 
 
@@ -164,8 +164,8 @@ def test_exchanged_joints_that_leave_their_limits_are_named() -> None:
     assert exchanged_joints(Motion(t, q), panda, every) == []
     q[:, 3], q[:, 5] = -2.0 + 0.1 * np.sin(t), 1.9 + 0.1 * np.cos(t)
     q[:, [3, 5]] = q[:, [5, 3]]
-    (found,) = exchanged_joints(Motion(t, q), panda, every)
-    assert found.name == f"{names[3]} and {names[5]}"
+    (result,) = exchanged_joints(Motion(t, q), panda, every)
+    assert result.name == f"{names[3]} and {names[5]}"
 
 
 @pytest.mark.parametrize("kind", range(4))
@@ -190,19 +190,19 @@ def test_motions_from_joints_to_joints_are_not_suspected(ur5: Robot, kind: int) 
 
 @pytest.mark.parametrize("rates", [1, 2])
 @pytest.mark.parametrize("speed", [0.9, -0.9])
-def test_a_wrapped_joint_is_told_once_and_offered_unwrapped(ur5: Robot, rates: int, speed: float) -> None:
+def test_a_wrapped_joint_is_reported_once_with_the_option_to_unwrap(ur5: Robot, rates: int, speed: float) -> None:
     t, q, v = swings(0.3)
     q[:, 5], v[:, 5] = 2.5 * np.sign(speed) + speed * t, speed
     sound = checked(ur5, t, *(q, v)[:rates])
     assert sound.passed, sound
     wrong = q.copy()
     wrong[:, 5] = (q[:, 5] + np.pi) % (2 * np.pi) - np.pi
-    found = checked(ur5, t, *(wrong, v)[:rates])
-    (fault,) = found.faults
+    check = checked(ur5, t, *(wrong, v)[:rates])
+    (fault,) = check.faults
     assert (fault.kind, fault.name) == ("jump", ur5.joint_names[5])
     assert "--unwrap" in fault.text
     assert fault.time == pytest.approx((np.pi - 2.5) / 0.9, abs=0.02)
-    assert [(row.name, row.verdict) for row in found.rows] == [(row.name, row.verdict) for row in sound.rows]
+    assert [(row.name, row.verdict) for row in check.rows] == [(row.name, row.verdict) for row in sound.rows]
     again = checked(ur5, t, *(wrong, v)[:rates], unwrap=True)
     assert again.passed, again
     np.testing.assert_allclose(again.cleaned.motion.q, q, atol=1e-12)

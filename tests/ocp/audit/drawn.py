@@ -22,16 +22,16 @@ LOBATTO = np.array([0.0, 0.5 - np.sqrt(5) / 10, 0.5 + np.sqrt(5) / 10, 1.0])
 
 def sampled(pool: Mapping[str, Curve], t: Array) -> dict[str, Array]:
     """Curves at times t (M,), each (M, n)."""
-    found = {}
+    by_name = {}
     for name, curve in pool.items():
         values = np.asarray(curve(t) if callable(curve) else curve, dtype=float)
         if values.ndim < 2:
             values = values[:, None] if values.shape == t.shape else np.tile(np.atleast_1d(values), (len(t), 1))
-        found[name] = values
-    return found
+        by_name[name] = values
+    return by_name
 
 
-def drawn(
+def random_program(
     problem: Problem,
     states: Mapping[str, Curve],
     controls: Mapping[str, Curve],
@@ -122,7 +122,7 @@ def is_no_proven_minimum(audit: Audit) -> None:
     assert not audit.passed
 
 
-def does_not_do_what_is_asked(audit: Audit) -> None:
+def violates_its_task(audit: Audit) -> None:
     """Check that the motion is infeasible."""
     assert not audit.feasible, str(audit)
     assert not audit.passed

@@ -34,8 +34,8 @@ def along(length: float, tolerance: tuple[float, float] | None = None) -> Soluti
     corners = np.array([(0.0, 0.0, 0.0), (1.0, 0.5, 0.0)]) * length
     path = smooth(Path.through(corners), deviation=0.05 * length)
     speed = path.length / SECONDS
-    told: dict[str, Any] = {} if tolerance is None else {"tolerance": tolerance}
-    task = TipTask.along(path, speed, gain=0.0, **told)
+    report: dict[str, Any] = {} if tolerance is None else {"tolerance": tolerance}
+    task = TipTask.along(path, speed, gain=0.0, **report)
     problem = minimum_velocity_problem(gantry(length), tasks=task, start=np.zeros(4), horizon=task.duration)
     return solve(problem, Collocation(12, 4).with_nodes_at(np.asarray(task.breaks) / task.duration))
 
@@ -50,9 +50,9 @@ def drifting(plan: Solution, off: float) -> Solution:
         values, columns = own.values.copy(), list(getattr(plan, pool))
         first = sum(getattr(plan, pool)[each].shape[1] for each in columns[: columns.index(name)])
         values[:, :, first] += off / plan.horizon if rates else off * at
-        told = {key: value.copy() for key, value in getattr(plan, pool).items()}
-        told[name][:, 0] += off / plan.horizon if rates else off * plan.t / plan.horizon
-        changes |= {pool: told, curve: replace(own, values=values)}
+        by_name = {key: value.copy() for key, value in getattr(plan, pool).items()}
+        by_name[name][:, 0] += off / plan.horizon if rates else off * plan.t / plan.horizon
+        changes |= {pool: by_name, curve: replace(own, values=values)}
     return replace(plan, **changes)
 
 
@@ -68,7 +68,7 @@ def test_a_long_path_is_followed_to_a_tenth_of_a_millimetre(length: float) -> No
     assert drifting(plan, 0.5e-4).audit()["task position"].passed
 
 
-def test_reported_joints_are_what_is_run() -> None:
+def test_reported_joints_are_those_executed() -> None:
     """Joints may deviate from their integrated rates by a thousandth of their spread, here 5 mm; the tip may not."""
     plan = along(10.0)
     curve = plan.state_interpolant

@@ -86,7 +86,7 @@ def test_good_plans_pass(method: str) -> None:
 
 
 @every_method
-def test_what_a_plan_loses_is_its_excess_over_the_optimum(method: str) -> None:
+def test_the_reported_loss_is_the_excess_over_the_optimum(method: str) -> None:
     best = solve(van_der_pol(), Collocation(60, 5, "legendre")).cost
     solution = plan(method)
     assert solution.audit().lost.sum() == pytest.approx(solution.cost - best, rel=0.05, abs=2e-6 * best)
@@ -272,7 +272,7 @@ def test_a_wrong_start_or_end_fails_by_name(method: str) -> None:
 
 
 @every_method
-def test_a_plan_that_ends_where_it_was_told_is_no_optimum_of_a_free_end(method: str) -> None:
+def test_a_plan_to_a_fixed_end_is_no_optimum_of_a_free_end(method: str) -> None:
     """Stationary, with a constant Hamiltonian, and yet no extremal: transversality tells."""
     pinned = solve(van_der_pol(terminal=[0.2, np.nan]), FINE[method])
     assert failed(pinned.audit()) == set()
@@ -302,18 +302,18 @@ def test_a_feasible_plan_that_is_not_optimal_fails_by_the_minimum_principle_alon
     prescribed = van_der_pol()
     u = prescribed.declared.controls["u"].symbol
     prescribed.path("prescribed", u - ca.sin(3 * prescribed.time), 0, 0)
-    found = failed(solve(prescribed, FINE[method]).audit(van_der_pol()))
-    assert LOST in found
-    assert not found & {INTEGRATION, COST, "start of x", "state jump, relative"}
+    result = failed(solve(prescribed, FINE[method]).audit(van_der_pol()))
+    assert LOST in result
+    assert not result & {INTEGRATION, COST, "start of x", "state jump, relative"}
 
 
-def test_another_cost_is_found() -> None:
+def test_a_different_cost_is_detected() -> None:
     other = van_der_pol()
     other.declared.running = other.declared.running + 0.2 * other.declared.controls["u"].symbol ** 2
     assert {COST, LOST} <= failed(plan("radau").audit(other))
 
 
-def test_other_dynamics_are_found() -> None:
+def test_different_dynamics_are_detected() -> None:
     other = van_der_pol()
     x = other.declared.states["x"].symbol
     other.declared.dynamics["x"] = other.declared.dynamics["x"] + ca.vertcat(0, 0.1 * x[1])
@@ -321,7 +321,7 @@ def test_other_dynamics_are_found() -> None:
 
 
 @pytest.mark.parametrize("method", ["radau", "rk4-held"])
-def test_a_bound_that_the_plan_does_not_keep_is_found(method: str) -> None:
+def test_a_violated_bound_is_detected(method: str) -> None:
     audit = plan(method).audit(van_der_pol(upper=0.5))
     assert "bounds of u" in failed(audit)
     excess = plan(method)["u"].max() - 0.5
@@ -386,7 +386,7 @@ def test_unstable_dynamics_on_a_coarse_mesh_fail() -> None:
     assert INTEGRATION in failed(solve(problem, Collocation(4, 2)).audit())
 
 
-def test_a_plan_that_breaks_the_integrator_down_is_told(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_breakdown_of_the_integrator_is_reported(capfd: pytest.CaptureFixture[str]) -> None:
     """x' = x^2 + u escapes to infinity before the end when its control is taken away."""
     problem, x, u = plant("escape", initial=1.0, horizon=2.0)
     problem.dynamics(x, x**2 + u)
@@ -448,7 +448,7 @@ def test_the_table_shows_every_finding_under_its_verdict() -> None:
     ],
     ids=["good", "not solved", "not optimal", "not feasible"],
 )
-def test_the_table_ends_in_what_follows_from_it(
+def test_the_table_ends_with_the_verdict(
     how: Callable[[Solution], Audit], marked: set[str], titles: tuple[str, str], sentence: str
 ) -> None:
     audit = how(plan("radau"))
@@ -468,7 +468,7 @@ def test_findings_are_found_by_name() -> None:
         audit["integratoin"]
 
 
-def test_limits_are_what_was_asked() -> None:
+def test_limits_of_the_audit_are_those_requested() -> None:
     solution = plan("rk4-linear")
     assert failed(solution.audit(integration=1e-12)) >= {INTEGRATION}
     assert failed(solution.audit(lost=1e-12)) == {LOST}
@@ -570,13 +570,13 @@ def lifted(horizon: float, order: str = "ab", **free: Any) -> Problem:
 
 
 @pytest.mark.parametrize(
-    ("asked", "free", "passes"),
+    ("requested", "free", "passes"),
     [(1.0, {}, False), (2.0, {}, True), (0.0, {"lower": 1.0, "upper": 2.0}, True), (0.0, {"upper": 1.9}, False)],
     ids=["shorter", "its own", "at its bound", "beyond its bound"],
 )
-def test_a_plan_of_another_horizon_fails(asked: float, free: dict[str, Any], passes: bool) -> None:
+def test_a_plan_of_another_horizon_fails(requested: float, free: dict[str, Any], passes: bool) -> None:
     plan = solve(lifted(2.0), Collocation(10))
-    audit = plan.audit(lifted(asked, **free))
+    audit = plan.audit(lifted(requested, **free))
     assert audit["horizon"].passed is passes
     assert audit.passed is passes
 

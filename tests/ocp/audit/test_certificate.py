@@ -59,8 +59,8 @@ def changed(solution: Solution, fields: dict[str, Any]) -> Solution:
     return replace(solution, **fields)
 
 
-def row(found: Certificate, name: str) -> Any:
-    return next(c for c in found.comparisons if c.name == name)
+def row(result: Certificate, name: str) -> Any:
+    return next(c for c in result.comparisons if c.name == name)
 
 
 # ---- agreement ---------------------------------------------------------------------------------------------------
@@ -68,16 +68,16 @@ def row(found: Certificate, name: str) -> Any:
 
 def test_three_methods_agree_and_the_indirect_one_is_the_reference() -> None:
     problem, solutions = three()
-    found = certificate(problem, solutions)
-    assert found.passed
-    assert found.reference == "Indirect"
-    assert [c.name for c in found.comparisons] == ["Indirect", "Collocation", "MultipleShooting"]
-    assert row(found, "Indirect").worst == 0
-    assert row(found, "Collocation").worst < 1e-5
-    assert 0 < row(found, "MultipleShooting").worst < found.tolerance
-    assert set(found.audits) == set(solutions)
-    assert all(audit.passed for audit in found.audits.values())
-    assert "3 solutions agree to 0.001" in found.verdict
+    result = certificate(problem, solutions)
+    assert result.passed
+    assert result.reference == "Indirect"
+    assert [c.name for c in result.comparisons] == ["Indirect", "Collocation", "MultipleShooting"]
+    assert row(result, "Indirect").worst == 0
+    assert row(result, "Collocation").worst < 1e-5
+    assert 0 < row(result, "MultipleShooting").worst < result.tolerance
+    assert set(result.audits) == set(solutions)
+    assert all(audit.passed for audit in result.audits.values())
+    assert "3 solutions agree to 0.001" in result.verdict
 
 
 def test_the_paper_example_is_certified_by_three_methods() -> None:
@@ -85,10 +85,10 @@ def test_the_paper_example_is_certified_by_three_methods() -> None:
     direct = solve(problem, Collocation(100, 3, "legendre"))
     shot = solve(problem, MultipleShooting(100, control="linear"), guess=direct)
     indirect = solve(problem, Indirect(shooting="backward"), guess=direct)
-    found = certificate(problem, [direct, shot, indirect])
-    assert found.passed, str(found)
-    assert found.reference == "Indirect backward, 20"
-    by_collocation = row(found, "Collocation legendre-3, 100")
+    result = certificate(problem, [direct, shot, indirect])
+    assert result.passed, str(result)
+    assert result.reference == "Indirect backward, 20"
+    by_collocation = row(result, "Collocation legendre-3, 100")
     assert by_collocation.costate < 1e-5
     assert by_collocation.cost_difference < 1e-9
 
@@ -98,8 +98,8 @@ def test_every_shape_of_problem_is_certified(name: str) -> None:
     case = EXTREMA[name]
     problem = case.build()
     plans = [solve(problem, by, parameters=case.parameters) for by in (case.direct, Indirect())]
-    found = certificate(problem, plans, tolerance=2e-2 if case.switches else 1e-3)
-    assert found.passed, str(found)
+    result = certificate(problem, plans, tolerance=2e-2 if case.switches else 1e-3)
+    assert result.passed, str(result)
 
 
 def test_differences_are_relative_and_measured() -> None:
@@ -109,10 +109,10 @@ def test_differences_are_relative_and_measured() -> None:
         problem, x, u = plant("weighted", initial=1.0)
         problem.dynamics(x, u - x**3)
         problem.minimize(running=weight * (x**2 + u**2))
-        found = certificate(
+        result = certificate(
             problem, {"coarse": solve(problem, MultipleShooting(10)), "exact": solve(problem, Indirect())}
         )
-        rows.append(row(found, "coarse"))
+        rows.append(row(result, "coarse"))
     for what in ("cost_difference", "state", "control", "costate", "hamiltonian"):
         assert getattr(rows[0], what) == pytest.approx(getattr(rows[1], what), rel=1e-3)
         assert getattr(rows[0], what) > 0
@@ -125,9 +125,9 @@ def test_a_hamiltonian_and_a_cost_that_vanish_are_compared_by_their_parts() -> N
     problem.minimize(running=x + u**2 / 2 - offset())
     plans = {"indirect": solve(problem, Indirect()), "direct": solve(problem, Collocation(20))}
     assert abs(plans["indirect"].cost) < 1e-9
-    found = certificate(problem, plans)
-    assert found.passed, str(found)
-    assert row(found, "direct").cost_difference < 1e-8
+    result = certificate(problem, plans)
+    assert result.passed, str(result)
+    assert row(result, "direct").cost_difference < 1e-8
 
 
 def offset() -> float:
@@ -140,15 +140,15 @@ def offset() -> float:
 
 def test_without_an_indirect_solution_the_first_is_the_reference() -> None:
     problem, solutions = three()
-    found = certificate(problem, [solutions["MultipleShooting"], solutions["Collocation"]])
-    assert found.reference == "MultipleShooting rk4 linear, 100"
-    assert found.passed
+    result = certificate(problem, [solutions["MultipleShooting"], solutions["Collocation"]])
+    assert result.reference == "MultipleShooting rk4 linear, 100"
+    assert result.passed
 
 
 def test_solutions_of_one_method_are_numbered() -> None:
     problem, solutions = three()
-    found = certificate(problem, [solutions["Collocation"]] * 3)
-    names = [c.name for c in found.comparisons]
+    result = certificate(problem, [solutions["Collocation"]] * 3)
+    names = [c.name for c in result.comparisons]
     assert names == ["Collocation legendre-3, 50", "Collocation legendre-3, 50 (2)", "Collocation legendre-3, 50 (3)"]
 
 
@@ -167,67 +167,67 @@ def test_loaded_solutions_are_certified_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("which", ["state", "costate", "control"])
-def test_a_solution_that_was_bent_is_found_out(which: str) -> None:
+def test_a_perturbed_solution_is_detected(which: str) -> None:
     problem, solutions = three()
-    bent = {**solutions, "bent": moved(solutions["Collocation"], which, 0.01)}
-    found = certificate(problem, bent)
-    assert not found.passed
-    assert getattr(row(found, "bent"), which) == pytest.approx(0.01, rel=0.5)
-    assert "bent differ from Indirect by more than 0.001" in found.verdict
-    assert row(found, "Collocation").worst < 1e-3
+    perturbed = {**solutions, "bent": moved(solutions["Collocation"], which, 0.01)}
+    result = certificate(problem, perturbed)
+    assert not result.passed
+    assert getattr(row(result, "bent"), which) == pytest.approx(0.01, rel=0.5)
+    assert "bent differ from Indirect by more than 0.001" in result.verdict
+    assert row(result, "Collocation").worst < 1e-3
 
 
-def test_a_cost_or_a_horizon_that_was_changed_is_found_out() -> None:
+def test_a_changed_cost_or_horizon_is_detected() -> None:
     problem, solutions = three()
     for change in (
         {"cost": solutions["Collocation"].cost * 1.01},
         {"horizon": solutions["Collocation"].horizon * 1.01},
     ):
-        found = certificate(problem, {**solutions, "changed": changed(solutions["Collocation"], change)})
-        assert not found.passed
-        assert not row(found, "changed").passed or "changed differ" in found.verdict
+        result = certificate(problem, {**solutions, "changed": changed(solutions["Collocation"], change)})
+        assert not result.passed
+        assert not row(result, "changed").passed or "changed differ" in result.verdict
 
 
 def test_a_reference_that_is_wrong_fails_all_the_same() -> None:
     problem, solutions = three()
-    found = certificate(problem, {**solutions, "Indirect": moved(solutions["Indirect"], "costate", 0.05)})
-    assert not found.passed
-    assert "the audit of Indirect failed" in found.verdict
-    assert "Collocation, MultipleShooting differ" in found.verdict
+    result = certificate(problem, {**solutions, "Indirect": moved(solutions["Indirect"], "costate", 0.05)})
+    assert not result.passed
+    assert "the audit of Indirect failed" in result.verdict
+    assert "Collocation, MultipleShooting differ" in result.verdict
 
 
-def test_an_extremal_of_another_branch_is_found_out_though_it_passes_its_audit() -> None:
+def test_an_extremal_of_another_branch_is_detected_though_it_passes_its_audit() -> None:
     """J = 1.7351 and J = 1.7467 both satisfy the minimum principle of the paper's example."""
     problem = paper_problem()
     best = solve(problem, Indirect(shooting="backward"))
     other = solve(paper_problem(guess_damping=0.03), Collocation(100))
     assert best.cost == pytest.approx(1.735114311245, abs=1e-9)
     assert other.cost > best.cost + 0.01
-    found = certificate(problem, {"best": best, "other": other})
-    assert found.audits["other"].passed
-    assert not found.passed
-    assert row(found, "other").cost_difference == pytest.approx(other.cost / best.cost - 1, rel=1e-4)
-    assert "other differ from best" in found.verdict
+    result = certificate(problem, {"best": best, "other": other})
+    assert result.audits["other"].passed
+    assert not result.passed
+    assert row(result, "other").cost_difference == pytest.approx(other.cost / best.cost - 1, rel=1e-4)
+    assert "other differ from best" in result.verdict
 
 
 def test_solutions_that_agree_on_a_failed_audit_are_not_certified() -> None:
     problem, solutions = three()
     wrong = replace(solutions["Collocation"], success=False, status=SolverStatus.ITERATION_LIMIT)
-    found = certificate(problem, {"Indirect": solutions["Indirect"], "wrong": wrong})
-    assert row(found, "wrong").worst < 1e-3
-    assert not row(found, "wrong").passed
-    assert not found.passed
-    assert found.verdict == "the audit of wrong failed"
+    result = certificate(problem, {"Indirect": solutions["Indirect"], "wrong": wrong})
+    assert row(result, "wrong").worst < 1e-3
+    assert not row(result, "wrong").passed
+    assert not result.passed
+    assert result.verdict == "the audit of wrong failed"
 
 
 def test_numbers_that_are_none_do_not_pass() -> None:
     problem, solutions = three()
     for change in ({"cost": np.nan}, {"cost": np.inf}):
-        found = certificate(problem, {**solutions, "broken": changed(solutions["Collocation"], change)})
-        assert not found.passed
-    found = certificate(problem, {**solutions, "broken": moved(solutions["Collocation"], "costate", np.nan)})
-    assert not found.passed
-    assert "broken" in found.verdict
+        result = certificate(problem, {**solutions, "broken": changed(solutions["Collocation"], change)})
+        assert not result.passed
+    result = certificate(problem, {**solutions, "broken": moved(solutions["Collocation"], "costate", np.nan)})
+    assert not result.passed
+    assert "broken" in result.verdict
 
 
 def test_the_tolerance_decides() -> None:
@@ -264,8 +264,8 @@ def test_solutions_at_other_parameters_are_refused() -> None:
 
 def test_the_table_has_a_line_for_every_solution_and_the_verdict() -> None:
     problem, solutions = three()
-    found = certificate(problem, {**solutions, "bent": moved(solutions["Collocation"], "costate", 0.02)})
-    lines = str(found).splitlines()
+    result = certificate(problem, {**solutions, "bent": moved(solutions["Collocation"], "costate", 0.02)})
+    lines = str(result).splitlines()
     assert lines[0] == "Certificate of 'van der Pol': FAILED"
     for head in ("cost", "d state", "d costate", "d H", "audit"):
         assert head in lines[1]
@@ -273,6 +273,6 @@ def test_the_table_has_a_line_for_every_solution_and_the_verdict() -> None:
     assert all(f"{solutions['Indirect'].cost:.6g}"[:6] in line for line in lines[2:5])
     assert lines[2].endswith("passed")
     assert lines[5].endswith("FAILED")
-    assert found.verdict in lines[-1]
+    assert result.verdict in lines[-1]
     assert len({len(line) for line in lines[2:-1]}) == 1  # columns line up
     assert str(certificate(problem, solutions)).splitlines()[0].endswith("passed")

@@ -68,8 +68,8 @@ def sprung(stiffness: float | None = None, unit: float = 1.0, zero: float = 0.0)
     """A mass on a spring with a free stiffness, stored as a constant state."""
     problem = Problem("sprung")
     q, v = problem.state("q", initial=1.0), problem.state("v", initial=0.0, terminal=0.0)
-    given: dict[str, Any] = {} if stiffness is None else {"initial": (stiffness - zero) * unit}
-    k, u = problem.state("k", guess=(5.0 - zero) * unit, **given), problem.control("u")
+    options: dict[str, Any] = {} if stiffness is None else {"initial": (stiffness - zero) * unit}
+    k, u = problem.state("k", guess=(5.0 - zero) * unit, **options), problem.control("u")
     stiff = k / unit + zero
     problem.dynamics(q, v)
     problem.dynamics(v, u - q * stiff)
@@ -83,8 +83,8 @@ def priced(stiffness: float | None = None, unit: float = 1.0, zero: float = 0.0)
     """The same with a choice that only enters the terminal cost."""
     problem = Problem("priced")
     q, v = problem.state("q", initial=1.0, terminal=0.0), problem.state("v", initial=0.0, terminal=0.0)
-    given: dict[str, Any] = {} if stiffness is None else {"initial": (stiffness - zero) * unit}
-    k, u = problem.state("k", guess=(5.0 - zero) * unit, **given), problem.control("u")
+    options: dict[str, Any] = {} if stiffness is None else {"initial": (stiffness - zero) * unit}
+    k, u = problem.state("k", guess=(5.0 - zero) * unit, **options), problem.control("u")
     problem.dynamics(q, v)
     problem.dynamics(v, u)
     problem.dynamics(k, 0 * k)
@@ -115,16 +115,16 @@ def test_the_best_choice_passes(what: str, method: str) -> None:
 @every_method
 @pytest.mark.parametrize("off", [-0.1, -0.05, -0.02, 0.01, 0.03, 0.08])
 @pytest.mark.parametrize("what", OPEN)
-def test_what_a_worse_choice_loses_is_what_it_costs_more(what: str, off: float, method: str) -> None:
+def test_the_loss_of_a_worse_choice_is_its_excess_cost(what: str, off: float, method: str) -> None:
     declare, _, best = OPEN[what]
     least = solve(declare(), Collocation(60, scheme="legendre")).cost
     plan = solve(declare(best * (1 + off)), METHODS[method])
-    found = audit(declare(), plan)
+    result = audit(declare(), plan)
     more = plan.cost / least - 1
-    assert found.feasible
-    assert found["cost lost, relative"].value * plan.cost == pytest.approx(more * least, rel=0.3, abs=1e-5 * least)
+    assert result.feasible
+    assert result["cost lost, relative"].value * plan.cost == pytest.approx(more * least, rel=0.3, abs=1e-5 * least)
     if more > 1.3 * LIMIT:
-        assert found.optimal is False
+        assert result.optimal is False
 
 
 @pytest.mark.parametrize("zero", [0.0, 2.0, -1e3])
@@ -147,5 +147,5 @@ def test_a_parameter_along_which_the_cost_falls_is_no_minimum() -> None:
     problem.dynamics(k, 0 * k)
     problem.horizon(1.0)
     problem.minimize(u**2 + x**2, terminal=-((k - 2) ** 2))
-    found = solve(problem, Collocation(20), check=False).audit()
-    assert found.optimal is not True
+    result = solve(problem, Collocation(20), check=False).audit()
+    assert result.optimal is not True

@@ -49,8 +49,8 @@ def flight(
 
 
 def proof(problem: Problem, intervals: int = 6) -> Clearance:
-    found: Clearance = solve(problem, Collocation(intervals, 3)).audit().clearances["clearance"]
-    return found
+    result: Clearance = solve(problem, Collocation(intervals, 3)).audit().clearances["clearance"]
+    return result
 
 
 BALL = Hull(0, np.zeros((1, 3)), 0.1)
@@ -59,14 +59,14 @@ BALL = Hull(0, np.zeros((1, 3)), 0.1)
 def test_a_ball_that_flies_past_a_ball() -> None:
     hulls = {"ball": BALL, "post": Hull(-1, np.array([[0.5, 0.3, 0.0]]), 0.05)}
     problem = flight([0, 0, 0], [1, 0, 0], hulls, [[0, 1, -1]], 0.1)
-    found = proof(problem)
-    assert found.settled
-    assert found.worst is not None
-    assert found.worst.bodies == ("ball", "post")
-    assert 0.15 - 0.02 * 0.05 - 1e-6 <= found.worst.least <= 0.15 <= found.worst.distance + 1e-12
-    assert found.worst.distance <= 0.15 / 0.98
-    assert_allclose(found.worst.time, 0.5, atol=0.05)
-    assert found.worst.missed == 0
+    result = proof(problem)
+    assert result.settled
+    assert result.worst is not None
+    assert result.worst.bodies == ("ball", "post")
+    assert 0.15 - 0.02 * 0.05 - 1e-6 <= result.worst.least <= 0.15 <= result.worst.distance + 1e-12
+    assert result.worst.distance <= 0.15 / 0.98
+    assert_allclose(result.worst.time, 0.5, atol=0.05)
+    assert result.worst.missed == 0
     solution = solve(problem, Collocation(6, 3))
     assert solution.audit()["clearance"].passed
     assert "proven; least ball and post" in str(solution.audit())
@@ -77,12 +77,12 @@ def test_the_nearest_two_at_a_time() -> None:
     problem = flight([0, 0, 0], [1, 0, 0], {"ball": BALL, **posts}, [[0, 1, -1], [2, 0, 0]], 0.1)
     solution = solve(problem, Collocation(6, 3))  # the second pair is seen from the ball
     for time in (0.0, 0.3, 0.7, 1.0):
-        (found,), x = closest_pairs_along(problem, solution, [time]), float(solution.at(time)["q"][0])
-        assert found is not None
-        assert set(found.bodies) == {"ball", "post 0" if time < 0.5 else "post 1"}
-        assert_allclose(found.distance, np.hypot(x - (0.2 if time < 0.5 else 0.8), 0.3) - 0.15, atol=1e-9)
+        (result,), x = closest_pairs_along(problem, solution, [time]), float(solution.at(time)["q"][0])
+        assert result is not None
+        assert set(result.bodies) == {"ball", "post 0" if time < 0.5 else "post 1"}
+        assert_allclose(result.distance, np.hypot(x - (0.2 if time < 0.5 else 0.8), 0.3) - 0.15, atol=1e-9)
         ends = [[x, 0, 0], [0.2 if time < 0.5 else 0.8, 0.3, 0]]
-        assert_allclose(found.points, ends if found.bodies[0] == "ball" else ends[::-1], atol=1e-9)
+        assert_allclose(result.points, ends if result.bodies[0] == "ball" else ends[::-1], atol=1e-9)
     free = Problem("free")
     q = free.state("q", initial=0.0)
     free.dynamics(q, free.control("u"))
@@ -91,7 +91,7 @@ def test_the_nearest_two_at_a_time() -> None:
     assert closest_pairs_along(free, solve(free, Collocation(3, 2)), [0.5]) == []
 
 
-def test_the_pair_that_misses_most_of_what_is_asked_of_it_is_the_worst() -> None:
+def test_the_worst_pair_has_the_largest_deficit_of_clearance() -> None:
     """One is nearer, and may be; the other one is farther off, and not far enough."""
     posts = {f"post {k}": Hull(-1, np.array([[0.5, y, 0.0]]), 0.0) for k, y in enumerate((0.3, -0.6))}
     problem = flight([0, 0, 0], [1, 0, 0], {"ball": BALL, **posts}, [[0, 1, -1], [0, 2, -1]], [0.1, 0.7])
@@ -105,14 +105,14 @@ def test_the_nearest_pair_is_named_however_loose_the_bound_of_another() -> None:
     """Distant pairs have a bound only, which may be below the smallest distance of the closest pair."""
     far = {f"far {k}": Hull(-1, np.array([[0.4, y, 0.0]]), 0.0) for k, y in enumerate(np.linspace(0.31, 0.9, 200))}
     hulls = {"ball": BALL, "near": Hull(-1, np.array([[0.5, 0.3, 0.0]]), 0.0), **far}
-    found = proof(flight([0, 0, 0], [1, 0, 0], hulls, [[0, k, -1] for k in range(1, len(hulls))], 0.0))
-    assert found.worst is not None
-    assert found.worst.bodies == ("ball", "near")
-    assert found.worst.distance == min(one.distance for one in found.pairs)
+    result = proof(flight([0, 0, 0], [1, 0, 0], hulls, [[0, k, -1] for k in range(1, len(hulls))], 0.0))
+    assert result.worst is not None
+    assert result.worst.bodies == ("ball", "near")
+    assert result.worst.distance == min(one.distance for one in result.pairs)
 
 
 @pytest.mark.parametrize(("thickness", "horizon"), [(1e-2, 1e2), (1e-4, 1.0), (1e-6, 1e-2), (1e-6, 1e2)])
-def test_a_wall_thinner_than_the_way_between_two_samples(thickness: float, horizon: float) -> None:
+def test_a_wall_thinner_than_the_step_between_two_samples(thickness: float, horizon: float) -> None:
     wall = np.array([[0.437, y, z] for y in (-1, 1) for z in (-1, 1)], dtype=float)
     point = Hull(0, np.zeros((1, 3)), 0.0)
     problem = flight(
@@ -140,9 +140,9 @@ def test_bounds_lie_below_a_fine_sampling_and_near_it(seed: int) -> None:
         return
     problem = flight([-2, 0.1, 0], [2, 0.1, 0.3], bodies, pairs, 0.0)
     solution = solve(problem, Collocation(5, 3))
-    found = solution.audit().clearances["clearance"]
+    result = solution.audit().clearances["clearance"]
     q = solution.at(np.linspace(0, 1, 4001))["q"]
-    for one in found.pairs:
+    for one in result.pairs:
         a, b = (bodies[name] for name in one.bodies)
         sides = [part.core[None] + (q[:, None] if part.frame == 0 else 0 * q[:, None]) for part in (a, b)]
         sampled = (gap_along(nearest_directions(*sides)[0], *sides) - a.radius - b.radius).min()
@@ -151,11 +151,11 @@ def test_bounds_lie_below_a_fine_sampling_and_near_it(seed: int) -> None:
             continue
         assert one.least <= sampled + 1e-9
         assert one.distance >= sampled - 1e-3
-        if found.settled and one is found.worst and 0 <= sampled < 0.2:
+        if result.settled and one is result.worst and 0 <= sampled < 0.2:
             assert one.least >= sampled - 0.021 * sampled - 1e-6 - 1e-6
 
 
-def test_what_time_alone_moves() -> None:
+def test_bodies_moved_by_time_alone() -> None:
     """A post that crosses the way: seen at the right time, in between."""
     problem = Problem("crossing")
     q = problem.state("q", initial=[0, 0, 0], terminal=[1, 0, 0])
@@ -169,20 +169,20 @@ def test_what_time_alone_moves() -> None:
         "clearance", ca.vertcat(EYE, q, post), hulls, [[0, 1, -1]], least=0.0,
         levers={"q": np.ones((1, 3))}, turns={"q": np.zeros((1, 3))},
     )  # fmt: skip
-    found = proof(problem, 3)
-    assert found.worst is not None
-    assert found.worst.missed > 0.19
-    assert_allclose(found.worst.time, 0.5, atol=0.01)
+    result = proof(problem, 3)
+    assert result.worst is not None
+    assert result.worst.missed > 0.19
+    assert_allclose(result.worst.time, 0.5, atol=0.01)
 
 
 def test_a_half_space() -> None:
     ground = Hull(-1, np.array([[5.0, 7.0, -0.5]]), 0.0, np.array([0.0, 0.0, 1.0]))
     rod = Hull(0, np.array([[0, 0, 0.2], [0, 0, -0.2]]), 0.05)
     for pair in ([0, 1, -1], [1, 0, -1]):
-        found = proof(flight([0, 0, 0], [0, 0, -0.2], {"ground": ground, "rod": rod}, [pair], 0.0))
-        assert found.worst is not None
-        assert_allclose(found.worst.distance, 0.05, atol=1e-9)
-        assert 0.04 <= found.worst.least <= 0.05
+        result = proof(flight([0, 0, 0], [0, 0, -0.2], {"ground": ground, "rod": rod}, [pair], 0.0))
+        assert result.worst is not None
+        assert_allclose(result.worst.distance, 0.05, atol=1e-9)
+        assert 0.04 <= result.worst.least <= 0.05
 
 
 def test_time_and_length_rescaled_change_no_verdict() -> None:
@@ -192,11 +192,11 @@ def test_time_and_length_rescaled_change_no_verdict() -> None:
             "post": Hull(-1, np.array([[0.5, 0.3, 0.0]]) * scale, 0.05 * scale),
         }
         problem = flight([0, 0, 0], [scale, 0, 0], hulls, [[0, 1, -1]], 0.1 * scale, horizon)
-        found = proof(problem)
-        assert found.settled
-        assert found.worst is not None
-        assert_allclose(found.worst.distance / scale, 0.15, rtol=0.03)
-        assert_allclose(found.worst.time / horizon, 0.5, atol=0.05)
+        result = proof(problem)
+        assert result.settled
+        assert result.worst is not None
+        assert_allclose(result.worst.distance / scale, 0.15, rtol=0.03)
+        assert_allclose(result.worst.time / horizon, 0.5, atol=0.05)
 
 
 # ---- what is hollow ----------------------------------------------------------------------------------------------
@@ -210,34 +210,34 @@ HOLLOW = {"ball": BALL, "frame": Hull(-1, np.vstack([bar.core for bar in BARS.va
 OF_BARS = {0: [[0, 2], [0, 3], [0, 4]]}
 
 
-def test_what_flies_through_a_hollow_is_as_far_off_as_what_covers_it() -> None:
+def test_distances_inside_a_hollow_are_those_of_its_cover() -> None:
     """The hull fills it; the nearest bar is 0.15 m off all the way, which is proven to a micrometre."""
     hull = proof(flight([0, 0, 0], [1, 0, 0], HOLLOW, [[0, 1, -1]], 0.1)).worst
     assert hull is not None
     assert hull.distance < -0.1
-    for asked, passes in ((0.1, True), (0.15 - 2e-6, True), (0.15 + 2e-6, False)):
-        found = proof(flight([0, 0, 0], [1, 0, 0], HOLLOW, [[0, 1, -1]], asked, covers=OF_BARS))
-        assert found.settled
-        assert found.worst is not None
-        assert (found.worst.missed == 0) == passes
-        assert found.worst.bodies == ("ball", "frame")
-        assert_allclose(found.worst.distance, 0.15, atol=1e-9)
-        assert found.worst.least == pytest.approx(0.15, abs=1.1e-3)
-        assert found.n_intervals < 2000  # the bound of second order holds for what covers, too
-        ball, bar = found.worst.points
+    for request, passes in ((0.1, True), (0.15 - 2e-6, True), (0.15 + 2e-6, False)):
+        result = proof(flight([0, 0, 0], [1, 0, 0], HOLLOW, [[0, 1, -1]], request, covers=OF_BARS))
+        assert result.settled
+        assert result.worst is not None
+        assert (result.worst.missed == 0) == passes
+        assert result.worst.bodies == ("ball", "frame")
+        assert_allclose(result.worst.distance, 0.15, atol=1e-9)
+        assert result.worst.least == pytest.approx(0.15, abs=1.1e-3)
+        assert result.n_intervals < 2000  # the bound of second order holds for what covers, too
+        ball, bar = result.worst.points
         assert_allclose(bar, [min(max(ball[0], 0.2), 0.8), np.copysign(0.3, bar[1]), 0.0], atol=1e-9)
 
 
 def test_covers_that_stand_out_take_nothing_away() -> None:
     """Beside bars that are swelled the hull says more; one bar that always touches leaves what the hull says."""
     thick = {name: replace(bar, radius=0.1) for name, bar in BARS.items()}
-    touching = {**BARS, "bar 2": Hull(0, np.zeros((1, 3)), 0.1)}
-    for bars in (thick, touching):
+    colliding = {**BARS, "bar 2": Hull(0, np.zeros((1, 3)), 0.1)}
+    for bars in (thick, colliding):
         problem = flight([0, 0.6, 0], [1, 0.6, 0], {**HOLLOW, **bars}, [[0, 1, -1]], 0.1, covers=OF_BARS)
-        found = proof(problem)
-        assert found.settled
-        assert found.worst is not None
-        assert_allclose(found.worst.distance, 0.15, atol=1e-9)
+        result = proof(problem)
+        assert result.settled
+        assert result.worst is not None
+        assert_allclose(result.worst.distance, 0.15, atol=1e-9)
 
 
 def test_a_fault_between_bars_and_between_nodes_is_found() -> None:
@@ -245,11 +245,11 @@ def test_a_fault_between_bars_and_between_nodes_is_found() -> None:
     post = {"bar 1": Hull(-1, np.array([[0.437, 0.1, 0.0]]), 1e-5)}
     for least, passes in ((-1e-3, True), (1e-3, False)):
         problem = flight([0, 0, 0], [1, 0, 0], {**HOLLOW, **post}, [[0, 1, -1]], least, covers=OF_BARS)
-        found = proof(problem, 4)
-        assert found.settled
-        assert found.worst is not None
-        assert (found.worst.missed == 0) == passes
-        assert not found.worst.missed or found.worst.time == pytest.approx(0.45, abs=0.05)
+        result = proof(problem, 4)
+        assert result.settled
+        assert result.worst is not None
+        assert (result.worst.missed == 0) == passes
+        assert not result.worst.missed or result.worst.time == pytest.approx(0.45, abs=0.05)
 
 
 @given(st.integers(0, 10**6))
@@ -270,23 +270,23 @@ def test_with_covers_it_is_the_larger_of_both_at_every_time(seed: int) -> None:
         pairs.append([0, first, -1])
     problem = flight([-2, 0.1, 0], [2, 0.1, 0.3], hulls, pairs, 0.0, covers=covers)
     solution = solve(problem, Collocation(5, 3))
-    found, bodies = solution.audit().clearances["clearance"], tuple(hulls.values())
+    result, bodies = solution.audit().clearances["clearance"], tuple(hulls.values())
     q = solution.at(np.linspace(0, 1, 2001))["q"]
 
     def apart(other: int) -> np.ndarray:
         sides = bodies[0].core[None] + q[:, None], np.tile(bodies[other].core, (len(q), 1, 1))
         return np.asarray(gap_along(nearest_directions(*sides)[0], *sides) - bodies[0].radius - bodies[other].radius)
 
-    for one in found.pairs:
+    for one in result.pairs:
         i = int(one.bodies[1].split()[1])
-        told = apart(pairs[i][1])
+        report = apart(pairs[i][1])
         if i in covers:
-            told = np.maximum(told, np.min([apart(other) for _, other in covers[i]], axis=0))
-        sampled = told.min()
+            report = np.maximum(report, np.min([apart(other) for _, other in covers[i]], axis=0))
+        sampled = report.min()
         assert one.least <= max(sampled, 0.0) + 1e-9
         if sampled > 0:
             assert one.distance >= sampled - 2e-3
-            if found.settled and one is found.worst:
+            if result.settled and one is result.worst:
                 assert one.least >= sampled - 0.021 * sampled - 2e-6
         else:
             assert one.least <= 0.0
@@ -312,9 +312,9 @@ def test_covers_stay_with_their_pair() -> None:
 def test_covers_are_saved_with_a_plan(tmp_path: Any) -> None:
     solution = solve(flight([0, 0, 0], [1, 0, 0], HOLLOW, [[0, 1, -1]], 0.1, covers=OF_BARS), Collocation(6, 3))
     solution.save(tmp_path / "plan.npz")
-    found = Solution.load(tmp_path / "plan.npz").audit().clearances["clearance"].worst
-    assert found is not None
-    assert found.missed == 0
+    result = Solution.load(tmp_path / "plan.npz").audit().clearances["clearance"].worst
+    assert result is not None
+    assert result.missed == 0
 
 
 # ---- what bends, and how finely it is looked at --------------------------------------------------------------------
@@ -324,7 +324,7 @@ SETTINGS = ProofSettings()
 
 
 def swinging(
-    low: float, pieces: int = 1, smooth: bool = True, asked: float = 0.0, settings: ProofSettings = SETTINGS
+    low: float, segments: int = 1, smooth: bool = True, request: float = 0.0, settings: ProofSettings = SETTINGS
 ) -> Clearance:
     """A point on a slide on an arm that turns, past a floor 1 m below where it passes the axis.
 
@@ -335,7 +335,7 @@ def swinging(
     place = ca.SX.sym("place", 12)
     apart = Separation(
         "clearance", place, {"point": Hull(0, np.zeros((1, 3))), "floor": Hull(-1, np.array([[0, -1.0, 0]]), 0.0, UP)},
-        np.array([[0, 1, -1]]), np.array([1.0 + asked]), {"slide": 1, "turn": 1},
+        np.array([[0, 1, -1]]), np.array([1.0 + request]), {"slide": 1, "turn": 1},
         np.array([[1.0, reach]]), np.array([[0.0, 1.0]]),
     )  # fmt: skip
 
@@ -344,8 +344,8 @@ def swinging(
         places = np.stack([s * np.cos(0.1 * s), s * np.sin(0.1 * s), 0 * s], axis=1)
         return frames_of(np.hstack([np.tile(EYE, (len(at), 1)), places]))
 
-    rates, seconds = np.tile([[1.0, 0.1]], (pieces, 1)), np.zeros((pieces, 2))
-    track = Track(np.linspace(0, 1, pieces + 1), 1.0, rates, seconds, smooth, frames)
+    rates, seconds = np.tile([[1.0, 0.1]], (segments, 1)), np.zeros((segments, 2))
+    track = Track(np.linspace(0, 1, segments + 1), 1.0, rates, seconds, smooth, frames)
     return clearance_along(apart, track, settings)
 
 
@@ -353,49 +353,49 @@ UP = np.array([0.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize("low", [0.3, 0.45, 0.6, 0.81])
-def test_what_slides_on_what_turns_bends_by_coriolis(low: float) -> None:
+def test_sliding_on_a_rotating_body_curves_by_coriolis(low: float) -> None:
     """The required clearance is violated briefly, between all samples of the first pass."""
-    found = swinging(low, asked=4e-4).worst
-    assert found is not None
-    assert found.missed > 0
-    assert found.least <= 1.0 <= found.distance + 1e-15
-    clearance_constraints = swinging(low, asked=-1e-2)
+    result = swinging(low, request=4e-4).worst
+    assert result is not None
+    assert result.missed > 0
+    assert result.least <= 1.0 <= result.distance + 1e-15
+    clearance_constraints = swinging(low, request=-1e-2)
     assert clearance_constraints.settled
     assert clearance_constraints.worst is not None
     assert clearance_constraints.worst.missed == 0
 
 
 @pytest.mark.parametrize("smooth", [True, False])
-def test_the_pieces_of_a_track_do_not_matter(smooth: bool) -> None:
+def test_the_proof_does_not_depend_on_the_segmentation_of_a_track(smooth: bool) -> None:
     """The first pass combines segments in blocks; the last of an odd number is separate."""
-    for pieces in (1, 2, 7, 128, 129, 1001):
-        found = swinging(0.3137, pieces, smooth, asked=-0.5)
-        assert found.settled
-        assert found.worst is not None
-        assert 1.0 - 0.02 * 0.5 <= found.worst.least <= 1.0 <= found.worst.distance <= 1.01
-        assert found.n_intervals < 3 * max(pieces, 20)
+    for segments in (1, 2, 7, 128, 129, 1001):
+        result = swinging(0.3137, segments, smooth, request=-0.5)
+        assert result.settled
+        assert result.worst is not None
+        assert 1.0 - 0.02 * 0.5 <= result.worst.least <= 1.0 <= result.worst.distance <= 1.01
+        assert result.n_intervals < 3 * max(segments, 20)
 
 
-@pytest.mark.parametrize("pieces", [1, 5, 129, 300, 1001])
+@pytest.mark.parametrize("segments", [1, 5, 129, 300, 1001])
 @pytest.mark.parametrize("smooth", [True, False])
-def test_what_comes_too_near_between_the_places_looked_at_first_is_found(pieces: int, smooth: bool) -> None:
+def test_collisions_between_the_first_samples_are_detected(segments: int, smooth: bool) -> None:
     """Half way between two of them in some piece, by half as much as it bends in between."""
     for share in (0.1, 0.37, 0.5, 0.63, 0.999):
-        low = (np.floor(share * pieces) + 0.25) / pieces
-        found = swinging(low, pieces, smooth, asked=0.1 * (0.25 / pieces) ** 2 / 2).worst
-        assert found is not None
-        assert found.missed > 0
+        low = (np.floor(share * segments) + 0.25) / segments
+        result = swinging(low, segments, smooth, request=0.1 * (0.25 / segments) ** 2 / 2).worst
+        assert result is not None
+        assert result.missed > 0
 
 
-@pytest.mark.parametrize("pieces", [1, 5, 300])
-def test_nothing_is_looked_at_beyond_the_ends(pieces: int) -> None:
+@pytest.mark.parametrize("segments", [1, 5, 300])
+def test_no_time_beyond_the_ends_is_checked(segments: int) -> None:
     """Where it would come nearer after the end, or had come before the start, the end or the start is nearest."""
     for low, time in ((1.3, 1.0), (-0.3, 0.0)):
-        found = swinging(low, pieces, asked=-0.5).worst
-        assert found is not None
-        assert found.time == time
-        assert found.distance == pytest.approx(1 + 0.3 * np.sin(0.03), abs=1e-12)
-        assert found.least <= found.distance
+        result = swinging(low, segments, request=-0.5).worst
+        assert result is not None
+        assert result.time == time
+        assert result.distance == pytest.approx(1 + 0.3 * np.sin(0.03), abs=1e-12)
+        assert result.least <= result.distance
 
 
 @pytest.mark.parametrize("unit", [1e-2, 1.0, 1e2])
@@ -408,17 +408,17 @@ def test_the_unit_of_a_state_does_not_matter(unit: float) -> None:
         heights = (1 + (at - 0.3) ** 2)[:, None] * UP
         return frames_of(np.hstack([np.tile(EYE, (len(at), 1)), heights]))
 
-    for asked in (0.5, 0.99, 1.0 + 1e-3):
+    for request in (0.5, 0.99, 1.0 + 1e-3):
         apart = Separation(
-            "clearance", ca.SX.sym("place", 12), hulls, np.array([[0, 1, -1]]), np.array([asked]), {"height": 1},
+            "clearance", ca.SX.sym("place", 12), hulls, np.array([[0, 1, -1]]), np.array([request]), {"height": 1},
             unit * one, 0 * one,
         )  # fmt: skip
-        found = clearance_along(apart, Track(np.array([0.0, 1.0]), 1.0, rate, second, True, frames))
-        assert found.settled
-        assert found.worst is not None
-        assert (found.worst.missed > 0) == (asked > 1)
-        assert found.worst.least <= 1.0
-        assert found.n_intervals < 60
+        result = clearance_along(apart, Track(np.array([0.0, 1.0]), 1.0, rate, second, True, frames))
+        assert result.settled
+        assert result.worst is not None
+        assert (result.worst.missed > 0) == (request > 1)
+        assert result.worst.least <= 1.0
+        assert result.n_intervals < 60
 
 
 def test_the_least_distance_is_known_to_two_hundredths_and_no_better_than_need_be() -> None:
@@ -427,39 +427,39 @@ def test_the_least_distance_is_known_to_two_hundredths_and_no_better_than_need_b
         spare = sign * np.geomspace(1e-3, 0.9, 16)
         shares = []
         for k, each in enumerate(spare):
-            worst = swinging(0.2 + 0.04 * k, asked=-each).worst
+            worst = swinging(0.2 + 0.04 * k, request=-each).worst
             assert worst is not None
             shares.append((worst.distance - worst.least) / abs(worst.distance - worst.required))
         assert 0.01 < max(shares) <= 0.02 + 1e-9
-    worst = swinging(0.3137, asked=1e-5).worst
+    worst = swinging(0.3137, request=1e-5).worst
     assert worst is not None
     assert 1e-7 < worst.distance - worst.least <= 1e-6
 
 
-def test_what_would_take_too_long_is_not_proven() -> None:
+def test_proofs_that_exceed_their_effort_are_inconclusive() -> None:
     """The result is still a lower bound, and the number of intervals stays within its limit."""
-    assert swinging(0.3137, asked=-1e-5).settled
-    short = swinging(0.3137, asked=-1e-5, settings=ProofSettings(most_intervals=12))
+    assert swinging(0.3137, request=-1e-5).settled
+    short = swinging(0.3137, request=-1e-5, settings=ProofSettings(most_intervals=12))
     assert not short.settled
     assert short.n_intervals <= 12
     assert short.worst is not None
     assert short.worst.least <= 1.0
     assert short.worst.missed > 0
     assert str(short).startswith("not proven")
-    assert not swinging(0.3137, asked=-1e-5, settings=ProofSettings(halvings=2)).settled
+    assert not swinging(0.3137, request=-1e-5, settings=ProofSettings(halvings=2)).settled
 
 
 def test_a_plan_of_held_controls_and_one_that_was_saved(tmp_path: Any) -> None:
     hulls = {"ball": BALL, "post": Hull(-1, np.array([[0.5, 0.3, 0.0]]), 0.05)}
     problem = flight([0, 0, 0], [1, 0, 0], hulls, [[0, 1, -1]], 0.1)
     solution = solve(problem, MultipleShooting(12))
-    found = solution.audit().clearances["clearance"]
-    assert found.settled
-    assert found.worst is not None
-    assert found.worst.missed == 0
+    result = solution.audit().clearances["clearance"]
+    assert result.settled
+    assert result.worst is not None
+    assert result.worst.missed == 0
     solution.save(tmp_path / "plan.npz")
     again = Solution.load(tmp_path / "plan.npz").audit().clearances["clearance"]
-    assert_allclose(again.pairs[0].least, found.worst.least, rtol=1e-12)
+    assert_allclose(again.pairs[0].least, result.worst.least, rtol=1e-12)
     assert str(pickle.loads(pickle.dumps(problem))) == str(problem)
 
 
@@ -496,10 +496,10 @@ BAD: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_cannot_be_declared(case: str) -> None:
-    given = {**GOOD, **BAD[case]}
+def test_invalid_declarations(case: str) -> None:
+    options = {**GOOD, **BAD[case]}
     with pytest.raises(ProblemError):
-        flight([0, 0, 0], [1, 0, 0], given.pop("hulls"), given.pop("pairs"), given.pop("least"), **given)
+        flight([0, 0, 0], [1, 0, 0], options.pop("hulls"), options.pop("pairs"), options.pop("least"), **options)
 
 
 @pytest.mark.parametrize(
@@ -511,12 +511,12 @@ def test_what_cannot_be_declared(case: str) -> None:
         ("normal", (0, np.zeros((1, 3)), 0.0, np.array([1.0, 1.0, 0.0]))),
     ],
 )
-def test_what_is_no_body(name: str, values: tuple[Any, ...]) -> None:
+def test_invalid_bodies(name: str, values: tuple[Any, ...]) -> None:
     with pytest.raises(ProblemError, match=name):
         Hull(*values)
 
 
-def test_pairs_left_out_by_assumption_are_told_where_the_clearance_is(tmp_path: Any) -> None:
+def test_pairs_ignored_by_assumption_are_reported_with_the_clearance(tmp_path: Any) -> None:
     hulls = {"ball": BALL, "post": Hull(-1, np.array([[0.5, 0.5, 0.0]]), 0.05)}
     assumed = {"hand and box": "always touch", **{f"a{k} and b{k}": "always touch" for k in range(5)}}
     solution = solve(flight([0, 0, 0], [1, 0, 0], hulls, [[0, 1, -1]], 0.1, assumed=assumed), Collocation(6, 3))
@@ -557,7 +557,7 @@ def test_kinks_are_proven_spikes_of_a_microsecond_are_found_and_jumps_are_named(
         "clearance", ca.vertcat(EYE, q, post), hulls, [[0, 1, -1]], least=0.0,
         levers={"q": np.ones((1, 3))}, turns={"q": np.zeros((1, 3))},
     )  # fmt: skip
-    found = proof(problem, 3)
-    assert found.worst is not None
-    assert re.match(word, str(found)), str(found)
-    assert found.worst.least == pytest.approx(least, abs=0.02)
+    result = proof(problem, 3)
+    assert result.worst is not None
+    assert re.match(word, str(result)), str(result)
+    assert result.worst.least == pytest.approx(least, abs=0.02)

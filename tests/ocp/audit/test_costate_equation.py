@@ -99,14 +99,14 @@ def test_the_integrated_costates_are_the_closed_form() -> None:
 
 
 @every_method
-def test_costates_scaled_or_shifted_or_bent_fail(method: str) -> None:
+def test_scaled_shifted_or_perturbed_costates_fail(method: str) -> None:
     plan = free_end(method)
     assert failed(tampered(plan, lambda s, lam: 1.1 * lam).audit()) & {EQUATION, ENDS, LOST}
     shifted = tampered(plan, lambda s, lam: lam + 0.1 * np.max(np.abs(lam))).audit()
     assert ENDS in failed(shifted)
-    bent = tampered(plan, lambda s, lam: lam + 0.1 * np.max(np.abs(lam)) * np.sin(np.pi * s)).audit()
-    assert EQUATION in failed(bent)
-    assert ENDS not in failed(bent)  # both ends are left alone
+    perturbed = tampered(plan, lambda s, lam: lam + 0.1 * np.max(np.abs(lam)) * np.sin(np.pi * s)).audit()
+    assert EQUATION in failed(perturbed)
+    assert ENDS not in failed(perturbed)  # both ends are left alone
 
 
 def test_costates_of_the_other_sign_fail() -> None:
@@ -116,9 +116,9 @@ def test_costates_of_the_other_sign_fail() -> None:
 
 
 @every_method
-def test_given_ends_ask_nothing_of_the_costates_and_free_ends_ask_for_the_slope_of_the_cost(method: str) -> None:
-    given = solve(energy(), DIRECT[method]).audit()
-    assert given[ENDS].value == pytest.approx(0, abs=1e-7)
+def test_costates_are_free_at_fixed_ends_and_the_gradient_of_the_cost_at_free_ends(method: str) -> None:
+    options = solve(energy(), DIRECT[method]).audit()
+    assert options[ENDS].value == pytest.approx(0, abs=1e-7)
     plan = free_end(method)
     x = plan["x"][-1]
     np.testing.assert_allclose(plan.costate("x")[-1], [4 * x[0], np.cos(x[1])], atol=1e-5)
@@ -164,7 +164,7 @@ def test_end_conditions_explain_the_costates_at_the_ends(what: str, solver: str)
 
 
 @pytest.mark.parametrize("what", ["line", "cycle"])
-def test_conditions_at_the_start_are_looked_at_too(what: str) -> None:
+def test_conditions_at_the_start_are_checked(what: str) -> None:
     plan = solve(constrained(what), Collocation(20))
     size = np.max(np.abs(plan.costate("x")))
     aside = np.array([2.0, -1.0]) / np.sqrt(5)  # off the slope (1, 2) of the line
@@ -238,7 +238,7 @@ def test_the_end_constraint_may_move_with_the_horizon() -> None:
 
 
 @pytest.mark.parametrize("upper", [1.2, 5.0], ids=["active", "never active"])
-def test_the_costate_equation_is_looked_at_beside_path_constraints(upper: float) -> None:
+def test_the_costate_equation_is_checked_with_path_constraints(upper: float) -> None:
     problem, x, u = plant("corridor", size=2, initial=[0.0, 0.0], terminal=[1.0, 0.0])
     problem.dynamics(x, ca.vertcat(x[1], u))
     problem.path("speed", x[1], upper=upper)
@@ -251,8 +251,8 @@ def test_the_costate_equation_is_looked_at_beside_path_constraints(upper: float)
     assert (pushes >= 0).all()
     assert pushes.any() == (upper < 1.5)
     np.testing.assert_allclose(adjoint.costate[:, 1], -plan.control_interpolant(audit.optimality.t)[:, 0], atol=0.02)
-    bent = tampered(plan, lambda s, lam: lam + 2.0 * np.sin(np.pi * s) * [1.0, 0.0]).audit()
-    assert EQUATION in failed(bent)
+    perturbed = tampered(plan, lambda s, lam: lam + 2.0 * np.sin(np.pi * s) * [1.0, 0.0]).audit()
+    assert EQUATION in failed(perturbed)
 
 
 @pytest.mark.parametrize("name", ["everything", "coupled", "mixed", "tabulated"])
@@ -263,9 +263,9 @@ def test_costates_of_the_indirect_method_are_taken_to_task_too(name: str) -> Non
     assert audit[EQUATION].value < 1e-6
     assert audit[ENDS].value < 1e-7
     size = np.max(np.abs(plan.costate_interpolant.values))
-    bent = tampered(plan, lambda s, lam: lam + 0.1 * size * np.sin(np.pi * s))
-    assert EQUATION in failed(bent.audit(costates=1e-2))
-    assert not bent.audit().passed
+    perturbed = tampered(plan, lambda s, lam: lam + 0.1 * size * np.sin(np.pi * s))
+    assert EQUATION in failed(perturbed.audit(costates=1e-2))
+    assert not perturbed.audit().passed
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -20,7 +20,7 @@ from ocp.audit.linearisation import Linearisation
 from ocp.audit.principle import balance, pseudo_inverses
 from ocp.audit.sizes import sizes
 from ocp.problem.formulation import Formulation
-from tests.ocp.audit.drawn import drawn
+from tests.ocp.audit.drawn import random_program
 from tests.ocp.problems import Array
 
 METHOD = Collocation(intervals=20, degree=3)
@@ -54,12 +54,12 @@ def oscillator(horizon: float, stiffness: float = 1.0, unit: float = 1.0, price:
 @given(st.floats(0.2, 8.0), st.floats(0.1, 30.0), st.sampled_from([1e-6, 1.0, 1e6]), st.sampled_from([1e-3, 1.0, 1e5]))
 def test_a_plan_is_a_minimum_until_the_conjugate_point(share: float, k: float, unit: float, price: float) -> None:
     assume(abs(share - np.pi) >= 0.02)
-    _, found = look(oscillator(share / np.sqrt(k), k, unit, price))
-    assert found.upwards is (share < np.pi)
+    _, result = look(oscillator(share / np.sqrt(k), k, unit, price))
+    assert result.upwards is (share < np.pi)
     if share > np.pi:  # the point conjugate to the end lies half a turn before it, in the interval that is named
         interval = share / np.sqrt(k) / 20
-        assert found.time is not None
-        assert -1e-9 <= (share - np.pi) / np.sqrt(k) - found.time <= interval * (1 + 1e-9)
+        assert result.time is not None
+        assert -1e-9 <= (share - np.pi) / np.sqrt(k) - result.time <= interval * (1 + 1e-9)
 
 
 def random_quadratic(rng: np.random.Generator, fixed: bool, bounded: bool) -> Problem:
@@ -99,9 +99,9 @@ def test_the_verdict_is_that_of_the_reduced_hessian(fixed: bool, bounded: bool) 
     verdicts = []
     for _ in range(12):
         problem = random_quadratic(rng, fixed, bounded)
-        _, found = look(problem)
-        verdicts.append(found.upwards)
-        assert found.upwards is bool(reduced_hessian(problem)[0] > 0)
+        _, result = look(problem)
+        verdicts.append(result.upwards)
+        assert result.upwards is bool(reduced_hessian(problem)[0] > 0)
     assert {True, False} <= set(verdicts)
 
 
@@ -110,25 +110,25 @@ def test_the_direction_that_is_returned_lowers_the_cost() -> None:
     seen = 0
     for fixed in (True, False) * 8:
         problem = random_quadratic(rng, fixed, False)
-        solution, found = look(problem)
-        if found.upwards:
+        solution, result = look(problem)
+        if result.upwards:
             continue
         seen += 1
-        assert found.direction is not None
-        controls, states = found.direction
+        assert result.direction is not None
+        controls, states = result.direction
         np.testing.assert_allclose(states[0], 0, atol=1e-12)
         if fixed:
             np.testing.assert_allclose(states[-1], 0, atol=1e-7 * np.abs(states).max())
         form = Formulation(problem)
         # the cost of the linear system driven by this variation, by a Runge-Kutta method of its own
         rates = ca.Function("rates", [form.x, form.u], [form.f, form.running])
-        x, cost, fractions = np.zeros(form.nx), 0.0, found.t.reshape(20, -1) / solution.horizon
+        x, cost, fractions = np.zeros(form.nx), 0.0, result.t.reshape(20, -1) / solution.horizon
         step = solution.horizon / 20 / 50
-        for k, piece in enumerate(controls.reshape(20, -1, form.nu)):
+        for k, part in enumerate(controls.reshape(20, -1, form.nu)):
             places = fractions[k] * 20 - k
             for j in range(50):
                 share = [(j + c) / 50 for c in (0.0, 0.5, 1.0)]
-                u = [np.array([np.polyval(np.polyfit(places, piece[:, i], len(places) - 1), c) for i in range(form.nu)])
+                u = [np.array([np.polyval(np.polyfit(places, part[:, i], len(places) - 1), c) for i in range(form.nu)])
                      for c in share]  # fmt: skip
                 k1, k2 = rates(x, u[0]), None
                 k2 = rates(x + step / 2 * np.array(k1[0]).ravel(), u[1])
@@ -159,7 +159,7 @@ def double_integrator(**bounds: Any) -> Problem:
     [Collocation(20, control="held"), MultipleShooting(40), MultipleShooting(10, control="linear"), METHOD],
     ids=str,
 )
-def test_the_lost_cost_is_what_a_held_control_costs_more(method: Any) -> None:
+def test_the_lost_cost_is_the_excess_of_a_piecewise_constant_control(method: Any) -> None:
     solution = solve(double_integrator(), method)
     audit = solution.audit()
     assert audit.optimality.curvature.upwards
@@ -168,7 +168,7 @@ def test_the_lost_cost_is_what_a_held_control_costs_more(method: Any) -> None:
     assert audit.passed is (excess < 6e-3)
 
 
-def test_what_pushes_against_a_bound_is_not_lost() -> None:
+def test_gradients_against_an_active_bound_are_no_loss() -> None:
     audit = solve(double_integrator(lower=-5.0, upper=5.0), Collocation(40)).audit()
     assert audit.optimality.curvature.upwards
     assert (audit.lost >= 0).all()
@@ -209,7 +209,7 @@ def test_a_free_horizon_may_turn_a_minimum_into_a_saddle() -> None:
         assert second_order(hurried(bend), plan).upwards is verdict
 
 
-def test_a_closed_way_may_drift_where_an_open_one_may_not() -> None:
+def test_a_closed_path_may_drift_where_an_open_path_may_not() -> None:
     """x(T) = x(0) free: the constant variation costs -k x^2 T, whatever T; with the start given it does not exist."""
     for start, verdict in ((None, False), (0.0, True)):
         problem = Problem("cyclic")
@@ -219,8 +219,8 @@ def test_a_closed_way_may_drift_where_an_open_one_may_not() -> None:
         problem.horizon(1.0)
         problem.end("closed", x - problem.at_start(x), 0.0, 0.0)
         problem.minimize(u**2 - 0.5 * x**2)
-        _, found = look(problem)
-        assert found.upwards is verdict
+        _, result = look(problem)
+        assert result.upwards is verdict
 
 
 def test_the_conditions_at_the_end_count_with_their_multipliers() -> None:
@@ -235,9 +235,9 @@ def test_the_conditions_at_the_end_count_with_their_multipliers() -> None:
         problem.horizon(1.0)
         problem.end("circle", x**2 + y**2, 1.0, 1.0)
         problem.minimize((u**2 + w**2) / 2)
-        solution, found = look(problem, guess={"x": lambda t, s=side: 0.3 + (s - 0.3) * t, "u": side - 0.3})
+        solution, result = look(problem, guess={"x": lambda t, s=side: 0.3 + (s - 0.3) * t, "u": side - 0.3})
         assert solution["x"][-1, 0] == pytest.approx(side)
-        assert found.upwards is verdict
+        assert result.upwards is verdict
 
 
 def test_multipliers_have_the_sign_of_the_bound_that_they_hold() -> None:
@@ -256,9 +256,9 @@ def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
     rng = np.random.default_rng(5)
     gradient, rows = rng.normal(size=(200, 3)), rng.normal(size=(200, 2, 3))
     upper = rng.random((200, 2)) < 0.7
-    found = balance(gradient, rows, np.zeros_like(upper), upper, inverse=pseudo_inverses(rows, upper))
-    assert (found >= 0).all()
-    assert (found[~upper] == 0).all()
+    result = balance(gradient, rows, np.zeros_like(upper), upper, inverse=pseudo_inverses(rows, upper))
+    assert (result >= 0).all()
+    assert (result[~upper] == 0).all()
     for k in range(200):
         best = np.inf
         for pattern in ([], [0], [1], [0, 1]):
@@ -267,7 +267,7 @@ def test_multipliers_leave_the_least_that_their_signs_allow() -> None:
             y = np.linalg.lstsq(rows[k, pattern].T, -gradient[k], rcond=None)[0] if pattern else np.zeros(0)
             if (y >= 0).all():
                 best = min(best, float(np.linalg.norm(gradient[k] + rows[k, pattern].T @ y)))
-        assert np.linalg.norm(gradient[k] + rows[k].T @ found[k]) == pytest.approx(best, abs=1e-9)
+        assert np.linalg.norm(gradient[k] + rows[k].T @ result[k]) == pytest.approx(best, abs=1e-9)
 
 
 METHODS = (METHOD, Collocation(20, 3, "legendre"), MultipleShooting(40, control="linear"), Indirect())
@@ -302,7 +302,7 @@ def pan_tilt(turn: float) -> Problem:
 
 
 @pytest.mark.parametrize(("turn", "verdict"), [(3.0, True), (3.3, False), (5.5, False)])
-def test_the_long_way_round_a_sphere_is_none(turn: float, verdict: bool) -> None:
+def test_the_longer_great_circle_is_no_minimum(turn: float, verdict: bool) -> None:
     """Great circles are shortest up to half a turn (Jacobi); the equator is stationary for any turn."""
     guess = {"pan": lambda t: turn * t, "rates": [turn, 0.0]}
     plan = solve(pan_tilt(turn), METHOD, guess=guess, check=False)
@@ -318,9 +318,9 @@ def test_an_entry_that_stands_still_is_curved_as_its_neighbours_are() -> None:
     problem.dynamics(q, rates + 1e-17 * ca.sin(7 * problem.time))
     problem.horizon(1.0)
     problem.minimize(ca.sumsqr(rates) * (1 + q[0] ** 2))
-    solution, found = look(problem)
+    solution, result = look(problem)
     assert np.abs(solution["rates"][:, 1]).max() < 1e-9
-    assert found.upwards is True
+    assert result.upwards is True
 
 
 # ---- what a plan loses where its variations hardly curve -------------------------------------------------------------
@@ -349,19 +349,19 @@ def test_near_a_conjugate_point_a_plan_loses_more_than_its_controls_alone_could_
         return np.asarray(k * (b * np.cos(k * t) - np.sin(k * t)) + bump * np.pi * np.cos(np.pi * t))
 
     def costate(t: Array) -> Array:  # of lambda' = w x, zero mean of u + lambda
-        way = (np.sin(k * t) + b * (1 - np.cos(k * t))) / k + bump * (1 - np.cos(np.pi * t)) / np.pi
-        return np.asarray(weight * way - weight * bump / np.pi - k * b)
+        path = (np.sin(k * t) + b * (1 - np.cos(k * t))) / k + bump * (1 - np.cos(np.pi * t)) / np.pi
+        return np.asarray(weight * path - weight * bump / np.pi - k * b)
 
-    plan = drawn(problem, {"x": place}, {"u": speed}, {"x": costate}, 1.0, 40)
-    found = plan.audit()
+    plan = random_program(problem, {"x": place}, {"u": speed}, {"x": costate}, 1.0, 40)
+    audit = plan.audit()
     more = bump**2 * (np.pi**2 - weight) / 4
-    assert found.feasible
-    assert found["cost lost, relative"].value * found.optimality.cost_size == pytest.approx(more, rel=0.02)
-    assert found.optimal is (more < 1e-3 * found.optimality.cost_size)
+    assert audit.feasible
+    assert audit["cost lost, relative"].value * audit.optimality.cost_size == pytest.approx(more, rel=0.02)
+    assert audit.optimal is (more < 1e-3 * audit.optimality.cost_size)
 
 
 @pytest.mark.parametrize("intervals", [3, 5, 12])
-def test_on_few_intervals_too_what_is_lost_is_what_the_controls_cost_more(intervals: int) -> None:
+def test_the_loss_is_the_excess_cost_on_few_intervals(intervals: int) -> None:
     """x' = u - x, min int (x^2 + u^2) / 2: the plan's controls integrated anew, beside the Riccati solution.
 
     What polynomials miss between their own points is seen at points of other places only.

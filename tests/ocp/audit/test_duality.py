@@ -26,7 +26,7 @@ METHODS: dict[str, Any] = {
 every_method = pytest.mark.parametrize("method", METHODS)
 
 
-def told(declare: str, unit: float = 1.0, second: float = 1.0) -> Problem:
+def declared_problem(declare: str, unit: float = 1.0, second: float = 1.0) -> Problem:
     """A metre (of so many units) in a second from rest to rest; the cost has no unit."""
     problem = Problem(declare)
     speed: dict[str, Any] = {"upper": 1.2 * unit / second} if declare == "speed limit" else {}
@@ -58,18 +58,20 @@ def fitted(plan: Solution) -> Fit:
     p = form.parameter_vector(plan.parameters)
     bounds = form.bound_values(p)
     along = Linearisation(form, plan, p, bounds, sizes=sizes(form, plan, p, bounds))
-    known = adjoint(along, None if along.form.path.equality.all() and not along.nodal else bent(along), abs(plan.cost))
-    found = best_multipliers(along, known, AccessoryProblem(along, known).curved, abs(plan.cost))
-    assert found is not None
-    return found
+    known = adjoint(
+        along, None if along.form.path.equality.all() and not along.nodal else perturb(along), abs(plan.cost)
+    )
+    result = best_multipliers(along, known, AccessoryProblem(along, known).curved, abs(plan.cost))
+    assert result is not None
+    return result
 
 
-def bent(along: Linearisation) -> np.ndarray:
+def perturb(along: Linearisation) -> np.ndarray:
     return np.zeros((len(along.s), along.form.nu, along.form.nu))
 
 
-def lost(found: Fit) -> float:
-    return float(found.lost.sum()) + found.adjoint.ends.charge
+def lost(result: Fit) -> float:
+    return float(result.lost.sum()) + result.adjoint.ends.charge
 
 
 def without_costates(plan: Solution) -> Solution:
@@ -86,21 +88,21 @@ CASES = ["effort", "speed limit", "late", "both ways"]
 
 @pytest.mark.parametrize("declare", CASES)
 @every_method
-def test_what_is_lost_is_what_the_plan_costs_more(declare: str, method: str) -> None:
+def test_the_loss_is_the_excess_cost_of_the_plan(declare: str, method: str) -> None:
     """Convex problems: the best multipliers leave no gap but that of the plan to the optimum.
 
     Where a limit begins to hold or a control switches within an interval, its points tell up to five times as much.
     """
-    least = solve(told(declare), Collocation(400, 2)).cost
-    plan = solve(told(declare), METHODS[method])
-    more, found, rounded = plan.cost - least, lost(fitted(plan)), 3e-4 * abs(least)
-    assert 0.85 * more - rounded <= found <= (1.15 if declare == "effort" else 5.0) * max(more, 0.0) + rounded
+    least = solve(declared_problem(declare), Collocation(400, 2)).cost
+    plan = solve(declared_problem(declare), METHODS[method])
+    more, result, rounded = plan.cost - least, lost(fitted(plan)), 3e-4 * abs(least)
+    assert 0.85 * more - rounded <= result <= (1.15 if declare == "effort" else 5.0) * max(more, 0.0) + rounded
 
 
 @pytest.mark.parametrize("declare", CASES)
 @every_method
 def test_it_does_not_matter_which_costates_are_reported(declare: str, method: str) -> None:
-    plan = solve(told(declare), METHODS[method])
+    plan = solve(declared_problem(declare), METHODS[method])
     before, after = fitted(plan), fitted(without_costates(plan))
     assert lost(after) == pytest.approx(lost(before), rel=1e-2, abs=1e-5 * abs(plan.cost))
     assert after.distance > 0.3 * abs(plan.cost)
@@ -110,14 +112,16 @@ def test_it_does_not_matter_which_costates_are_reported(declare: str, method: st
 @pytest.mark.parametrize(("unit", "second"), [(1e3, 1.0), (1e-3, 60.0), (1.0, 1e-3)])
 @pytest.mark.parametrize("declare", CASES)
 def test_units_change_nothing(declare: str, unit: float, second: float) -> None:
-    one, other = (fitted(solve(told(declare, *units), METHODS["held"])) for units in ((1.0, 1.0), (unit, second)))
+    one, other = (
+        fitted(solve(declared_problem(declare, *units), METHODS["held"])) for units in ((1.0, 1.0), (unit, second))
+    )
     assert lost(other) == pytest.approx(lost(one), rel=2e-2, abs=1e-6)
 
 
-def test_multipliers_push_their_own_way_and_only_where_a_limit_is_near() -> None:
-    plan = solve(told("speed limit"), METHODS["radau"])
-    found = fitted(plan).adjoint
-    speed = found.state_multipliers[:, 1]
+def test_multipliers_have_their_sign_and_are_zero_away_from_limits() -> None:
+    plan = solve(declared_problem("speed limit"), METHODS["radau"])
+    result = fitted(plan).adjoint
+    speed = result.state_multipliers[:, 1]
     assert speed.min() >= -1e-6
     at_limit = plan.state_interpolant(np.repeat(0.5, 1))[0, 1] > 1.2 - 1e-6
     assert at_limit
@@ -127,6 +131,6 @@ def test_multipliers_push_their_own_way_and_only_where_a_limit_is_near() -> None
 
 
 def test_a_plan_far_from_the_best_loses_more() -> None:
-    plan = solve(told("effort"), MultipleShooting(6))
-    finer = solve(told("effort"), MultipleShooting(60))
+    plan = solve(declared_problem("effort"), MultipleShooting(6))
+    finer = solve(declared_problem("effort"), MultipleShooting(60))
     assert lost(fitted(plan)) > 20 * lost(fitted(finer))

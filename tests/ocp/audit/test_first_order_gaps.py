@@ -12,7 +12,7 @@ import pytest
 
 from models import FixedBase, Joint, Link, Robot
 from ocp import Collocation, MultipleShooting, Problem, Solution, TipTask, minimum_velocity_problem, resolve, solve
-from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, is_no_proven_minimum, of
+from tests.ocp.audit.drawn import holds, is_no_minimum, is_no_proven_minimum, of, random_program
 from tests.ocp.problems import Array, double_integrator
 
 pytestmark = pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")  # arms of a kilometre are meant
@@ -53,7 +53,7 @@ def detour(problem: Problem, bump: float, mesh: int = 40) -> Solution:
     def slope(t: Array) -> Array:
         return np.asarray(-12 + bump * (24 * t - 12))
 
-    return drawn(problem, {"q": q, "v": v}, {"u": u}, {"q": slope, "v": lambda t: -u(t)}, 1.0, mesh)
+    return random_program(problem, {"q": q, "v": v}, {"u": u}, {"q": slope, "v": lambda t: -u(t)}, 1.0, mesh)
 
 
 NEVER_ACTIVE: dict[str, Declare] = {
@@ -67,7 +67,7 @@ NEVER_ACTIVE: dict[str, Declare] = {
 
 @pytest.mark.parametrize("declared", NEVER_ACTIVE)
 @pytest.mark.parametrize("timed", [0.0, 1.0], ids=["autonomous", "in time"])
-def test_a_constraint_that_never_holds_anything_hides_no_made_up_costates(declared: str, timed: float) -> None:
+def test_an_inactive_constraint_hides_no_false_costates(declared: str, timed: float) -> None:
     """A bump of 1 costs 0.4 of 6, one of 5 costs 10."""
     problem = least_effort(NEVER_ACTIVE[declared], timed)
     holds(detour(problem, 0.0).audit())
@@ -84,7 +84,7 @@ def test_the_same_problem_passes_by_every_method(method: str) -> None:
 
 
 @pytest.mark.parametrize("as_path", [True, False], ids=["path", "state"])
-def test_a_state_that_touches_its_bound_at_one_point_hides_no_made_up_costates(as_path: bool) -> None:
+def test_a_state_at_its_bound_at_one_point_hides_no_false_costates(as_path: bool) -> None:
     """The detour's own greatest speed is made the bound of the speed."""
     for bump in (1.5, 4.0):
         bare = detour(least_effort(lambda *_: None, timed=1.0), bump, 80)
@@ -102,7 +102,7 @@ def test_a_state_that_touches_its_bound_at_one_point_hides_no_made_up_costates(a
         is_no_minimum(of(bare, problem).audit())
 
 
-def test_the_optimum_that_touches_a_bound_at_one_point_passes() -> None:
+def test_an_optimum_at_its_bound_at_one_point_passes() -> None:
     """v of least effort has its greatest value 3/2 at 1/2: with that as its bound nothing changes."""
     problem = Problem("touching")
     q, v = problem.state("q", initial=0.0, terminal=1.0), problem.state("v", initial=0.0, terminal=0.0, upper=1.5)
@@ -116,7 +116,7 @@ def test_the_optimum_that_touches_a_bound_at_one_point_passes() -> None:
 
 @pytest.mark.parametrize("ceiling", ["state", "path"])
 @pytest.mark.parametrize("pull", [0.0, 60.0])
-def test_a_jump_where_a_bound_is_touched_has_the_sign_that_pushes_back(pull: float, ceiling: str) -> None:
+def test_a_costate_jump_at_an_active_bound_has_the_sign_of_its_multiplier(pull: float, ceiling: str) -> None:
     """From rest at 0 to rest at 0 in 1 s, touching q = 0.1 at 1/2: the least int u^2 / 2 through that point.
 
     Without a wish to go up standing still costs nothing, and the costate of q jumps up at the ceiling, by 19.2; a cost
@@ -143,7 +143,7 @@ def test_a_jump_where_a_bound_is_touched_has_the_sign_that_pushes_back(pull: flo
     def sign(t: Array) -> Array:
         return np.where(t < 0.5, 1.0, -1.0)
 
-    plan = drawn(
+    plan = random_program(
         problem,
         {
             "q": lambda t: rest * side(t) ** 2 * (3 - 2 * side(t)) + pull * t**2 * (1 - t) ** 2 / 24,
@@ -162,7 +162,7 @@ def test_a_jump_where_a_bound_is_touched_has_the_sign_that_pushes_back(pull: flo
     (holds if pull else is_no_minimum)(plan.audit())
 
 
-def test_a_control_at_its_bound_beside_a_path_equality_hides_no_made_up_costates() -> None:
+def test_a_control_at_its_bound_with_a_path_equality_hides_no_false_costates() -> None:
     """w is tied to v; u saturates for a moment; q and v take a detour."""
     for bump in (1.0, 5.0):
         problem, _, v, u = double_integrator("tied")
@@ -177,7 +177,9 @@ def test_a_control_at_its_bound_beside_a_path_equality_hides_no_made_up_costates
         bounded.minimize(bu**2 / 2)
         along = {name: (lambda t, n=name, b=bare: b.at(t)[n][:, 0]) for name in ("q", "v", "u")}
         costates = {n: (lambda t, n=n, b=bare: np.interp(t, b.t, b.costate(n)[:, 0])) for n in ("q", "v")}
-        plan = drawn(bounded, {n: along[n] for n in ("q", "v")}, {"u": along["u"], "w": along["v"]}, costates, 1.0, 40)
+        plan = random_program(
+            bounded, {n: along[n] for n in ("q", "v")}, {"u": along["u"], "w": along["v"]}, costates, 1.0, 40
+        )
         is_no_minimum(plan.audit())
 
 
@@ -206,9 +208,9 @@ MOTIONS = {  # start, rad, and direction of the tip; what the pseudo-inverse cos
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_the_pseudo_inverse_is_no_optimum_of_the_whole_motion(size: float, motion: str) -> None:
     """Smallest rates at each time, with costates of minus the rates: stationary, but costlier than the optimum."""
-    start, way, dearer = MOTIONS[motion]
+    start, path, costlier = MOTIONS[motion]
     machine = planar([size] * len(start))
-    task = TipTask(rows=(3, 4), velocity=size * np.array(way))
+    task = TipTask(rows=(3, 4), velocity=size * np.array(path))
     local = resolve(machine, task, start, 2.0)
     assert local.stopped is None
     for bound in (None, 99.0):
@@ -216,7 +218,7 @@ def test_the_pseudo_inverse_is_no_optimum_of_the_whole_motion(size: float, motio
         if bound:  # never active
             problem.path("far", problem.declared.states["joints"].symbol[0], -bound, bound)
         optimum = solve(problem, Collocation(20))
-        assert local.cost[-1] / optimum.cost == pytest.approx(dearer, abs=0.015)
+        assert local.cost[-1] / optimum.cost == pytest.approx(costlier, abs=0.015)
         holds(optimum.audit())
 
         def joint_positions(t: Array) -> Array:
@@ -225,7 +227,9 @@ def test_the_pseudo_inverse_is_no_optimum_of_the_whole_motion(size: float, motio
         def rates(t: Array) -> Array:
             return np.array([[np.interp(time, local.t, c) for c in local.joint_rates.T] for time in t])
 
-        plan = drawn(problem, {"joints": joint_positions}, {"rates": rates}, {"joints": lambda t: -rates(t)}, 2.0, 60)
+        plan = random_program(
+            problem, {"joints": joint_positions}, {"rates": rates}, {"joints": lambda t: -rates(t)}, 2.0, 60
+        )
         is_no_minimum(plan.audit())
 
 
@@ -236,7 +240,7 @@ SIDES = {"start": (0.0, -2.0), "end": (1.0, 2.0)}
 
 @every_method
 @pytest.mark.parametrize("place", ["end", "path", "state", "two ends"])
-def test_an_inequality_at_the_end_pushes_one_way_only(method: str, place: str) -> None:
+def test_a_multiplier_of_an_end_inequality_has_one_sign(method: str, place: str) -> None:
     """min int u^2 / 2 - 2 x(1) from 0: -2 at x(1) = 2, -1.5 at x(1) = 1, on which no lower bound of 1 holds it."""
 
     def build(low: Any, high: Any) -> Problem:
@@ -271,7 +275,7 @@ def test_an_inequality_at_the_end_pushes_one_way_only(method: str, place: str) -
 
 @every_method
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
-def test_an_inequality_at_the_start_pushes_one_way_only(method: str, unit: float) -> None:
+def test_a_multiplier_of_a_start_inequality_has_one_sign(method: str, unit: float) -> None:
     """min int u^2 / 2 + 2 x(0) - ... to 0: the free start is -2, a start held at -1 from below is right, above not."""
 
     def build(low: Any, high: Any, start: Any = None) -> Problem:
@@ -301,7 +305,7 @@ def test_each_of_several_multipliers_has_its_own_sign() -> None:
     problem.end("walls", x, [-9.0, -9.0, 1.0], [1.0, 9.0, 9.0])
     for last, verdict in ((2.0, holds), (1.0, is_no_minimum)):
         ends = np.array([1.0, 2.0, last])
-        plan = drawn(
+        plan = random_program(
             problem, {"x": lambda t, e=ends: np.outer(t, e)}, {"u": ends.tolist()}, {"x": (-ends).tolist()}, 1.0
         )
         verdict(plan.audit())
@@ -309,7 +313,7 @@ def test_each_of_several_multipliers_has_its_own_sign() -> None:
 
 @every_method
 @pytest.mark.parametrize(("held", "passes"), [(10.0, False), (0.2, False), (1 / np.sqrt(2), True)])
-def test_a_bound_of_the_horizon_pushes_one_way_only(method: str, held: float, passes: bool) -> None:
+def test_a_multiplier_of_a_horizon_bound_has_one_sign(method: str, held: float, passes: bool) -> None:
     """min T + int u^2 / 2 from 0 to 1: 1.414 at T = 0.707; 10.05 at 10 s, 2.7 at 0.2 s."""
 
     def build(**horizon: Any) -> Problem:
@@ -377,7 +381,7 @@ def test_parts_of_the_cost_that_cancel_hide_no_loss(slope: float) -> None:
     problem.dynamics(x, u)
     problem.horizon(1.0)
     problem.minimize(u**2 + slope * u)
-    plan = drawn(
+    plan = random_program(
         problem,
         {"x": lambda t: 0.5 * np.minimum(t, 1 - t)},
         {"u": lambda t: np.where(t < 0.5, 0.5, -0.5)},
@@ -385,7 +389,7 @@ def test_parts_of_the_cost_that_cancel_hide_no_loss(slope: float) -> None:
         1.0,
     )
     is_no_minimum(plan.audit())
-    holds(drawn(problem, {"x": 0.0}, {"u": 0.0}, {"x": -slope}, 1.0).audit())
+    holds(random_program(problem, {"x": 0.0}, {"u": 0.0}, {"x": -slope}, 1.0).audit())
 
 
 @pytest.mark.parametrize(
@@ -426,7 +430,7 @@ def test_held_controls_pass_where_they_cost_less_than_a_thousandth_too_much(seed
             holds(audit)
 
 
-def test_what_singular_arcs_lose_is_never_granted() -> None:
+def test_losses_of_singular_arcs_are_not_tolerated() -> None:
     """min int x^2 with |u| <= 1 from 1: at once to 0 and there; a plan that lingers at 1/2 first is dearer."""
     problem = Problem("singular")
     x, u = problem.state("x", initial=1.0), problem.control("u", lower=-1.0, upper=1.0)
@@ -436,7 +440,7 @@ def test_what_singular_arcs_lose_is_never_granted() -> None:
     mesh = [0, 1 / 6, 1 / 3, 1 / 2, 2 / 3, 1]
     knots, places = np.array([0.0, 0.5, 1.5, 2.0, 3.0]), np.array([1.0, 0.5, 0.5, 0.0, 0.0])
     rates = [-1.0, 0.0, -1.0, 0.0]
-    plan = drawn(
+    plan = random_program(
         problem,
         {"x": lambda t: np.interp(t, knots, places)},
         {"u": lambda t: np.choose(np.clip(np.searchsorted(knots, t, side="right") - 1, 0, 3), rates)},

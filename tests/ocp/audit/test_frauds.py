@@ -74,10 +74,10 @@ def walled() -> Solution:
 def indirect() -> Solution:
     """Braking against drag, by the minimum principle; its states have sizes of their own."""
     problem = Problem("braking")
-    v, way = problem.state("v", initial=1.0), problem.state("way", initial=0.0, terminal=60.0)
+    v, path = problem.state("v", initial=1.0), problem.state("way", initial=0.0, terminal=60.0)
     u = problem.control("u")
     problem.dynamics(v, u - v**2)
-    problem.dynamics(way, 100 * v)
+    problem.dynamics(path, 100 * v)
     problem.horizon(1.0)
     problem.minimize(v**2 + u**2)
     return solve(problem, Indirect())
@@ -98,11 +98,11 @@ def plan(kind: str) -> Solution:
 def reported(solution: Solution, pool: str, curve: PiecewisePolynomial) -> Solution:
     """The plan with another curve, which its reported values follow."""
     values, offset = curve(solution.t / solution.horizon), 0
-    found: dict[str, Array] = {}
+    by_name: dict[str, Array] = {}
     for name, old in getattr(solution, pool).items():
-        found[name] = values[:, offset : offset + old.shape[1]]
+        by_name[name] = values[:, offset : offset + old.shape[1]]
         offset += old.shape[1]
-    changes: dict[str, Any] = {pool: found, CURVES[pool]: curve}
+    changes: dict[str, Any] = {pool: by_name, CURVES[pool]: curve}
     return replace(solution, **changes)
 
 
@@ -324,7 +324,7 @@ FOR_ONE: dict[str, dict[str, Edit]] = {
 }
 
 
-def found_out(make: Callable[[], Solution], audit: Callable[[Solution], Any]) -> str:
+def detection(make: Callable[[], Solution], audit: Callable[[Solution], Any]) -> str:
     """What became of a fraud: refused with a name, failed by rows, or passed. No foreign exception leaves."""
     try:
         result = audit(make())
@@ -350,7 +350,7 @@ def test_every_fraud_fails_or_is_refused_by_name(kind: str, capfd: pytest.Captur
     passed = []
     for name, edit in {**FRAUDS, **FOR_ONE.get(kind, {})}.items():
         try:
-            outcome = found_out(partial(edit, genuine), lambda s: s.audit())
+            outcome = detection(partial(edit, genuine), lambda s: s.audit())
         except Exception as error:
             outcome = f"passed on: {type(error).__name__}: {error}"
         if outcome.startswith("passed"):
@@ -391,9 +391,9 @@ def head(change: Any) -> FileEdit:
     """An edit of the JSON of a file; what is returned, if anything, takes its place."""
 
     def edit(arrays: dict[str, Array]) -> None:
-        found = json.loads(arrays["head"].tobytes().decode())
-        instead = change(found)
-        text = json.dumps(found if instead is None else instead)
+        data = json.loads(arrays["head"].tobytes().decode())
+        instead = change(data)
+        text = json.dumps(data if instead is None else instead)
         arrays["head"] = np.frombuffer(text.encode(), dtype=np.uint8)
 
     return edit
@@ -417,7 +417,7 @@ def file_frauds(genuine: Solution) -> Iterator[tuple[str, FileEdit]]:
     """Every edit of the file of a plan."""
     names = {pool: list(getattr(genuine, pool)) for pool in CURVES}
     keys = ["t", *(f"{pool}/{n}" for pool in CURVES for n in names[pool])]
-    keys += [f"{curve}/{piece}" for curve in CURVES.values() for piece in ("breaks", "nodes", "values")]
+    keys += [f"{curve}/{segment}" for curve in CURVES.values() for segment in ("breaks", "nodes", "values")]
     for key in [*keys, "head", "variables", "multipliers"]:
         yield f"{key} missing", drop(key)
     for key in keys:
@@ -489,7 +489,7 @@ def test_every_fraud_in_a_file_fails_or_is_refused_by_name(
         edit(edited)
         file = written(tmp_path / "edited.npz", edited)
         try:
-            outcome = found_out(partial(Solution.load, file), lambda s: s.audit(genuine.problem))
+            outcome = detection(partial(Solution.load, file), lambda s: s.audit(genuine.problem))
         except Exception as error:
             outcome = f"passed on: {type(error).__name__}: {error}"
         if outcome.startswith("passed"):

@@ -22,7 +22,7 @@ from ocp import (
     solve,
     tighten,
 )
-from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, of
+from tests.ocp.audit.drawn import holds, is_no_minimum, of, random_program
 from tests.ocp.audit.test_unsound_motions import START, arm, circle
 from tests.ocp.motion.builders.standing_tasks import table_plan
 from tests.ocp.problems import double_integrator
@@ -58,7 +58,7 @@ def pushed(price: float, most: float = 0.2) -> Problem:
 
 
 @pytest.mark.parametrize("most", [0.2, 1e-3, np.inf])
-def test_a_push_that_is_too_dear_to_be_used_rests_on_its_limit(most: float) -> None:
+def test_a_costly_force_stays_at_its_limit(most: float) -> None:
     """It is off but for the solver's tolerance, and shows no size but that; where it would pay it is missed."""
     plan = solve(pushed(10.0, most), Collocation(8, degree=4, scheme="legendre"))
     assert np.abs(plan["f"]).max() < 1e-6
@@ -102,7 +102,7 @@ def test_perfect_tracking_passes(method: str) -> None:
 
 @every_method
 @pytest.mark.parametrize("size", [1, 3])
-def test_standing_still_where_nothing_is_asked_passes(method: str, size: int) -> None:
+def test_rest_without_a_task_passes(method: str, size: int) -> None:
     for place in (0.0, 3.0):
         problem = Problem("at rest")
         x, u = problem.state("x", size, initial=place, terminal=place), problem.control("u", size)
@@ -117,7 +117,7 @@ def test_standing_still_where_nothing_is_asked_passes(method: str, size: int) ->
 
 @direct_methods
 @pytest.mark.parametrize("heading", [0.0, np.pi / 2, 1.0])
-def test_a_unicycle_that_drives_straight_passes(method: str, heading: float) -> None:
+def test_a_straight_motion_of_a_unicycle_passes(method: str, heading: float) -> None:
     """Its way aside is rounding: 1e-20 m."""
     problem = Problem("unicycle")
     c, s = np.cos(heading), np.sin(heading)
@@ -204,7 +204,7 @@ def test_arms_of_any_size_pass(size: float) -> None:
 
 @direct_methods
 @pytest.mark.parametrize(("time", "length"), [(1e-6, 1.0), (1e-6, 1e-9), (1.0, 1e9), (1e5, 1e9), (1e-3, 1e-6)])
-def test_horizons_of_a_microsecond_and_ways_of_a_million_kilometres_pass(
+def test_horizons_of_a_microsecond_and_paths_of_a_million_kilometres_pass(
     method: str, time: float, length: float
 ) -> None:
     for limit in (None, 5.0):
@@ -240,7 +240,7 @@ def test_states_of_very_different_size_pass(ratio: float) -> None:
 
 
 @pytest.mark.parametrize("intervals", [40, pytest.param(80, marks=pytest.mark.long)])
-def test_a_standing_plan_with_its_tip_at_its_position_fails_by_nothing_but_what_it_loses(intervals: int) -> None:
+def test_a_standing_plan_with_a_fixed_tip_fails_by_its_loss_alone(intervals: int) -> None:
     """An inequality with a held control is active at one end of an interval; its multiplier is not inside it.
 
     These meshes cost 5 and 2 thousandths more than the optimum, -0.7093.
@@ -305,7 +305,7 @@ def test_a_random_tightened_plan_passes(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_the_fastest_way_between_random_ends_is_found_from_the_exact_time_as_guess(seed: int) -> None:
+def test_the_fastest_motion_between_random_ends_is_found_from_the_exact_time(seed: int) -> None:
     """x'' = u, |u| <= 1: the time is known in closed form."""
     rng = np.random.default_rng(seed)
     q0, v0, q1, v1 = rng.uniform(-2, 2, size=4)
@@ -370,6 +370,6 @@ def test_a_cost_that_is_negative_or_zero_at_its_optimum_passes() -> None:
         problem.dynamics(x, u)
         problem.horizon(1.0)
         problem.minimize(u**2 / 2 + shift, -x)
-        holds(drawn(problem, {"x": lambda t: t}, {"u": 1.0}, {"x": -1.0}, 1.0).audit())
+        holds(random_program(problem, {"x": lambda t: t}, {"u": 1.0}, {"x": -1.0}, 1.0).audit())
         for method in METHODS.values():
             holds(solve(problem, method).audit())

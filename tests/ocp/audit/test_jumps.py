@@ -155,15 +155,15 @@ def test_costates_between_nodes_at_a_bound_are_those_of_the_closed_form(sign: fl
     problem, costate = pushed(sign, gain)
     plan = solve(problem, MultipleShooting(60, control="held"))
     times, falling, rising = means(plan)
-    times, found = times + HORIZON / 120, falling + rising
-    assert found == pytest.approx(costate(times), abs=LARGEST / 50)
+    times, result = times + HORIZON / 120, falling + rising
+    assert result == pytest.approx(costate(times), abs=LARGEST / 50)
     on_bound = plan.t[:-1] > CONTACT + HORIZON / 60
     assert np.abs(plan.costates["q"][:-1, 0] - costate(plan.t[:-1]))[on_bound].max() > LARGEST / 5  # as reported
 
 
 @pytest.mark.parametrize("gain", [0.0, 0.3])
 @pytest.mark.parametrize("control", ["held", "linear"])
-def test_what_a_plan_by_shooting_loses_along_a_bound_is_its_true_excess(control: Any, gain: float) -> None:
+def test_the_loss_of_a_shooting_plan_along_a_bound_is_its_excess(control: Any, gain: float) -> None:
     """Atoms at the nodes belong to the transcription and lose no cost.
 
     Those between linear controls go to and fro, and their spread is told too high by the square of the width.

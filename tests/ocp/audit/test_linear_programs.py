@@ -42,7 +42,7 @@ class Linear:
     end: Array | None
 
     @classmethod
-    def drawn(cls, seed: int, ends: str) -> Linear:
+    def random(cls, seed: int, ends: str) -> Linear:
         rng = np.random.default_rng(seed)
         sizes = ((2, 2), (2, 2), 2, 2, 2, 2)
         A, B, c, d, e, goal = (rng.normal(size=size) for size in sizes)
@@ -61,9 +61,9 @@ class Linear:
             onward = onward @ step[:3, :3]
         rows = np.hstack(effects)
         fixed = {} if self.end is None else {"A_eq": rows[:2], "b_eq": self.end}
-        found = linprog(price @ rows, bounds=(-MOST, MOST), **fixed)
-        assert found.success
-        return float(found.fun)
+        result = linprog(price @ rows, bounds=(-MOST, MOST), **fixed)
+        assert result.success
+        return float(result.fun)
 
     def problem(self, soft: bool = False, unit: float = 1.0, second: float = 1.0, turned: bool = False) -> Problem:
         """It, or with a `soft` cost beside it; in other units; or `turned`, its states and controls the other way."""
@@ -94,16 +94,16 @@ class Linear:
         t = np.linspace(0.0, SECONDS, 20001)
         return float(np.trapezoid(x @ self.c + u @ self.d, t) + x[-1] @ self.e)
 
-    def judged(self, kind: str, **told: Any) -> Solution:
+    def judged(self, kind: str, **report: Any) -> Solution:
         """Return a feasible plan of this program: its optimum, or the optimum of another cost."""
         if kind == "another":
             rng = np.random.default_rng(99)
             c, d, e = (rng.normal(size=2) for _ in range(3))
-            plan = solve(replace(self, c=c, d=d, e=e).problem(**told), METHOD)
+            plan = solve(replace(self, c=c, d=d, e=e).problem(**report), METHOD)
         else:
-            plan = solve(self.problem(kind == "soft", **told), METHOD)
-        cost = self.cost(solve(self.problem(kind == "soft"), METHOD) if told else plan)
-        return replace(plan, problem=self.problem(**told), cost=cost)
+            plan = solve(self.problem(kind == "soft", **report), METHOD)
+        cost = self.cost(solve(self.problem(kind == "soft"), METHOD) if report else plan)
+        return replace(plan, problem=self.problem(**report), cost=cost)
 
 
 KINDS = ("own", "soft", "another")
@@ -115,36 +115,36 @@ every_program = pytest.mark.parametrize(
 
 @every_program
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_lost_is_the_excess(seed: int, ends: str, kind: str) -> None:
-    program = Linear.drawn(seed, ends)
+def test_the_loss_is_the_excess(seed: int, ends: str, kind: str) -> None:
+    program = Linear.random(seed, ends)
     plan = program.judged(kind)
-    found, excess = lost(fitted(plan)), plan.cost - program.least()
+    result, excess = lost(fitted(plan)), plan.cost - program.least()
     # where a control switches within one of 40 intervals its points see more of the gaps, or less
-    assert found == pytest.approx(excess, rel=1e-2, abs=2e-3 * (abs(plan.cost) + 0.1))
-    assert found > 0.05 or kind != "soft"
+    assert result == pytest.approx(excess, rel=1e-2, abs=2e-3 * (abs(plan.cost) + 0.1))
+    assert result > 0.05 or kind != "soft"
 
 
 @every_program
-def test_what_is_lost_does_not_depend_on_the_costates_reported(seed: int, ends: str) -> None:
-    plan = Linear.drawn(seed, ends).judged("soft")
+def test_the_loss_does_not_depend_on_the_reported_costates(seed: int, ends: str) -> None:
+    plan = Linear.random(seed, ends).judged("soft")
     curve = plan.costate_interpolant
     wild = replace(plan, costate_interpolant=replace(curve, values=1e4 * (curve.values + 1)))
-    for told in (without_costates(plan), wild):
-        assert lost(fitted(told)) == pytest.approx(lost(fitted(plan)), rel=1e-3)
+    for report in (without_costates(plan), wild):
+        assert lost(fitted(report)) == pytest.approx(lost(fitted(plan)), rel=1e-3)
 
 
 @every_program
-@pytest.mark.parametrize("told", [{"unit": 1e3}, {"unit": 1e-3, "second": 60.0}, {"turned": True}], ids=str)
-def test_units_and_the_order_of_declaration_change_nothing(seed: int, ends: str, told: dict[str, Any]) -> None:
-    program = Linear.drawn(seed, ends)
-    one, other = (lost(fitted(program.judged("soft", **given))) for given in ({}, told))
+@pytest.mark.parametrize("report", [{"unit": 1e3}, {"unit": 1e-3, "second": 60.0}, {"turned": True}], ids=str)
+def test_units_and_the_order_of_declaration_change_nothing(seed: int, ends: str, report: dict[str, Any]) -> None:
+    program = Linear.random(seed, ends)
+    one, other = (lost(fitted(program.judged("soft", **options))) for options in ({}, report))
     assert other == pytest.approx(one, rel=1e-3)
 
 
 @pytest.mark.parametrize("seed", some(range(3), 1))
 def test_a_film_played_backwards_loses_as_much(seed: int) -> None:
     """From the end to the start: x' = -(A x + B u), the same controls at the time that is left."""
-    there = Linear.drawn(seed, "fixed")
+    there = Linear.random(seed, "fixed")
     assert there.end is not None
     # its own start is zero: the way back begins at the end, which is moved to zero: x = end + y
     plan = there.judged("soft")
@@ -186,6 +186,6 @@ def test_of_multipliers_that_lose_as_much_the_nearest_to_those_reported_are_take
     curve = plan.costate_interpolant
     for least in (-0.5, -1.5, -4.5):
         values = curve.values - curve.values.max() + least
-        found = fitted(replace(plan, costate_interpolant=replace(curve, values=values)))
-        assert found.distance < 0.05
-        assert lost(found) < 1e-4 * plan.cost
+        result = fitted(replace(plan, costate_interpolant=replace(curve, values=values)))
+        assert result.distance < 0.05
+        assert lost(result) < 1e-4 * plan.cost

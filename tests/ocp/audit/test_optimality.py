@@ -16,7 +16,7 @@ from tests.ocp.problems import double_integrator, energy
 METHOD = Collocation(8)
 
 
-def looked_at(solution: Solution) -> Optimality:
+def optimality_of(solution: Solution) -> Optimality:
     form = Formulation.of(solution.problem)
     p = form.parameter_vector(solution.parameters)
     return optimality(form, solution, p, form.bound_values(p))
@@ -30,38 +30,38 @@ def swerved(size: float) -> tuple[Solution, float]:
     problem, _, _, u = double_integrator("swerved")
     t = problem.time
     problem.minimize(running=(u - (6 - 12 * t) - size * (6 * t**2 - 6 * t + 1)) ** 2 / 2)
-    found, excess = solve(problem, METHOD), size**2 / 10
-    assert found.cost == pytest.approx(0.0, abs=1e-12)
+    result, excess = solve(problem, METHOD), size**2 / 10
+    assert result.cost == pytest.approx(0.0, abs=1e-12)
     best = solve(energy(), METHOD)
     costates: dict[str, Any] = {"costates": best.costates, "costate_interpolant": best.costate_interpolant}
-    return replace(found, problem=energy(), cost=6 + excess, **costates), excess
+    return replace(result, problem=energy(), cost=6 + excess, **costates), excess
 
 
 def test_an_optimum_loses_nothing_and_its_costates_are_the_known_ones() -> None:
-    found = looked_at(solve(energy(), METHOD))
-    assert found.lost.sum() == pytest.approx(0.0, abs=1e-10)
-    assert found.cost_size == pytest.approx(6.0)
-    assert found.stationarity.max() < 1e-7
-    assert found.curvature.upwards
-    np.testing.assert_allclose(found.adjoint.costate[:, 0], -12.0, atol=1e-5)
-    np.testing.assert_allclose(found.adjoint.costate[:, 1], 12 * found.t - 6, atol=1e-5)
+    result = optimality_of(solve(energy(), METHOD))
+    assert result.lost.sum() == pytest.approx(0.0, abs=1e-10)
+    assert result.cost_size == pytest.approx(6.0)
+    assert result.stationarity.max() < 1e-7
+    assert result.curvature.upwards
+    np.testing.assert_allclose(result.adjoint.costate[:, 0], -12.0, atol=1e-5)
+    np.testing.assert_allclose(result.adjoint.costate[:, 1], 12 * result.t - 6, atol=1e-5)
 
 
 @pytest.mark.parametrize("size", [0.03, -0.3, 3.0])
-def test_what_is_lost_is_what_it_costs_more(size: float) -> None:
+def test_the_loss_is_the_excess_cost(size: float) -> None:
     plan, excess = swerved(size)
-    found = looked_at(plan)
-    assert found.lost.sum() == pytest.approx(excess, rel=1e-6)
-    assert found.costate_accuracy == pytest.approx(np.sqrt(excess / (6 + excess)), rel=1e-6)
+    result = optimality_of(plan)
+    assert result.lost.sum() == pytest.approx(excess, rel=1e-6)
+    assert result.costate_accuracy == pytest.approx(np.sqrt(excess / (6 + excess)), rel=1e-6)
 
 
-def test_units_of_the_cost_scale_what_is_lost_and_change_no_share() -> None:
+def test_units_of_the_cost_scale_the_loss_and_keep_its_share() -> None:
     """On a mesh too coarse for the optimum."""
 
     def scaled(factor: float) -> Optimality:
         problem, q, _, u = double_integrator("far", limit=5.0)
         problem.minimize(running=factor * (u**2 / 2 + q**4))
-        return looked_at(solve(problem, Collocation(3, 2)))
+        return optimality_of(solve(problem, Collocation(3, 2)))
 
     one, other = scaled(1.0), scaled(1e3)
     assert one.lost.sum() > 1e-6
@@ -79,6 +79,6 @@ def test_the_cost_curves_upwards_as_far_as_the_conjugate_point(horizon: float, l
     problem.dynamics(x, u)
     problem.horizon(horizon)
     problem.minimize(running=(u**2 - x**2) / 2)
-    found = looked_at(solve(problem, METHOD, guess={"x": 0.0, "u": 0.0}, check=False))
-    assert found.curvature.upwards is least
-    assert found.stationarity.max() < 1e-7
+    result = optimality_of(solve(problem, METHOD, guess={"x": 0.0, "u": 0.0}, check=False))
+    assert result.curvature.upwards is least
+    assert result.stationarity.max() < 1e-7

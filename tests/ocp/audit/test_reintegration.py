@@ -17,7 +17,7 @@ from ocp.audit.linearisation import Linearisation
 from ocp.audit.reintegration import Reintegration, integrated_motion, reintegrate
 from ocp.audit.sizes import FineGrid, fine_grid, sizes
 from ocp.problem.formulation import Formulation
-from tests.ocp.audit.drawn import drawn, of
+from tests.ocp.audit.drawn import of, random_program
 from tests.ocp.problems import Array, van_der_pol
 
 METHODS = {
@@ -33,8 +33,8 @@ def linearised(problem: Problem, solution: Solution) -> tuple[Linearisation, Fin
     form = Formulation(problem)
     p = form.parameter_vector(solution.parameters)
     bounds = form.bound_values(p)
-    found = sizes(form, solution, p, bounds)
-    return Linearisation(form, solution, p, bounds, sizes=found), fine_grid(solution)
+    result = sizes(form, solution, p, bounds)
+    return Linearisation(form, solution, p, bounds, sizes=result), fine_grid(solution)
 
 
 def again(problem: Problem, solution: Solution) -> Reintegration:
@@ -48,7 +48,7 @@ def driven(rate: Callable[[Any, Any, Any], Any], horizon: float = 1.0, control: 
     problem.dynamics(x, rate(x, u, problem.time))
     problem.horizon(horizon)
     problem.minimize(u**2)
-    return problem, drawn(problem, {"x": lambda t: t}, {"u": control}, {"x": 0.0}, horizon)
+    return problem, random_program(problem, {"x": lambda t: t}, {"u": control}, {"x": 0.0}, horizon)
 
 
 # ---- the integration itself ------------------------------------------------------------------------------------------
@@ -67,16 +67,16 @@ def driven(rate: Callable[[Any, Any, Any], Any], horizon: float = 1.0, control: 
 )
 def test_states_are_those_of_the_closed_form(rate: Any, exact: Callable[[Array], Array]) -> None:
     problem, plan = driven(rate, control=1.0)
-    found = again(problem, plan)
-    np.testing.assert_allclose(found.states[:, 0], exact(found.t), atol=1e-9)
-    assert found.breakdown_time is None
+    result = again(problem, plan)
+    np.testing.assert_allclose(result.states[:, 0], exact(result.t), atol=1e-9)
+    assert result.breakdown_time is None
 
 
 def test_a_motion_that_leaves_for_infinity_breaks_down_where_it_does() -> None:
     problem, plan = driven(lambda x, u, t: 1 + (2 * x) ** 2)  # x = tan(2 t) / 2
-    found = again(problem, plan)
-    assert found.breakdown_time == pytest.approx(np.pi / 4, abs=4e-3)
-    assert np.isfinite(found.states[found.t < np.pi / 4 - 4e-3]).all()
+    result = again(problem, plan)
+    assert result.breakdown_time == pytest.approx(np.pi / 4, abs=4e-3)
+    assert np.isfinite(result.states[result.t < np.pi / 4 - 4e-3]).all()
     assert not plan.audit().feasible
 
 
@@ -88,19 +88,19 @@ def test_the_integration_is_as_exact_in_any_unit(unit: float, time: float) -> No
     problem.dynamics(x, (unit * ca.cos(9 * problem.time / time) * 9 - x) / time)
     problem.horizon(time)
     problem.minimize(u**2)
-    plan = drawn(problem, {"x": lambda t: unit * t / time}, {"u": 1.0}, {"x": 0.0}, time)
-    found = again(problem, plan)
-    s = found.t / time
+    plan = random_program(problem, {"x": lambda t: unit * t / time}, {"u": 1.0}, {"x": 0.0}, time)
+    result = again(problem, plan)
+    s = result.t / time
     exact = 9 * (np.cos(9 * s) + 9 * np.sin(9 * s) - np.exp(-s)) / 82
-    np.testing.assert_allclose(found.states[:, 0] / unit, exact, atol=1e-9)
+    np.testing.assert_allclose(result.states[:, 0] / unit, exact, atol=1e-9)
 
 
 @every_method
 def test_the_running_cost_is_integrated_along(method: str) -> None:
     plan = solve(van_der_pol(), METHODS[method])
-    found = again(van_der_pol(), plan)
-    assert found.cost == pytest.approx(plan.cost, rel=1e-3)
-    assert found.local_cost == pytest.approx(found.cost, rel=1e-3)
+    result = again(van_der_pol(), plan)
+    assert result.cost == pytest.approx(plan.cost, rel=1e-3)
+    assert result.local_cost == pytest.approx(result.cost, rel=1e-3)
 
 
 @every_method
@@ -120,10 +120,10 @@ def test_a_wrong_plan_is_corrected_or_left_to_the_integration(share: float) -> N
     curve = plan.control_interpolant
     wrong = replace(plan, control_interpolant=replace(curve, values=(1 + share) * curve.values))
     along, grid = linearised(van_der_pol(), wrong)
-    exact, found = integrated_motion(along, grid), again(van_der_pol(), wrong)
-    np.testing.assert_allclose(found.states, exact.states.reshape(found.states.shape), rtol=0, atol=2e-10)
-    np.testing.assert_allclose(found.local, exact.local.reshape(found.local.shape), rtol=0, atol=2e-10)
-    assert found.cost == pytest.approx(exact.cost, rel=1e-9)
+    exact, result = integrated_motion(along, grid), again(van_der_pol(), wrong)
+    np.testing.assert_allclose(result.states, exact.states.reshape(result.states.shape), rtol=0, atol=2e-10)
+    np.testing.assert_allclose(result.local, exact.local.reshape(result.local.shape), rtol=0, atol=2e-10)
+    assert result.cost == pytest.approx(exact.cost, rel=1e-9)
 
 
 def test_jumps_of_the_plan_are_carried_on_by_its_dynamics() -> None:
@@ -138,13 +138,13 @@ def test_jumps_of_the_plan_are_carried_on_by_its_dynamics() -> None:
 
 
 @pytest.mark.parametrize("half_cells", [1, 2, 3])
-def test_what_swings_in_time_with_the_grid_is_seen(half_cells: int) -> None:
+def test_oscillations_in_phase_with_the_grid_are_detected(half_cells: int) -> None:
     """20 intervals of 30 cells: at their ends and middles the push is nothing."""
     problem, plan = driven(lambda x, u, t: 1 - ca.cos(2 * np.pi * 1200 / half_cells * t))
     rest = replace(plan, state_interpolant=replace(plan.state_interpolant, values=0 * plan.state_interpolant.values))
-    found = again(problem, rest)
+    result = again(problem, rest)
     swing = 2 * np.pi * 1200 / half_cells
-    np.testing.assert_allclose(found.states[:, 0], found.t - np.sin(swing * found.t) / swing, atol=1e-8)
+    np.testing.assert_allclose(result.states[:, 0], result.t - np.sin(swing * result.t) / swing, atol=1e-8)
 
 
 # ---- between the points ----------------------------------------------------------------------------------------------
@@ -188,7 +188,7 @@ def unstable(growth: float, horizon: float = 2.0) -> Problem:
     return problem
 
 
-def test_what_unstable_dynamics_carry_off_is_told_and_the_intervals_are_judged() -> None:
+def test_divergence_of_unstable_dynamics_is_reported_and_intervals_are_checked() -> None:
     plan = solve(unstable(15.0), Collocation(60))
     audit = plan.audit()
     assert audit.feasible
@@ -205,7 +205,7 @@ def test_errors_that_only_add_up_are_not_excused() -> None:
     problem.dynamics(x, 0.98 * u)
     problem.horizon(1.0)
     problem.minimize(u**2)
-    plan = drawn(problem, {"x": lambda t: t}, {"u": 1.0}, {"x": 0.0}, 1.0, 50)
+    plan = random_program(problem, {"x": lambda t: t}, {"u": 1.0}, {"x": 0.0}, 1.0, 50)
     audit = plan.audit()
     assert audit["integration error of one interval"].value == pytest.approx(4e-4, rel=1e-3)
     assert audit["integration error of one interval"].passed

@@ -38,11 +38,11 @@ def travel(
     return problem, q
 
 
-def test_a_state_is_as_large_as_its_way() -> None:
+def test_the_scale_of_a_state_is_its_range() -> None:
     problem, _ = travel(2.0)
-    found = sizes_of(problem, solve(problem, Collocation(8)))
-    np.testing.assert_allclose(found.state, [2.0, 3.0], rtol=1e-3)  # v peaks at 3/2 of the mean
-    np.testing.assert_allclose(found.control, [12.0], rtol=1e-3)
+    result = sizes_of(problem, solve(problem, Collocation(8)))
+    np.testing.assert_allclose(result.state, [2.0, 3.0], rtol=1e-3)  # v peaks at 3/2 of the mean
+    np.testing.assert_allclose(result.control, [12.0], rtol=1e-3)
 
 
 @given(*(st.floats(-9.0, 9.0) for _ in range(3)))
@@ -61,10 +61,10 @@ def test_sizes_follow_the_units(length: float, force: float, time: float) -> Non
     problem, q = travel(length, time, force=force)
     problem.end("arrive", q - length, 0, 0)
     problem.path("way", q, upper=1e12)
-    found = sizes_of(problem, solution)
-    np.testing.assert_allclose(found.state, [length, 1.5 * length / time], rtol=1e-3)
-    np.testing.assert_allclose(found.control, [12.0 * force], rtol=1e-2)
-    np.testing.assert_allclose([found.end[0], found.path[0]], length, rtol=1e-3)
+    result = sizes_of(problem, solution)
+    np.testing.assert_allclose(result.state, [length, 1.5 * length / time], rtol=1e-3)
+    np.testing.assert_allclose(result.control, [12.0 * force], rtol=1e-2)
+    np.testing.assert_allclose([result.end[0], result.path[0]], length, rtol=1e-3)
 
 
 @pytest.mark.parametrize("upper", [2e3, 1e6, 1e12])
@@ -72,8 +72,8 @@ def test_sizes_follow_the_units(length: float, force: float, time: float) -> Non
 def test_neither_the_bounds_nor_the_origin_have_a_say(upper: float, origin: float) -> None:
     problem, q = travel(origin=origin, upper=upper)
     problem.path("room", q, lower=-upper, upper=upper)
-    found = sizes_of(problem, solve(problem, Collocation(8)))
-    np.testing.assert_allclose([found.state[0], found.path[0]], 1.0, rtol=1e-3)
+    result = sizes_of(problem, solve(problem, Collocation(8)))
+    np.testing.assert_allclose([result.state[0], result.path[0]], 1.0, rtol=1e-3)
 
 
 def test_each_entry_is_measured_by_itself() -> None:
@@ -85,19 +85,19 @@ def test_each_entry_is_measured_by_itself() -> None:
     problem.dynamics(b, w)
     problem.horizon(1.0)
     problem.minimize(ca.sumsqr(u) + w**2)
-    found = sizes_of(problem, solve(problem, Collocation(4)))
-    np.testing.assert_allclose(found.state, [1.0, 1e-6, 1e-7], rtol=1e-6)
+    result = sizes_of(problem, solve(problem, Collocation(4)))
+    np.testing.assert_allclose(result.state, [1.0, 1e-6, 1e-7], rtol=1e-6)
 
 
-def test_what_was_to_move_and_stands_still_has_the_size_of_its_way() -> None:
-    asked, _ = travel(0.9e-3)
+def test_a_state_at_rest_has_the_scale_of_its_required_displacement() -> None:
+    request, _ = travel(0.9e-3)
     standing, _, _, u = double_integrator("standing", end=(0.0, 0.0))
     standing.minimize(u**2)
-    found = sizes_of(asked, solve(standing, Collocation(4)))
-    assert found.state[0] == pytest.approx(0.9e-3)
+    result = sizes_of(request, solve(standing, Collocation(4)))
+    assert result.state[0] == pytest.approx(0.9e-3)
 
 
-def test_what_stands_at_zero_is_given_a_floor_and_leaves_no_trace_in_what_moves() -> None:
+def test_zero_states_get_a_least_scale_that_does_not_affect_others() -> None:
     problem = Problem("straight")
     x = problem.state("x", initial=0.0, terminal=1e-3)
     y = problem.state("y", initial=0.0, terminal=0.0)
@@ -110,10 +110,10 @@ def test_what_stands_at_zero_is_given_a_floor_and_leaves_no_trace_in_what_moves(
     problem.end("aside", y, 0, 0)
     problem.horizon(1.0)
     problem.minimize(v**2 + w**2)
-    found = sizes_of(problem, solve(problem, Collocation(4)))
-    assert found.state[0] == pytest.approx(1e-3)
-    assert np.all((found.state[1:] > 0) & (found.state[1:] <= 1e-6))
-    np.testing.assert_allclose(found.end, [1e-3, found.state[1]], rtol=1e-3)
+    result = sizes_of(problem, solve(problem, Collocation(4)))
+    assert result.state[0] == pytest.approx(1e-3)
+    assert np.all((result.state[1:] > 0) & (result.state[1:] <= 1e-6))
+    np.testing.assert_allclose(result.end, [1e-3, result.state[1]], rtol=1e-3)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-20, 1e-14])
@@ -124,11 +124,11 @@ def test_where_nothing_moves_nothing_is_smaller_than_a_millionth(noise: float) -
     solution = solve(problem, Collocation(4))
     curve = solution.state_interpolant
     values = curve.values + noise * np.random.default_rng(1).normal(size=curve.values.shape)
-    found = sizes_of(problem, replace(solution, state_interpolant=replace(curve, values=values)))
-    np.testing.assert_allclose([*found.state, *found.control, found.path[0]], [1e-6, 1e-6, 1e-6, 2e-6])
+    result = sizes_of(problem, replace(solution, state_interpolant=replace(curve, values=values)))
+    np.testing.assert_allclose([*result.state, *result.control, result.path[0]], [1e-6, 1e-6, 1e-6, 2e-6])
 
 
-def test_an_equality_is_as_large_as_what_it_is_made_of() -> None:
+def test_the_scale_of_an_equality_is_that_of_its_terms() -> None:
     """A plan that meets it has no spread of it; the tip of a short arm moves by millimetres."""
     length = 3e-3
     problem = Problem("short arm")
@@ -140,8 +140,8 @@ def test_an_equality_is_as_large_as_what_it_is_made_of() -> None:
     problem.end("tip", tip - goal, 0, 0)
     problem.horizon(1.0)
     problem.minimize(ca.sumsqr(u))
-    found = sizes_of(problem, solve(problem, Collocation(8)))
-    assert np.all((found.end > length / 10) & (found.end < 4 * length))
+    result = sizes_of(problem, solve(problem, Collocation(8)))
+    assert np.all((result.end > length / 10) & (result.end < 4 * length))
 
 
 def test_the_cyclic_end_is_as_large_as_both_of_its_sides() -> None:
@@ -149,18 +149,18 @@ def test_the_cyclic_end_is_as_large_as_both_of_its_sides() -> None:
     problem.end("turned", q - problem.at_start(q), 0.5, 0.5)
     problem.minimize(u**2 + q)
     solution = solve(problem, Collocation(8))
-    found = sizes_of(problem, solution)
-    assert found.end[0] == pytest.approx(2 * found.state[0])
+    result = sizes_of(problem, solution)
+    assert result.end[0] == pytest.approx(2 * result.state[0])
 
 
-def test_what_is_not_finite_has_no_say() -> None:
+def test_infinite_values_do_not_affect_the_scale() -> None:
     problem, _ = travel()
     solution = solve(problem, Collocation(8))
     values = solution.state_interpolant.values.copy()
     values[3, 1] = [np.inf, np.nan]
     broken = replace(solution, state_interpolant=replace(solution.state_interpolant, values=values))
-    found = sizes_of(problem, broken)
-    np.testing.assert_allclose(found.state, [1.0, 1.5], rtol=1e-2)
+    result = sizes_of(problem, broken)
+    np.testing.assert_allclose(result.state, [1.0, 1.5], rtol=1e-2)
 
 
 def test_the_fine_grid_stands_on_both_sides_of_a_break() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from models import FixedBase, Joint, Link, Robot
 from ocp import Collocation, Indirect, MultipleShooting, Problem, certificate, solve
-from tests.ocp.audit.drawn import drawn, holds, is_no_minimum, is_no_proven_minimum
+from tests.ocp.audit.drawn import holds, is_no_minimum, is_no_proven_minimum, random_program
 
 pytestmark = pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")  # arms of a kilometre are meant
 
@@ -75,7 +75,7 @@ def test_the_greatest_cost_is_not_the_least(bounds: dict[str, Any], end: float |
     problem.horizon(1.0)
     problem.minimize(-ca.sumsqr(u))
     still = np.zeros(size).tolist()
-    is_no_minimum(drawn(problem, {"x": still}, {"u": still}, {"x": still}, 1.0).audit())
+    is_no_minimum(random_program(problem, {"x": still}, {"u": still}, {"x": still}, 1.0).audit())
 
 
 def test_one_control_that_curves_downwards_is_found_among_others_that_curve_upwards() -> None:
@@ -88,7 +88,7 @@ def test_one_control_that_curves_downwards_is_found_among_others_that_curve_upwa
         problem.declared.running = None
         problem.minimize(u[0] ** 2 + 1e3 * u[1] ** 2 + sign * 1e-2 * u[2] ** 2)
         still = [0.0, 0.0, 0.0]
-        verdict(drawn(problem, {"x": still}, {"u": still}, {"x": still}, 1.0).audit())
+        verdict(random_program(problem, {"x": still}, {"u": still}, {"x": still}, 1.0).audit())
 
 
 def test_a_hamiltonian_that_is_a_saddle_in_two_controls_is_no_minimum() -> None:
@@ -100,7 +100,7 @@ def test_a_hamiltonian_that_is_a_saddle_in_two_controls_is_no_minimum() -> None:
     problem.horizon(1.0)
     problem.minimize(ca.bilin(ca.DM([[1.0, 2.0], [2.0, 1.0]]), u, u) / 2)
     still = [0.0, 0.0]
-    is_no_minimum(drawn(problem, {"x": still}, {"u": still}, {"x": still}, 1.0).audit())
+    is_no_minimum(random_program(problem, {"x": still}, {"u": still}, {"x": still}, 1.0).audit())
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
@@ -117,10 +117,10 @@ def test_standing_on_a_hilltop_is_no_minimum(unit: float, bounds: dict[str, Any]
         problem.horizon(1.0)
         problem.minimize(price * (u / unit) ** 2, -((x / unit) ** 2))
         still = {"x": 0.0, "v": 0.0}
-        is_no_proven_minimum(drawn(problem, still, {"u": 0.0}, still, 1.0).audit())
+        is_no_proven_minimum(random_program(problem, still, {"u": 0.0}, still, 1.0).audit())
 
 
-def test_an_end_that_bends_down_less_than_the_way_bends_up_is_a_minimum() -> None:
+def test_an_end_cost_of_small_negative_curvature_is_a_minimum() -> None:
     """min int u^2 - c x(T)^2 from 0: x(T)^2 (1 / T - c)."""
     for bend, verdict in ((0.9, holds), (1.1, is_no_minimum), (50.0, is_no_minimum)):
         problem = Problem("bent end")
@@ -128,7 +128,7 @@ def test_an_end_that_bends_down_less_than_the_way_bends_up_is_a_minimum() -> Non
         problem.dynamics(x, u)
         problem.horizon(1.0)
         problem.minimize(u**2, -bend * x**2)
-        verdict(drawn(problem, {"x": 0.0}, {"u": 0.0}, {"x": 0.0}, 1.0).audit())
+        verdict(random_program(problem, {"x": 0.0}, {"u": 0.0}, {"x": 0.0}, 1.0).audit())
 
 
 # ---- geodesics and films ---------------------------------------------------------------------------------------------
@@ -151,12 +151,12 @@ def surface(turn: float, axis: float, order: str) -> Problem:
 
 @pytest.mark.parametrize("axis", [0.6, 1.0, 1.5])
 @pytest.mark.parametrize("order", ["pan tilt", "tilt pan"])
-def test_the_equator_is_the_shortest_way_up_to_the_conjugate_point(axis: float, order: str) -> None:
+def test_the_equator_is_the_shortest_path_up_to_the_conjugate_point(axis: float, order: str) -> None:
     """Jacobi: with the Gauss curvature 1 / axis^2 of the equator, the conjugate point comes after pi axis."""
     for share, verdict in ((0.95, holds), (1.05, is_no_minimum), (1.7, is_no_minimum), (-1.3, is_no_minimum)):
         turn = share * np.pi * axis
         problem = surface(turn, axis, order)
-        plan = drawn(
+        plan = random_program(
             problem,
             {"pan": lambda t, turn=turn: 0.3 + turn * t, "tilt": 0.0},
             {"rate of pan": turn, "rate of tilt": 0.0},
@@ -183,7 +183,7 @@ def test_of_two_soap_films_between_rings_the_deep_one_is_no_minimum() -> None:
     problem.horizon(1.0)
     problem.minimize(r * ca.sqrt(1 + slope**2))
     for c, verdict in ((shallow, holds), (deep, is_no_minimum)):
-        plan = drawn(
+        plan = random_program(
             problem,
             {"r": lambda t, c=c: c * np.cosh((t - 0.5) / c)},
             {"slope": lambda t, c=c: np.sinh((t - 0.5) / c)},
@@ -205,18 +205,18 @@ def test_the_farthest_point_of_a_circle_is_no_nearest() -> None:
             problem.horizon(1.0)
             problem.end("circle", ca.sumsqr(place), radius**2, radius**2)
             problem.minimize(ca.sumsqr(rate) / 2)
-            way = (side - 0.3) * radius
-            plan = drawn(
+            path = (side - 0.3) * radius
+            plan = random_program(
                 problem,
-                {"place": lambda t, w=way, r=radius: np.column_stack([0.3 * r + w * t, 0 * t])},
-                {"rate": [way, 0.0]},
-                {"place": [-way, 0.0]},
+                {"place": lambda t, w=path, r=radius: np.column_stack([0.3 * r + w * t, 0 * t])},
+                {"rate": [path, 0.0]},
+                {"place": [-path, 0.0]},
                 1.0,
             )
             verdict(plan.audit())
 
 
-def test_the_slowest_of_all_horizons_is_not_the_cheapest() -> None:
+def test_the_longest_horizon_has_not_the_lowest_cost() -> None:
     """x from 0 to 1 at int u^2 / 2 + (T - 1) / 2 - b (T - 1)^2 / 2: stationary at T = 1, a minimum for b < 1."""
     for bend, verdict in ((0.5, holds), (1.5, is_no_minimum)):
         problem = Problem("horizon")
@@ -224,7 +224,7 @@ def test_the_slowest_of_all_horizons_is_not_the_cheapest() -> None:
         problem.dynamics(x, u)
         horizon = problem.horizon(lower=0.1, upper=10.0, guess=1.0)
         problem.minimize(u**2 / 2, (horizon - 1) / 2 - bend * (horizon - 1) ** 2 / 2)
-        verdict(drawn(problem, {"x": lambda t: t}, {"u": 1.0}, {"x": -1.0}, 1.0).audit())
+        verdict(random_program(problem, {"x": lambda t: t}, {"u": 1.0}, {"x": -1.0}, 1.0).audit())
 
 
 # ---- robots ----------------------------------------------------------------------------------------------------------
@@ -242,7 +242,7 @@ def head(length: float) -> FixedBase:
 
 @pytest.mark.parametrize("length", [0.01, 1.0, 1e3])
 @pytest.mark.parametrize("turn", [2.9, 3.4, 5.0, -4.0])
-def test_a_lens_that_goes_the_long_way_round_is_no_minimum(length: float, turn: float) -> None:
+def test_a_longer_homotopy_class_is_no_minimum(length: float, turn: float) -> None:
     """The least square of the lens's speed: great circles are shortest up to half a turn."""
     machine = head(length)
     problem = Problem("head")
@@ -253,7 +253,7 @@ def test_a_lens_that_goes_the_long_way_round_is_no_minimum(length: float, turn: 
     tip = ca.vertcat(machine.tip_pose((), joints).position)
     speed = ca.mtimes(ca.jacobian(tip, joints), rates)
     problem.minimize(ca.sumsqr(speed) / length**2)
-    plan = drawn(
+    plan = random_program(
         problem,
         {"joints": lambda t: np.column_stack([turn * t, 0 * t])},
         {"rates": [turn, 0.0]},
@@ -275,18 +275,18 @@ def indefinite(rng: np.random.Generator) -> tuple[Problem, float]:
     n = int(rng.integers(1, 4))
     a, b, q = rng.normal(size=(n, n)), rng.normal(size=(n, 1)), rng.normal(size=(n, n))
     q = 4.0 * (q + q.T) / 2
-    horizon, pieces = float(rng.uniform(0.5, 3.0)), 160
-    step = horizon / pieces
+    horizon, segments = float(rng.uniform(0.5, 3.0)), 160
+    step = horizon / segments
     # exact step of (x, u held): exponentials by squaring of the augmented matrix, and the cost by Simpson's rule
     from scipy.linalg import expm
 
     whole = np.zeros((n + 1, n + 1))
     whole[:n, :n], whole[:n, n:] = a, b
     half, full = expm(whole * step / 2), expm(whole * step)
-    reach = np.zeros((pieces + 1, n, pieces))
-    hessian = np.eye(pieces) * step
-    for k in range(pieces):
-        own = np.zeros((1, pieces))
+    reach = np.zeros((segments + 1, n, segments))
+    hessian = np.eye(segments) * step
+    for k in range(segments):
+        own = np.zeros((1, segments))
         own[0, k] = 1.0
         reach[k + 1] = full[:n, :n] @ reach[k] + full[:n, n:] @ own
         middle = half[:n, :n] @ reach[k] + half[:n, n:] @ own

@@ -27,9 +27,9 @@ def push(limit: float) -> Problem:
 def under(limit: float, method: Collocation | MultipleShooting, declared: float = 10.0) -> Solution:
     """The plan of a smaller limit that claims to be one of the declared limit, tightened."""
     plan = solve(push(limit), method)
-    drawn = np.zeros((2, method.intervals, 3))
-    drawn[:, :, 2] = declared - limit
-    return replace(plan, problem=push(declared), bound_tightening=drawn)
+    tightening = np.zeros((2, method.intervals, 3))
+    tightening[:, :, 2] = declared - limit
+    return replace(plan, problem=push(declared), bound_tightening=tightening)
 
 
 def without_multipliers(plan: Solution) -> Solution:
@@ -54,7 +54,7 @@ def test_a_bound_tightened_far_is_no_bound(limit: float, method: Collocation) ->
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
 @pytest.mark.parametrize("declared", [4.6, 4.8, 5.1])
-def test_a_tightened_bound_costs_what_its_multipliers_win_over_it(declared: float, method: Collocation) -> None:
+def test_the_cost_of_a_tightened_bound_follows_from_its_multipliers(declared: float, method: Collocation) -> None:
     """The problem is convex: the price is an upper bound, and no more than a first-order one is too large by."""
     plan, best = under(4.5, method, declared), solve(push(declared), method)
     loss = plan.audit()["cost lost, relative"]
@@ -84,7 +84,7 @@ def test_a_bound_that_is_hardly_tightened_costs_hardly_anything() -> None:
 
 
 @pytest.mark.parametrize("intervals", [10, 20, 40, 80])
-def test_what_tighten_costs_is_no_more_than_the_price(intervals: int) -> None:
+def test_tightening_costs_no_more_than_its_price(intervals: int) -> None:
     """The true optimum under a ceiling of 1/9 is 4 (Bryson, Denham): the price bounds what is lost to it."""
     problem, _, _, u = double_integrator("ceiling", (0.0, 1.0), (0.0, -1.0), ceiling=1 / 9)
     problem.minimize(running=u**2 / 2)
@@ -110,10 +110,10 @@ def test_a_tightened_bound_makes_no_minimum_of_a_maximum(width: float) -> None:
         return problem
 
     plan = solve(hump(width), Collocation(10, control="held"))
-    drawn = np.zeros((2, 10, 2))
-    drawn[:, :, 1] = 1.5 - width
+    tightening = np.zeros((2, 10, 2))
+    tightening[:, :, 1] = 1.5 - width
     assert replace(plan, problem=hump(width)).audit().feasible
-    assert not replace(plan, problem=hump(1.5), bound_tightening=drawn).audit().passed
+    assert not replace(plan, problem=hump(1.5), bound_tightening=tightening).audit().passed
 
 
 def test_tightening_without_the_path_rows_is_none_of_these() -> None:

@@ -26,7 +26,7 @@ from ocp import (
     solve,
     standing_problem,
 )
-from tests.ocp.audit.drawn import does_not_do_what_is_asked, drawn, holds, is_no_minimum, of
+from tests.ocp.audit.drawn import holds, is_no_minimum, of, random_program, violates_its_task
 from tests.ocp.problems import Array, double_integrator
 
 pytestmark = pytest.mark.filterwarnings("ignore::models.errors.ModelWarning")  # arms of a kilometre are meant
@@ -53,20 +53,20 @@ def least_effort(horizon: Any = 1.0, distance: float = 1.0, **free: Any) -> Prob
 
 
 @every_method
-@pytest.mark.parametrize(("own", "asked"), [(10.0, 1.0), (2.0, 3.0), (1.0, 1.001), (1e-3, 1.0)])
-def test_a_plan_of_another_horizon_does_not_do_what_is_asked(method: str, own: float, asked: float) -> None:
+@pytest.mark.parametrize(("own", "requested"), [(10.0, 1.0), (2.0, 3.0), (1.0, 1.001), (1e-3, 1.0)])
+def test_a_plan_of_another_horizon_violates_its_task(method: str, own: float, requested: float) -> None:
     plan = solve(least_effort(own), METHODS[method])
     holds(plan.audit())
-    does_not_do_what_is_asked(of(plan, least_effort(asked)).audit())
-    if own > asked:
-        does_not_do_what_is_asked(of(plan, least_effort(lower=0.1 * asked, upper=asked)).audit())
+    violates_its_task(of(plan, least_effort(requested)).audit())
+    if own > requested:
+        violates_its_task(of(plan, least_effort(lower=0.1 * requested, upper=requested)).audit())
 
 
 def test_a_plan_that_is_loaded_is_held_to_the_horizon_of_the_task(tmp_path: Path) -> None:
     solve(least_effort(2.0), METHODS["radau"]).save(tmp_path / "plan.npz")
     plan = Solution.load(tmp_path / "plan.npz")
     holds(plan.audit(least_effort(2.0)))
-    does_not_do_what_is_asked(plan.audit(least_effort(3.0)))
+    violates_its_task(plan.audit(least_effort(3.0)))
 
 
 def test_a_plan_of_another_horizon_fails_where_parameters_say_the_horizon() -> None:
@@ -81,16 +81,16 @@ def test_a_plan_of_another_horizon_fails_where_parameters_say_the_horizon() -> N
 
     plan = solve(build(), METHODS["radau"], parameters={"T": 4.0})
     holds(plan.audit())
-    does_not_do_what_is_asked(replace(plan, parameters={"T": np.array([2.0])}).audit())
+    violates_its_task(replace(plan, parameters={"T": np.array([2.0])}).audit())
 
 
 def arm(size: float = 1.0, joints: int = 3) -> FixedBase:
-    links, made = [Link("base", 1.0)], []
+    links, result = [Link("base", 1.0)], []
     for i in range(joints):
         links.append(Link(f"link{i}", 1.0, (size / 2, 0, 0), np.diag([0.01, 0.1, 0.1]) * size**2))
         mount = (0.0 if i == 0 else size, 0, 0)
-        made.append(Joint(f"joint{i}", "revolute", links[i].name, links[i + 1].name, mount, axis=(0, 0, 1)))
-    return FixedBase(Robot(tuple(links), tuple(made), tip_translation=(size, 0, 0)))
+        result.append(Joint(f"joint{i}", "revolute", links[i].name, links[i + 1].name, mount, axis=(0, 0, 1)))
+    return FixedBase(Robot(tuple(links), tuple(result), tip_translation=(size, 0, 0)))
 
 
 START = np.array([0.3, 0.8, 0.9])
@@ -110,9 +110,9 @@ def test_one_lap_does_not_pass_for_two() -> None:
     )
     plan = solve(one, Collocation(20))
     holds(plan.audit())
-    does_not_do_what_is_asked(of(plan, two).audit())
+    violates_its_task(of(plan, two).audit())
     # nor stretched over the time of two
-    does_not_do_what_is_asked(replace(of(plan, two), horizon=4.0, t=2 * plan.t).audit())
+    violates_its_task(replace(of(plan, two), horizon=4.0, t=2 * plan.t).audit())
 
 
 @pytest.mark.parametrize(
@@ -150,38 +150,40 @@ def test_times_and_breaks_outside_the_plan_are_refused(beyond: Callable[[Solutio
         audit = beyond(plan).audit()
     except ProblemError:
         return
-    does_not_do_what_is_asked(audit)
+    violates_its_task(audit)
 
 
 # ---- small things ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("way", [9e-4, 1e-5, 1e-9])
+@pytest.mark.parametrize("path", [9e-4, 1e-5, 1e-9])
 @pytest.mark.parametrize("where", ["initial", "terminal", "end", "path"])
-def test_a_plan_that_stands_still_does_not_go_a_small_way(way: float, where: str) -> None:
+def test_a_plan_at_rest_does_not_reach_a_near_goal(path: float, where: str) -> None:
     """A distance below a millimetre counts: resting costs nothing, moving costs distance^2 / 2."""
 
     def build() -> Problem:
         problem = Problem("small way")
         x = problem.state(
-            "x", initial=way if where == "initial" else 0.0, terminal={"initial": 0.0, "terminal": way}.get(where)
+            "x", initial=path if where == "initial" else 0.0, terminal={"initial": 0.0, "terminal": path}.get(where)
         )
         u = problem.control("u")
         problem.dynamics(x, u)
         problem.horizon(1.0)
         if where == "end":
-            problem.end("there", x - way, 0.0, 0.0)
+            problem.end("there", x - path, 0.0, 0.0)
         if where == "path":
-            problem.path("pace", u - way, 0.0, 0.0)
+            problem.path("pace", u - path, 0.0, 0.0)
         problem.minimize(u**2 / 2)
         return problem
 
     back = -1.0 if where == "initial" else 1.0
-    going: dict[str, Any] = {"x": lambda t: way * (1 - t) if where == "initial" else way * t}
-    holds(drawn(build(), going, {"u": back * way}, {"x": 0.0 if where == "path" else -back * way}, 1.0).audit())
-    for place in (0.0, way):
-        plan = drawn(build(), {"x": place}, {"u": 0.0}, {"x": 0.0}, 1.0)
-        does_not_do_what_is_asked(plan.audit())
+    going: dict[str, Any] = {"x": lambda t: path * (1 - t) if where == "initial" else path * t}
+    holds(
+        random_program(build(), going, {"u": back * path}, {"x": 0.0 if where == "path" else -back * path}, 1.0).audit()
+    )
+    for place in (0.0, path):
+        plan = random_program(build(), {"x": place}, {"u": 0.0}, {"x": 0.0}, 1.0)
+        violates_its_task(plan.audit())
 
 
 @pytest.mark.parametrize("size", [3e-3, 1e-5, 1.0, 1e4])
@@ -192,12 +194,12 @@ def test_an_arm_that_never_moves_does_no_task_however_small_it_is(size: float) -
     problem = minimum_velocity_problem(machine, tasks=task, start=START, horizon=2.0)
     holds(solve(problem, Collocation(20)).audit())
     still = {"joints": START.tolist()}
-    does_not_do_what_is_asked(drawn(problem, still, {"rates": 0 * START}, {"joints": 0 * START}, 2.0).audit())
+    violates_its_task(random_program(problem, still, {"rates": 0 * START}, {"joints": 0 * START}, 2.0).audit())
 
 
 @pytest.mark.parametrize("size", [1e-3, 1.0])
 @pytest.mark.parametrize("drift", [1e-2, 5e-3])
-def test_a_tip_that_drifts_from_its_task_is_found(size: float, drift: float) -> None:
+def test_a_drifting_tip_is_detected(size: float, drift: float) -> None:
     """A tip to move 0.05 link lengths a second drifts sideways by a share of it: 1e-4 m/s for 0.2 m links."""
     machine = arm(size)
     velocity = np.array([0.05, -0.02]) * size
@@ -206,7 +208,7 @@ def test_a_tip_that_drifts_from_its_task_is_found(size: float, drift: float) -> 
     problem = minimum_velocity_problem(machine, task, 3.0, start=START)
     holds(solve(problem, Collocation(20)).audit())
     drifting = solve(minimum_velocity_problem(machine, wrong, 3.0, start=START), Collocation(20))
-    does_not_do_what_is_asked(of(drifting, problem).audit())
+    violates_its_task(of(drifting, problem).audit())
 
 
 def test_a_small_thing_beside_a_large_one_is_not_drowned_in_it() -> None:
@@ -220,14 +222,16 @@ def test_a_small_thing_beside_a_large_one_is_not_drowned_in_it() -> None:
         problem.minimize((u[0] / large) ** 2 + u[1] ** 2)
         costates = {"x": [-2 / large, -2.0]}
         holds(
-            drawn(problem, {"x": lambda t, g=large: np.outer(t, [g, 1.0])}, {"u": [large, 1.0]}, costates, 1.0).audit()
+            random_program(
+                problem, {"x": lambda t, g=large: np.outer(t, [g, 1.0])}, {"u": [large, 1.0]}, costates, 1.0
+            ).audit()
         )
         for wrong in (0.0, 0.6, 0.9):  # the small one stops short, or its motion is not that of its control
             for rate in (wrong, 1.0):
-                plan = drawn(
+                plan = random_program(
                     problem, {"x": lambda t, w=wrong, g=large: np.outer(t, [g, w])}, {"u": [large, rate]}, costates, 1.0
                 )
-                does_not_do_what_is_asked(plan.audit())
+                violates_its_task(plan.audit())
 
 
 @pytest.mark.parametrize("away", [1e2, 1e6])
@@ -242,12 +246,12 @@ def test_the_place_of_the_origin_hides_no_error(method: str, away: float) -> Non
 
     plan = solve(build(), METHODS[method])
     holds(plan.audit())
-    does_not_do_what_is_asked(of(solve(build(0.9), METHODS[method]), build()).audit())
+    violates_its_task(of(solve(build(0.9), METHODS[method]), build()).audit())
     curve = plan.control_interpolant
-    does_not_do_what_is_asked(replace(plan, control_interpolant=replace(curve, values=0.9 * curve.values)).audit())
+    violates_its_task(replace(plan, control_interpolant=replace(curve, values=0.9 * curve.values)).audit())
 
 
-def test_a_made_up_costate_of_a_small_price_is_not_drowned_in_a_large_one() -> None:
+def test_a_false_costate_of_a_small_cost_is_detected_beside_a_large_one() -> None:
     """Two independent motions, one with 100 times the cost; the other has a needless bend: b^2 / 6 of 50.5."""
     for price in (1.0, 100.0):
         problem = Problem("two prices")
@@ -258,7 +262,7 @@ def test_a_made_up_costate_of_a_small_price_is_not_drowned_in_a_large_one() -> N
         problem.horizon(1.0)
         problem.minimize(price * u**2 / 2 + w**2 / 2)
         for bend, verdict in ((0.0, holds), (1.0, is_no_minimum), (2.0, is_no_minimum)):
-            plan = drawn(
+            plan = random_program(
                 problem,
                 {"x": lambda t: t, "y": lambda t, b=bend: t + b * t * (1 - t)},
                 {"u": 1.0, "w": lambda t, b=bend: 1 + b * (1 - 2 * t)},
@@ -294,7 +298,7 @@ def test_the_width_of_a_range_excuses_nothing(wide: float, where: str) -> None:
 
     dipping = solve(build(False), Collocation(20))
     assert dipping["q"].min() < -0.5
-    does_not_do_what_is_asked(of(dipping, build(True)).audit())
+    violates_its_task(of(dipping, build(True)).audit())
     holds(solve(build(True), Collocation(30)).audit())
 
 
@@ -311,7 +315,7 @@ def test_the_width_of_a_range_of_a_control_excuses_nothing(wide: float) -> None:
             )
         return problem
 
-    does_not_do_what_is_asked(of(solve(build(False), Collocation(20)), build(True)).audit())
+    violates_its_task(of(solve(build(False), Collocation(20)), build(True)).audit())
 
 
 @pytest.mark.parametrize("limit", [1e-3, 5e-6, 1e-9])
@@ -341,7 +345,7 @@ def test_half_the_push_that_is_allowed_is_not_the_fastest(limit: float) -> None:
     for share, verdict in ((1.0, holds), (0.5, is_no_minimum)):
         half = 1 / np.sqrt(share)  # s; of the way, in which it pushes
         push = share * limit
-        plan = drawn(
+        plan = random_program(
             problem,
             {
                 "q": lambda t, a=push, h=half: np.where(t < h, a * t**2 / 2, limit - a * (2 * h - t) ** 2 / 2),
@@ -378,7 +382,7 @@ def test_states_and_controls_are_read_by_name_in_whatever_order(order: str, load
         plan = Solution.load(tmp_path / "plan.npz")
     holds(plan.audit(several(order, ends)))
     swapped = dict(zip(order, ends.values(), strict=True))  # what reading by position would call right
-    does_not_do_what_is_asked(plan.audit(several(order, swapped)))
+    violates_its_task(plan.audit(several(order, swapped)))
 
 
 # ---- between the samples ---------------------------------------------------------------------------------------------
@@ -402,7 +406,7 @@ def test_a_push_between_the_nodes_is_not_stepped_over(shape: str, width: float, 
         problem.minimize(u**2 / 2)
         return problem
 
-    does_not_do_what_is_asked(of(solve(build(0.0), METHODS[method]), build(1.0)).audit())
+    violates_its_task(of(solve(build(0.0), METHODS[method]), build(1.0)).audit())
 
 
 @pytest.mark.parametrize("at", [0.31, 0.777])
@@ -435,7 +439,7 @@ def test_a_wall_as_thick_as_the_samples_are_apart_is_not_gone_through(thick: flo
         problem.minimize(u**2 / 2)
         return problem
 
-    does_not_do_what_is_asked(of(solve(build(False), MultipleShooting(10)), build(True)).audit())
+    violates_its_task(of(solve(build(False), MultipleShooting(10)), build(True)).audit())
 
 
 # ---- files and margins -----------------------------------------------------------------------------------------------
@@ -482,13 +486,13 @@ def test_no_rule_lets_the_zero_moment_point_leave_the_foot() -> None:
         assert any("foot" in name or "support" in name or "zero moment" in name for name in names), names
 
 
-def test_the_helpers_draw_what_they_say() -> None:
+def test_the_helpers_draw_their_quantities() -> None:
     """A plan sampled from the optimum has its cost, and its arrays and curves agree."""
 
     def q(t: Array) -> Array:
         return 3 * t**2 - 2 * t**3
 
-    plan = drawn(
+    plan = random_program(
         least_effort(),
         {"q": q, "v": lambda t: 6 * t - 6 * t**2},
         {"u": lambda t: 6 - 12 * t},

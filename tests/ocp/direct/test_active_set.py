@@ -41,7 +41,7 @@ def test_from_the_last_plan_a_few_steps_lead_to_the_next(name: str, method: str)
 
 
 @pytest.mark.parametrize("change", [{"fastest": 0.7}, {"strength": 0.5}, {"way": 1.2}, {"fastest": 0.8}], ids=str)
-def test_where_other_limits_push_the_plan_beside_is_found_by_newtons_steps_alone(change: dict[str, float]) -> None:
+def test_neighbouring_plans_with_other_active_limits_follow_by_newton_steps(change: dict[str, float]) -> None:
     prepared = ready(moved(), FINE["radau"])
     near = prepared.solve(MOVED)
     cold = prepared.solve(MOVED | change)
@@ -107,7 +107,7 @@ def test_a_saddle_to_which_curved_steps_lead_is_none() -> None:
 
 def test_units_of_states_controls_and_cost_do_not_matter() -> None:
     """With scales of powers of two nothing is rounded: the same steps lead to the same plan."""
-    found = {}
+    by_name = {}
     for scale, strength, price in ((1.0, 1.0, 1.0), (2.0**20, 1.0, 1.0), (2.0**-18, 2.0**15, 2.0**17)):
         problem = Problem("in units")
         end = problem.parameter("end")
@@ -123,11 +123,11 @@ def test_units_of_states_controls_and_cost_do_not_matter() -> None:
         assert again.solver == "newton"
         assert again.cost == pytest.approx(plan.cost, rel=1e-9)
         assert relative(again["x"], plan["x"]) < 1e-7
-        found[scale] = again.iterations
-    assert len(set(found.values())) == 1, found
+        by_name[scale] = again.iterations
+    assert len(set(by_name.values())) == 1, by_name
 
 
-def test_where_other_plans_are_as_good_one_is_found() -> None:
+def test_one_of_several_equal_optima_is_found() -> None:
     """Two motors of which the sum counts alone: rounding says whether the cost curves along their difference."""
     problem = Problem("two motors")
     x = problem.state("x", initial=[0.0], terminal=problem.parameter("end"))
@@ -180,7 +180,7 @@ def test_rows_are_met_so_well_that_the_cost_is_that_of_the_optimum() -> None:
         assert (up.cost - down.cost) / (2 * step) == pytest.approx(float(plan.cost_gradient("speed")[0]), rel=1e-6)
 
 
-def test_what_is_no_plan_of_the_very_program_is_a_guess_like_any_other() -> None:
+def test_solutions_of_other_programs_are_ordinary_guesses() -> None:
     prepared = ready(moved(), FINE["radau"])
     plan = prepared.solve(MOVED)
     other = ready(moved(), Collocation(14)).solve(MOVED)
@@ -210,19 +210,19 @@ def test_a_horizon_that_recedes_goes_on_from_the_plan_moved_on(method: Method) -
     steps = {0: 0, 1: 0}
     for _ in range(8):
         now = {"now": plan.at(6.0 / 30)["x"].ravel()}
-        found = {shift: prepared.solve(now, plan, shift=shift) for shift in steps}
+        by_name = {shift: prepared.solve(now, plan, shift=shift) for shift in steps}
         cold = prepared.solve(now)
-        for shift, each in found.items():
+        for shift, each in by_name.items():
             steps[shift] += each.iterations
             assert each.cost == pytest.approx(cold.cost, rel=1e-9)
-        assert found[1].solver == "newton"
-        plan = found[1]
+        assert by_name[1].solver == "newton"
+        plan = by_name[1]
     assert steps[1] < steps[0]
 
 
 @pytest.mark.parametrize("method", FINE)
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_what_is_later_stands_for_the_same_so_many_intervals_later(method: str, solver: str) -> None:
+def test_later_rows_are_the_first_rows_shifted_by_intervals(method: str, solver: str) -> None:
     transcription = ready(van_der_pol(), FINE[method], solver).transcription
     n = len(transcription.mesh) - 1
     of_x, of_g = shifted_indices(transcription, 3)

@@ -60,11 +60,11 @@ def test_factors_solve_the_whole_matrix_and_tell_whether_it_is_positive_definite
         assert (factors is not None) == (above > 0)
         if factors is not None:
             right = rng.normal(size=size)
-            found = factors.solve(right[np.argsort(order.place)])[order.place]
-            np.testing.assert_allclose(shifted @ found, right, atol=1e-8)
+            result = factors.solve(right[np.argsort(order.place)])[order.place]
+            np.testing.assert_allclose(shifted @ result, right, atol=1e-8)
 
 
-def test_what_all_share_and_one_end_of_a_tie_stand_last() -> None:
+def test_shared_variables_and_one_end_of_a_coupling_are_last() -> None:
     """So that the band stays as narrow as neighbours are near, whatever the length."""
     for size in (40, 400):
         matrix = coupled(np.random.default_rng(1), size, 3, 2, 4)
@@ -74,7 +74,7 @@ def test_what_all_share_and_one_end_of_a_tie_stand_last() -> None:
 
 
 @pytest.mark.parametrize("what", [np.nan, np.inf, -np.inf])
-def test_what_is_no_number_has_no_factors(what: float) -> None:
+def test_values_that_are_no_numbers_have_no_factors(what: float) -> None:
     matrix = 4 * np.eye(4) + np.eye(4, k=1) + np.eye(4, k=-1)
     order = order_of(matrix)
     matrix[2, 1] = what

@@ -66,7 +66,7 @@ def test_held_control_costs_second_order(scheme: str) -> None:
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_held_controls_of_the_double_integrator_cost_exactly_what_they_must(scheme: str) -> None:
+def test_piecewise_constant_controls_of_the_double_integrator_have_their_exact_cost(scheme: str) -> None:
     """The best N held controls cost 6 N^2 / (N^2 - 1)."""
     for n in (2, 3, 7):
         cost = solve(energy(), Collocation(n, 3, scheme, "held")).cost
@@ -120,10 +120,10 @@ def test_states_obey_the_dynamics_at_every_collocation_point(
 
     interpolant = solution.state_interpolant
     points = np.array(ca.collocation_points(degree, scheme))
-    piece, place = np.repeat(np.arange(len(steps)), degree), np.tile(points, len(steps))
-    x_at, slopes = interpolant.within(piece, place), slope(solution, mesh, points)
+    segment, place = np.repeat(np.arange(len(steps)), degree), np.tile(points, len(steps))
+    x_at, slopes = interpolant.within(segment, place), slope(solution, mesh, points)
     t = (mesh[:-1, None] + np.diff(mesh)[:, None] * points).ravel() * time_scale
-    u_at = solution.control_interpolant.within(piece, place)[:, 0]
+    u_at = solution.control_interpolant.within(segment, place)[:, 0]
     pull = -x_at[:, 0] - 0.3 * x_at[:, 1] + u_at + 0.2 * t / time_scale
     expected = np.column_stack([x_at[:, 1], pull])  # over the fraction, the horizon cancels the time scale
     np.testing.assert_allclose(slopes, expected, atol=1e-6 * max(1.0, float(np.abs(expected).max())))

@@ -55,7 +55,7 @@ def number(value: int) -> Library:
     return Library((f"number {value}",), lambda: f"int number(void) {{ return {value}; }}")
 
 
-def told(library: Path) -> int:
+def call_count(library: Path) -> int:
     return int(ctypes.CDLL(str(library)).number())
 
 
@@ -73,7 +73,7 @@ def is_compiled(prepared: Any) -> bool:
 # ---- the same numbers --------------------------------------------------------------------------------------------
 
 
-def looked_up() -> Problem:
+def table_problem() -> Problem:
     """Dynamics of MX symbols, with a table in them."""
     x = np.linspace(-3.0, 3.0, 13)
     hill = ca.interpolant("hill", "bspline", [x], 1 + x**2 / 2)
@@ -86,7 +86,7 @@ def looked_up() -> Problem:
 CASES = {
     "SX, parameters, points": (swing, Collocation(4, 2), SWING),
     "SX, four steps": (swing, MultipleShooting(4, steps=4), SWING),
-    "MX": (looked_up, Collocation(4, 2, "legendre"), None),
+    "MX": (table_problem, Collocation(4, 2, "legendre"), None),
 }
 
 
@@ -101,8 +101,8 @@ def test_compiled_functions_are_the_interpreted_ones_to_the_last_bit(shared: Pat
         for name, plain, other in zip(Derivatives._fields, derivatives(block.function), own, strict=True):
             seen += other.class_name() == "External"
             for _ in range(5):
-                given = [ca.DM(random.uniform(0.1, 2.0, plain.size_in(i))) for i in range(plain.n_in())]
-                for one, two in zip(plain.call(given), other.call(given), strict=True):
+                options = [ca.DM(random.uniform(0.1, 2.0, plain.size_in(i))) for i in range(plain.n_in())]
+                for one, two in zip(plain.call(options), other.call(options), strict=True):
                     assert one.sparsity() == two.sparsity(), name
                     np.testing.assert_array_equal(one.nonzeros(), two.nonzeros(), name)
     assert seen
@@ -132,8 +132,8 @@ def test_known_optima_are_met_compiled(shared: Path, case: Case) -> None:
 
 
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
-def test_what_cannot_hold_together_is_named_in_the_same_words(shared: Path, solver: str) -> None:
-    told = []
+def test_conflicting_constraints_are_named_in_the_same_words(shared: Path, solver: str) -> None:
+    results = []
     for how in (True, False):
         problem, x, u = plant("too far", initial=0.0, terminal=3.0, u={"lower": -1.0, "upper": 1.0})
         problem.dynamics(x, u * ca.cos(x / 10) ** 2 + ca.sin(x) ** 2 / 100)
@@ -143,9 +143,9 @@ def test_what_cannot_hold_together_is_named_in_the_same_words(shared: Path, solv
         assert is_compiled(prepared) == how
         with pytest.raises(SolveError) as error:
             prepared.solve()
-        told.append(str(error.value))
-    assert told[0] == told[1]
-    assert "would have to go" in told[0]
+        results.append(str(error.value))
+    assert results[0] == results[1]
+    assert "would have to go" in results[0]
 
 
 def test_no_optimization_changes_no_number(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,7 +154,7 @@ def test_no_optimization_changes_no_number(shared: Path, monkeypatch: pytest.Mon
     np.testing.assert_array_equal(plans[0].variables, plans[1].variables)
 
 
-def test_what_has_no_c_is_interpreted(own: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_functions_without_c_code_are_interpreted(own: Path, caplog: pytest.LogCaptureFixture) -> None:
     """An integrator of variable step has none; a function of Python's has no text either."""
     method = MultipleShooting(3, "cvodes")
     prepared = prepare(van_der_pol(), method, compiled=True)
@@ -180,7 +180,7 @@ def number(value):
 COUNTED = 'echo once >> "$(dirname "$0")/count"; exec cc "$@"'
 
 
-def test_meshes_share_what_is_compiled(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_meshes_share_compiled_functions(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "counted", COUNTED))
     for method in (Collocation(3), Collocation(9), Collocation(2, mesh=(0.0, 0.1, 1.0))):
         prepared = prepare(van_der_pol(), method, compiled=True)
@@ -199,7 +199,7 @@ def test_processes_compile_once(own: Path, tmp_path: Path, monkeypatch: pytest.M
     assert [file.suffix for file in own.iterdir()] == [".so"]
 
 
-def test_compilers_and_contents_are_told_apart(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compilers_and_contents_are_distinguished(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = number(1), number(2)
     keys = [library.key for library in (one, two)]
     monkeypatch.setenv("CC", script(tmp_path / "another", COUNTED))
@@ -216,13 +216,13 @@ def test_compilers_and_contents_are_told_apart(own: Path, tmp_path: Path, monkey
 
 
 @pytest.mark.parametrize("damage", [b"", b"\x7fELF", None])
-def test_a_damaged_file_is_made_again(own: Path, damage: bytes | None) -> None:
+def test_a_damaged_file_is_written_anew(own: Path, damage: bytes | None) -> None:
     library = build_library(number(4))
     whole = library.read_bytes()
     library.unlink()  # Python has not loaded it
     library.write_bytes(whole[:-1] + b"x" if damage is None else damage)
     assert cache.load_library(number(4).key) is None
-    assert told(build_library(number(4))) == 4
+    assert call_count(build_library(number(4))) == 4
     assert [file.read_bytes() for file in own.iterdir()] == [whole]
 
 
@@ -245,7 +245,7 @@ def test_a_folder_that_may_only_be_read_serves(own: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(os, "utime", refused)
     monkeypatch.setattr(cache, "NamedTemporaryFile", refused)
     assert build_library(number(5)) == library
-    assert told(build_library(number(6))) == 6
+    assert call_count(build_library(number(6))) == 6
     assert build_library(number(6)) != library
 
 
@@ -281,7 +281,7 @@ def test_the_solver_and_its_numbers_depend_on_no_cache_and_no_compiler(
         np.testing.assert_array_equal(plans[-1].variables, plans[0].variables)
 
 
-def test_a_compiler_that_fails_is_told_of_and_not_asked_again(
+def test_a_failing_compiler_is_reported_and_not_tried_again(
     own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "failing", "echo no room on device >&2; exit 1"))
@@ -291,13 +291,13 @@ def test_a_compiler_that_fails_is_told_of_and_not_asked_again(
     assert "no room on device" in caplog.text
 
 
-def test_what_is_not_defined_is_no_library() -> None:
+def test_undefined_functions_are_no_library() -> None:
     """A call of it would be the end of Python."""
     with pytest.raises(CompilerError, match="fails"):
         build_library(Library(("undefined",), lambda: "int gone(void); int number(void) { return gone(); }"))
 
 
-def test_what_is_too_long_is_not_compiled(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_functions_are_not_compiled(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(code_generation, "CODE_SIZES", code_generation.CodeSizes(accepted=10))
     with pytest.raises(CompilerError, match="characters"):
         build_library(number(8))
@@ -423,17 +423,17 @@ def is_gone(pid: int) -> bool:
 def test_a_result_is_the_same_with_an_empty_cache_a_warm_one_and_without_a_compiler(
     own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def found() -> list[bytes | str | int]:
+    def contents() -> list[bytes | str | int]:
         one = prepare(van_der_pol(), Collocation(8, 3)).solve()
         other = prepare(van_der_pol((1.0, 0.0), upper=1.0, lower=-1.0), MultipleShooting(8)).solve()
         parts = [(each.variables.tobytes(), each.multipliers.tobytes(), each.solver) for each in (one, other)]
         return [*parts[0], *parts[1], one.iterations, other.iterations]
 
-    empty = found()
+    empty = contents()
     prepare(van_der_pol(), Collocation(8, 3), compiled=True)
     assert list(own.rglob("*.so")), "the cache is warm now"
-    assert found() == empty
+    assert contents() == empty
     monkeypatch.setenv("CC", "false")
-    assert found() == empty
+    assert contents() == empty
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "another"))
-    assert found() == empty
+    assert contents() == empty

@@ -23,7 +23,7 @@ CASES = {
 }
 
 
-def made(folder: Path) -> Path:
+def compiled_controller(folder: Path) -> Path:
     subprocess.run(["make", f"CFLAGS={STRICT}"], cwd=folder, check=True, capture_output=True)
     return folder / "plan"
 
@@ -33,8 +33,8 @@ def run(program: Path, period: object, *numbers: Array) -> subprocess.CompletedP
     return subprocess.run([str(program), str(period)], input=words, capture_output=True, text=True, check=False)
 
 
-def table(told: str) -> tuple[list[str], Array]:
-    head, *lines = told.splitlines()
+def table(report: str) -> tuple[list[str], Array]:
+    head, *lines = report.splitlines()
     return head.split(","), np.array([[float(word) for word in line.split(",")] for line in lines])
 
 
@@ -49,7 +49,7 @@ def test_the_program_tells_the_plan_and_its_functions_are_those_solved_with(case
     prepared: Any = prepare(swing(), method, solver=solver)
     plan = prepared.solve(SWING)
     assert prepared.to_c(tmp_path / "new" / "folder", SWING, plan) == tmp_path / "new" / "folder"
-    program = made(tmp_path / "new" / "folder")
+    program = compiled_controller(tmp_path / "new" / "folder")
     p = prepared.formulation.parameter_vector(SWING)
     done = run(program, plan.horizon / 7.5, p)
     assert done.returncode == 0, done.stderr
@@ -64,31 +64,33 @@ def test_the_program_tells_the_plan_and_its_functions_are_those_solved_with(case
     words = ["cc", "-shared", "-fPIC", "-w", "-ffp-contract=off", str(program.parent / "plan.c"), "-o", str(library)]
     subprocess.run([*words, "-lm"], check=True)
 
-    def made_of(name: str, *given: Any) -> list[Array]:
-        found = ca.external(f"plan_{name}", str(library)).call([ca.DM(each) for each in given])
-        return [np.asarray(each.full()) for each in found]
+    def values_of(name: str, *options: Any) -> list[Array]:
+        result = ca.external(f"plan_{name}", str(library)).call([ca.DM(each) for each in options])
+        return [np.asarray(each.full()) for each in result]
 
     random = np.random.default_rng(0)
     x = plan.variables + random.uniform(-0.1, 0.1, plan.variables.shape)
     sigma, lam = random.uniform(0.5, 1.0), random.normal(size=plan.multipliers.shape)
-    for name, function, given in (
+    for name, function, options in (
         ("objective", prepared.program.gradient, (x, p)),
         ("constraints", prepared.program.jacobian, (x, p)),
         ("hessian", prepared.program.hessian, (x, p, sigma, lam)),
     ):
-        for ours, theirs in zip(made_of(name, *given), function.call([ca.DM(each) for each in given]), strict=True):
+        for ours, theirs in zip(
+            values_of(name, *options), function.call([ca.DM(each) for each in options]), strict=True
+        ):
             np.testing.assert_array_equal(ours, theirs.full())
     lower, upper = prepared.formulation.bound_values(p)
     transcription = prepared.transcription
     expected = [side[at] for at in (transcription.variable_bounds, transcription.row_bounds) for side in (lower, upper)]
-    for ours, theirs in zip(made_of("bounds", p), expected, strict=True):
+    for ours, theirs in zip(values_of("bounds", p), expected, strict=True):
         np.testing.assert_array_equal(ours.ravel(), theirs)
 
 
 def test_another_plan_and_other_parameters_are_read(tmp_path: Path) -> None:
     prepared: Any = prepare(swing(), Collocation(4))
     prepared.to_c(tmp_path, SWING)
-    program = made(tmp_path)
+    program = compiled_controller(tmp_path)
     other = {name: 1.05 * np.asarray(value) for name, value in SWING.items()}
     plan = prepared.solve(other)
     p = prepared.formulation.parameter_vector(other)
@@ -110,7 +112,7 @@ def test_a_plan_that_is_not_finite_fails(tmp_path: Path) -> None:
     prepared.to_c(tmp_path, guess=plan)
     broken = plan.variables.copy()
     broken[5] = np.nan
-    assert run(made(tmp_path), 0.5, broken).returncode == 1
+    assert run(compiled_controller(tmp_path), 0.5, broken).returncode == 1
 
 
 def test_names_are_written_as_they_are(tmp_path: Path) -> None:
@@ -121,11 +123,11 @@ def test_names_are_written_as_they_are(tmp_path: Path) -> None:
     problem.horizon(1.0)
     problem.minimize(running=u**2)
     prepared: Any = prepare(problem, Collocation(2))
-    done = run(made(prepared.to_c(tmp_path, guess=prepared.solve())), 1.0)
+    done = run(compiled_controller(prepared.to_c(tmp_path, guess=prepared.solve())), 1.0)
     assert done.stdout.splitlines()[0] == "time,größe,u"
 
 
-def test_what_has_no_c_is_refused(tmp_path: Path) -> None:
+def test_functions_without_c_code_are_refused(tmp_path: Path) -> None:
     prepared: Any = prepare(van_der_pol(), MultipleShooting(2, "cvodes"))
     with pytest.raises(ProblemError, match="has no C"):
         prepared.to_c(tmp_path / "none")
@@ -133,7 +135,7 @@ def test_what_has_no_c_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "match"),
+    ("options", "match"),
     [
         ({"folder": 3}, "path"),
         ({"parameters": 3}, "parameters"),
@@ -142,10 +144,10 @@ def test_what_has_no_c_is_refused(tmp_path: Path) -> None:
         ({"guess": 3}, "guess"),
     ],
 )
-def test_bad_input_is_refused(given: dict[str, Any], match: str, tmp_path: Path) -> None:
+def test_bad_input_is_refused(options: dict[str, Any], match: str, tmp_path: Path) -> None:
     prepared: Any = prepare(van_der_pol(), Collocation(2))
     with pytest.raises(ProblemError, match=match):
-        prepared.to_c(**{"folder": tmp_path / "bad", **given})
+        prepared.to_c(**{"folder": tmp_path / "bad", **options})
     assert not (tmp_path / "bad").exists()
 
 
@@ -155,5 +157,5 @@ def test_a_plan_is_written_over_an_older_one(tmp_path: Path) -> None:
     problem.minimize(running=u**2)
     for how, cost in ((Collocation(2), 4.0), (MultipleShooting(3), 4.0)):
         prepared: Any = prepare(problem, how)
-        done = run(made(prepared.to_c(tmp_path, guess=prepared.solve())), 1.0)
+        done = run(compiled_controller(prepared.to_c(tmp_path, guess=prepared.solve())), 1.0)
         assert float(done.stderr.split()[1].rstrip(",")) == pytest.approx(cost)

@@ -30,15 +30,15 @@ METHODS: dict[str, Any] = {
 
 def differences(prepared: Any, solution: Solution, parameters: dict[str, Any]) -> dict[str, Array]:
     """Central differences of the optimal cost in every parameter."""
-    found = {}
+    by_name = {}
     for name, value in parameters.items():
         entries = np.atleast_1d(np.asarray(value, dtype=float))
         slopes = []
         for shift in STEP * np.eye(entries.size):
             ahead, behind = (prepared.solve({**parameters, name: entries + s * shift}, solution) for s in (1, -1))
             slopes.append((ahead.cost - behind.cost) / (2 * STEP))
-        found[name] = np.array(slopes)
-    return found
+        by_name[name] = np.array(slopes)
+    return by_name
 
 
 def assert_gradients(prepared: Any, parameters: dict[str, Any], tolerance: float) -> Solution:

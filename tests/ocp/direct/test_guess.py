@@ -90,7 +90,7 @@ def test_values_of_every_kind_are_held(value: Any) -> None:
         assert np.all(entries(transcription, point, "state", entry)[1] == expected)
 
 
-def test_what_is_not_guessed_is_a_line_between_the_ends_or_the_middle_of_the_bounds() -> None:
+def test_missing_guesses_are_lines_between_the_ends_or_the_middle_of_the_bounds() -> None:
     transcription, point = start(free_time(guess=3.0), Collocation(4), None)
     s, values = entries(transcription, point, "state", 0)
     np.testing.assert_allclose(values, s, atol=1e-14)
@@ -156,7 +156,7 @@ def test_a_solution_is_stretched_over_another_horizon_and_started_from_its_own()
     assert point[transcription.horizon] == pytest.approx(free.horizon)
 
 
-def test_a_solution_of_another_problem_gives_what_it_shares() -> None:
+def test_a_solution_of_another_problem_guesses_the_shared_variables() -> None:
     other = Problem("other")
     x = other.state("x", 2, initial=[1.0, 0.0])
     u, w = other.control("u"), other.control("w")

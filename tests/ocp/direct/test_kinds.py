@@ -35,14 +35,14 @@ def driven(symbols: Any, hill: Any) -> Problem:
 @pytest.mark.parametrize("method", METHODS)
 def test_an_interpolant_inside_the_dynamics_is_as_good_as_its_formula(method: str, solver: str) -> None:
     """The way has the length int (1 + x^2/2) dx = l, and the best speed along it is constant: cost l^2 / 2."""
-    looked_up = solve(driven(ca.MX, table()), METHODS[method], solver=solver)
+    interpolated = solve(driven(ca.MX, table()), METHODS[method], solver=solver)
     formula = solve(driven(ca.SX, lambda x: 1 + x**2 / 2), METHODS[method], solver=solver)
     length = 1.5 + 1.5**3 / 6
-    assert looked_up.cost == pytest.approx(formula.cost, abs=1e-8)
-    assert looked_up.cost == pytest.approx(length**2 / 2, rel=2e-3)
-    assert relative(looked_up["x"], formula["x"]) < 1e-7
-    assert relative(looked_up.costate("x"), formula.costate("x")) < 1e-6
-    assert "integration error, relative" not in {finding.name for finding in looked_up.audit().failures}
+    assert interpolated.cost == pytest.approx(formula.cost, abs=1e-8)
+    assert interpolated.cost == pytest.approx(length**2 / 2, rel=2e-3)
+    assert relative(interpolated["x"], formula["x"]) < 1e-7
+    assert relative(interpolated.costate("x"), formula.costate("x")) < 1e-6
+    assert "integration error, relative" not in {finding.name for finding in interpolated.audit().failures}
 
 
 def test_an_interpolant_in_a_problem_of_sx_symbols_is_refused() -> None:

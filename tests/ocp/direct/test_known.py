@@ -38,15 +38,15 @@ def clocked(limit: str, end: float | None = None, upper: float | None = None, ho
 
 @EVERY
 @pytest.mark.parametrize("limit", ["clock", "band", "under", "none"])
-@pytest.mark.parametrize("given", [{}, {"end": 1.0}, {"upper": 1.0}, {"end": 1.0, "upper": 1.0}], ids=str)
-def test_a_clock_kept_as_a_state_changes_nothing(method: Any, limit: str, given: Any) -> None:
-    solution = solve(clocked(limit, **given), method)
+@pytest.mark.parametrize("options", [{}, {"end": 1.0}, {"upper": 1.0}, {"end": 1.0, "upper": 1.0}], ids=str)
+def test_time_as_a_state_changes_no_solution(method: Any, limit: str, options: Any) -> None:
+    solution = solve(clocked(limit, **options), method)
     assert solution.start == "guess"
     assert solution.cost == pytest.approx(1.0, rel=1e-6)
     np.testing.assert_allclose(solution["c"][:, 0], solution.t, atol=1e-12)
 
 
-def test_a_clock_that_is_asked_for_another_time_is_told() -> None:
+def test_a_conflicting_end_time_of_a_clock_is_reported() -> None:
     with pytest.raises(SolveError, match=r"c is missed by 0\.5"):
         solve(clocked("none", end=1.5), Collocation(5))
     with pytest.raises(SolveError, match=r"limit is missed by 0\.5"):

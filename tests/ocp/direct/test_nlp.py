@@ -83,7 +83,7 @@ def test_ipopt_and_fatrop_agree_without_inequalities_to_rounding(method: str) ->
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("method", METHODS)
-def test_plans_keep_the_bounds_that_were_asked(method: str, solver: str) -> None:
+def test_plans_respect_the_requested_bounds(method: str, solver: str) -> None:
     solution = solve(energy(lower=-5.0, upper=5.0), METHODS[method], solver=solver)
     values = solution.control_interpolant.values
     assert values.max() <= 5.0
@@ -152,7 +152,7 @@ def too_far() -> Problem:
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("method", METHODS)
-def test_an_infeasible_problem_names_what_is_missed_and_where(method: str, solver: str) -> None:
+def test_an_infeasible_problem_names_the_violated_constraint_and_place(method: str, solver: str) -> None:
     with pytest.raises(SolveError) as caught:
         solve(too_far(), METHODS[method], solver=solver)
     message = str(caught.value)
@@ -192,19 +192,19 @@ def no_least_cost() -> Problem:
     ],
     ids=["iteration limit", "deadpoint", "unbounded"],
 )
-def test_what_casadi_reports_of_sleqp_as_success_is_a_failure(
+def test_a_false_success_of_sleqp_is_a_failure(
     problem: Problem, options: dict[str, Any], word: str, status: SolverStatus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = []
+    results = []
 
     def call_solver(solver: Any, *arguments: Any) -> nlp.Outcome:
         outcome = nlp.call_solver(solver, *arguments)
-        told.append((solver.stats()["return_status"], solver.stats()["success"]))
+        results.append((solver.stats()["return_status"], solver.stats()["success"]))
         return outcome
 
     monkeypatch.setattr(prepared, "call_solver", call_solver)
     solution = solve(problem, MultipleShooting(4), solver="sleqp", options=options, check=False)
-    assert told[-1] == (word, True)
+    assert results[-1] == (word, True)
     assert (solution.success, solution.status) == (False, status)
     with pytest.raises(SolveError, match=str(status)):
         solve(problem, MultipleShooting(4), solver="sleqp", options=options)
@@ -219,14 +219,14 @@ def test_conflicting_constraints_are_named() -> None:
         solve(problem, Collocation(5))
 
 
-def test_a_stop_before_the_optimum_is_told() -> None:
+def test_a_stop_before_the_optimum_is_reported() -> None:
     with pytest.raises(SolveError, match="Maximum_Iterations_Exceeded") as caught:
         solve(van_der_pol(), Collocation(5), options={"max_iter": 1})
     assert caught.value.solution is not None
     assert caught.value.solution.t.shape == (16,)
 
 
-def test_a_feasible_plan_that_is_not_optimal_is_told_so() -> None:
+def test_a_feasible_plan_that_is_not_optimal_is_reported_as_such() -> None:
     """Linear dynamics are met after one step; the cost is far from its optimum."""
     problem, x, u = plant("quartic", initial=1.0, u={"guess": 5.0})
     problem.dynamics(x, u - x)
@@ -269,7 +269,7 @@ def test_fatrop_does_not_hang_on_functions_that_are_not_finite() -> None:
     assert "told: problem 'rooted'" in done.stdout, done.stderr
 
 
-def test_an_unbounded_cost_is_told() -> None:
+def test_an_unbounded_cost_is_reported() -> None:
     problem, x, u = plant("endless", initial=1.0)
     problem.dynamics(x, u)
     problem.minimize(running=u)

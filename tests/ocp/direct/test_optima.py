@@ -30,7 +30,7 @@ every_method = pytest.mark.parametrize("method", FINE)
 
 @pytest.mark.parametrize("name", PROBLEMS)
 @every_method
-def test_what_is_found_is_stationary_and_feasible_in_the_program(name: str, method: str) -> None:
+def test_solutions_are_stationary_and_feasible_in_the_program(name: str, method: str) -> None:
     problem, parameters = PROBLEMS[name]
     prepared = prepare(problem(), FINE[method])
     assert isinstance(prepared, Prepared)
@@ -50,10 +50,10 @@ def test_what_is_found_is_stationary_and_feasible_in_the_program(name: str, meth
     ):
         assert np.all(value >= lower - 1e-9)
         assert np.all(value <= upper + 1e-9)
-        given = lower == upper
+        options = lower == upper
         # what pushes stands at its limit, and at the right one
-        assert np.all(np.maximum(push, 0)[~given] * np.minimum(1.0, (upper - value)[~given]) < 1e-8)
-        assert np.all(np.maximum(-push, 0)[~given] * np.minimum(1.0, (value - lower)[~given]) < 1e-8)
+        assert np.all(np.maximum(push, 0)[~options] * np.minimum(1.0, (upper - value)[~options]) < 1e-8)
+        assert np.all(np.maximum(-push, 0)[~options] * np.minimum(1.0, (value - lower)[~options]) < 1e-8)
 
 
 @pytest.mark.parametrize("name", ["swing", "moved"])
@@ -97,10 +97,10 @@ def test_other_parameters_may_make_equalities_of_limits() -> None:
     problem.minimize(running=x**2 + 0.1 * ca.sumsqr(u))
     prepared = prepare(problem, Collocation(6))
     for value in (0.0, 0.5, 0.0, 50.0, 0.5):
-        found, anew = prepared.solve({"reach": value}), solve(problem, Collocation(6), parameters={"reach": value})
-        assert found.cost == pytest.approx(anew.cost, rel=1e-9)
+        result, anew = prepared.solve({"reach": value}), solve(problem, Collocation(6), parameters={"reach": value})
+        assert result.cost == pytest.approx(anew.cost, rel=1e-9)
         if value == 0.0:
-            np.testing.assert_allclose(found["u"][:, 1], 0.0, atol=1e-12)
+            np.testing.assert_allclose(result["u"][:, 1], 0.0, atol=1e-12)
 
 
 def test_the_ceiling_that_leaves_no_freedom_is_reached() -> None:
@@ -189,16 +189,16 @@ def test_a_stationary_plan_that_is_no_minimum_is_left() -> None:
 def test_two_threads_solve_at_once() -> None:
     prepared = [prepare(van_der_pol(), Collocation(n)) for n in (20, 30)]
     expected = [one.solve().cost for one in prepared]
-    found: list[list[float]] = [[], []]
+    results: list[list[float]] = [[], []]
 
     def work(i: int) -> None:
         for _ in range(5):
-            found[i].append(prepare(van_der_pol(), Collocation((20, 30)[i])).solve().cost)
-            found[i].append(prepared[i].solve().cost)
+            results[i].append(prepare(van_der_pol(), Collocation((20, 30)[i])).solve().cost)
+            results[i].append(prepared[i].solve().cost)
 
     threads = [threading.Thread(target=work, args=(i,)) for i in range(2)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert [set(costs) for costs in found] == [{cost} for cost in expected]
+    assert [set(costs) for costs in results] == [{cost} for cost in expected]

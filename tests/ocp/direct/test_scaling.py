@@ -41,8 +41,8 @@ def race(metre: float, second: float, guess: bool) -> Problem:
     u = problem.control("u", lower=-metre / second**2, upper=metre / second**2)
     problem.dynamics(q, v)
     problem.dynamics(v, u)
-    told: dict[str, Any] = {"guess": second} if guess else {}
-    problem.minimize(terminal=problem.horizon(lower=1e-3 * second, upper=100 * second, **told))
+    report: dict[str, Any] = {"guess": second} if guess else {}
+    problem.minimize(terminal=problem.horizon(lower=1e-3 * second, upper=100 * second, **report))
     return problem
 
 
@@ -112,7 +112,7 @@ def test_gradients_of_the_cost_stay_in_the_units_of_the_problem(metre: float) ->
     assert solution.cost_gradient("far")[0] == pytest.approx(12 * metre, rel=1e-8)
 
 
-def test_what_is_near_one_is_left_alone() -> None:
+def test_variables_near_one_are_not_scaled() -> None:
     a, b = (prepare(swing(), Collocation(8), scaling=scaling).solve(SWING) for scaling in (True, False))
     np.testing.assert_array_equal(a.variables, b.variables)
     np.testing.assert_array_equal(a.multipliers, b.multipliers)
@@ -136,14 +136,14 @@ def test_a_scaled_program_is_the_program_in_other_variables() -> None:
     np.testing.assert_allclose(curved, program.hessian(x, p, 1.5 / c, lam / b).full() * a * a[:, None], rtol=1e-13)
 
 
-def told(problem: Problem, method: Any, scaling: bool = True) -> str:
+def reported_scaling(problem: Problem, method: Any, scaling: bool = True) -> str:
     with pytest.raises(SolveError) as caught:
         prepare(problem, method, scaling=scaling).solve()
     return str(caught.value)
 
 
-def test_what_is_badly_scaled_is_called_so_and_nothing_else() -> None:
-    words = told(drive(1e9, 1.0, push=5.0), Collocation(8), scaling=False)
+def test_only_badly_scaled_problems_are_reported_as_such() -> None:
+    words = reported_scaling(drive(1e9, 1.0, push=5.0), Collocation(8), scaling=False)
     assert "badly scaled: " in words
     assert "leave scaling on" in words
     assert "meets all constraints" not in words
@@ -151,18 +151,21 @@ def test_what_is_badly_scaled_is_called_so_and_nothing_else() -> None:
     assert "would have to go" not in words
 
 
-def test_what_cannot_be_is_not_called_badly_scaled() -> None:
-    words = told(drive(1e9, 1.0, push=3.0), Collocation(8))
+def test_infeasible_problems_are_not_reported_as_badly_scaled() -> None:
+    words = reported_scaling(drive(1e9, 1.0, push=3.0), Collocation(8))
     assert "badly scaled" not in words
     assert "u would have to go" in words
 
 
 def test_nothing_is_called_impossible_and_possible_at_once() -> None:
-    for words in (told(drive(1.0, 1.0, push=3.0), Collocation(8)), told(drive(1e9, 1.0, push=3.0), Collocation(8))):
+    for words in (
+        reported_scaling(drive(1.0, 1.0, push=3.0), Collocation(8)),
+        reported_scaling(drive(1e9, 1.0, push=3.0), Collocation(8)),
+    ):
         assert not ("no point near the guess" in words and "\nall constraints can hold together" in words)
 
 
-def test_conflicts_are_told_in_the_units_of_the_problem() -> None:
+def test_conflicts_are_reported_in_the_units_of_the_problem() -> None:
     """4 m/s^2 are needed."""
     with pytest.raises(SolveError) as caught:
         solve(drive(1e9, 1.0, push=3.0), Collocation(20))

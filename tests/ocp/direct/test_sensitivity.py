@@ -69,7 +69,7 @@ CASES: dict[str, tuple[Callable[[], Problem], Method, dict[str, Any], str]] = {
 STEPS = ((1.0, 8 / 12), (2.0, -1 / 12))  # of the central difference of fourth order
 
 
-def told(plan: Solution) -> dict[str, np.ndarray]:
+def sensitivities(plan: Solution) -> dict[str, np.ndarray]:
     return {**plan.states, **plan.controls, "horizon": np.array([plan.horizon])}
 
 
@@ -78,25 +78,25 @@ def test_derivatives_are_the_differences_of_plans_solved_again(case: str) -> Non
     build, method, parameters, name = CASES[case]
     prepared = prepare(build(), method)
     plan = prepared.solve(parameters)
-    found = plan.sensitivity(name)
-    assert isinstance(found, Sensitivity)
-    for k in range(len(found.value)):
-        room = min(found.value[k] - found.lower[k], found.upper[k] - found.value[k])
+    result = plan.sensitivity(name)
+    assert isinstance(result, Sensitivity)
+    for k in range(len(result.value)):
+        room = min(result.value[k] - result.lower[k], result.upper[k] - result.value[k])
         assert room > 0
         h = min(2e-3, 0.4 * room)
-        rates = {key: np.zeros_like(value) for key, value in told(plan).items()}
+        rates = {key: np.zeros_like(value) for key, value in sensitivities(plan).items()}
         cost = 0.0
         for steps, weight in STEPS:
             for sign in (1.0, -1.0):
-                value = found.value.copy()
+                value = result.value.copy()
                 value[k] += sign * steps * h
                 other = prepared.solve({**parameters, name: value}, plan)
                 cost += sign * weight / h * other.cost
-                for key, values in told(other).items():
+                for key, values in sensitivities(other).items():
                     rates[key] += sign * weight / h * values
-        assert found.cost[k] == pytest.approx(cost, rel=1e-6, abs=1e-6)
+        assert result.cost[k] == pytest.approx(cost, rel=1e-6, abs=1e-6)
         for key, rate in rates.items():
-            mine = found.horizon[[k]] if key == "horizon" else found[key][:, :, k]
+            mine = result.horizon[[k]] if key == "horizon" else result[key][:, :, k]
             assert relative(mine, rate) < 1e-6, key
 
 
@@ -108,44 +108,44 @@ def test_the_range_ends_where_the_limits_that_push_change() -> None:
     """Within the reported range the active torques stay the same, to first order; the next limit is named."""
     prepared = prepare(loaded(4.0), Collocation(8))
     plan = prepared.solve({"payload": 0.5})
-    found = plan.sensitivity("payload")
+    result = plan.sensitivity("payload")
     assert pushing(plan, 4.0).any()
-    assert found.lower[0] < 0.5 < found.upper[0]
-    inside = [found.value + 0.9 * (end - found.value) for end in (found.lower, found.upper)]
-    outside = [found.value + 1.5 * (end - found.value) for end in (found.lower, found.upper)]
+    assert result.lower[0] < 0.5 < result.upper[0]
+    inside = [result.value + 0.9 * (end - result.value) for end in (result.lower, result.upper)]
+    outside = [result.value + 1.5 * (end - result.value) for end in (result.lower, result.upper)]
     now = pushing(plan, 4.0)
     for value in inside:
         assert np.array_equal(pushing(prepared.solve({"payload": value}), 4.0), now)
     for value in outside:
         assert not np.array_equal(pushing(prepared.solve({"payload": value}), 4.0), now)
-    assert all("torque" in word for word in found.limits[0])
-    assert f"payload = 0.5: same active limits from {found.lower[0]:.6g}" in str(found)
+    assert all("torque" in word for word in result.limits[0])
+    assert f"payload = 0.5: same active limits from {result.lower[0]:.6g}" in str(result)
 
 
 def test_a_linear_plan_moves_linearly_without_end() -> None:
     """x' = u, int u^2 from 0 to w in 1 s: u = w, whatever w."""
     problem = Problem("linear")
-    way = problem.parameter("way")
-    x, u = problem.state("x", initial=0.0, terminal=way), problem.control("u")
+    path = problem.parameter("way")
+    x, u = problem.state("x", initial=0.0, terminal=path), problem.control("u")
     problem.dynamics(x, u)
     problem.horizon(1.0)
     problem.minimize(running=u**2)
-    found = solve(problem, Collocation(3), parameters={"way": 2.0}).sensitivity("way")
-    np.testing.assert_allclose(found["u"], 1.0, atol=1e-9)
-    np.testing.assert_allclose(found["x"][:, 0, 0], found.t, atol=1e-9)
-    assert (found.lower[0], found.upper[0], found.limits[0]) == (-np.inf, np.inf, ("", ""))
-    assert found.cost[0] == pytest.approx(4.0, abs=1e-8)
-    assert found.horizon[0] == 0.0
+    result = solve(problem, Collocation(3), parameters={"way": 2.0}).sensitivity("way")
+    np.testing.assert_allclose(result["u"], 1.0, atol=1e-9)
+    np.testing.assert_allclose(result["x"][:, 0, 0], result.t, atol=1e-9)
+    assert (result.lower[0], result.upper[0], result.limits[0]) == (-np.inf, np.inf, ("", ""))
+    assert result.cost[0] == pytest.approx(4.0, abs=1e-8)
+    assert result.horizon[0] == 0.0
 
 
 def test_a_plan_that_was_saved_tells_how_it_moves(tmp_path: Any) -> None:
     plan = solve(loaded(4.0), Collocation(6), parameters={"payload": 0.5})
     plan.save(tmp_path / "plan.npz")
-    found, again = (p.sensitivity("payload") for p in (plan, Solution.load(tmp_path / "plan.npz")))
-    np.testing.assert_array_equal(found["torque"], again["torque"])
+    result, again = (p.sensitivity("payload") for p in (plan, Solution.load(tmp_path / "plan.npz")))
+    np.testing.assert_array_equal(result["torque"], again["torque"])
 
 
-def test_what_cannot_tell_how_it_moves_is_refused() -> None:
+def test_solutions_without_derivatives_are_refused() -> None:
     plan = solve(loaded(), Collocation(4), parameters={"payload": 0.5})
     wrong: Any
     for wrong in ("payloat", None, ["payload"], 3):

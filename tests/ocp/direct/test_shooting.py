@@ -69,7 +69,7 @@ def test_costates_of_shooting_converge(control: str) -> None:
 
 
 @pytest.mark.parametrize("n", [2, 5, 50])
-def test_held_controls_of_the_double_integrator_cost_exactly_what_they_must(n: int) -> None:
+def test_piecewise_constant_controls_of_the_double_integrator_have_their_exact_cost(n: int) -> None:
     """The best N held controls cost 6 N^2 / (N^2 - 1)."""
     assert solve(energy(), MultipleShooting(n)).cost == pytest.approx(6 * n**2 / (n**2 - 1), abs=1e-9)
 

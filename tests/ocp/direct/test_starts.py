@@ -65,16 +65,16 @@ def test_a_swing_up_is_found_whatever_the_guess(method: Any) -> None:
         assert solution["angle"][-1, 0] == pytest.approx(np.pi, abs=1e-9)
 
 
-def test_the_start_that_worked_is_told_and_saved(tmp_path: Any) -> None:
+def test_the_successful_start_is_reported_and_saved(tmp_path: Any) -> None:
     rng = np.random.default_rng(7)
-    found = [solve(race(rng)[0], Collocation(20)) for _ in range(6)]
-    other = next(plan for plan in found if plan.start != "guess")
+    matches = [solve(race(rng)[0], Collocation(20)) for _ in range(6)]
+    other = next(plan for plan in matches if plan.start != "guess")
     other.save(tmp_path / "plan.npz")
     assert Solution.load(tmp_path / "plan.npz").start == other.start
     assert solve(van_der_pol(), Collocation(5)).start == "guess"
 
 
-def test_an_error_tells_what_became_of_every_start() -> None:
+def test_an_error_reports_the_outcome_of_every_start() -> None:
     problem, x, u = plant("too far", initial=0.5, terminal=2.0, u={"lower": -0.1, "upper": 0.1, "guess": 0.05})
     problem.dynamics(x, u)
     problem.minimize(running=u**2)

@@ -52,15 +52,15 @@ def test_the_costate_rate_is_minus_the_slope_of_the_least_hamiltonian(name: str,
     def least(x: Array, lam: Array, T: Array) -> float:
         return float(outputs(x, lam, at[2], T, at[4], *tail)[2])
 
-    found = [np.asarray(out.full()).ravel() for out in flow(*at, *tail)]
+    matches = [np.asarray(out.full()).ravel() for out in flow(*at, *tail)]
     step = 1e-6
     for i, unit in enumerate(np.eye(form.nx)):
         by_x = (least(at[0] + step * unit, at[1], at[3]) - least(at[0] - step * unit, at[1], at[3])) / (2 * step)
         by_lam = (least(at[0], at[1] + step * unit, at[3]) - least(at[0], at[1] - step * unit, at[3])) / (2 * step)
-        assert found[1][i] == pytest.approx(-by_x, abs=1e-7)
-        assert found[0][i] == pytest.approx(by_lam, abs=1e-7)
+        assert matches[1][i] == pytest.approx(-by_x, abs=1e-7)
+        assert matches[0][i] == pytest.approx(by_lam, abs=1e-7)
     by_horizon = (least(at[0], at[1], at[3] + step) - least(at[0], at[1], at[3] - step)) / (2 * step)
-    assert found[3][0] == pytest.approx(by_horizon, abs=1e-7)
+    assert matches[3][0] == pytest.approx(by_horizon, abs=1e-7)
 
 
 @pytest.mark.parametrize("name", SMOOTH)
@@ -100,7 +100,7 @@ def joined(form: Formulation, x: Array, t: Array, T: Array, p: Array) -> tuple[A
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
-def test_smooth_and_linear_controls_are_told_apart(symbols: Any) -> None:
+def test_smooth_and_linear_controls_are_distinguished(symbols: Any) -> None:
     problem, x, u = plant("kinds", symbols=symbols, initial=0.0, u={"size": 2, "lower": -1, "upper": 1})
     w = problem.control("w", 2)
     b = problem.control("b", lower=-1, upper=2)
@@ -214,7 +214,7 @@ BACKWARD: dict[str, tuple[Callable[[], Problem], str]] = {
 
 
 @pytest.mark.parametrize("kind", BACKWARD)
-def test_backward_shooting_says_what_it_cannot_take(kind: str) -> None:
+def test_backward_shooting_names_unsupported_problems(kind: str) -> None:
     build, message = BACKWARD[kind]
     with pytest.raises(ProblemError, match=rf"backward shooting does not support.*{message}.*shooting='multiple'"):
         prepare(build(), Indirect(shooting="backward"))
@@ -243,7 +243,7 @@ def test_bad_settings_are_refused(arguments: dict[str, Any], message: str) -> No
         Indirect(**arguments)
 
 
-def test_what_is_no_problem_and_no_solver_is_refused() -> None:
+def test_invalid_problems_and_solvers_are_refused() -> None:
     with pytest.raises(ProblemError, match="a Problem is expected, not str"):
         prepare("energy", Indirect())  # type: ignore[arg-type]
     words = "solver must be 'ipopt' or 'fatrop' or 'sleqp', not 'snopt'"
@@ -291,7 +291,7 @@ def test_a_guess_without_costates_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("guess", "message"), [(3, "guess must be"), ({"speed": 1.0}, "variable in guess")])
-def test_what_is_no_guess_is_refused(guess: Any, message: str) -> None:
+def test_invalid_guesses_are_refused(guess: Any, message: str) -> None:
     with pytest.raises(ProblemError, match=message):
         solve(energy(), Indirect(), guess=guess)
 
@@ -350,7 +350,7 @@ def test_singular_arcs_and_chattering_are_named(build: Callable[[], Problem]) ->
     assert "singular arc" in unsolved.message
 
 
-def test_chattering_is_told_from_the_switches_of_the_seed() -> None:
+def test_chattering_is_distinguished_from_the_switches_of_the_seed() -> None:
     """A seed whose switching function changes sign at every other reported time."""
     problem = bang_bang()
     seed = solve(problem, Collocation(40, control="held"), parameters=EXTREMA["bang-bang"].parameters)
@@ -369,7 +369,7 @@ def oscillator(horizon: float, rate: float) -> Problem:
 
 
 @pytest.mark.parametrize(("horizon", "rate"), [(1.0, 0.2), (8.0, 0.3)])
-def test_the_switches_of_another_problem_are_found_out(horizon: float, rate: float) -> None:
+def test_switches_of_another_problem_are_detected(horizon: float, rate: float) -> None:
     """Newton's method converges all the same: only the sign of the switching function tells."""
     right = solve(oscillator(8.0, 1.7), Indirect())
     seed = solve(oscillator(horizon, rate), Collocation(40, control="held"))
@@ -489,7 +489,7 @@ def stiff(shove: float) -> Problem:
 
 
 @pytest.mark.parametrize("shooting", ["multiple", "backward"])
-def test_newton_from_a_bad_guess_says_so_and_returns_what_it_has(
+def test_newton_from_a_bad_guess_reports_failure_with_its_last_iterate(
     shooting: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     guess = solve(stiff(0.0), Collocation(5))

@@ -402,8 +402,8 @@ def test_the_status_says_that_it_seeded_itself() -> None:
     problem = energy()
     own = solve(problem, Indirect(seed=Collocation(7)))
     assert "seeded by its own direct solution (Collocation, 7 intervals)" in own.message
-    given = solve(problem, Indirect(), guess=solve(problem, Collocation(7)))
-    assert "seeded" not in given.message
+    options = solve(problem, Indirect(), guess=solve(problem, Collocation(7)))
+    assert "seeded" not in options.message
     assert "seeded" in solve(problem, Indirect(), guess={"q": 0.3}).message
 
 

@@ -31,31 +31,31 @@ def test_a_null_space_is_orthonormal_unseen_and_as_large_as_the_rank_leaves_it(
     rng = np.random.default_rng(seed)
     rank, size = min(rank, m, n), 10.0**power
     rows = of_rank(rng, m, n, rank, size)
-    found = null_space(rows)
-    assert found.shape == (n, n - rank)
-    assert found.T @ found == pytest.approx(np.eye(n - rank), abs=1e-12)
-    assert rows @ found == pytest.approx(np.zeros((m, n - rank)), abs=1e-12 * size)
+    result = null_space(rows)
+    assert result.shape == (n, n - rank)
+    assert result.T @ result == pytest.approx(np.eye(n - rank), abs=1e-12)
+    assert rows @ result == pytest.approx(np.zeros((m, n - rank)), abs=1e-12 * size)
 
 
 @given(seeds, st.integers(1, 5), st.integers(2, 6))
-def test_rows_that_are_zero_or_told_again_in_another_unit_change_no_null_space(seed: int, m: int, n: int) -> None:
+def test_zero_rows_and_rows_repeated_in_another_unit_change_no_null_space(seed: int, m: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(m, n))
-    found = null_space(rows)
+    result = null_space(rows)
     for other in (
         np.vstack([rows, np.zeros((2, n))]),
         np.vstack([rows, rng.normal(size=(m, m)) @ rows]),
         10.0 ** rng.uniform(-3, 3, (m, 1)) * rows,
     ):
         same = null_space(other)
-        assert same @ same.T == pytest.approx(found @ found.T, abs=1e-9)
+        assert same @ same.T == pytest.approx(result @ result.T, abs=1e-9)
 
 
 @pytest.mark.parametrize("n", [1, 4])
 def test_without_rows_or_with_zeros_alone_every_direction_is_free(n: int) -> None:
     for rows in (np.zeros((0, n)), np.zeros((3, n))):
-        found = null_space(rows)
-        assert found.T @ found == pytest.approx(np.eye(n), abs=0)
+        result = null_space(rows)
+        assert result.T @ result == pytest.approx(np.eye(n), abs=0)
 
 
 def verdict(
@@ -113,35 +113,35 @@ units = pytest.mark.parametrize(("cost", "unit"), [(1.0, 1.0), (1e8, 1.0), (1e-8
 
 
 @units
-def test_the_closed_form_is_least_and_what_is_beside_it_is_not_in_any_unit(cost: float, unit: float) -> None:
+def test_the_closed_form_is_the_minimum_in_any_unit(cost: float, unit: float) -> None:
     for costate in (0.5, -2.0):
         least = np.array([-costate / 1.0, -costate / 4.0])
-        told: dict[str, Any] = {"costate": costate, "curvatures": (1.0, 4.0), "cost": cost, "unit": unit}
-        assert verdict(least, **told) == ""
-        assert verdict(least * (1 + 1e-8), **told) == ""
-        assert "not minimal in control 'u[1]'" in verdict(least * [1, 1 + 1e-4], **told)
+        by_name: dict[str, Any] = {"costate": costate, "curvatures": (1.0, 4.0), "cost": cost, "unit": unit}
+        assert verdict(least, **by_name) == ""
+        assert verdict(least * (1 + 1e-8), **by_name) == ""
+        assert "not minimal in control 'u[1]'" in verdict(least * [1, 1 + 1e-4], **by_name)
 
 
 @units
 def test_a_control_at_its_bound_must_push_outwards(cost: float, unit: float) -> None:
-    told: dict[str, Any] = {"lower": [-3.0, -3.0], "upper": [5.0, 5.0], "cost": cost, "unit": unit}
+    by_name: dict[str, Any] = {"lower": [-3.0, -3.0], "upper": [5.0, 5.0], "cost": cost, "unit": unit}
     for costate, bound in ((7.0, -3.0), (-7.0, 5.0)):  # H is least beyond it
-        assert verdict([bound, bound], costate, **told) == ""
-        assert "not minimal" in verdict([bound, bound + 1e-3 * np.sign(costate)], costate, **told)
-        assert "not minimal" in verdict([bound, 2 - bound], costate, **told)  # the other bound
-        assert "not minimal" in verdict([bound, bound], -costate, **told)
+        assert verdict([bound, bound], costate, **by_name) == ""
+        assert "not minimal" in verdict([bound, bound + 1e-3 * np.sign(costate)], costate, **by_name)
+        assert "not minimal" in verdict([bound, 2 - bound], costate, **by_name)  # the other bound
+        assert "not minimal" in verdict([bound, bound], -costate, **by_name)
     # a stationary control on its bound need not push
-    assert verdict([-3.0, -3.0], 3.0, **told) == verdict([5.0, 5.0], -5.0, **told) == ""
+    assert verdict([-3.0, -3.0], 3.0, **by_name) == verdict([5.0, 5.0], -5.0, **by_name) == ""
 
 
 @pytest.mark.parametrize("width", [1e3, 2.0, 1e-3])
 @pytest.mark.parametrize("middle", [0.0, 0.4])
-def test_a_bound_holds_what_is_nearer_than_a_billionth_of_its_range(width: float, middle: float) -> None:
+def test_bounds_fix_variables_within_a_billionth_of_their_range(width: float, middle: float) -> None:
     low, high = middle - width / 2, middle + width / 2
-    told: dict[str, Any] = {"lower": [low, low], "upper": [high, high]}
+    by_name: dict[str, Any] = {"lower": [low, low], "upper": [high, high]}
     for costate, bound, inwards in ((2 * width + 1, low, 1.0), (-2 * width - 1, high, -1.0)):
-        assert verdict([bound, bound + inwards * 0.5e-9 * width], costate, **told) == ""
-        assert "not minimal" in verdict([bound, bound + inwards * 3e-9 * width], costate, **told)
+        assert verdict([bound, bound + inwards * 0.5e-9 * width], costate, **by_name) == ""
+        assert "not minimal" in verdict([bound, bound + inwards * 3e-9 * width], costate, **by_name)
 
 
 def test_between_equal_bounds_any_slope_is_held() -> None:
@@ -150,19 +150,19 @@ def test_between_equal_bounds_any_slope_is_held() -> None:
 
 
 @units
-def test_what_curves_downwards_is_stationary_but_not_least_unless_held(cost: float, unit: float) -> None:
-    told: dict[str, Any] = {"cost": cost, "unit": unit}
-    assert "stationary but not minimal" in verdict([-1.0, 2.0], 1.0, (1.0, -0.5), **told)
-    assert "stationary but not minimal" in verdict([-1.0, 1e3], 1.0, (1.0, -1e-3), **told)
+def test_negative_curvature_is_stationary_but_no_minimum_unless_fixed(cost: float, unit: float) -> None:
+    by_name: dict[str, Any] = {"cost": cost, "unit": unit}
+    assert "stationary but not minimal" in verdict([-1.0, 2.0], 1.0, (1.0, -0.5), **by_name)
+    assert "stationary but not minimal" in verdict([-1.0, 1e3], 1.0, (1.0, -1e-3), **by_name)
     # along u1 + u2 = const the curvature is the sum of both
-    assert verdict([-1.0, 2.0], 1.0, (1.0, -0.5), total=1.0, **told) == ""
-    assert "stationary but not minimal" in verdict([-1.0, 2.0], 1.0, (-1.0, 0.5), total=1.0, **told)
+    assert verdict([-1.0, 2.0], 1.0, (1.0, -0.5), total=1.0, **by_name) == ""
+    assert "stationary but not minimal" in verdict([-1.0, 2.0], 1.0, (-1.0, 0.5), total=1.0, **by_name)
     # at a bound that it is pushed to the curvature does not count
     bounds: dict[str, Any] = {"lower": [-9.0, -9.0], "upper": [9.0, 3.0]}
-    assert verdict([-1.0, 3.0], 1.0, (1.0, -0.5), **bounds, **told) == ""
+    assert verdict([-1.0, 3.0], 1.0, (1.0, -0.5), **bounds, **by_name) == ""
 
 
-def test_a_sum_that_is_missed_is_told() -> None:
+def test_a_violated_sum_is_reported() -> None:
     for size in (1.0, 1e3):
         share = np.array([0.5, 0.5]) * size
         assert verdict(share, total=size) == ""

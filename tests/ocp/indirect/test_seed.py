@@ -40,10 +40,10 @@ def test_rest_to_rest_in_least_time_switches_half_way(distance: float, most: flo
     time = 2 * np.sqrt(abs(distance) / most)
     horizon = problem.horizon(lower=0.5 * time, upper=2 * time, guess=1.2 * time)
     problem.minimize(terminal=horizon)
-    found = solve(problem, Indirect(), guess=solve(problem, Collocation(8, control="held")))
-    assert found.horizon == pytest.approx(time, rel=1e-9)
-    assert found.method["switches"] == pytest.approx([time / 2], rel=1e-9)
-    np.testing.assert_allclose(np.abs(found["u"]), most, rtol=1e-12)
+    solution = solve(problem, Indirect(), guess=solve(problem, Collocation(8, control="held")))
+    assert solution.horizon == pytest.approx(time, rel=1e-9)
+    assert solution.method["switches"] == pytest.approx([time / 2], rel=1e-9)
+    np.testing.assert_allclose(np.abs(solution["u"]), most, rtol=1e-12)
 
 
 def test_a_singular_arc_is_refused_with_the_control_and_its_time() -> None:

@@ -77,7 +77,7 @@ def equinoctial_rates(x: Any, thrust: Any) -> Any:
 def flown() -> dict[str, Callable[[float], Any]]:
     """Elements over the time of each leg, with the guessed thrust: where the search starts."""
     state = np.array([*PARKING, 1.0])
-    found: dict[str, Callable[[float], Any]] = {}
+    by_name: dict[str, Callable[[float], Any]] = {}
     y = ca.SX.sym("y", 7)
     for name, (_, _, duration, angles) in LEGS.items():
         thrust = None if angles is None else (_acceleration(y[6]), *np.deg2rad(angles))
@@ -90,8 +90,8 @@ def flown() -> dict[str, Callable[[float], Any]]:
         def at(t: float, times: Any = times, values: Any = values) -> Any:
             return [np.interp(t, times, values[:, j]) for j in range(6)]
 
-        found[name] = at
-    return found
+        by_name[name] = at
+    return by_name
 
 
 def _acceleration(weight: Any) -> Any:

@@ -91,13 +91,13 @@ def line() -> Problem:
 
 
 @cache
-def made() -> tuple[Problem, Solution]:
+def solved_problem() -> tuple[Problem, Solution]:
     problem = line()
     return problem, solve(problem, PLAN, parameters={"p": 1.0})
 
 
 def plan() -> Solution:
-    return made()[1]
+    return solved_problem()[1]
 
 
 @cache
@@ -106,17 +106,17 @@ def plan_of_phases() -> Solution:
 
 
 def declared() -> Problem:
-    return made()[0]
+    return solved_problem()[0]
 
 
 def about_blank(name: str, good: dict[str, Any], /, **bad: Bad) -> Case:
     """A declaration on a problem that has the state x and the control u; "x" stands for its symbol."""
 
-    def call(**given: Any) -> Any:
+    def call(**options: Any) -> Any:
         problem = blank()
         x = problem.declared.states["x"].symbol
         return getattr(problem, name)(
-            **{k: x if isinstance(v, str) and v == "the state" else v for k, v in given.items()}
+            **{k: x if isinstance(v, str) and v == "the state" else v for k, v in options.items()}
         )
 
     return Case(f"Problem.{name}", call, good, bad)
@@ -125,7 +125,10 @@ def about_blank(name: str, good: dict[str, Any], /, **bad: Bad) -> Case:
 def about_phases(name: str, good: dict[str, Any], /, **bad: Bad) -> Case:
     """What is asked of two phases."""
     return Case(
-        f"Phases.{name}", lambda **given: getattr(Phases("a", {"one": line(), "two": line()}), name)(**given), good, bad
+        f"Phases.{name}",
+        lambda **options: getattr(Phases("a", {"one": line(), "two": line()}), name)(**options),
+        good,
+        bad,
     )
 
 
@@ -226,7 +229,6 @@ DECLARATIONS = [
     about_phases("minimize", {"terminal": 0.0}, running={"one": 1.0}, terminal=EXPRESSION | {"two": [1.0, 2.0]}),
     about_phases("__getitem__", {"name": "one"}, name=NAME | {"unknown": "three"}),
     about_phases("of", {"phase": "one"}, phase=NAME | {"unknown": "three"}),
-    about_phases("guess", {"plans": {}}, plans=MAPPING | {"no plan": {"one": 1.0}, "unknown": {"three": None}}),
     about_blank("minimize", {"running": "the state"}, running=EXPRESSION | {"two": [1.0, 2.0]}, terminal=EXPRESSION),
 ]
 
@@ -316,7 +318,7 @@ SOLVED = {"method": PLAN, "parameters": {"p": 1.0}}
 
 def on_line(call: Any, good: dict[str, Any], /, **bad: Bad) -> Case:
     """A call that takes the problem of a line."""
-    return Case(call.__name__, lambda **given: call(**{"problem": declared(), **given}), good, bad)
+    return Case(call.__name__, lambda **options: call(**{"problem": declared(), **options}), good, bad)
 
 
 FRONTS = [
@@ -353,13 +355,13 @@ FRONTS = [
     ),
     Case(
         "Indirect.prepare",
-        lambda **given: Indirect().prepare(**{"problem": declared(), **given}),
+        lambda **options: Indirect().prepare(**{"problem": declared(), **options}),
         {},
         {"problem": INSTANCE | {"unfinished": blank()}, "solver": CHOICE, "options": MAPPING},
     ),
     Case(
         "certificate",
-        lambda **given: certificate(**{"problem": declared(), "solutions": [plan(), plan()], **given}),
+        lambda **options: certificate(**{"problem": declared(), "solutions": [plan(), plan()], **options}),
         {},
         {
             "problem": INSTANCE | {"another": blank()},
@@ -370,7 +372,9 @@ FRONTS = [
     ),
     Case(
         "certificate by a second solver",
-        lambda **given: certificate(**{"problem": declared(), "solutions": [plan()], "second_solver": True, **given}),
+        lambda **options: certificate(
+            **{"problem": declared(), "solutions": [plan()], "second_solver": True, **options}
+        ),
         {},
         {
             "problem": INSTANCE | {"another": blank()},
@@ -416,7 +420,7 @@ CASES = [*DECLARATIONS, *METHODS, *FRONTS]
 
 
 @pytest.mark.parametrize("case", good_calls(case for case in CASES if case.what not in ("plan.save", "Solution.load")))
-def test_what_is_good_is_taken(case: Case) -> None:
+def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 

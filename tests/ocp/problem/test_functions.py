@@ -105,7 +105,7 @@ def test_a_function_and_its_derivative_survive_being_written(what: str) -> None:
 
 
 @pytest.mark.parametrize("what", EXPRESSIONS)
-def test_writing_what_was_read_adds_no_function(what: str) -> None:
+def test_writing_a_read_file_adds_no_function(what: str) -> None:
     first = written(ca.Function("function", [X, A], [EXPRESSIONS[what]()]))
     second = written(FunctionReader(first).functions[-1])
     third = written(FunctionReader(second).functions[-1])
@@ -164,7 +164,7 @@ class OfPython(ca.Callback):  # type: ignore[misc]
         return [arguments[0] ** 2]
 
 
-def test_what_is_no_list_of_operations_is_refused_by_its_name() -> None:
+def test_invalid_lists_of_operations_are_refused_by_name() -> None:
     callback = OfPython()
     root = ca.rootfinder("root", "newton", {"x": decaying, "p": rate, "g": decaying**3 - rate})
     for name, value in (("of_python", callback(X[0])), ("root", root(X[0], X[1])), ("function", ca.convexify(A))):

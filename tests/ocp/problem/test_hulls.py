@@ -20,7 +20,7 @@ def turns(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.asarray(q * np.sign(np.linalg.det(q))[:, None, None])
 
 
-def found(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def separation(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Distances, after it is shown that nothing nearer nor farther is possible."""
     n, here, there = nearest_directions(one, other)
     assert_allclose(np.linalg.norm(n, axis=1), 1, atol=1e-12)
@@ -35,7 +35,7 @@ def found(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def test_the_gap_is_met_by_two_points(m: int, k: int) -> None:
     rng = np.random.default_rng(m * 100 + k)
     one, other = rng.normal(size=(400, m, 3)), rng.normal(size=(400, k, 3)) + 3 * rng.normal(size=(400, 1, 3))
-    gap = found(one, other)
+    gap = separation(one, other)
     assert (gap > 0).sum() > 200
     n, here, there = nearest_directions(one, other)
     back, there_again, here_again = nearest_directions(other, one)
@@ -57,13 +57,13 @@ def test_a_segment_beside_a_box_is_as_near_as_beside_the_hull_of_its_corners() -
     rods[50:100, 1] = rods[50:100, 0] + 2 * (boxes[50:100, 1] - boxes[50:100, 0])
     assert is_box(boxes[0])
     assert not is_box(boxes[0][::-1][[1, 0, *range(2, 8)]])
-    known = found(rods, boxes)
-    way, here, there = nearest_directions(rods, boxes, (False, True))
-    gap = gap_along(way, rods, boxes)
+    known = separation(rods, boxes)
+    path, here, there = nearest_directions(rods, boxes, (False, True))
+    gap = gap_along(path, rods, boxes)
     assert ((known > 0) == (gap > 0)).all()
     assert_allclose(gap[known > 0], known[known > 0], atol=1e-9)
     back, there_again, here_again = nearest_directions(boxes, rods, (True, False))
-    for one, other in ((back, -way), (here_again, here), (there_again, there)):
+    for one, other in ((back, -path), (here_again, here), (there_again, there)):
         assert_allclose(one[known > 0], other[known > 0], atol=1e-12)
 
 
@@ -71,13 +71,13 @@ def test_boxes_that_are_placed_side_by_side() -> None:
     shifts = np.array([[3.0, 0, 0], [0, 1.5, 0.2], [2, 2, 0.3], [2, 2, 2], [0.1, 0.1, 1.0 + 1e-6]])
     exact = np.linalg.norm(np.maximum(np.abs(shifts) - 1, 0), axis=1)
     one = np.tile(CORNERS, (5, 1, 1))
-    assert_allclose(found(one, one + shifts[:, None]), exact, atol=1e-9)
+    assert_allclose(separation(one, one + shifts[:, None]), exact, atol=1e-9)
 
 
 def test_boxes_that_overlap_do_so_by_the_least_shift() -> None:
     shifts = np.array([[0.9, 0, 0], [0.2, 0.7, 0.1], [0.0, 0.0, 0.0]])
     one = np.tile(CORNERS, (3, 1, 1))
-    assert_allclose(found(one, one + shifts[:, None]), [-0.1, -0.3, -1.0], atol=1e-12)
+    assert_allclose(separation(one, one + shifts[:, None]), [-0.1, -0.3, -1.0], atol=1e-12)
 
 
 def test_a_corner_within_a_face_overlaps_along_its_normal() -> None:
@@ -88,7 +88,7 @@ def test_a_corner_within_a_face_overlaps_along_its_normal() -> None:
     place = normal * (0.5 * np.sqrt(3) - 0.1 + 2.0) + 0.7 * turn[:, 1]
     block = place + (4 * CORNERS) @ turn.T
     for one, other in ((CORNERS, block), (block, CORNERS)):
-        assert_allclose(found(one[None], other[None]), [-0.1], atol=1e-12)
+        assert_allclose(separation(one[None], other[None]), [-0.1], atol=1e-12)
 
 
 @given(st.integers(0, 10**6), st.floats(1e-3, 1e3))
@@ -96,11 +96,11 @@ def test_a_corner_within_a_face_overlaps_along_its_normal() -> None:
 def test_moved_and_scaled_together(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
     one, other = rng.normal(size=(5, 4, 3)), rng.normal(size=(5, 6, 3)) + 4 * rng.normal(size=(5, 1, 3))
-    gap = found(one, other)
+    gap = separation(one, other)
     turn, shift = turns(rng, 1)[0], rng.normal(size=3)
     moved = [scale * (part @ turn.T + shift) for part in (one, other)]
     far = gap > 1e-3
-    assert_allclose(found(*moved)[far], scale * gap[far], rtol=1e-7)
+    assert_allclose(separation(*moved)[far], scale * gap[far], rtol=1e-7)
 
 
 @pytest.mark.parametrize("power", [-30, -10, 10])
@@ -109,15 +109,15 @@ def test_the_unit_of_length_does_not_matter(power: int) -> None:
     rng = np.random.default_rng(4)
     one, other = rng.normal(size=(60, 6, 3)), rng.normal(size=(60, 7, 3)) + rng.normal(size=(60, 1, 3))
     scale = 2.0**power
-    gap = found(one, other)
+    gap = separation(one, other)
     assert min((gap < 0).sum(), (gap > 0).sum()) > 15
-    assert_allclose(found(scale * one, scale * other) / scale, gap, atol=1e-14)
+    assert_allclose(separation(scale * one, scale * other) / scale, gap, atol=1e-14)
 
 
-def test_hulls_overlap_along_what_is_found_by_no_more_than_along_their_middles() -> None:
+def test_the_penetration_direction_has_the_least_overlap() -> None:
     rng = np.random.default_rng(5)
     one, other = rng.normal(size=(80, 20, 3)), rng.normal(size=(80, 30, 3)) + 0.3 * rng.normal(size=(80, 1, 3))
-    gap, middles = found(one, other), other.mean(axis=1) - one.mean(axis=1)
+    gap, middles = separation(one, other), other.mean(axis=1) - one.mean(axis=1)
     assert (gap < 0).all()
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
     assert (gap >= np.maximum(gap_along(middles, one, other), gap_along(-middles, one, other)) - 1e-12).all()
@@ -126,7 +126,7 @@ def test_hulls_overlap_along_what_is_found_by_no_more_than_along_their_middles()
 def test_against_a_convex_program() -> None:
     rng = np.random.default_rng(3)
     one, other = rng.normal(size=(12, 5, 3)), rng.normal(size=(12, 7, 3)) + 3
-    gaps = found(one, other)
+    gaps = separation(one, other)
     for a, b, gap in zip(one, other, gaps, strict=True):
         if gap <= 0:
             continue
@@ -143,7 +143,7 @@ def test_against_a_convex_program() -> None:
 def test_points_that_coincide_and_lines_that_are_parallel() -> None:
     one = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 0, 0]], [[0, 0, 0], [1, 0, 0]]], dtype=float)
     other = np.array([[[0, 2, 0], [1, 2, 0]], [[0, 0, 3], [0, 0, 3]], [[3, 0, 0], [5, 0, 0]]], dtype=float)
-    assert_allclose(found(one, other), [2, 3, 2], atol=1e-12)
+    assert_allclose(separation(one, other), [2, 3, 2], atol=1e-12)
 
 
 def test_balls_about_bodies_are_no_farther_apart_than_the_bodies() -> None:
@@ -157,16 +157,18 @@ def test_balls_about_bodies_are_no_farther_apart_than_the_bodies() -> None:
     places = np.concatenate([np.swapaxes(turns(rng, 150), 1, 2).reshape(-1, 9), rng.normal(size=(150, 3))], axis=1)
     frames = frames_of(places.reshape(50, 36))
     bodies = BodyPairs([*hulls, ground], pairs, {})
+    together = [bodies.balls(frames, np.arange(50), np.full(50, pair)) for pair in range(len(pairs))]
+    assert_allclose(bodies.all_balls(frames), np.transpose(together), atol=1e-12)
     for kind in group_pairs([*hulls, ground], pairs):
         for pair in np.flatnonzero(kind.has):
             one, other = ([*hulls, ground][k] for k in pairs[pair, :2])
             at, row = np.arange(50), np.full(50, kind.row[pair])
-            way, gap, points = kind.nearest(frames, at, row)
+            path, gap, points = kind.nearest(frames, at, row)
             apart = bodies.balls(frames, at, np.full(50, pair))
             widths = sum(np.linalg.norm(hull.core[:, None] - hull.core, axis=2).max() for hull in (one, other))
             assert (apart <= gap + 1e-9).all()
             assert kind.flat[row[0]] or (apart >= np.maximum(gap, -one.radius - other.radius) - widths - 1e-9).all()
-            assert_allclose(kind.gaps(way, frames, at, row), gap, atol=1e-12)
+            assert_allclose(kind.gaps(path, frames, at, row), gap, atol=1e-12)
             sides = placed(frames, one), placed(frames, other)
             if not (one.normal.size or other.normal.size):
                 known = gap_along(nearest_directions(*sides)[0], *sides) - one.radius - other.radius

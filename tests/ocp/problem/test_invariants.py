@@ -41,8 +41,8 @@ def quaternion_rate(q: Any, w: Any) -> Any:
 def body(name: str, angle: float, inertia: Any = (1.0, 1.0, 1.0), terminal: Any = "all", free: bool = False) -> Problem:
     """A rigid body from rest to rest at another attitude, with the least squared torque."""
     problem = Problem(name)
-    told = turned(angle) if isinstance(terminal, str) else terminal
-    q = problem.state("q", 4, initial=[1, 0, 0, 0], terminal=told, guess=lambda t: turned(angle * t / TIME))
+    report = turned(angle) if isinstance(terminal, str) else terminal
+    q = problem.state("q", 4, initial=[1, 0, 0, 0], terminal=report, guess=lambda t: turned(angle * t / TIME))
     w, u = problem.state("w", 3, initial=0.0, terminal=0.0), problem.control("u", 3)
     point_data = ca.diag(ca.DM(inertia))
     problem.dynamics(q, quaternion_rate(q, w))
@@ -79,10 +79,10 @@ def test_a_whole_quaternion_at_the_end(method: Any, angle: float) -> None:
 
 @pytest.mark.parametrize("method", METHODS[:5], ids=str)
 def test_it_costs_as_much_as_with_one_entry_less(method: Any) -> None:
-    told = turned(2.0)
-    told[3] = np.nan
+    report = turned(2.0)
+    report[3] = np.nan
     inertia = (1.0, 1.5, 2.0)
-    whole, less = (solve(body("body", 2.0, inertia, end), method) for end in ("all", told))
+    whole, less = (solve(body("body", 2.0, inertia, end), method) for end in ("all", report))
     assert whole.cost == pytest.approx(less.cost, rel=1e-9)
     assert np.abs(whole.multipliers).max() < 10 * np.abs(less.multipliers).max()
 
@@ -102,7 +102,7 @@ def test_a_free_horizon_and_few_digits() -> None:
     np.testing.assert_allclose(plan["q"][-1], turned(2.0), atol=1e-4)
 
 
-def test_what_contradicts_the_start_is_held_as_it_was_asked() -> None:
+def test_constraints_contradicting_the_start_are_kept_as_declared() -> None:
     assert let_go(body("long", 2.0, terminal=1.2 * turned(2.0))) == {"terminal": [], "end": []}
 
 
@@ -110,8 +110,8 @@ def rotation() -> Problem:
     """All nine entries of a rotation matrix, of which six follow."""
     problem = Problem("rotation")
     k = np.cross(np.eye(3), -AXIS)
-    told = np.eye(3) + np.sin(1.0) * k + (1 - np.cos(1.0)) * k @ k
-    r = problem.state("r", 9, initial=np.eye(3).ravel(), terminal=told.ravel(order="F"))
+    report = np.eye(3) + np.sin(1.0) * k + (1 - np.cos(1.0)) * k @ k
+    r = problem.state("r", 9, initial=np.eye(3).ravel(), terminal=report.ravel(order="F"))
     w, u = problem.state("w", 3, initial=0.0, terminal=0.0), problem.control("u", 3)
     problem.dynamics(r, ca.vec(ca.mtimes(ca.reshape(r, 3, 3), ca.skew(w))))
     problem.dynamics(w, u)
@@ -204,7 +204,7 @@ def test_other_conditions_that_follow(make: Callable[[], Problem], count: int) -
     assert costs[0] == pytest.approx(costs[1], rel=1e-3)
 
 
-def test_nothing_is_let_go_of_what_controls_move() -> None:
+def test_no_constraint_on_controlled_states_is_dropped() -> None:
     problem, _, _, u = double_integrator("plain")
     problem.minimize(running=u**2)
     assert let_go(problem) == {"terminal": [], "end": []}

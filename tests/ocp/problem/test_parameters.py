@@ -50,15 +50,15 @@ def everywhere(symbols: Any = ca.SX, values: dict[str, Any] | None = None) -> Pr
 def test_a_parameter_is_as_good_as_its_number(method: str, solver: str, symbols: Any) -> None:
     by = METHODS[method]
     problems = [everywhere(symbols), everywhere(symbols, VALUES)]
-    given_later = solve(problems[0], by, parameters=VALUES, solver=solver)
+    late = solve(problems[0], by, parameters=VALUES, solver=solver)
     numbers = solve(problems[1], by, solver=solver)
-    assert given_later.cost == pytest.approx(numbers.cost, abs=1e-10)
-    assert given_later.horizon == numbers.horizon == 1.2
+    assert late.cost == pytest.approx(numbers.cost, abs=1e-10)
+    assert late.horizon == numbers.horizon == 1.2
     for name in ("q", "v", "u"):
-        np.testing.assert_allclose(given_later[name], numbers[name], atol=1e-8)
-    assert given_later["q"][0, 0] == 0.2
-    assert given_later["q"][-1, 0] == pytest.approx(1.3, abs=1e-12)
-    assert given_later["v"][-1, 0] == pytest.approx(-0.2, abs=1e-9)
+        np.testing.assert_allclose(late[name], numbers[name], atol=1e-8)
+    assert late["q"][0, 0] == 0.2
+    assert late["q"][-1, 0] == pytest.approx(1.3, abs=1e-12)
+    assert late["v"][-1, 0] == pytest.approx(-0.2, abs=1e-9)
 
 
 @pytest.mark.parametrize("method", ["radau", "rk4-held"])

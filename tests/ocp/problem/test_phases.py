@@ -63,7 +63,7 @@ def interior() -> Solution:
         (Indirect(), 1e-10),
     ],
 )
-def test_an_interior_point_costs_what_is_known(method: Any, within: float) -> None:
+def test_an_interior_point_has_its_known_cost(method: Any, within: float) -> None:
     plan = solve(through_a_point(), method)
     exact = between(1.0, 0.9, 0.75)[0] + between(0.9, 0.75, 0.25)[0]
     assert exact == pytest.approx(0.9205314414730, abs=1e-12)
@@ -71,7 +71,7 @@ def test_an_interior_point_costs_what_is_known(method: Any, within: float) -> No
     assert plan.audit().passed
 
 
-def test_the_costate_jumps_where_a_point_is_given_and_nowhere_else() -> None:
+def test_the_costate_jumps_at_fixed_points_alone() -> None:
     first, second = interior().phase("first"), interior().phase("second")
     ends = [between(1.0, 0.9, 0.75), between(0.9, 0.75, 0.25)]
     for phase, (cost, begin, end) in zip((first, second), ends, strict=True):
@@ -177,12 +177,12 @@ def swing(symbols: Any, horizon: Any, first: bool = False, last: bool = False, b
 
 @pytest.mark.parametrize("symbols", [(ca.SX, ca.SX), (ca.SX, ca.MX)])
 def test_a_problem_that_is_split_is_the_same(symbols: tuple[Any, Any]) -> None:
-    given = {"gain": [2.0, 1.5]}
-    whole = solve(swing(ca.SX, 2.0, first=True, last=True), Collocation(10, 4), parameters=given)
+    options = {"gain": [2.0, 1.5]}
+    whole = solve(swing(ca.SX, 2.0, first=True, last=True), Collocation(10, 4), parameters=options)
     parts = swing(symbols[0], 1.2, first=True), swing(symbols[1], 0.8, last=True, begin=1.2)
     phases = Phases("split", dict(zip("ab", parts, strict=True)))
     phases.join("a", "b")
-    plan = solve(phases, Collocation(10, 4), parameters=given)
+    plan = solve(phases, Collocation(10, 4), parameters=options)
     assert plan.cost == pytest.approx(whole.cost, rel=1e-6)
     for name, (begin, end) in plan.phases.items():
         part = plan.phase(name)
@@ -293,7 +293,7 @@ def moved(plan: Solution, name: str, by: Any) -> Solution:
     return replace(plan, states=states, state_interpolant=replace(curve, values=values))
 
 
-def test_a_gap_a_wrong_jump_and_times_out_of_order_are_found() -> None:
+def test_gaps_wrong_jumps_and_unordered_times_are_detected() -> None:
     plan = interior()
     assert "first to second: x" in failed(moved(plan, "second.x", lambda x, s: x + 0.05 * (1 - s)).audit())
     phases = Phases("fast", {"on": fast(True, False), "off": fast(False, True)})
@@ -337,7 +337,7 @@ def test_a_part_of_a_plan_is_a_plan_over_its_own_time() -> None:
 # ---- what is refused -------------------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_joined_is_named() -> None:
+def test_phases_that_cannot_be_joined_are_named() -> None:
     phases = through_a_point()
     first, second = phases["first"], phases["second"]
     signalled = Problem("signalled")
@@ -392,7 +392,7 @@ def test_two_burns_raise_an_orbit_as_published() -> None:
     assert plan.audit().feasible
 
 
-def test_the_launch_of_a_delta_carries_what_is_published() -> None:
+def test_the_launch_of_a_delta_carries_the_published_mass() -> None:
     """Four stages that burn out: 7529.712 kg (Betts; GPOPS). PSOPT's 7529.661 is what its coarse mesh comes to."""
     plan = solve(launch(), Collocation(10, 5))
     assert -plan.cost * MASS == pytest.approx(7529.712, abs=1e-3)

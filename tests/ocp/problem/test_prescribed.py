@@ -45,29 +45,29 @@ def motion_of(frame: Any) -> PrescribedMotion:
 
 
 @pytest.mark.parametrize("name", MOTIONS)
-def test_no_point_strays_or_leaves_its_chord_by_more_than_is_said(name: str) -> None:
+def test_deviations_and_chord_distances_are_within_their_bounds(name: str) -> None:
     frame = MOTIONS[name](T)
     motion, sampled = motion_of(frame), ca.Function("frame", [T], [frame])
     tight = {"stray": 0.0, "bow": 0.0}
     for count in (3, 40, 500):
         marks = np.linspace(0, 1, count + 1)
         pair = np.zeros(count, dtype=int)
-        strays, bows = motion.bounds(pair, marks[:-1], marks[1:])
+        deviations, bows = motion.bounds(pair, marks[:-1], marks[1:])
         times = marks[:-1, None] + np.linspace(0, 1, 41) / count
         entries = np.array(sampled(times.ravel()[None])).T.reshape(count, 41, 12)
         turns, places = entries[..., :9].reshape(count, 41, 3, 3), entries[..., None, 9:]
         points = np.einsum("vj,ktji->ktvi", CORE, turns) + places
         share = np.linspace(0, 1, 41)[None, :, None, None]
         chord = (1 - share) * points[:, :1] + share * points[:, -1:]
-        for what, bound, off in (("stray", strays, points - points[:, 20:21]), ("bow", bows, points - chord)):
+        for what, bound, off in (("stray", deviations, points - points[:, 20:21]), ("bow", bows, points - chord)):
             largest = np.linalg.norm(off, axis=3).max(axis=(1, 2))
             assert (largest <= bound * (1 + 1e-9) + 1e-9).all(), what
-            found = np.isfinite(bound) & (largest > 1e-6)
-            tight[what] = max(tight[what], (largest[found] / bound[found]).max(initial=0.0))
+            result = np.isfinite(bound) & (largest > 1e-6)
+            tight[what] = max(tight[what], (largest[result] / bound[result]).max(initial=0.0))
     assert tight["stray"] > 0.25  # and the bounds are no idle ones
 
 
-def test_what_is_smooth_leaves_its_chord_by_the_square_of_the_time() -> None:
+def test_smooth_motions_deviate_from_their_chord_quadratically() -> None:
     motion = motion_of(MOTIONS["smooth"](T))
     bows = [motion.bounds(ONE, np.array([0.4]), np.array([0.4 + h]))[1][0] for h in (0.1, 0.01, 0.001)]
     assert bows[1] < 0.012 * bows[0]
@@ -78,16 +78,16 @@ def test_a_kink_is_bounded_by_its_slopes_and_a_jump_by_its_height() -> None:
     kink, jump = motion_of(ca.vertcat(EYE, ca.fabs(T), 0, 0)), motion_of(ca.vertcat(EYE, 0.3 * (T > 0), 0, 0))
     ends = np.array([-0.01]), np.array([0.01])
     np.testing.assert_allclose(kink.bounds(ONE, *ends), [[0.01], [0.01]], rtol=1e-9)
-    stray, bow = jump.bounds(ONE, *ends)
-    np.testing.assert_allclose(stray, 0.3, rtol=1e-9)
+    deviation, bow = jump.bounds(ONE, *ends)
+    np.testing.assert_allclose(deviation, 0.3, rtol=1e-9)
     assert np.isinf(bow).all()
 
 
-def test_what_cannot_be_proven_is_refused_by_name() -> None:
+def test_unprovable_separations_are_refused_by_name() -> None:
     problem = Problem("moved")
     q, p = problem.state("q", 3), problem.parameter("p")
     hulls = {"a": Hull(0, np.zeros((1, 3)), 0.1), "b": Hull(1, np.zeros((1, 3)), 0.1)}
-    told: dict[str, Any] = {"levers": {"q": np.ones((1, 3))}, "turns": {"q": np.zeros((1, 3))}}
+    by_name: dict[str, Any] = {"levers": {"q": np.ones((1, 3))}, "turns": {"q": np.zeros((1, 3))}}
     frame = ca.vertcat(EYE, q)
     for other, seen, word in (
         (ca.vertcat(EYE, q + problem.time), -1, "frame 1 depends on time and on states"),
@@ -95,5 +95,5 @@ def test_what_cannot_be_proven_is_refused_by_name() -> None:
         (ca.vertcat(EYE, problem.time, p, 0), 0, "observed from the world"),
     ):
         with pytest.raises(ProblemError, match=word):
-            problem.separate("apart", ca.vertcat(frame, other), hulls, [[0, 1, seen]], least=0.0, **told)
-    problem.separate("apart", ca.vertcat(frame, EYE, p * problem.time, p, 0), hulls, [[0, 1, -1]], least=0.0, **told)
+            problem.separate("apart", ca.vertcat(frame, other), hulls, [[0, 1, seen]], least=0.0, **by_name)
+    problem.separate("apart", ca.vertcat(frame, EYE, p * problem.time, p, 0), hulls, [[0, 1, -1]], least=0.0, **by_name)

@@ -135,12 +135,12 @@ def test_a_plan_is_audited_for_its_problem_as_it_stands() -> None:
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
-def test_what_is_kept_by_a_name_is_made_once(symbols: Any) -> None:
+def test_objects_cached_by_name_are_made_once(symbols: Any) -> None:
     form = Formulation(swing(symbols))
-    made = []
+    results = []
 
     def outputs() -> list[Any]:
-        made.append(1)
+        results.append(1)
         return [form.f, form.x[0] * lam]
 
     lam = form.sym("lam")
@@ -153,7 +153,7 @@ def test_what_is_kept_by_a_name_is_made_once(symbols: Any) -> None:
         for one, other in zip(own, anew, strict=True):
             np.testing.assert_array_equal(one, other)
         np.testing.assert_allclose(own[1][:, 0], x[:, 0] * costate, rtol=1e-15)
-    assert made == [1]
+    assert results == [1]
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
@@ -210,12 +210,12 @@ def test_sampled_expressions_are_those_of_every_sample_alone(samples: int, symbo
     t, lam, p = np.linspace(0.0, 2.0, samples), rng.uniform(-1, 1, (samples, form.nx)), np.array([1.0, 1.1])
     costate, first = form.sym("lam", form.nx), np.array([0.3, -0.2, 0.1])
     outputs = [ca.jacobian(form.f, form.u), form.running + ca.dot(costate, form.f), form.x0 * form.T]
-    found = form.sampled(outputs, x, u, t, 2.0, p, (costate, lam), (form.x0, first))
-    assert [out.shape for out in found] == [(samples, form.nx * form.nu), (samples, 1), (samples, form.nx)]
+    result = form.sampled(outputs, x, u, t, 2.0, p, (costate, lam), (form.x0, first))
+    assert [out.shape for out in result] == [(samples, form.nx * form.nu), (samples, 1), (samples, form.nx)]
     inputs = [form.x, form.u, form.t, form.T, form.p, costate, form.x0]
     alone = ca.Function("alone", inputs, [ca.densify(out) for out in outputs])
     for k in range(samples):
-        for out, expected in zip(found, alone(x[k], u[k], t[k], 2.0, p, lam[k], first), strict=True):
+        for out, expected in zip(result, alone(x[k], u[k], t[k], 2.0, p, lam[k], first), strict=True):
             np.testing.assert_allclose(out[k], np.asarray(expected.full()).ravel(order="F"), atol=1e-14)
 
 
@@ -354,7 +354,7 @@ ALL = {f"{kind} {name}": case for kind, pool in POOLS.items() for name, case in 
 
 
 @pytest.mark.parametrize("case", ALL)
-def test_wrong_declarations_are_named_where_they_are_made(case: str) -> None:
+def test_wrong_declarations_are_named_at_once(case: str) -> None:
     act, message = ALL[case]
     with pytest.raises(ProblemError, match=message):
         act()

@@ -127,7 +127,7 @@ def test_more_can_be_declared_of_a_copy_alone() -> None:
 
 
 @pytest.mark.parametrize("name", ["energy", "swing", "van der Pol"])
-def test_what_is_not_complete_is_kept_too(name: str) -> None:
+def test_incomplete_problems_are_stored(name: str) -> None:
     problem = Problem(name)
     problem.state("x", 2, initial=[1.0, np.nan], guess=lambda t: [t, t])
     again = pickle.loads(pickle.dumps(problem))
@@ -210,8 +210,8 @@ def test_an_exception_whose_value_cannot_be_pickled_tells_how_it_is_shown() -> N
 
 @pytest.mark.parametrize("part", ["functions", "expressions", "declared", "symbols", "name"])
 def test_a_record_that_was_changed_is_refused(part: str) -> None:
-    told, arrays = pack_record(energy().__getstate__())
-    record = unpack_record(json.loads(json.dumps(told)), arrays)
+    report, arrays = pack_record(energy().__getstate__())
+    record = unpack_record(json.loads(json.dumps(report)), arrays)
     assert str(Problem.from_record(record)) == str(energy())
     without = {key: value for key, value in record.items() if key != part}
     changed = {**record, part: record["symbols"][:1]}
@@ -220,13 +220,13 @@ def test_a_record_that_was_changed_is_refused(part: str) -> None:
             Problem.from_record(wrong)
 
 
-def test_units_watches_drawn_in_bounds_and_starts_survive_the_file(tmp_path: Path) -> None:
+def test_units_outputs_tightened_bounds_and_starts_survive_the_file(tmp_path: Path) -> None:
     plan = solve(mapped(), Collocation(5))
-    drawn = replace(plan, bound_tightening=np.full((2, 5, 6), 0.25), start="zeros", regularised=True)
-    drawn.save(tmp_path / "plan.npz")
+    tightening = replace(plan, bound_tightening=np.full((2, 5, 6), 0.25), start="zeros", regularised=True)
+    tightening.save(tmp_path / "plan.npz")
     loaded = Solution.load(tmp_path / "plan.npz")
     assert (loaded.start, loaded.regularised) == ("zeros", True)
-    np.testing.assert_array_equal(loaded.bound_tightening, drawn.bound_tightening)
+    np.testing.assert_array_equal(loaded.bound_tightening, tightening.bound_tightening)
     assert loaded.problem.declared.states["x"].unit == "rad"
     assert loaded.problem.declared.start["third"].unit == "rad"
     watched = loaded.problem.declared.watch["drift"]

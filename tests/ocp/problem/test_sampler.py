@@ -21,7 +21,7 @@ def test_samples_are_those_of_the_expressions_with_their_zeros(symbols: Any, cou
     _ = [np.full(5000, 1e300) for _ in range(20)]  # what memory may hold
     sampler = Sampler([x, y], outputs)
     values = rng.normal(size=(count, 2)), rng.normal(size=(count, 1))
-    found = sampler(*values)
+    result = sampler(*values)
     expected = [
         np.zeros((count, 1)),
         np.column_stack([0 * values[1], values[0][:, 1:] * values[1], 0 * values[1], np.sin(values[0][:, :1])]),
@@ -30,5 +30,5 @@ def test_samples_are_those_of_the_expressions_with_their_zeros(symbols: Any, cou
         np.column_stack([2 * values[0][:, 0], np.zeros(count)]),
         np.full((count, 1), 3.0),
     ]
-    for own, wanted in zip(found, expected, strict=True):
+    for own, wanted in zip(result, expected, strict=True):
         np.testing.assert_allclose(own, wanted, atol=1e-15)

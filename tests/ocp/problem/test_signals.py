@@ -58,11 +58,11 @@ METHODS: dict[str, Any] = {
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_signal_is_the_expression_that_it_stands_for(method: str, symbols: Any) -> None:
-    told, written = (solve(everywhere(known, symbols), METHODS[method]) for known in (True, False))
-    assert told.cost == pytest.approx(written.cost, rel=1e-9)
+    report, written = (solve(everywhere(known, symbols), METHODS[method]) for known in (True, False))
+    assert report.cost == pytest.approx(written.cost, rel=1e-9)
     for name in ("x", "v", "u"):
-        np.testing.assert_allclose(told[name], written[name], atol=1e-7)
-    first, second = told.audit(), written.audit()
+        np.testing.assert_allclose(report[name], written[name], atol=1e-7)
+    first, second = report.audit(), written.audit()
     assert (first.passed, first.feasible, first.optimal) == (second.passed, second.feasible, second.optimal)
     findings = {finding.name: finding.value for finding in second.findings}
     assert {finding.name for finding in first.findings} == set(findings)
@@ -71,25 +71,25 @@ def test_a_signal_is_the_expression_that_it_stands_for(method: str, symbols: Any
 def test_a_signal_may_be_an_interpolant_in_a_problem_of_other_symbols() -> None:
     """Splines take MX symbols only; the problem of SX symbols has the cost of the one of MX symbols."""
     mesh = Collocation(8, 3)
-    told, written = solve(everywhere(True, ca.SX, SPLINE), mesh), solve(everywhere(False, ca.MX, SPLINE), mesh)
-    assert told.cost == pytest.approx(written.cost, rel=1e-9)
-    assert told.audit().passed is written.audit().passed
+    report, written = solve(everywhere(True, ca.SX, SPLINE), mesh), solve(everywhere(False, ca.MX, SPLINE), mesh)
+    assert report.cost == pytest.approx(written.cost, rel=1e-9)
+    assert report.audit().passed is written.audit().passed
 
 
 @pytest.mark.parametrize("track", [wave, SPLINE], ids=["expression", "spline"])
 def test_a_problem_with_signals_is_read_and_audited_in_another_process(track: Track, tmp_path: Path) -> None:
-    found = solve(everywhere(True, ca.SX, track), Collocation(8, 3))
-    found.save(tmp_path / "wave.npz")
+    solution = solve(everywhere(True, ca.SX, track), Collocation(8, 3))
+    solution.save(tmp_path / "wave.npz")
     again = Solution.load(tmp_path / "wave.npz")
-    assert [f.value for f in again.audit().findings] == [f.value for f in found.audit().findings]
+    assert [f.value for f in again.audit().findings] == [f.value for f in solution.audit().findings]
     done = run(f"""
         from ocp import Collocation, Solution, solve
         plan = Solution.load({str(tmp_path / "wave.npz")!r})
         print(plan.audit().passed, repr(solve(plan.problem, Collocation(8, 3)).cost))
     """)
     passed, cost = done.stdout.split()
-    assert passed == str(found.audit().passed), done.stderr
-    assert float(cost) == pytest.approx(found.cost, rel=1e-12)
+    assert passed == str(solution.audit().passed), done.stderr
+    assert float(cost) == pytest.approx(solution.cost, rel=1e-12)
 
 
 def test_a_pure_state_row_holds_the_controls_by_the_signals_derivatives() -> None:
@@ -107,11 +107,11 @@ def test_a_pure_state_row_holds_the_controls_by_the_signals_derivatives() -> Non
         problem.minimize(running=u**2 / 2 + (free - w) ** 2)
         return problem
 
-    told, written = (solve(tracked(known), Collocation(12, 4)) for known in (True, False))
+    report, written = (solve(tracked(known), Collocation(12, 4)) for known in (True, False))
     inside = np.linspace(0.1, HORIZON - 0.1, 50)
-    np.testing.assert_allclose(told.at(inside)["v"][:, 0], np.cos(inside), atol=1e-5)
-    assert told.cost == pytest.approx(written.cost, rel=1e-9)
-    first, second = told.audit(), written.audit()
+    np.testing.assert_allclose(report.at(inside)["v"][:, 0], np.cos(inside), atol=1e-5)
+    assert report.cost == pytest.approx(written.cost, rel=1e-9)
+    first, second = report.audit(), written.audit()
     assert (first.feasible, first.optimal) == (second.feasible, second.optimal)
     values = {finding.name: finding.value for finding in second.findings}
     for finding in first.findings:
@@ -157,7 +157,7 @@ def with_signal(**horizon: Any) -> Problem:
     ],
     ids=["free horizon", "parametric horizon", "indirect"],
 )
-def test_what_takes_no_signals_says_so_by_name(problem: Any, method: Any, parameters: dict[str, Any]) -> None:
+def test_expressions_without_signals_are_refused_by_name(problem: Any, method: Any, parameters: dict[str, Any]) -> None:
     with pytest.raises(ProblemError, match="wave") as caught:
         solve(problem(), method, parameters=parameters)
     assert caught.value.name == "wave"
@@ -166,8 +166,8 @@ def test_what_takes_no_signals_says_so_by_name(problem: Any, method: Any, parame
 @pytest.mark.parametrize("control", ["held", "linear"])
 def test_cvodes_takes_signals_too(control: Any) -> None:
     method = MultipleShooting(6, integrator="cvodes", control=control)
-    told, written = (solve(everywhere(known), method) for known in (True, False))
-    assert told.cost == pytest.approx(written.cost, rel=1e-6)
+    report, written = (solve(everywhere(known), method) for known in (True, False))
+    assert report.cost == pytest.approx(written.cost, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -56,9 +56,9 @@ def test_a_name_that_two_bear_has_a_unit_only_where_it_is_one() -> None:
 def test_a_unit_is_a_string(kind: str, unit: Any) -> None:
     problem = Problem("units")
     x = problem.state("x")
-    given: tuple[Any, ...] = () if kind in ("state", "control") else (x, 0)
+    options: tuple[Any, ...] = () if kind in ("state", "control") else (x, 0)
     with pytest.raises(ProblemError, match="unit must be a string") as caught:
-        getattr(problem, kind)("y", *given, unit=unit)
+        getattr(problem, kind)("y", *options, unit=unit)
     assert (caught.value.name, caught.value.value) == ("unit", unit)
 
 

@@ -28,7 +28,7 @@ def runner(pace: float = 1.0, length: float = 1.0, watched: bool = True, **watch
 
 @pytest.mark.parametrize("length", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("method", [Collocation(5), MultipleShooting(10)], ids=["points", "held"])
-def test_errors_too_small_for_a_velocity_are_found_where_they_add_up(length: float, method: Any) -> None:
+def test_accumulating_errors_of_a_velocity_are_detected(length: float, method: Any) -> None:
     assert solve(runner(1.0005, length), method).audit().feasible
     audit = solve(runner(1.004, length), method).audit()
     assert {f.name for f in audit.failures if f.verdict == "feasible"} == {"way"}
@@ -38,19 +38,19 @@ def test_errors_too_small_for_a_velocity_are_found_where_they_add_up(length: flo
     assert audit["way"].time == pytest.approx(2.0)
 
 
-def test_no_method_holds_what_is_watched() -> None:
+def test_no_method_constrains_watched_quantities() -> None:
     plain, watched = (solve(runner(1.004, watched=which), Collocation(5)) for which in (False, True))
     np.testing.assert_array_equal(plain.variables, watched.variables)
     assert len(plain.multipliers) == len(watched.multipliers)
 
 
-def test_a_tolerance_by_name_is_in_the_unit_of_what_is_watched() -> None:
+def test_a_tolerance_by_name_is_in_the_unit_of_its_quantity() -> None:
     plan = solve(runner(1.004), Collocation(5))
     assert plan.audit(tolerances={"way": 9e-3}).feasible
     assert not plan.audit(tolerances={"way": 7e-3}).feasible
 
 
-def test_what_is_watched_may_be_bounded_like_a_path() -> None:
+def test_watched_quantities_may_be_bounded_like_a_path() -> None:
     problem = Problem("watched")
     x, u = problem.state("x", initial=0.0, terminal=1.0), problem.control("u")
     problem.dynamics(x, u)
@@ -62,7 +62,7 @@ def test_what_is_watched_may_be_bounded_like_a_path() -> None:
     assert audit.constraints["below"] == pytest.approx(0.1)
 
 
-def test_the_problem_shows_what_is_watched() -> None:
+def test_the_problem_shows_watched_quantities() -> None:
     text = str(runner())
     assert "  watch        way (1): 0 <= integral of (u-1) dt <= 0 m" in text.splitlines()
     form = Formulation(runner())
@@ -78,7 +78,7 @@ def test_the_problem_shows_what_is_watched() -> None:
         ({"way": ca.SX.sym("z")}, "uses the symbol 'z'"),
     ],
 )
-def test_what_cannot_be_watched_is_named(arguments: dict[str, Any], words: str) -> None:
+def test_invalid_watched_quantities_are_named(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(ProblemError, match=words) as caught:
         runner(**arguments)
     assert caught.value.name == "way"
@@ -105,13 +105,13 @@ def planar() -> FixedBase:
 def test_the_builders_watch_where_the_tips_are() -> None:
     machine, start = planar(), [0.3, 0.8, 0.9]
     place = np.array(ca.DM(machine.tip_pose((), np.array(start)).position)).ravel()
-    asked: dict[str, Any] = {"start": start, "horizon": 1.0}
+    request: dict[str, Any] = {"start": start, "horizon": 1.0}
     moving = TipTask(position=lambda t: [place[0] - 0.1 * t, place[1]], rows=(3, 4))
     for task, names in (
         (moving, ("task position",)),
         (TipTask(velocity=[-0.1, 0.0, 0.1], rows=(2, 3, 4)), ("task displacement", "task rotation")),
     ):
-        problem = minimum_velocity_problem(machine, tasks=task, **asked)
+        problem = minimum_velocity_problem(machine, tasks=task, **request)
         assert tuple(problem.declared.watch) == names
         audit = solve(problem, Collocation(10)).audit()
         for name in names:

@@ -143,11 +143,11 @@ def is_paper_at_1ms(row: dict[str, str]) -> bool:
 
 @pytest.mark.long
 def test_the_default_mapping_is_the_better_one_everywhere(run: Run[Results]) -> None:
-    found: dict[tuple[str, str, str], dict[str, float]] = {}
+    by_name: dict[tuple[str, str, str], dict[str, float]] = {}
     for row in run.table("mapping_small_blends.csv"):
         case = (row["blend"], row["remaining_mm"], row["period_ms"])
-        found.setdefault(case, {})[row["mapping"]] = abs(float(row["drift_um"]))
-    for case, drifts in found.items():
+        by_name.setdefault(case, {})[row["mapping"]] = abs(float(row["drift_um"]))
+    for case, drifts in by_name.items():
         assert drifts["gauss_newton"] < drifts["predictor_corrector"], case
 
 
@@ -170,7 +170,7 @@ def test_centripetal_acceleration_that_the_example_asks(summary: Summary) -> Non
 
 
 @pytest.mark.long
-def test_limits_asked_for_are_kept(run: Run[Results], summary: Summary) -> None:
+def test_requested_limits_hold(run: Run[Results], summary: Summary) -> None:
     rows = {row["case"]: row for row in summary["limited"]}
     assert list(rows) == list(run.results.plans)
     for name, row in rows.items():
@@ -239,7 +239,7 @@ def test_the_example_fits_the_arm() -> None:
     assert task.lengths[:2] / MM == pytest.approx([400, np.hypot(650, 50)], abs=1e-9)
 
 
-def test_a_corner_has_the_angle_it_is_given() -> None:
+def test_a_corner_has_its_requested_angle() -> None:
     for degrees in (5, 45, 90, 179):
         path = corner(degrees, 20 * MM, 3.0)
         assert np.degrees(path.blend(0).angle) == pytest.approx(degrees, abs=1e-9)
@@ -268,7 +268,7 @@ def test_files_are_whole_and_the_script_succeeds(run: Run[Results]) -> None:
 
 
 @pytest.mark.long
-def test_the_tables_say_what_the_summary_says(run: Run[Results], summary: Summary) -> None:
+def test_the_tables_agree_with_the_summary(run: Run[Results], summary: Summary) -> None:
     gamma = run.table("table2_gamma.csv")
     names = ("remaining_mm", "constant_30_90deg", "shape_1_90deg", "shape_1_45deg")
     np.testing.assert_allclose(
@@ -276,9 +276,9 @@ def test_the_tables_say_what_the_summary_says(run: Run[Results], summary: Summar
     )
     events = run.table("events.csv")
     np.testing.assert_allclose([float(row["mean_s"]) for row in events[:4]], summary["blend_times_s"], rtol=1e-9)
-    for row, told in zip(run.table("limits.csv"), summary["limited"], strict=True):
-        assert row["case"] == told["case"]
-        assert float(row["duration_s"]) == pytest.approx(told["duration_s"], rel=1e-9)
+    for row, report in zip(run.table("limits.csv"), summary["limited"], strict=True):
+        assert row["case"] == report["case"]
+        assert float(row["duration_s"]) == pytest.approx(report["duration_s"], rel=1e-9)
 
 
 @pytest.mark.long

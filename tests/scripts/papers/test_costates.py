@@ -68,11 +68,11 @@ def test_partials_are_those_of_automatic_differentiation(build: Any, size: int) 
     joints = case.chain.N - case.chain.n
     u = optimal_control(case.chain, case.x, case.lam)
     u_x, Phi_x, Gamma_x, G_x = case.derivatives(case.x, case.lam, case.v, u)[3:]
-    found = partials(*case.task)
-    assert error(found.u, by_index(u_x, (joints, 1))[:, :, 0]) < TOLERANCE
-    assert error(found.Phi, by_index(Phi_x, (joints, 1))[:, :, 0]) < TOLERANCE
-    assert error(found.Gamma, by_index(Gamma_x, (joints, joints))) < TOLERANCE
-    assert error(found.G, by_index(G_x, (len(case.rows), joints))) < TOLERANCE
+    result = partials(*case.task)
+    assert error(result.u, by_index(u_x, (joints, 1))[:, :, 0]) < TOLERANCE
+    assert error(result.Phi, by_index(Phi_x, (joints, 1))[:, :, 0]) < TOLERANCE
+    assert error(result.Gamma, by_index(Gamma_x, (joints, joints))) < TOLERANCE
+    assert error(result.G, by_index(G_x, (len(case.rows), joints))) < TOLERANCE
 
 
 @every_case

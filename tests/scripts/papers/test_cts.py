@@ -49,7 +49,7 @@ def test_iterations_are_those_of_the_reference(summary: Summary) -> None:
 
 
 @pytest.mark.long
-def test_divergence_is_told_by_the_stability_bound(summary: Summary) -> None:
+def test_divergence_is_predicted_by_the_stability_bound(summary: Summary) -> None:
     for index, method, stable in (
         ("i1", "jacobian", True),
         ("i1", "jacobian_gain_1", True),
@@ -83,11 +83,11 @@ def test_the_release_is_tracked_and_keeps_clear(summary: Summary) -> None:
 
 @pytest.mark.long
 def test_the_plan_keeps_its_limits_where_single_targets_do_not(summary: Summary) -> None:
-    found = summary["plan"]
-    plan, single = found["plan"], found["each_target_by_itself"]
-    assert found["audit_passed"]
-    assert plan["rate_max_rad_s"] <= found["rate_limit_rad_s"] * 1.001 < single["rate_max_rad_s"]
-    assert plan["least_clearance_m"] >= found["clearance_m"] - 1e-5 > single["least_clearance_m"]
+    result = summary["plan"]
+    plan, single = result["plan"], result["each_target_by_itself"]
+    assert result["audit_passed"]
+    assert plan["rate_max_rad_s"] <= result["rate_limit_rad_s"] * 1.001 < single["rate_max_rad_s"]
+    assert plan["least_clearance_m"] >= result["clearance_m"] - 1e-5 > single["least_clearance_m"]
     assert plan["index_integral_s"] > single["index_integral_s"]
 
 
@@ -120,16 +120,16 @@ def test_generated_c_called_from_c_gives_the_joints_of_python(tmp_path: Path, fu
     previous = np.random.default_rng(10).uniform(-3, 3, 500)
     lines = [" ".join(f"{value:.17g}" for value in (*row, roll)) for row, roll in zip(targets.T, previous, strict=True)]
     command = [str(example / "build" / "cts")]
-    told = subprocess.run(command, input="\n".join(lines) + "\n", check=True, capture_output=True, text=True).stdout
-    found = np.array([[float(word) for word in line.split()] for line in told.splitlines()])
+    report = subprocess.run(command, input="\n".join(lines) + "\n", check=True, capture_output=True, text=True).stdout
+    values = np.array([[float(word) for word in line.split()] for line in report.splitlines()])
     joints, _, active, status = functions["optimal_inverse_i1"].map(500)(targets, previous[None])
-    np.testing.assert_array_equal(found[:, 0], np.array(status)[0])
-    np.testing.assert_array_equal(found[:, 1], np.array(active)[0])
-    np.testing.assert_allclose(found[:, 2:], np.array(joints).T, rtol=0, atol=1e-12, equal_nan=True)
-    assert {0, 1, 2, 3} <= set(found[:, 0].astype(int))
+    np.testing.assert_array_equal(values[:, 0], np.array(status)[0])
+    np.testing.assert_array_equal(values[:, 1], np.array(active)[0])
+    np.testing.assert_allclose(values[:, 2:], np.array(joints).T, rtol=0, atol=1e-12, equal_nan=True)
+    assert {0, 1, 2, 3} <= set(values[:, 0].astype(int))
 
 
-def test_export_refuses_what_is_no_c_file(tmp_path: Path, functions: dict[str, Any]) -> None:
+def test_export_refuses_names_that_are_no_c_files(tmp_path: Path, functions: dict[str, Any]) -> None:
     with pytest.raises(ModelError, match=r"must end in \.c"):
         export(functions, tmp_path / "rig.cpp")
     with pytest.raises(ModelError, match="no function"):

@@ -150,9 +150,9 @@ def test_every_method_finds_the_same_optimum(run: Run[Results]) -> None:
     ],
 )
 def test_cost_of_each_method_and_mesh(run: Run[Results], method: str, intervals: int, error: float) -> None:
-    found = column(run.table("convergence.csv"), "cost", method=method, intervals=str(intervals))
-    assert found.shape == (1,)
-    assert abs(found[0] - REFERENCE) < error
+    result = column(run.table("convergence.csv"), "cost", method=method, intervals=str(intervals))
+    assert result.shape == (1,)
+    assert abs(result[0] - REFERENCE) < error
 
 
 @pytest.mark.parametrize("method", [name for name, *_ in free_floating_results.METHODS])
@@ -201,12 +201,12 @@ def test_plan_passes_its_audit_and_the_script_succeeds(run: Run[Results]) -> Non
 def test_momentum_of_the_links_is_that_of_the_momentum_matrices(machine: FreeFloating) -> None:
     rng = np.random.default_rng(1)
     base, joints, base_rates, rates = (rng.normal(size=(5, 3)) for _ in range(4))
-    found = momentum(machine, base, joints, base_rates, rates)
+    result = momentum(machine, base, joints, base_rates, rates)
     for k in range(5):
         twist = [base_rates[k, 2], *base_rates[k, :2]]
         expected = np.array(machine.momentum(base[k], joints[k], twist, rates[k])).ravel()
-        assert found[k] == pytest.approx(expected, rel=1e-12, abs=1e-10)
-    assert np.abs(found).min() > 1e-3  # of a motion that nothing conserves
+        assert result[k] == pytest.approx(expected, rel=1e-12, abs=1e-10)
+    assert np.abs(result).min() > 1e-3  # of a motion that nothing conserves
 
 
 def test_center_of_mass_moves_with_the_linear_momentum(machine: FreeFloating) -> None:
@@ -285,7 +285,7 @@ def test_paper_ours_and_difference_stand_side_by_side(run: Run[Results]) -> None
             assert f"{value:.6g}" in run.printed
 
 
-def test_what_cannot_be_reproduced_is_said_beside_it(run: Run[Results]) -> None:
+def test_numbers_that_cannot_be_reproduced_are_marked(run: Run[Results]) -> None:
     for name in ("table1_peak_velocity.csv", "table2_acceleration.csv"):
         for row in run.table(name):
             if row["method"] == "optimum":
@@ -308,12 +308,12 @@ def test_summary_agrees_with_the_tables(run: Run[Results]) -> None:
     summary = run.summary
     peaks = run.table("table1_peak_velocity.csv")
     for method, part in (("pseudo-inverse", "pseudo_inverse"), ("optimum", "optimal")):
-        found = column(peaks, "ours_deg_s", method=method)
-        assert found == pytest.approx(summary[part]["peak_joint_velocity_deg_s"], rel=1e-9)
+        result = column(peaks, "ours_deg_s", method=method)
+        assert result == pytest.approx(summary[part]["peak_joint_velocity_deg_s"], rel=1e-9)
     costs = run.table("convergence.csv")
     for part, method in (("collocation", "Legendre 3"), ("multiple_shooting", "multiple shooting RK4, linear control")):
-        found = column(costs, "cost", method=method, intervals="100")
-        assert found == pytest.approx([summary["optimal"][part]["cost"]], abs=1e-12)
+        result = column(costs, "cost", method=method, intervals="100")
+        assert result == pytest.approx([summary["optimal"][part]["cost"]], abs=1e-12)
     verdicts = [row["verdict"] for row in run.table("false_optima.csv")]
     assert len(verdicts) == summary["false_optima"]["guesses"]
     assert verdicts.count(FALSE) == summary["false_optima"]["false"]

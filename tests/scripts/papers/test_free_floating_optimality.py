@@ -29,8 +29,8 @@ INDIRECT = ("multiple", "backward")
 
 
 def indirect(run: Run[Results], shooting: str) -> dict[str, Any]:
-    found: dict[str, Any] = run.summary["optimal"]["indirect"]
-    return found if shooting == "multiple" else found["backward"]
+    result: dict[str, Any] = run.summary["optimal"]["indirect"]
+    return result if shooting == "multiple" else result["backward"]
 
 
 # ---- the minimum principle
@@ -38,10 +38,10 @@ def indirect(run: Run[Results], shooting: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("shooting", INDIRECT)
 def test_minimum_principle_gives_the_known_cost_in_a_few_newton_steps(run: Run[Results], shooting: str) -> None:
-    found = indirect(run, shooting)
-    assert found["shooting"] == shooting
-    assert found["cost"] == pytest.approx(REFERENCE, abs=1e-9)
-    assert 1 <= found["newton_steps"] <= 5
+    result = indirect(run, shooting)
+    assert result["shooting"] == shooting
+    assert result["cost"] == pytest.approx(REFERENCE, abs=1e-9)
+    assert 1 <= result["newton_steps"] <= 5
 
 
 @pytest.mark.parametrize("shooting", INDIRECT)
@@ -57,27 +57,27 @@ def test_costates_vanish_at_the_free_end_and_the_start_is_met(run: Run[Results],
 
 @pytest.mark.parametrize("shooting", INDIRECT)
 def test_costates_of_direct_and_indirect_agree(run: Run[Results], shooting: str) -> None:
-    found = run.results.agreement
-    difference = costate_difference(found.plan, found.multiple if shooting == "multiple" else found.backward)
-    assert difference.shape == (len(found.plan.t), 6)
+    result = run.results.agreement
+    difference = costate_difference(result.plan, result.multiple if shooting == "multiple" else result.backward)
+    assert difference.shape == (len(result.plan.t), 6)
     assert np.abs(difference).max() < 1e-5
-    told = indirect(run, shooting)["costate_difference_from_direct"]
-    assert told == pytest.approx(np.abs(difference).max(), rel=1e-9)
-    assert told > 1e-12  # they are two solutions, not one
+    report = indirect(run, shooting)["costate_difference_from_direct"]
+    assert report == pytest.approx(np.abs(difference).max(), rel=1e-9)
+    assert report > 1e-12  # they are two solutions, not one
 
 
 def test_costates_are_the_same_in_both_formulations(run: Run[Results]) -> None:
-    found = run.results.agreement
+    result = run.results.agreement
     fractions = np.linspace(0.0, 1.0, 51)
-    reference = costates(found.multiple, fractions)
-    for name, solution in found.null_space.items():
+    reference = costates(result.multiple, fractions)
+    for name, solution in result.null_space.items():
         if name.startswith("minimum principle"):
             assert costates(solution, fractions) == pytest.approx(reference, abs=1e-9 * np.abs(reference).max())
 
 
 def test_costates_of_the_base_position_vanish_for_the_cost_does_not_depend_on_the_place(run: Run[Results]) -> None:
-    found = run.results.agreement
-    for solution in (found.plan, found.multiple, found.backward, found.shooting):
+    result = run.results.agreement
+    for solution in (result.plan, result.multiple, result.backward, result.shooting):
         assert np.abs(solution.costate("base")[:, :2]).max() < 1e-9
         assert np.abs(solution.costate("base")[:, 2]).max() > 3.0
 
@@ -143,8 +143,8 @@ def test_certificates_are_printed_and_written(run: Run[Results]) -> None:
 @pytest.mark.parametrize(("horizon", "cost"), [(h, cost) for h, costs in KNOWN.items() for cost in costs])
 def test_known_extremals_are_found(run: Run[Results], horizon: float, cost: float) -> None:
     rows = [row for row in run.table("extremals.csv") if float(row["horizon_s"]) == horizon]
-    found = column(rows, "cost_indirect", verdict=CONFIRMED)
-    assert np.abs(found - cost).min() < 2e-5
+    result = column(rows, "cost_indirect", verdict=CONFIRMED)
+    assert np.abs(result - cost).min() < 2e-5
 
 
 def test_direct_and_indirect_cost_of_every_confirmed_extremal_agree(run: Run[Results]) -> None:
@@ -155,21 +155,21 @@ def test_direct_and_indirect_cost_of_every_confirmed_extremal_agree(run: Run[Res
 
 def test_best_is_the_confirmed_extremal_of_least_cost_at_each_horizon(run: Run[Results]) -> None:
     rows = run.table("extremals.csv")
-    for told in run.summary["extremals"]["by_horizon"]:
-        mine = [row for row in rows if float(row["horizon_s"]) == told["horizon_s"]]
+    for report in run.summary["extremals"]["by_horizon"]:
+        mine = [row for row in rows if float(row["horizon_s"]) == report["horizon_s"]]
         best = [row for row in mine if row["best"] == "yes"]
         assert len(best) == 1
         costs = column(mine, "cost_indirect", verdict=CONFIRMED)
         assert float(best[0]["cost_indirect"]) == costs.min()
-        assert told["best_cost"] == pytest.approx(costs.min(), rel=1e-11)
-        assert told["costs"] == pytest.approx(sorted(costs), rel=1e-11)
-        assert f"best J = {told['best_cost']:.9f}" in run.printed
+        assert report["best_cost"] == pytest.approx(costs.min(), rel=1e-11)
+        assert report["costs"] == pytest.approx(sorted(costs), rel=1e-11)
+        assert f"best J = {report['best_cost']:.9f}" in run.printed
 
 
 def test_every_start_is_accounted_for(run: Run[Results]) -> None:
     for one in run.results.searches:
         assert one.starts == STARTS
-        assert one.rejected + sum(extremal.found for extremal in one.extremals) == one.solved <= one.starts
+        assert one.rejected + sum(extremal.guess_count for extremal in one.extremals) == one.solved <= one.starts
 
 
 def test_extremals_of_one_horizon_are_different_motions(run: Run[Results]) -> None:
@@ -193,8 +193,8 @@ def test_no_extremal_has_the_peaks_of_the_paper_and_none_is_called_global(run: R
     differences = np.abs(peaks - PAPER_PEAKS["optimum"]).max(axis=1)
     assert column(rows, "largest_difference_from_paper_deg_s") == pytest.approx(differences, abs=1e-6)
     assert differences.min() > 20
-    told = run.summary["extremals"]["nearest_to_paper"]["largest_difference_deg_s"]
-    assert told == pytest.approx(differences.min(), abs=1e-6)
+    report = run.summary["extremals"]["nearest_to_paper"]["largest_difference_deg_s"]
+    assert report == pytest.approx(differences.min(), abs=1e-6)
     assert NOT_GLOBAL in run.printed
     assert "None has the peaks of the paper's optimum" in run.printed
     assert "global" not in run.printed.lower()

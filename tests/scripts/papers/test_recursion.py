@@ -80,8 +80,8 @@ def test_algorithm_1_is_the_momentum_matrices_in_virtual_coordinates(build: Any,
         axes = [np.eye(3)[0], first[:, 1], turn.as_matrix()[:, 2]]
         twist_of_rates = np.block([[np.zeros((3, 3)), np.column_stack(axes)], [np.eye(3), np.zeros((3, 3))]])
     E1, E2 = (numeric(part) for part in case.machine.momentum_matrices(base, case.x[n:]))
-    found = D(case.chain, case.x)[case.chain.momentum_rows]
-    assert error(found, np.hstack([E1 @ twist_of_rates, E2])) < TOLERANCE
+    result = D(case.chain, case.x)[case.chain.momentum_rows]
+    assert error(result, np.hstack([E1 @ twist_of_rates, E2])) < TOLERANCE
     expected = numeric(case.machine.tip_jacobian(base, case.x[n:]))
     assert error(generalized_jacobian(case.chain, case.x), expected) < TOLERANCE
 

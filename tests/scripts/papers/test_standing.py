@@ -71,23 +71,23 @@ def plans_of(run: Run[Results]) -> Iterator[tuple[str, str, Plan]]:
 
 
 def test_the_pseudo_inverse_leaves_the_foot(summary: Summary) -> None:
-    found = summary["table1"]["pseudo_inverse"]
-    assert found["index_min"] == pytest.approx(-5.3, abs=0.05)
-    assert (found["zmp_min_m"], found["zmp_max_m"]) == pytest.approx((-0.066, 0.250), abs=5e-4)
-    assert found["reason"] == "tips"
-    assert 0 < found["fails_s"] < 6.17  # before it falls in a contact simulation
-    assert found["cost"] == pytest.approx(2.49, rel=0.01)
+    result = summary["table1"]["pseudo_inverse"]
+    assert result["index_min"] == pytest.approx(-5.3, abs=0.05)
+    assert (result["zmp_min_m"], result["zmp_max_m"]) == pytest.approx((-0.066, 0.250), abs=5e-4)
+    assert result["reason"] == "tips"
+    assert 0 < result["fails_s"] < 6.17  # before it falls in a contact simulation
+    assert result["cost"] == pytest.approx(2.49, rel=0.01)
 
 
 def test_an_index_of_one_is_no_success(summary: Summary) -> None:
     for form in ("augmented", "null_space"):
-        found = summary["table1"][form]
-        assert found["index_min"] == pytest.approx(1.0, abs=1e-9)
-        assert found["reason"] == "lift_off"
-        assert found["stopped_s"] == pytest.approx(1.13, abs=5e-3)
-        assert found["diverges_s"] == pytest.approx(1.26, abs=5e-3)
-        assert found["vertical_force_min_n"] < 0
-        assert "lifts off at 1.131 s" in found["verdict"]
+        result = summary["table1"][form]
+        assert result["index_min"] == pytest.approx(1.0, abs=1e-9)
+        assert result["reason"] == "lift_off"
+        assert result["stopped_s"] == pytest.approx(1.13, abs=5e-3)
+        assert result["diverges_s"] == pytest.approx(1.26, abs=5e-3)
+        assert result["vertical_force_min_n"] < 0
+        assert "lifts off at 1.131 s" in result["verdict"]
 
 
 def test_the_two_forms_of_the_law_agree(summary: Summary) -> None:
@@ -103,20 +103,20 @@ def test_every_layer_over_a_pinned_point_falls(run: Run[Results]) -> None:
         assert float(row["index_min"]) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_stabilised_law_stands_and_what_it_misses_is_told(run: Run[Results], summary: Summary) -> None:
-    found = summary["table1"]["stabilised"]
-    assert found["reason"] == "stands"
-    assert found["index_min"] == pytest.approx(1.0, abs=1e-9)
-    assert found["peak_joint_velocity_rad_s"] == pytest.approx(0.99, rel=0.05)
-    assert found["vertical_force_min_n"] >= 589
-    assert found["leaves_joint_limits_s"] == "never"
+def test_the_stabilised_law_stands_and_its_error_is_reported(run: Run[Results], summary: Summary) -> None:
+    result = summary["table1"]["stabilised"]
+    assert result["reason"] == "stands"
+    assert result["index_min"] == pytest.approx(1.0, abs=1e-9)
+    assert result["peak_joint_velocity_rad_s"] == pytest.approx(0.99, rel=0.05)
+    assert result["vertical_force_min_n"] >= 589
+    assert result["leaves_joint_limits_s"] == "never"
     rows = {row["quantity"]: row for row in run.table("comparison.csv") if row["motion"] == "stabilised"}
-    assert float(rows["cost"]["difference"]) == pytest.approx(found["cost"] - 0.17, abs=1e-6)
+    assert float(rows["cost"]["difference"]) == pytest.approx(result["cost"] - 0.17, abs=1e-6)
     assert CAVEATS["stabilised"] in run.printed
     used = [row for row in run.table("stabiliser.csv") if row["used"] == "yes"]
     assert len(used) == 1
     assert (float(used[0]["poles_1_s"]), float(used[0]["p1_gain_1_s2"])) == (4.0, 0.0)
-    assert float(used[0]["cost"]) == pytest.approx(found["cost"], rel=1e-5)
+    assert float(used[0]["cost"]) == pytest.approx(result["cost"], rel=1e-5)
 
 
 def test_the_stabilised_law_fails_against_the_spring(summary: Summary) -> None:
@@ -124,11 +124,11 @@ def test_the_stabilised_law_fails_against_the_spring(summary: Summary) -> None:
 
 
 def test_with_the_sign_as_printed_the_machine_does_not_fall_and_its_index_is_not_one(summary: Summary) -> None:
-    found = summary["table1"]["as_printed"]
-    assert found["reason"] == "joint_limit"
-    assert found["reaches_s"] == pytest.approx(2 * np.pi)
-    assert found["index_min"] == pytest.approx(0.84, abs=0.005)
-    assert found["tip_error_m"] < 1e-9
+    result = summary["table1"]["as_printed"]
+    assert result["reason"] == "joint_limit"
+    assert result["reaches_s"] == pytest.approx(2 * np.pi)
+    assert result["index_min"] == pytest.approx(0.84, abs=0.005)
+    assert result["tip_error_m"] < 1e-9
 
 
 def test_the_printed_law_with_the_right_sign_is_the_null_space_law() -> None:
@@ -141,7 +141,7 @@ def test_the_printed_law_with_the_right_sign_is_the_null_space_law() -> None:
     np.testing.assert_allclose(ours.joint_accelerations, other.joint_accelerations, atol=1e-8)
 
 
-def test_motions_are_judged_by_what_fails_first_on_the_ground(run: Run[Results]) -> None:
+def test_motions_are_judged_by_their_first_violation_of_ground_contact(run: Run[Results]) -> None:
     sound = run.results.local["table1"]["stabilised"].motion
     assert fails(sound)[0] == "stands"
     assert fails(sound)[1] == pytest.approx(HORIZON)
@@ -164,19 +164,19 @@ def test_motions_are_judged_by_what_fails_first_on_the_ground(run: Run[Results])
 @pytest.mark.parametrize(("task", "key"), COSTS)
 def test_optimal_costs_are_the_known_ones(task: str, key: str, summary: Summary) -> None:
     assert HELD[task] == 80
-    found = summary[task][key]
-    assert found["held"]["cost"] == pytest.approx(COSTS[task, key], rel=1e-3)
-    assert found["cost"] == pytest.approx(COSTS[task, key], rel=0.01)
-    assert found["cost"] <= found["held"]["cost"]
+    result = summary[task][key]
+    assert result["held"]["cost"] == pytest.approx(COSTS[task, key], rel=1e-3)
+    assert result["cost"] == pytest.approx(COSTS[task, key], rel=0.01)
+    assert result["cost"] <= result["held"]["cost"]
 
 
 def test_minimum_times_are_the_known_ones_and_grow_with_the_restriction(summary: Summary) -> None:
-    found = [summary["minimum_time"][f"{key}_s"] for key in ("free", "in_foot", "index_nine_tenths")]
+    matches = [summary["minimum_time"][f"{key}_s"] for key in ("free", "in_foot", "index_nine_tenths")]
     held = [summary["minimum_time"][key]["held"]["reaches_s"] for key in ("free", "in_foot", "index_nine_tenths")]
     assert held == pytest.approx([0.457, 0.503, 0.539], rel=1e-3)
-    assert found == pytest.approx(held, rel=0.01)
-    assert all(np.less(found, held))
-    assert found == sorted(found)
+    assert matches == pytest.approx(held, rel=0.01)
+    assert all(np.less(matches, held))
+    assert matches == sorted(matches)
 
 
 def test_a_stricter_rule_costs_more(summary: Summary) -> None:
@@ -196,8 +196,8 @@ def test_local_motions_that_get_to_the_end_cost_more_than_the_plan_of_their_rule
 
 
 def test_the_zero_moment_point_of_the_plan_keeps_inside_the_foot(summary: Summary) -> None:
-    found = summary["table1"]["optimal_range"]
-    assert -0.081 < found["zmp_min_m"] < found["zmp_max_m"] < 0.181
+    result = summary["table1"]["optimal_range"]
+    assert -0.081 < result["zmp_min_m"] < result["zmp_max_m"] < 0.181
 
 
 def test_every_plan_that_is_drawn_holds_between_its_nodes(run: Run[Results], summary: Summary) -> None:
@@ -220,7 +220,7 @@ def test_the_audit_of_every_plan_that_is_drawn_finds_it_feasible_and_no_worse_th
     for task, key, plan in plans_of(run):
         assert f"{task}, {key}:" in text
         audit = plan.audit
-        if not plan.request.drawn:
+        if not plan.request.has_figure:
             assert plan.request.transcription == "held"
             assert "zero moment point" in {name for name, _, _ in failures(plan)}  # pinned, and held accelerations
             assert not audit.feasible
@@ -232,7 +232,7 @@ def test_the_audit_of_every_plan_that_is_drawn_finds_it_feasible_and_no_worse_th
         assert audit["cost lost, relative"].limit == 1e-3
 
 
-def test_plans_are_looked_at_on_ten_times_their_grid_with_both_ends_of_every_interval(run: Run[Results]) -> None:
+def test_plans_are_checked_on_ten_times_their_grid_with_both_ends_of_every_interval(run: Run[Results]) -> None:
     for _, _, plan in plans_of(run):
         motion, n = plan.motion, plan.request.intervals
         assert motion.t.shape == (11 * n,)
@@ -281,9 +281,9 @@ def test_checks_and_exit_status_find_a_plan_that_does_not_hold(run: Run[Results]
     assert not row["holds"]
     assert not sound(replace(run.results, checks=[{**row, "drawn": True}]))
     failed = replace(plan, audit=run.results.plans["table1"]["optimal_pinned"].audit)
-    dearer = [replace(one, value=2e-3) if one.name == "cost lost, relative" else one for one in plan.audit.findings]
+    costlier = [replace(one, value=2e-3) if one.name == "cost lost, relative" else one for one in plan.audit.findings]
     assert sound(run.results)
-    for other in (failed, replace(plan, audit=replace(plan.audit, findings=tuple(dearer)))):
+    for other in (failed, replace(plan, audit=replace(plan.audit, findings=tuple(costlier)))):
         assert not sound(replace(run.results, plans={"table1": {"optimal_range": other}}))
 
 
@@ -359,13 +359,13 @@ def test_tables_are_written_and_the_differences_are_theirs(run: Run[Results], su
         assert row["source"] in ("paper", "reference", "reference, held")
         if row["quantity"] != "time_s":
             mine = summary[row["task"]][row["motion"]]
-            told = (mine["held"] if "held" in row["source"] else mine)[row["quantity"]]
-            assert float(row["ours"]) == pytest.approx(told, rel=1e-6, abs=1e-9)
+            report = (mine["held"] if "held" in row["source"] else mine)[row["quantity"]]
+            assert float(row["ours"]) == pytest.approx(report, rel=1e-6, abs=1e-9)
     motions = run.table("motions.csv")
     assert len(motions) == sum(map(len, LOCAL.values())) + sum(map(len, PLANS.values()))
 
 
-def test_what_was_assumed_is_printed_and_written(run: Run[Results], summary: Summary) -> None:
+def test_assumptions_are_printed_and_written(run: Run[Results], summary: Summary) -> None:
     for words in summary["assumptions"]:
         assert words in run.printed
     for words in summary["caveats"].values():

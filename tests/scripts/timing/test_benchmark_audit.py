@@ -18,15 +18,15 @@ pytestmark = pytest.mark.xdist_group("benchmark_audit")  # one process, so that 
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def measured_audit(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("benchmark")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(benchmark_audit, "INTERVALS", (50, 100))
         return folder, benchmark.run_part("audit", folder, 1)
 
 
-def test_every_case_is_timed_on_every_number_of_intervals(found: tuple[Path, dict[str, Any]]) -> None:
-    _, numbers = found
+def test_every_case_is_timed_on_every_number_of_intervals(measured_audit: tuple[Path, dict[str, Any]]) -> None:
+    _, numbers = measured_audit
     named = [(row["case"], row["intervals"]) for row in numbers["rows"]]
     assert named == [(case, n) for case in benchmark_audit.CASES for n in (50, 100)]
     for row in numbers["rows"]:
@@ -35,16 +35,16 @@ def test_every_case_is_timed_on_every_number_of_intervals(found: tuple[Path, dic
         assert row["audit_ms_an_interval"] == pytest.approx(1e3 * row["audit_s"] / row["intervals"])
 
 
-def test_the_worst_ratio_and_growth_stand_beside_their_goals(found: tuple[Path, dict[str, Any]]) -> None:
-    _, numbers = found
+def test_the_worst_ratio_and_growth_stand_beside_their_goals(measured_audit: tuple[Path, dict[str, Any]]) -> None:
+    _, numbers = measured_audit
     assert numbers["worst_ratio"] == max(row["audit_over_solve"] for row in numbers["rows"])
     assert numbers["worst_growth_over_linear"] == pytest.approx(1.0)  # from 100 to 100 intervals
     assert numbers["goals"] == {"worst_ratio": 1.0, "worst_growth_over_linear": 1.2}
     assert "audit over solve, worst" in benchmark_audit.report(numbers)
 
 
-def test_tables_and_the_picture_are_written(found: tuple[Path, dict[str, Any]]) -> None:
-    folder, numbers = found
+def test_tables_and_the_picture_are_written(measured_audit: tuple[Path, dict[str, Any]]) -> None:
+    folder, numbers = measured_audit
     assert "audit" in benchmark.PARTS
     assert json.loads((folder / "audit.json").read_text(encoding="utf-8"))["worst_ratio"] == numbers["worst_ratio"]
     with (folder / "audit.csv").open(newline="", encoding="utf-8") as stream:

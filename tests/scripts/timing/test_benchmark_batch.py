@@ -26,7 +26,7 @@ def test_batches_are_measured_and_drawn(tmp_path: Path, monkeypatch: pytest.Monk
     assert [row["record"] for row in numbers["short"]] == list(range(30))
     assert numbers["goals"]["Dask, two workers"]["figure"] is None
     assert "of 30 short tasks" in batch.report(numbers)
-    shares = [numbers["goals"][f"{way}, share"]["figure"] for way in ("two workers", "Dask, two workers")]
+    shares = [numbers["goals"][f"{path}, share"]["figure"] for path in ("two workers", "Dask, two workers")]
     gains = [row["times_one_worker"] for row in numbers["rows"]]
     assert shares == [pytest.approx(gains[1] / numbers["plain"]["gain"]), None]
     with Image.open(tmp_path / "batch.png") as picture:

@@ -32,8 +32,8 @@ def test_every_method_is_timed_and_as_accurate_as_it_is(summary: dict[str, Any])
     rows = by_method(summary)
     assert len(rows) == len(summary["rows"])
     assert all(np.isfinite(row["ns_per_sample"]) and row["ns_per_sample"] > 0 for row in rows.values())
-    ways = ("map", "march", *(("compiled",) if has_compiler() else ()))
-    for how in ways:
+    paths = ("map", "march", *(("compiled",) if has_compiler() else ()))
+    for how in paths:
         # the drift at a blend's end that was checked for 1 ms: 3.73 um, and rounding
         assert rows[f"predictor_corrector, cubic, {how}"]["worst_error_um"] == pytest.approx(3.73, abs=0.01)
         for kind in ("cubic", "quintic"):

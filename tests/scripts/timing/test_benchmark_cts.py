@@ -34,14 +34,14 @@ def test_a_part_is_run_and_its_tables_written(tmp_path: Path, monkeypatch: pytes
         assert picture.width > 600
 
 
-def test_compiled_is_what_python_gives_and_a_bad_row_leaves_the_others() -> None:
+def test_compiled_functions_equal_python_and_a_bad_row_affects_no_other() -> None:
     function = optimal_inverse(reference_rig(**benchmark_cts.LIMITS), reference_tunnel())
     rows = np.vstack([benchmark_cts.random_reachable(60), sweep_targets(20)])
     rows[[5, 17], [0, 3]] = np.nan, np.inf
-    found = benchmark_cts.compiled_inverse(function, rows, 1)[0]
+    result = benchmark_cts.compiled_inverse(function, rows, 1)[0]
     joints, cost, active, status = (np.array(part) for part in function.map(80)(rows.T, np.zeros((1, 80))))
-    np.testing.assert_array_equal(found[:, 8], status[0])
-    np.testing.assert_array_equal(found[:, 7][status[0] == 0], active[0][status[0] == 0])
-    np.testing.assert_allclose(found[:, :6], joints.T, rtol=0, atol=1e-9, equal_nan=True)
-    np.testing.assert_allclose(found[:, 6], cost[0], rtol=0, atol=1e-12, equal_nan=True)
+    np.testing.assert_array_equal(result[:, 8], status[0])
+    np.testing.assert_array_equal(result[:, 7][status[0] == 0], active[0][status[0] == 0])
+    np.testing.assert_allclose(result[:, :6], joints.T, rtol=0, atol=1e-9, equal_nan=True)
+    np.testing.assert_allclose(result[:, 6], cost[0], rtol=0, atol=1e-12, equal_nan=True)
     assert set(np.flatnonzero(status[0] == 1)) == {5, 17}

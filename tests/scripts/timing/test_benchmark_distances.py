@@ -10,7 +10,7 @@ from scripts import benchmark
 from scripts.timing import distances
 
 
-def test_distances_are_timed_by_every_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_distances_are_timed_by_every_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(distances, "BOXES", 1)
     monkeypatch.setattr(distances, "CALLS", 1)
     assert "distances" in benchmark.PARTS

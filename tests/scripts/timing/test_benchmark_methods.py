@@ -29,12 +29,12 @@ def test_the_loop_of_constraints_finds_the_optimum_of_the_package(
     assert {path.name for path in tmp_path.iterdir()} == {f"build_and_solve.{ending}" for ending in endings}
 
 
-def test_costates_are_timed_by_four_ways(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_costates_are_timed_by_four_methods(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(costate_rate, "JOINTS", (3, 7))
     numbers = costate_rate.run(1)
     for row, joints in zip(numbers["rows"], (3, 7), strict=True):
         assert row["joints"] == joints
-        times = [row[f"{way}_us"] for way in ("casadi_vm", "compiled", "recursion_numpy", "finite_differences")]
+        times = [row[f"{path}_us"] for path in ("casadi_vm", "compiled", "recursion_numpy", "finite_differences")]
         assert np.isfinite(times).all()
         assert row["recursion_over_compiled"] == pytest.approx(times[2] / times[1])
     assert numbers["recursion_over_compiled_at_7"] == numbers["rows"][1]["recursion_over_compiled"]
@@ -44,14 +44,14 @@ def test_costates_are_timed_by_four_ways(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_the_summary_holds_the_numbers_of_both_and_the_others_have_their_own_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found: dict[str, dict[str, Any]] = {
+    by_name: dict[str, dict[str, Any]] = {
         "build_and_solve": {"rows": [{"intervals": 100}], "build_ratio_at_100": 2.0},
         "costate_rate": {"rows": [{"joints": 7}], "recursion_over_compiled_at_7": 3.0},
     }
-    monkeypatch.setattr(benchmark, "run_part", lambda name, folder, repeats: found[name])
+    monkeypatch.setattr(benchmark, "run_part", lambda name, folder, repeats: by_name[name])
     for module in (build_and_solve, costate_rate):
         monkeypatch.setattr(module, "report", lambda numbers: "")
-    assert benchmark.main(["--out", str(tmp_path), "--only", *found]) == 0
+    assert benchmark.main(["--out", str(tmp_path), "--only", *by_name]) == 0
     assert json.loads((tmp_path / "benchmark" / "summary.json").read_text(encoding="utf-8")) == {
         "build_and_solve": [{"intervals": 100}],
         "build_ratio_at_100": 2.0,

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.parametrize("name", ["brachistochrone", "van der Pol", "Goddard", "cart-pole", "paper's arm"])
-def test_the_formulas_that_peers_are_given_hold_along_our_plan(name: str) -> None:
+def test_the_formulas_for_peers_hold_along_our_plan(name: str) -> None:
     statement = STATEMENTS[name]()
     method = Collocation(10, 5, control="held" if statement.held else "points")
     plan = prepare(statement.problem, method, compiled=False).solve({"p": statement.p})
@@ -51,17 +51,17 @@ def test_a_tool_is_measured_against_the_known_optimum() -> None:
     assert min(row["cold_s"], row["warm_s"]) > 0
 
 
-def test_what_dymos_is_given_is_the_same_formulas() -> None:
+def test_the_formulas_for_dymos_are_the_same() -> None:
     """Bounds as one row each, inside -1 .. 1; the cost as it adds up."""
     statement = STATEMENTS["brachistochrone"]()
     along = tools._along(statement)
-    found = along.call({"x": [1.0, 2.0, 3.0], "u": np.pi / 4, "t": 0.5, "c": 0.25, "p": 9.8})
-    assert float(found["inside"]) == pytest.approx(-0.5)
-    assert float(found["total"]) == pytest.approx(0.75)
-    assert found["rates"].full().ravel() == pytest.approx([3 * 0.5**0.5, 3 * 0.5**0.5, 9.8 * 0.5**0.5])
+    result = along.call({"x": [1.0, 2.0, 3.0], "u": np.pi / 4, "t": 0.5, "c": 0.25, "p": 9.8})
+    assert float(result["inside"]) == pytest.approx(-0.5)
+    assert float(result["total"]) == pytest.approx(0.75)
+    assert result["rates"].full().ravel() == pytest.approx([3 * 0.5**0.5, 3 * 0.5**0.5, 9.8 * 0.5**0.5])
 
 
-def test_the_first_mesh_that_is_near_enough_is_told_and_what_failed_is_left_blank() -> None:
+def test_the_first_accurate_mesh_is_reported_and_failures_are_blank() -> None:
     def row(tool: str, intervals: int, error: float | None) -> dict[str, Any]:
         return {"problem": "p", "tool": tool, "intervals": intervals, "error": error, "cold_s": 0.012, "warm_s": 0.0034}
 
@@ -96,15 +96,15 @@ def test_the_readme_has_the_table_of_the_last_run(tmp_path: Path) -> None:
 def test_a_peer_that_is_not_installed_is_left_out_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(optimal_control, "installed", lambda _: "not installed")
     monkeypatch.setattr(optimal_control, "STATEMENTS", ["van der Pol"])
-    asked: list[str] = []
+    request: list[str] = []
 
     def rows_of(tool: str, *_: Any) -> list[Any]:
-        asked.append(tool)
+        request.append(tool)
         return []
 
     monkeypatch.setattr(optimal_control, "rows_of", rows_of)
     numbers = optimal_control.run()
-    assert asked == ["selfmotion"]
+    assert request == ["selfmotion"]
     assert numbers["versions"] == {"rockit": "not installed", "Dymos": "not installed", "Drake": "not installed"}
     assert "rockit: not installed" in optimal_control.report({**numbers, "rows": [], "first": [{"tool": "-"}]})
 
@@ -118,8 +118,10 @@ def test_pages_are_drawn(tmp_path: Path) -> None:
         assert name in benchmark.PARTS
 
 
-def test_the_misfit_of_a_posture_is_its_distance_and_angle() -> None:
+def test_the_pose_error_of_a_configuration_is_its_distance_and_angle() -> None:
     place, axes = arms.tip_function()(ca.DM(HOME))
     turn = np.array([[np.cos(0.01), -np.sin(0.01), 0], [np.sin(0.01), np.cos(0.01), 0], [0, 0, 1]])
-    found = arms.misfit(np.array([HOME]), place.full().T + np.array([0.0, 0.003, 0.004]), (axes.full() @ turn)[None])
-    assert found == pytest.approx((0.005, 0.01), rel=1e-6)
+    result = arms.pose_error(
+        np.array([HOME]), place.full().T + np.array([0.0, 0.003, 0.004]), (axes.full() @ turn)[None]
+    )
+    assert result == pytest.approx((0.005, 0.01), rel=1e-6)

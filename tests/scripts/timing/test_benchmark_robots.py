@@ -10,7 +10,7 @@ from PIL import Image
 from scripts.timing import robots as benchmark_robots
 
 
-def test_the_ways_to_the_generalized_jacobian_agree_and_are_drawn(
+def test_formulas_of_the_generalized_jacobian_agree_and_are_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The script compares the results before it compares the times."""
@@ -33,7 +33,7 @@ def test_functions_that_differ_are_not_timed() -> None:
         benchmark_robots.check(np.array([1.0 + 1e-9]), np.array([1.0]), "ours")
 
 
-def test_what_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_peers_are_omitted(monkeypatch: pytest.MonkeyPatch) -> None:
     missing: dict[str, Any] = {name: ("no-such-distribution", "robot.urdf", {}) for name in ("UR5", "space arm")}
     monkeypatch.setattr(benchmark_robots, "ROBOTS", missing)
     assert benchmark_robots.run(repeats=1) == {"loading": [], "space_arm": [], "goals_us": benchmark_robots.GOALS}

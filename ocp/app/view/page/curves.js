@@ -1,18 +1,18 @@
-// Curves over time with limits and a cursor, and the way of the zero moment point in its footprint, as inline SVG.
+// Curves over time with limits and a cursor, and the path of the zero moment point in its footprint, as inline SVG.
 
 const SPACE = "http://www.w3.org/2000/svg";
 const WIDE = 240, TALL = 96, LEFT = 42, RIGHT = 6, TOP = 6, BOTTOM = 14;
-const LEAST = 0.02;  // of a chart's largest value is its range at least: less would show rounding as if it were something
+const LEAST = 0.02;  // least range of a chart relative to its largest value, so that rounding is not shown
 const OPEN = ["Cost", "The motion", "Standing", "Momentum", "Joints"];
 
-function shape(kind, given, inside) {
-  const made = document.createElementNS(SPACE, kind);
-  for (const [name, value] of Object.entries(given)) made.setAttribute(name, value);
-  if (inside) inside.append(made);
-  return made;
+function shape(kind, attributes, parent) {
+  const node = document.createElementNS(SPACE, kind);
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  if (parent) parent.append(node);
+  return node;
 }
 
-function written(value) {
+function formatted(value) {
   if (!Number.isFinite(value)) return "";
   const size = Math.abs(value);
   if (size < 1e-9) return "0";
@@ -39,8 +39,8 @@ class Chart {
     const caption = document.createElement("figcaption"), title = document.createElement("b");
     title.textContent = name;
     title.title = name;
-    this.told = document.createElement("span");
-    caption.append(title, this.told);
+    this.readout = document.createElement("span");
+    caption.append(title, this.readout);
     this.svg = shape("svg", {viewBox: `0 0 ${WIDE} ${TALL}`, role: "img", "aria-label": `${name} over time`});
     this.figure.append(caption, this.svg);
     this.draw();
@@ -74,11 +74,11 @@ class Chart {
     shape("path", {class: "axis", d: `M${LEFT} ${TOP}V${TALL - BOTTOM}H${WIDE - RIGHT}`}, this.svg);
     for (const value of [low + room, high - room]) {
       const label = shape("text", {x: LEFT - 3, y: y(value) + 3, "text-anchor": "end"}, this.svg);
-      label.textContent = written(value);
+      label.textContent = formatted(value);
     }
     for (const [time, anchor] of [[0, "start"], [this.horizon, "end"]]) {
       const label = shape("text", {x: this.x(time), y: TALL - 3, "text-anchor": anchor}, this.svg);
-      label.textContent = time ? `${written(time)} s` : "0";
+      label.textContent = time ? `${formatted(time)} s` : "0";
     }
     for (const limit of limits)
       shape("line", {class: "limit", x1: LEFT, x2: WIDE - RIGHT, y1: y(limit), y2: y(limit)}, this.svg);
@@ -101,11 +101,11 @@ class Chart {
 
   show(time) {
     this.cursor.setAttribute("transform", `translate(${this.x(Math.min(time, this.horizon)).toFixed(2)} 0)`);
-    this.told.replaceChildren(...this.curves.map((curve, k) => {
-      const made = document.createElement("span");
-      made.className = `ink-${curve.kind}`;
-      made.textContent = `${k ? " | " : ""}${written(valueAt(curve.times, curve.values, time))}`;
-      return made;
+    this.readout.replaceChildren(...this.curves.map((curve, k) => {
+      const value = document.createElement("span");
+      value.className = `ink-${curve.kind}`;
+      value.textContent = `${k ? " | " : ""}${formatted(valueAt(curve.times, curve.values, time))}`;
+      return value;
     }), ` ${this.curves[0].unit}`);
   }
 }
@@ -116,7 +116,7 @@ class FootChart {
     this.figure = document.createElement("figure");
     this.figure.className = "chart";
     const caption = document.createElement("figcaption"), title = document.createElement("b");
-    const lacking = feet.length > 1 && feet[0].forces !== feet[1].forces ? `, ${feet[0].forces ? "what it is held against" :
+    const lacking = feet.length > 1 && feet[0].forces !== feet[1].forces ? `, ${feet[0].forces ? "the compared motion" :
       "the plan"} without external forces` : feet[0].forces ? "" : ", without external forces";
     title.textContent = `zero moment point in the footprint, seen from above${lacking}`;
     caption.append(title);

@@ -1,6 +1,6 @@
 // The player: what the page holds, the time that it shows, and which motions, alone, over each other or side by side.
 
-const COLORS = {plan: [0, 0.447, 0.698], other: [0.835, 0.369, 0], asked: [0, 0.62, 0.451], near: [0.8, 0.475, 0.655],
+const COLORS = {plan: [0, 0.447, 0.698], other: [0.835, 0.369, 0], target: [0, 0.62, 0.451], near: [0.8, 0.475, 0.655],
   solid: [0.43, 0.43, 0.43, 0.55], grid: [0.5, 0.5, 0.5, 0.28]};
 const AXES = [[0.84, 0.15, 0.16], [0.17, 0.63, 0.17], [0.12, 0.47, 0.71]];
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10];
@@ -14,22 +14,22 @@ async function unpacked() {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   const whole = await new Response(stream).arrayBuffer();
   const size = new DataView(whole).getUint32(0, true);
-  const told = JSON.parse(new TextDecoder().decode(new Uint8Array(whole, 4, size)));
+  const data = JSON.parse(new TextDecoder().decode(new Uint8Array(whole, 4, size)));
   const arrays = ({at, kind, shape}) =>
     new KINDS[kind](whole, 4 + size + at, shape.reduce((product, count) => product * count, 1));
-  return {told, arrays};
+  return {data, arrays};
 }
 
 class Motion {
-  constructor(told, arrays, scene) {
-    Object.assign(this, {told, name: told.name, horizon: told.horizon, t: arrays(told.t), poses: arrays(told.poses)});
-    this.width = told.poses.shape[1];
-    this.time = arrays(told.time);
-    this.curves = told.curves.map((one) => ({...one, times: this.time, values: arrays(one.values)}));
-    this.around = told.around.map((one) => ({surface: scene.surface(one, arrays), mover: one.mover}));
-    this.way = told.tip ? this.trail(this.width - 1) : new Float32Array(0);
-    this.done = scene.line(this.way);
-    this.targets = told.targets.map((one) => {
+  constructor(data, arrays, scene) {
+    Object.assign(this, {data, name: data.name, horizon: data.horizon, t: arrays(data.t), poses: arrays(data.poses)});
+    this.width = data.poses.shape[1];
+    this.time = arrays(data.time);
+    this.curves = data.curves.map((one) => ({...one, times: this.time, values: arrays(one.values)}));
+    this.around = data.around.map((one) => ({surface: scene.surface(one, arrays), mover: one.mover}));
+    this.trace = data.tip ? this.trail(this.width - 1) : new Float32Array(0);
+    this.done = scene.line(this.trace);
+    this.targets = data.targets.map((one) => {
       const t = arrays(one.t), position = arrays(one.position), rotation = arrays(one.rotation), lines = [];
       for (let k = 0; k + 1 < t.length; k++) {
         const pair = position.subarray(3 * k, 3 * k + 6);
@@ -37,21 +37,21 @@ class Motion {
       }
       return {t, position, rotation, line: scene.line(new Float32Array(lines))};
     });
-    if (told.near) this.near = {t: arrays(told.near.t), points: arrays(told.near.points),
-      distances: arrays(told.near.distances), bodies: told.near.bodies, which: told.near.which,
+    if (data.near) this.near = {t: arrays(data.near.t), points: arrays(data.near.points),
+      distances: arrays(data.near.distances), bodies: data.near.bodies, which: data.near.which,
       line: scene.line(new Float32Array(6), true)};
-    if (told.footing) this.footing = {corners: told.footing.corners, forces: told.footing.forces, points: arrays(told.footing.points),
-      times: this.time, line: scene.line(this.outline(told.footing.corners))};
+    if (data.footing) this.footing = {corners: data.footing.corners, forces: data.footing.forces, points: arrays(data.footing.points),
+      times: this.time, line: scene.line(this.outline(data.footing.corners))};
     this.pose = new Float32Array(7 * this.width);
   }
 
   trail(column) {
-    const count = this.t.length, made = new Float32Array(6 * Math.max(count - 1, 0));
+    const count = this.t.length, segments = new Float32Array(6 * Math.max(count - 1, 0));
     for (let k = 0; k + 1 < count; k++) for (let i = 0; i < 3; i++) {
-      made[6 * k + i] = this.poses[7 * (k * this.width + column) + i];
-      made[6 * k + 3 + i] = this.poses[7 * ((k + 1) * this.width + column) + i];
+      segments[6 * k + i] = this.poses[7 * (k * this.width + column) + i];
+      segments[6 * k + 3 + i] = this.poses[7 * ((k + 1) * this.width + column) + i];
     }
-    return made;
+    return segments;
   }
 
   outline(corners) {
@@ -64,7 +64,7 @@ class Motion {
     return low;
   }
 
-  at(time) {  // poses of all that moves, straight between the times that are told
+  at(time) {  // poses of all that moves, straight between the sampled times
     const k = this.before(this.t, time), size = 7 * this.width;
     const share = Math.max(0, Math.min(1, (time - this.t[k]) / (this.t[k + 1] - this.t[k] || 1)));
     for (let i = 0; i < size; i++)
@@ -74,12 +74,12 @@ class Motion {
 }
 
 class Player {
-  constructor({told, arrays}) {
-    this.told = told;
+  constructor({data, arrays}) {
+    this.data = data;
     this.scene = new Scene(element("scene"));
-    this.robots = told.robots.map((robot) => ({...robot, parts: robot.parts.map((part) => ({...part,
+    this.robots = data.robots.map((robot) => ({...robot, parts: robot.parts.map((part) => ({...part,
       surface: this.scene.surface(part, arrays)}))}));
-    this.motions = told.motions.map((one) => new Motion(one, arrays, this.scene));
+    this.motions = data.motions.map((one) => new Motion(one, arrays, this.scene));
     this.horizon = Math.max(...this.motions.map((one) => one.horizon));
     this.triad = this.scene.line(new Float32Array([0, 0, 0, 1, 0, 0]));
     Object.assign(this, {time: 0, playing: false, speed: 1, loop: true, mode: "alone", first: 0, second: 1});
@@ -89,8 +89,8 @@ class Player {
     this.controls();
     this.chart();
     this.table();
-    this.scene.changed = () => this.ask();
-    new ResizeObserver(() => this.ask()).observe(element("scene"));
+    this.scene.changed = () => this.schedule();
+    new ResizeObserver(() => this.schedule()).observe(element("scene"));
     this.seek(0);
   }
 
@@ -101,7 +101,7 @@ class Player {
     });
     const step = (count) => Math.max(1, Math.floor(count / 12));
     for (const motion of this.motions) {
-      const robot = this.robots[motion.told.robot], count = motion.t.length;
+      const robot = this.robots[motion.data.robot], count = motion.t.length;
       for (let k = 0; k < count; k += step(count)) {
         const pose = motion.at(motion.t[k]);
         for (const {mover, surface} of robot.parts) {
@@ -113,11 +113,11 @@ class Player {
         }
       }
       for (const {position} of motion.targets) for (let k = 0; k < position.length; k += 3) take([...position.slice(k, k + 3)]);
-      for (let k = 0; k < motion.way.length; k += 6) take([...motion.way.slice(k, k + 3)]);
+      for (let k = 0; k < motion.trace.length; k += 6) take([...motion.trace.slice(k, k + 3)]);
     }
     this.reach = Math.hypot(...high.map((value, k) => value - low[k]));
     this.scene.look(low, high);
-    const floats = this.motions.every((one) => one.told.floats), lines = [], middle = low.map((value, k) => (value + high[k]) / 2);
+    const floats = this.motions.every((one) => one.data.floats), lines = [], middle = low.map((value, k) => (value + high[k]) / 2);
     const cell = 10 ** Math.floor(Math.log10(this.reach / 2)), half = Math.ceil(0.8 * this.reach / cell);
     const [x, y] = middle.map((value) => Math.round(value / cell)), floor = Math.min(low[2], 0) - 1e-3 * this.reach;
     for (let k = -half; k <= half; k++) {
@@ -130,18 +130,18 @@ class Player {
   get visible() {  // motions that are seen, and in what colour
     const alone = this.mode === "alone" || this.motions.length < 2;
     const kinds = this.first && (alone || !this.second) ? ["other", "plan"] : ["plan", "other"];
-    const made = [this.first, this.second].map((number, k) => ({motion: this.motions[number], kind: kinds[k]}));
-    return alone ? made.slice(0, 1) : made;
+    const shown = [this.first, this.second].map((number, k) => ({motion: this.motions[number], kind: kinds[k]}));
+    return alone ? shown.slice(0, 1) : shown;
   }
 
-  ask() {
-    if (this.asked) return;
-    this.asked = true;
+  schedule() {
+    if (this.scheduled) return;
+    this.scheduled = true;
     requestAnimationFrame((now) => this.tick(now));
   }
 
   tick(now) {
-    this.asked = false;
+    this.scheduled = false;
     if (this.playing) {
       const passed = this.last === undefined ? 0 : Math.min(now - this.last, 250) / 1000;
       this.last = now;
@@ -153,17 +153,17 @@ class Player {
       this.set(time);
     }
     this.draw();
-    if (this.playing) this.ask();
+    if (this.playing) this.schedule();
   }
 
-  play() { this.playing = true; this.last = undefined; if (this.time >= this.horizon) this.time = 0; this.button(); this.ask(); }
+  play() { this.playing = true; this.last = undefined; if (this.time >= this.horizon) this.time = 0; this.button(); this.schedule(); }
   stop() { this.playing = false; this.button(); }
   button() {
     element("play").textContent = this.playing ? "❚❚" : "▶";
     element("play").setAttribute("aria-label", this.playing ? "pause" : "play");
   }
 
-  seek(time) { this.set(Math.max(0, Math.min(this.horizon, time))); this.ask(); }
+  seek(time) { this.set(Math.max(0, Math.min(this.horizon, time))); this.schedule(); }
 
   set(time) {
     this.time = time;
@@ -186,27 +186,27 @@ class Player {
       this.drawPart(side ? [visible[k]] : visible, visible.length > 1);
     }
     element("labels").replaceChildren(...(visible.length > 1 ? visible : []).map(({motion, kind}, k) => {
-      const made = document.createElement("span");
-      made.className = `ink-${kind}`;
-      made.textContent = motion.name;
-      made.style.left = side ? `${50 * k}%` : "0";
-      if (!side) made.style.top = `${0.5 + 1.4 * k}rem`;
-      return made;
+      const label = document.createElement("span");
+      label.className = `ink-${kind}`;
+      label.textContent = motion.name;
+      label.style.left = side ? `${50 * k}%` : "0";
+      if (!side) label.style.top = `${0.5 + 1.4 * k}rem`;
+      return label;
     }));
   }
 
-  drawPart(visible, told) {
+  drawPart(visible, compared) {
     const {scene, shown} = this;
     if (this.grid && shown.floor) scene.drawLine(this.grid, COLORS.grid, 1);
     for (const [number, {motion, kind}] of visible.entries()) {
       const time = Math.min(this.time, motion.horizon), pose = motion.at(time), faint = number > 0;
       if (!faint)
-        this.drawRobot(motion, pose, (color) => told ? this.tinted(color, COLORS[kind]) : color);
+        this.drawRobot(motion, pose, (color) => compared ? this.tinted(color, COLORS[kind]) : color);
       if (shown.paths) {
         const upto = this.motions.length ? motion.before(motion.t, time) : 0;
         scene.drawLine(motion.done, [...COLORS[kind], 0.35], 1.6);
         scene.drawLine(motion.done, [...COLORS[kind], 1], 3.4, IDENTITY, upto);
-        if (!faint) for (const target of motion.targets) scene.drawLine(target.line, [...COLORS.asked, 0.9], 1.8);
+        if (!faint) for (const target of motion.targets) scene.drawLine(target.line, [...COLORS.target, 0.9], 1.8);
       }
       if (shown.frames) this.drawFrames(motion, pose, time);
       if (motion.footing) scene.drawLine(motion.footing.line, [0.4, 0.4, 0.4, 1], 2);
@@ -232,13 +232,13 @@ class Player {
   }
 
   drawRobot(motion, pose, paint) {
-    const {parts} = this.robots[motion.told.robot];
+    const {parts} = this.robots[motion.data.robot];
     for (const {mover, surface, color} of parts.filter((one) => one.color[3] > 0.99))
       this.scene.drawSurface(surface, matrixOf(pose, 7 * mover), paint(color));
   }
 
   drawGlass(motion, pose) {
-    const glass = this.robots[motion.told.robot].parts.filter((one) => one.color[3] <= 0.99);
+    const glass = this.robots[motion.data.robot].parts.filter((one) => one.color[3] <= 0.99);
     if (glass.length) this.scene.drawFaint(() => {
       for (const {mover, surface, color} of glass) this.scene.drawSurface(surface, matrixOf(pose, 7 * mover), color);
     });
@@ -251,7 +251,7 @@ class Player {
 
   drawFrames(motion, pose, time) {
     const length = 0.055 * this.reach;
-    if (motion.told.tip) this.drawTriad(matrixOf(pose, 7 * (motion.width - 1)), length, 2.6, 1);
+    if (motion.data.tip) this.drawTriad(matrixOf(pose, 7 * (motion.width - 1)), length, 2.6, 1);
     for (const {t, position, rotation} of motion.targets) {
       const k = Math.min(motion.before(t, time) + 1, t.length - 1);
       const place = [...position.slice(3 * k, 3 * k + 3)], turn = rotation.slice(9 * k, 9 * k + 9);
@@ -305,12 +305,12 @@ class Player {
       else if (step) { event.preventDefault(); this.stop(); this.seek(this.time + step * this.horizon); }
     });
     const choice = (label, entries, value, pick) => {
-      const made = document.createElement("label"), list = document.createElement("select");
+      const field = document.createElement("label"), list = document.createElement("select");
       list.append(...entries.map(([key, text]) => new Option(text, key, key === value, key === value)));
       list.setAttribute("aria-label", label);
       list.addEventListener("change", () => { pick(list.value); this.chart(); this.table(); this.seek(this.time); });
-      made.append(`${label} `, list);
-      options.append(made);
+      field.append(`${label} `, list);
+      options.append(field);
     };
     if (this.motions.length > 1) {
       const names = this.motions.map((one, k) => [String(k), one.name]);
@@ -321,14 +321,14 @@ class Player {
     }
     const keys = {paths: "paths", frames: "frames", ghosts: "ghosts", near: "nearest bodies", around: "obstacles", floor: "floor"};
     const there = {near: this.motions.some((one) => one.near), around: this.motions.some((one) => one.around.length),
-      floor: this.grid, ghosts: true, frames: this.motions.some((one) => one.told.tip), paths: this.motions.some((one) => one.told.tip)};
+      floor: this.grid, ghosts: true, frames: this.motions.some((one) => one.data.tip), paths: this.motions.some((one) => one.data.tip)};
     for (const [name, text] of Object.entries(keys)) {
       if (!there[name]) continue;
-      const made = document.createElement("label"), box = document.createElement("input");
+      const label = document.createElement("label"), box = document.createElement("input");
       Object.assign(box, {type: "checkbox", checked: this.shown[name], id: `show-${name}`});
-      box.addEventListener("change", () => { this.shown[name] = box.checked; this.ask(); });
-      made.append(box, ` ${text}`);
-      options.append(made);
+      box.addEventListener("change", () => { this.shown[name] = box.checked; this.schedule(); });
+      label.append(box, ` ${text}`);
+      options.append(label);
     }
   }
 
@@ -368,16 +368,16 @@ class Player {
   }
 
   table() {
-    const audit = element("audit"), {motion} = this.visible[0], {rows, verdict, passed} = motion.told;
-    const said = element("verdict");
-    said.textContent = [this.visible.length > 1 ? `${motion.name}: ` : "", verdict].join("");
-    said.className = passed === true ? "good" : passed === false ? "bad" : "";
+    const audit = element("audit"), {motion} = this.visible[0], {rows, verdict, passed} = motion.data;
+    const sentence = element("verdict");
+    sentence.textContent = [this.visible.length > 1 ? `${motion.name}: ` : "", verdict].join("");
+    sentence.className = passed === true ? "good" : passed === false ? "bad" : "";
     audit.replaceChildren();
     const keys = document.createElement("p");
-    const words = {plan: this.visible.length > 1 ? "the plan" : "the motion", other: "what it is held against"};
+    const words = {plan: this.visible.length > 1 ? "the plan" : "the motion", other: "the compared motion"};
     const key = (kind, text, more = "") => `<span><i class="key ${more} ink-${kind}"></i>${text}</span>&emsp;`;
     keys.innerHTML = this.visible.map(({kind}) => key(kind, words[kind])).join("") +
-      (motion.targets.length ? key("asked", "the path asked for") : "") + key("limit", "limits, where near", "dashed");
+      (motion.targets.length ? key("target", "the required path") : "") + key("limit", "limits, where near", "dashed");
     audit.append(keys);
     if (!rows.length) return;
     const head = document.createElement("h2"), table = document.createElement("table"), box = document.createElement("div");
@@ -395,7 +395,7 @@ class Player {
       });
       return row;
     };
-    table.append(line(["looked at", "worst", "limit", "unit", "at, s", "", ""], "th"));
+    table.append(line(["quantity", "worst", "limit", "unit", "at, s", "", ""], "th"));
     for (const [name, value, limit, unit, time, word, note] of rows)
       table.append(line([name, number(value, 4), number(limit, 3), unit, number(time, 4), word, note], "td"));
     box.append(table);
@@ -406,11 +406,11 @@ class Player {
 (async () => {
   try {
     window.player = new Player(await unpacked());
-    const missing = Object.keys(window.player.told.missing);
-    element("foot").textContent = [missing.length ? `${missing.length} meshes are not shown, what these links touch ` +
-      "with is: " + missing.slice(0, 3).join(", ") + (missing.length > 3 ? ", …" : "") + ". " : "",
-      "Drag to turn, shift and drag to shift, scroll to come nearer, double click for the whole; space plays, arrows step. ",
-      "SI units, radians. Made by selfmotion."].join("");
+    const missing = Object.keys(window.player.data.missing);
+    element("foot").textContent = [missing.length ? `${missing.length} meshes are missing; the collision shapes of these links are shown: ` +
+      missing.slice(0, 3).join(", ") + (missing.length > 3 ? ", …" : "") + ". " : "",
+      "Drag to turn, shift and drag to shift, scroll to zoom, double click for the whole; space plays, arrows step. ",
+      "SI units, radians. Written by selfmotion."].join("");
     document.documentElement.dataset.ready = "yes";
   } catch (error) {
     element("nearest").textContent = `${error.message || error}`;

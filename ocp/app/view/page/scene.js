@@ -90,7 +90,7 @@ class Scene {
     return {program, at: Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]))};
   }
 
-  surface(told, arrays) {  // a part's vertices, normals and faces, kept by the graphics card
+  surface(data, arrays) {  // a part's vertices, normals and faces, kept by the graphics card
     const gl = this.gl, array = gl.createVertexArray();
     gl.bindVertexArray(array);
     const put = (data, kind) => {
@@ -98,17 +98,17 @@ class Scene {
       gl.bindBuffer(kind, buffer);
       gl.bufferData(kind, data, gl.STATIC_DRAW);
     };
-    put(arrays(told.vertices), gl.ARRAY_BUFFER);
+    put(arrays(data.vertices), gl.ARRAY_BUFFER);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 3, gl.UNSIGNED_SHORT, false, 8, 0);
-    put(arrays(told.normals), gl.ARRAY_BUFFER);
+    put(arrays(data.normals), gl.ARRAY_BUFFER);
     gl.enableVertexAttribArray(1);
     gl.vertexAttribPointer(1, 3, gl.BYTE, true, 4, 0);
-    const faces = arrays(told.faces);
+    const faces = arrays(data.faces);
     put(faces, gl.ELEMENT_ARRAY_BUFFER);
     gl.bindVertexArray(null);
     const kind = faces instanceof Uint16Array ? gl.UNSIGNED_SHORT : gl.UNSIGNED_INT;
-    return {array, count: faces.length, kind, low: told.low, grain: told.step};
+    return {array, count: faces.length, kind, low: data.low, grain: data.step};
   }
 
   line(segments, dynamic) {  // of pairs of points, six numbers each
@@ -215,7 +215,7 @@ class Scene {
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
   }
 
-  listen() {  // drag turns, with shift or another button it shifts, two fingers do both, the wheel comes nearer
+  listen() {  // drag turns, with shift or another button it shifts, two fingers do both, the wheel zooms
     const canvas = this.canvas, fingers = new Map();
     const shift = (dx, dy) => {
       const scale = this.camera.far / canvas.clientHeight * 0.66;

@@ -29,9 +29,9 @@ ROOT = Path(__file__).resolve().parents[4]
 
 def driver(folder: Path, tasks: list[Any], workers: int = 2, **options: Any) -> subprocess.Popen[str]:
     """A process that runs a batch of `square`."""
-    asked = json.dumps({"folder": str(folder), "tasks": tasks, "workers": workers})
+    request = json.dumps({"folder": str(folder), "tasks": tasks, "workers": workers})
     return subprocess.Popen(
-        [sys.executable, "-m", "tests.ocp.app.batch.functions", asked],
+        [sys.executable, "-m", "tests.ocp.app.batch.functions", request],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
@@ -43,21 +43,23 @@ def driver(folder: Path, tasks: list[Any], workers: int = 2, **options: Any) -> 
 
 def children_of(process: int) -> list[int]:
     """Processes that a process has started and that run."""
-    told = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process)], capture_output=True, text=True, check=False)
-    return [int(word) for word in told.stdout.split()]
+    completed = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(process)], capture_output=True, text=True, check=False
+    )
+    return [int(word) for word in completed.stdout.split()]
 
 
 def workers_of(process: int) -> list[int]:
     """The workers of a driver: Python processes that multiprocessing has begun."""
-    asked = ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(process)]
-    told = subprocess.run(asked, capture_output=True, text=True, check=False)
-    return [int(line.split()[0]) for line in told.stdout.splitlines() if "multiprocessing-fork" in line]
+    request = ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(process)]
+    completed = subprocess.run(request, capture_output=True, text=True, check=False)
+    return [int(line.split()[0]) for line in completed.stdout.splitlines() if "multiprocessing-fork" in line]
 
 
 def runs(process: int) -> bool:
     """Whether a process is there and no zombie."""
-    told = subprocess.run(["ps", "-o", "stat=", "-p", str(process)], capture_output=True, text=True, check=False)
-    return told.stdout.strip()[:1] not in ("", "Z")
+    completed = subprocess.run(["ps", "-o", "stat=", "-p", str(process)], capture_output=True, text=True, check=False)
+    return completed.stdout.strip()[:1] not in ("", "Z")
 
 
 def kill(process: int) -> None:
@@ -115,8 +117,8 @@ def cluster(workers: int) -> Iterator[tuple[str, dict[str, list[int]]]]:
             alone = ("--nthreads", "1", "--no-dashboard", "--local-directory", folder)
             nannies = [start("dask_worker", address, *alone) for _ in range(workers)]
             until(lambda: all(children_of(nanny.pid) for nanny in nannies))
-            found = [children_of(nanny.pid)[-1] for nanny in nannies]
-            yield address, {"scheduler": [scheduler.pid], "workers": found}
+            matches = [children_of(nanny.pid)[-1] for nanny in nannies]
+            yield address, {"scheduler": [scheduler.pid], "workers": matches}
         finally:
             for process in begun:
                 with suppress(ProcessLookupError):
@@ -163,8 +165,8 @@ def disturbed(folder: Path, tasks: list[Any], every: int, drivers: tuple[int, ..
             if workers:
                 kill(chance.choice(workers))
                 killed += 1
-    said, _ = process.communicate()
-    assert process.returncode == 0, said
+    message, _ = process.communicate()
+    assert process.returncode == 0, message
     return killed, ended
 
 
@@ -220,15 +222,15 @@ def check_full_disk(folder: Path) -> str:
     """Fill a disk of 400 kB of its own, and make room: one error, nothing broken; what was found, in words."""
     disk = folder / "disk"
     disk.mkdir()
-    asked = {"folder": str(disk / "b"), "tasks": [{"x": i} for i in range(60)], "workers": 2}
-    run = f"{sys.executable} -m tests.ocp.app.batch.functions '{json.dumps(asked)}'"
+    request = {"folder": str(disk / "b"), "tasks": [{"x": i} for i in range(60)], "workers": 2}
+    run = f"{sys.executable} -m tests.ocp.app.batch.functions '{json.dumps(request)}'"
     script = f"""mount -t tmpfs -o size=400k none {disk} || exit 77
 dd if=/dev/zero of={disk}/filler bs=1k count=300 2>/dev/null
 {run}
 echo "status $?"; ls {disk}/b/results/*/ | grep -c json$; find {disk} -name '*.part' | wc -l; rm {disk}/filler
 {run}
 """
-    told = subprocess.run(
+    completed = subprocess.run(
         ["unshare", "-rm", "sh", "-c", script],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -236,12 +238,12 @@ echo "status $?"; ls {disk}/b/results/*/ | grep -c json$; find {disk} -name '*.p
         text=True,
         check=False,
     )
-    if told.returncode == 77 or "unshare" in told.stderr:
+    if completed.returncode == 77 or "unshare" in completed.stderr:
         return "no disk of its own can be made here: a full one is not tried"
-    assert told.returncode == 0, told
-    assert told.stderr.count("No space left on device; ") == 1, told.stderr
-    status, kept, parts, done = told.stdout.split("\n")[:4]
-    assert (status, parts.strip()) == ("status 1", "0"), told
+    assert completed.returncode == 0, completed
+    assert completed.stderr.count("No space left on device; ") == 1, completed.stderr
+    status, kept, parts, done = completed.stdout.split("\n")[:4]
+    assert (status, parts.strip()) == ("status 1", "0"), completed
     assert 0 < int(kept) < 60
     assert "60 done" in done
     return f"a disk was full after {kept} of 60 results: one error, nothing broken, and all done when there was room"

@@ -92,8 +92,8 @@ def of_file(task: Any) -> float:
 
 def spring(task: Any) -> dict[str, Any]:
     """A solution, of a problem that is prepared once in each worker."""
-    made = cached(arm, task["stiffness"])
-    return {"plan": made.solve(parameters={"mass": task["mass"]}), "built": id(made), "process": os.getpid()}
+    result = cached(arm, task["stiffness"])
+    return {"plan": result.solve(parameters={"mass": task["mass"]}), "built": id(result), "process": os.getpid()}
 
 
 def warm(task: Any, guess: Any) -> dict[str, Any]:
@@ -101,8 +101,8 @@ def warm(task: Any, guess: Any) -> dict[str, Any]:
     solution: Solution = cached(arm, 1.0).solve(
         parameters={"mass": task["mass"]}, guess=None if guess is None else guess["plan"]
     )
-    told = {"solver": solution.solver, "guess": None if guess is None else guess["mass"]}
-    return {"plan": solution, **told, **task}
+    by_name = {"solver": solution.solver, "guess": None if guess is None else guess["mass"]}
+    return {"plan": solution, **by_name, **task}
 
 
 def without_room(task: Any) -> float:
@@ -115,8 +115,8 @@ def without_room(task: Any) -> float:
 def main() -> None:
     """A driver: `python -m tests.ocp.app.batch.functions '{"folder": ..., "tasks": [...], "workers": 2}'`."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs with Ctrl-C ignored
-    asked = json.loads(sys.argv[1])
-    done = run_batch(square, asked["tasks"], asked["folder"], cluster=asked["workers"])
+    request = json.loads(sys.argv[1])
+    done = run_batch(square, request["tasks"], request["folder"], cluster=request["workers"])
     print(done, flush=True)
 
 

@@ -102,8 +102,8 @@ def batch() -> Batch:
     return read_batch(folder())
 
 
-def again(**given: Any) -> Batch:
-    return run_batch(**{"folder": folder(), **given})
+def again(**options: Any) -> Batch:
+    return run_batch(**{"folder": folder(), **options})
 
 
 CASES = [
@@ -142,7 +142,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", good_calls([case for case in CASES if case.good]))
-def test_what_is_good_is_taken(case: Case, tmp_path: Path) -> None:
+def test_valid_values_are_accepted(case: Case, tmp_path: Path) -> None:
     case.call(**{**case.good, **({"path": tmp_path / "a.csv"} if "path" in case.good else {})})
 
 

@@ -24,7 +24,7 @@ from tests.ocp.app.batch.drivers import check_killed_cluster, cluster
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore")  # of Dask's own, at its end
-def test_a_cluster_does_what_processes_do_and_loses_nothing_when_it_is_killed(
+def test_a_cluster_equals_processes_and_loses_no_result_when_it_is_killed(
     tmp_path: Path, here: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Engine.__init__, "__defaults__", (EngineSettings(patience=2.0),))
@@ -52,7 +52,7 @@ def test_a_cluster_does_what_processes_do_and_loses_nothing_when_it_is_killed(
     assert caught.value.name == "cluster"
 
 
-def said_to(stranger: ssl.SSLContext | None, address: str) -> bytes:
+def reply_to(stranger: ssl.SSLContext | None, address: str) -> bytes:
     """What a server says first: one of Dask's greets whom it accepts."""
     host, port = address.rpartition("/")[2].split(":")
     with socket.create_connection((host, int(port))) as as_data:
@@ -78,8 +78,8 @@ def test_no_other_user_of_the_machine_reaches_the_workers_of_a_batch() -> None:
             context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
         for address in (own.scheduler_address, nanny.address, nanny.worker_address):
             assert address.startswith("tls://127.0.0.1:")
-            assert said_to(friend, address) != b""
-            assert [said_to(stranger, address) for stranger in (None, nobody, foreign)] == [b""] * 3
+            assert reply_to(friend, address) != b""
+            assert [reply_to(stranger, address) for stranger in (None, nobody, foreign)] == [b""] * 3
         for page in ("json/index.html", "info/main/workers.html", "health", "metrics"):
             with pytest.raises(urllib.error.HTTPError, match="404"):
                 urllib.request.urlopen(f"http://127.0.0.1:{own.scheduler.http_server.port}/{page}")

@@ -48,16 +48,16 @@ def started(folder: Path) -> subprocess.CompletedProcess[str]:
 
 def test_a_script_whose_file_is_missing_ends_with_status_1_and_is_done_when_the_file_is_there(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
-    told = started(tmp_path)
-    assert told.returncode == 1
-    assert "BatchError: b: 20 tasks: 0 done, 20 failed, first: ModelError: " in told.stderr
-    (message,) = (line for line in told.stderr.splitlines() if "BatchError: b: " in line)
+    report = started(tmp_path)
+    assert report.returncode == 1
+    assert "BatchError: b: 20 tasks: 0 done, 20 failed, first: ModelError: " in report.stderr
+    (message,) = (line for line in report.stderr.splitlines() if "BatchError: b: " in line)
     assert message.endswith('run again with again="failed"')
     assert "robot.urdf" in message
     assert not (tmp_path / "b.csv").exists()
     (tmp_path / "robot.urdf").write_text(URDF)
-    told = started(tmp_path)
-    assert (told.returncode, told.stderr) == (0, "")
+    report = started(tmp_path)
+    assert (report.returncode, report.stderr) == (0, "")
     rows = list(csv.DictReader((tmp_path / "b.csv").read_text().splitlines()))
     assert [float(row["cost"]) for row in rows] == [1.0 + i for i in range(20)]
     before = stored(tmp_path / "b")
@@ -92,7 +92,7 @@ def test_failures_are_tried_again_when_a_file_has_changed_and_results_stay(tmp_p
 
 
 @pytest.mark.long
-def test_failures_are_tried_again_when_the_function_or_what_stands_beside_it_has_changed(tmp_path: Path) -> None:
+def test_failures_are_repeated_when_the_function_or_its_module_has_changed(tmp_path: Path) -> None:
     def run(helper: str, function: str) -> subprocess.CompletedProcess[str]:
         source = f"""
 from ocp.app.batch import run_batch
@@ -108,9 +108,9 @@ if __name__ == "__main__":
 
     assert "2 tasks: 0 done, 2 failed, first: ZeroDivisionError" in run("return x / 0", "return helper(task)").stderr
     assert "2 failed, first: ValueError: 1.5" in run("return x / 0", "raise ValueError(task)").stderr
-    told = run("return 2 * x", "return helper(task)")
-    assert "b: 2 done" in told.stdout
-    assert told.returncode == 0
+    completed = run("return 2 * x", "return helper(task)")
+    assert "b: 2 done" in completed.stdout
+    assert completed.returncode == 0
     changed = run("return 2 * x", "return 3 * helper(task)")
     assert "the source has changed" in changed.stderr, "results of two functions are not mixed"
 
@@ -140,7 +140,7 @@ def test_the_error_carries_the_results_and_can_be_had_later(tmp_path: Path, here
     run_batch(functions.endings, ["good"], tmp_path / "b", cluster=here).check()
 
 
-def test_what_kept_raises_names_the_function_and_its_arguments(tmp_path: Path) -> None:
+def test_errors_of_cached_functions_name_the_function_and_its_arguments(tmp_path: Path) -> None:
     with pytest.raises(ProblemError, match=r"cached: read\('.*nothing'\) raised FileNotFoundError") as caught:
         cached(functions.read, str(tmp_path / "nothing"))
     assert caught.value.name == "make"
@@ -246,14 +246,14 @@ def test_records_that_nobody_wrote_are_none_and_values_that_do_not_fit_are_named
     ):
         place.write_text(wrong)
         assert len(read_batch(folder)) == 0, wrong[:80]
-    for told in (
+    for report in (
         {**file, "kind": "Popen"},
         {**file, "at": ["nowhere", 1]},
         {**file, "at": [["plan"]]},
         {**file, "at": ["cost", 0]},
         {"bytes": file["bytes"]},
     ):
-        place.write_text(changed(record, files=[told]))
+        place.write_text(changed(record, files=[report]))
         with pytest.raises(ProblemError):
             _ = read_batch(folder)[0].value
     source = record["inputs"]["source"]
@@ -283,7 +283,7 @@ def test_a_result_is_read_by_load_alone_and_a_pickle_in_its_place_runs_nothing(t
     assert not (tmp_path / "run").exists()
 
 
-def test_a_batch_is_made_of_results_alone(tmp_path: Path) -> None:
+def test_a_batch_consists_of_results(tmp_path: Path) -> None:
     for wrong in ((1, 2), (None, ()), (tmp_path, [1])):
         with pytest.raises(ProblemError):
             Batch(*wrong)

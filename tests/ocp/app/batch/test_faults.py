@@ -23,7 +23,7 @@ def test_workers_and_drivers_are_killed_and_nothing_is_lost_or_done_twice(tmp_pa
     check_disturbed(tmp_path / "b", 60, 10)
 
 
-def test_a_driver_waits_for_another_and_takes_over_what_it_leaves(tmp_path: Path) -> None:
+def test_a_driver_waits_for_another_and_completes_its_tasks(tmp_path: Path) -> None:
     log, gate = tmp_path / "log", tmp_path / "gate"
     tasks = [{"x": i, "log": str(log), **({"gate": str(gate)} if i > 3 else {})} for i in range(12)]
     one = driver(tmp_path / "b", tasks, 1)
@@ -34,8 +34,8 @@ def test_a_driver_waits_for_another_and_takes_over_what_it_leaves(tmp_path: Path
     kill(one.pid)
     one.communicate()
     gate.touch()
-    said, _ = two.communicate()
-    assert "12 done" in said
+    message, _ = two.communicate()
+    assert "12 done" in message
     ends = [int(line) for line in log.read_text().split()]
     assert set(ends) == set(range(12))
     assert len(ends) <= 14  # what the first was at

@@ -24,7 +24,7 @@ from tests.ocp.app.batch.drivers import ROOT, count, driver, runs, stored, until
 X = [{"x": i} for i in range(12)]
 
 
-def test_results_are_what_the_function_returns_in_the_order_of_the_tasks(tmp_path: Path, pair: Any) -> None:
+def test_results_are_the_returned_values_in_the_order_of_the_tasks(tmp_path: Path, pair: Any) -> None:
     tasks = [{"x": i} for i in (5, 3, 9, 0, 7)]
     batch = run_batch(functions.square, tasks, tmp_path / "b", cluster=pair)
     assert [result.task for result in batch] == tasks
@@ -39,7 +39,7 @@ def test_results_are_what_the_function_returns_in_the_order_of_the_tasks(tmp_pat
     assert [result.key for result in read_batch(tmp_path / "b")] == sorted(result.key for result in batch)
 
 
-def test_running_again_does_what_is_missing_or_not_whole_and_only_that(tmp_path: Path, here: Any) -> None:
+def test_a_repeated_batch_computes_missing_or_damaged_results_alone(tmp_path: Path, here: Any) -> None:
     tasks = [{"mass": 1.0 + i, "stiffness": 0.0} for i in range(8)]
     batch = run_batch(functions.spring, tasks[:6], tmp_path / "b", cluster=here)
     before = stored(tmp_path / "b")
@@ -92,14 +92,14 @@ def test_one_content_is_one_task_whatever_the_order_of_its_names(tmp_path: Path,
 def test_plans_are_kept_as_files_and_problems_are_prepared_once_in_a_worker(tmp_path: Path, pair: Any) -> None:
     tasks = [{"mass": 1.0 + 0.1 * i, "stiffness": float(i % 2)} for i in range(8)]
     batch = run_batch(functions.spring, tasks, tmp_path / "b", cluster=pair)
-    found = [result.value for result in batch]
-    for task, result, value in zip(tasks, batch, found, strict=True):
+    matches = [result.value for result in batch]
+    for task, result, value in zip(tasks, batch, matches, strict=True):
         assert value["plan"].cost == result.cost
         assert value["plan"].parameters["mass"] == pytest.approx(task["mass"], abs=0.0)
         if not task["stiffness"]:
             assert result.cost == pytest.approx(12 * task["mass"] ** 2, rel=1e-9)  # integral of (m a)^2, a = 6 - 12 t
-    made = {(value["process"], value["built"]) for value in found}
-    assert len(made) <= 2 * len({value["process"] for value in found}) <= 4
+    distinct = {(value["process"], value["built"]) for value in matches}
+    assert len(distinct) <= 2 * len({value["process"] for value in matches}) <= 4
 
 
 def test_tasks_begin_from_the_results_of_neighbours_the_same_whoever_does_them(
@@ -128,7 +128,7 @@ def test_tasks_begin_from_the_results_of_neighbours_the_same_whoever_does_them(
 def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not_tried_again(
     tmp_path: Path, here: Any
 ) -> None:
-    told = {
+    by_name = {
         "problem": ("ProblemError", "the arm is too short"),
         "solve": ("SolveError", "no motion was found"),
         "mistake": ("ZeroDivisionError", "float division by zero (functions.py, line "),
@@ -139,10 +139,10 @@ def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not
         "inf": ("ProblemError", "the result[1] is inf"),
         "inside": ("ProblemError", "the result['a']['b'][1] is nan"),
     }
-    batch = run_batch(functions.endings, [*told, "good"], tmp_path / "b", cluster=here, failures="return")
-    assert batch.counts == {"failed": len(told), "done": 1}
+    batch = run_batch(functions.endings, [*by_name, "good"], tmp_path / "b", cluster=here, failures="return")
+    assert batch.counts == {"failed": len(by_name), "done": 1}
     for result in batch.results[:-1]:
-        error, words = told[result.task]
+        error, words = by_name[result.task]
         assert result.error == error
         assert words.replace("float division", "division") in result.message.replace("float division", "division")
         assert result.cost is None
@@ -155,14 +155,14 @@ def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not
     before = stored(tmp_path / "b")
     words = '9 tasks: 0 done, 9 failed, first: ProblemError: the arm is too short; run again with again="failed"'
     with pytest.raises(BatchError, match=words) as again:
-        run_batch(functions.endings, list(told), tmp_path / "b", cluster=here)
+        run_batch(functions.endings, list(by_name), tmp_path / "b", cluster=here)
     assert stored(tmp_path / "b") == before
     assert (again.value.name, again.value.value) == ("b", 9)
     assert again.value.batch is not None
     assert again.value.batch.counts == {"failed": 9}
-    run_batch(functions.endings, list(told), tmp_path / "b", cluster=here, again="failed", failures="return")
+    run_batch(functions.endings, list(by_name), tmp_path / "b", cluster=here, again="failed", failures="return")
     after = stored(tmp_path / "b")
-    assert sum(after[name][0] != before[name][0] for name in before) == len(told)
+    assert sum(after[name][0] != before[name][0] for name in before) == len(by_name)
 
 
 def test_a_task_that_always_ends_its_worker_is_set_aside_and_the_others_are_done(tmp_path: Path) -> None:
@@ -185,8 +185,8 @@ def test_ctrl_c_stops_a_batch_whose_tasks_never_end_and_the_rest_is_done_later(t
     workers = workers_of(process.pid)
     assert len(workers) == 2
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate()
-    assert "KeyboardInterrupt" in said
+    message, _ = process.communicate()
+    assert "KeyboardInterrupt" in message
     until(lambda: not any(runs(worker) for worker in workers))
     assert len(run_batch(functions.square, tasks[:4], tmp_path / "b", cluster=here)) == 4
 
@@ -219,7 +219,7 @@ SCRIPT = "from ocp.app.batch import run_batch\ndef double(task):\n    return 2 *
 )
 def test_a_script_runs_its_own_function_under_its_guard(end: str, says: str, tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT + end)
-    told = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "script.py"],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -228,14 +228,14 @@ def test_a_script_runs_its_own_function_under_its_guard(end: str, says: str, tmp
         timeout=60,
         check=False,
     )
-    assert says in told.stdout + told.stderr
-    assert (told.returncode == 0) == (says == "b: 2 done")
-    if not told.returncode:
+    assert says in completed.stdout + completed.stderr
+    assert (completed.returncode == 0) == (says == "b: 2 done")
+    if not completed.returncode:
         (tmp_path / "other.py").write_text((SCRIPT + end).replace("2 *", "3 *"))
         assert json.loads((tmp_path / "b" / "batch.json").read_text())["function"] == "script:double"
 
 
-def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_folder_of_another_function_version_or_program_is_refused(tmp_path: Path) -> None:
     ResultStore.of(tmp_path / "b", "tests.ocp.app.batch.functions:square", source_version(functions.square), False)
     run_batch(functions.square, X[:1], tmp_path / "b")
     with pytest.raises(ProblemError, match=r"contains results of .*square, not of .*same") as caught:
@@ -264,18 +264,18 @@ def test_a_folder_of_another_function_or_version_or_of_something_else_is_refused
         run_batch(functions.square, X, tmp_path / "file")
 
 
-def test_what_is_kept_is_made_once_for_each_content_and_forgotten_in_turn() -> None:
-    made: list[float] = []
+def test_cached_objects_are_made_once_for_each_content_and_evicted_in_turn() -> None:
+    results: list[float] = []
 
     def make(value: dict[str, float]) -> float:
-        made.append(value["a"])
+        results.append(value["a"])
         return value["a"]
 
     assert [cached(make, {"a": value}) for value in (1.0, 1.0, 2.0, 1.0)] == [1.0, 1.0, 2.0, 1.0]
-    assert made == [1.0, 2.0]
+    assert results == [1.0, 2.0]
     for value in range(3, 10):
         cached(make, {"a": float(value)})
     cached(make, {"a": 1.0})
     cached(make, {"a": 2.0})
-    assert made[-1] == 2.0
-    assert made.count(1.0) == 1 or made.count(1.0) == 2
+    assert results[-1] == 2.0
+    assert results.count(1.0) == 1 or results.count(1.0) == 2

@@ -28,8 +28,11 @@ def written(folder: Path, results: list[tuple[Any, Any]]) -> Batch:
         if isinstance(value, Exception):
             record, files = failed("failed", type(value).__name__, str(value))
         else:
-            found = pack_result(value)
-            record, files = {"status": "done", "error": "", "message": "", "seconds": 0.25, **found.record}, found.files
+            result = pack_result(value)
+            record, files = (
+                {"status": "done", "error": "", "message": "", "seconds": 0.25, **result.record},
+                result.files,
+            )
         own = {"key": key_of(canonical_text(task, "task")), "task": task, "neighbour": None, "inputs": {}}
         store.write({**own, **record}, files)
     return read_batch(folder)
@@ -92,7 +95,7 @@ def test_no_text_in_a_table_begins_a_formula_and_numbers_stay(tmp_path: Path) ->
         assert (float(row["task.x"]), float(row["cost"])) == (-1.5, -2.0)
 
 
-def test_the_best_of_a_group_is_the_cheapest_that_is_done_and_of_no_bad_verdict(tmp_path: Path) -> None:
+def test_the_best_of_a_group_has_the_lowest_cost_among_valid_results(tmp_path: Path) -> None:
     batch = written(tmp_path / "b", RESULTS)
     best = batch.best("robot")
     assert {group: result.cost for group, result in best.items()} == {"a": 2.0, "ü": 0.5}
@@ -107,7 +110,7 @@ def test_solutions_come_back_wherever_they_stood(at: Any) -> None:
     payload = pack_result(at(plan))
     json.dumps(payload.record)
     assert len(payload.files) == len(payload.record["files"]) >= 1
-    found = unpack_result(payload)
+    result = unpack_result(payload)
 
     def same(one: Any, two: Any) -> bool:
         if isinstance(one, Solution):
@@ -118,10 +121,10 @@ def test_solutions_come_back_wherever_they_stood(at: Any) -> None:
             return len(one) == len(two) and all(same(*pair) for pair in zip(one, two, strict=True))
         return bool(one == two)
 
-    assert same(at(plan), found)
+    assert same(at(plan), result)
 
 
-def test_the_cost_is_what_the_function_says_or_the_only_plan() -> None:
+def test_the_cost_is_that_of_the_function_or_of_the_only_plan() -> None:
     plan = solved()
     assert pack_result(plan).record["cost"] == plan.cost
     assert pack_result({"plan": plan, "cost": 7}).record["cost"] == 7.0
@@ -133,8 +136,8 @@ def test_the_cost_is_what_the_function_says_or_the_only_plan() -> None:
 
 
 def test_data_are_plain_and_their_own() -> None:
-    given = {"a": (np.int64(1), np.arange(2.0)), "b": [np.bool_(True)]}
-    assert as_data(given, "task") == {"a": [1, [0.0, 1.0]], "b": [True]}
+    options = {"a": (np.int64(1), np.arange(2.0)), "b": [np.bool_(True)]}
+    assert as_data(options, "task") == {"a": [1, [0.0, 1.0]], "b": [True]}
     assert canonical_text({"b": 1, "a": {"d": 1, "c": 2}}, "task") == '{"a":{"c":2,"d":1},"b":1}'
     assert len({key_of(canonical_text(value, "task")) for value in (0.1, 0.1 + 1e-18, np.float64(0.1))}) == 1
     assert len({key_of(canonical_text(value, "task")) for value in (0.1, np.nextafter(0.1, 1), np.float32(0.1))}) == 3
@@ -145,17 +148,17 @@ def test_a_neighbour_is_the_nearest_of_all_generations_before() -> None:
     tasks: dict[str, Any] = {
         key_of(str(i)): {"x": float(x), "y": [float(y), 0.0]} for i, (x, y) in enumerate(chance.random((300, 2)))
     }
-    found = neighbours(tasks, ["x", "y"])
-    order = list(found)
+    result = neighbours(tasks, ["x", "y"])
+    order = list(result)
     assert sorted(order) == order == sorted(tasks)
     places = np.array([[tasks[key]["x"], tasks[key]["y"][0]] for key in order])
     places /= np.ptp(places, axis=0)
-    assert found[order[0]] is None
+    assert result[order[0]] is None
     for i in range(1, len(order)):
         before = 2 ** int(np.log2(i))
-        assert found[order[i]] == order[int(np.argmin(np.linalg.norm(places[:before] - places[i], axis=1)))]
+        assert result[order[i]] == order[int(np.argmin(np.linalg.norm(places[:before] - places[i], axis=1)))]
     depth = {order[0]: 0}
-    for key, parent in list(found.items())[1:]:
+    for key, parent in list(result.items())[1:]:
         assert parent is not None
         depth[key] = depth[parent] + 1
     assert max(depth.values()) <= 9

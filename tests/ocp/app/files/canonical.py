@@ -40,24 +40,24 @@ def of_canonical(text: str) -> list[Move]:
     unit, plane, feed, here, offset = 1e-3, "XY", 0.0, np.zeros(3), np.zeros(3)
     moves: list[Move] = []
     for line in text.splitlines():
-        if not (found := CALL.match(line)):
+        if not (result := CALL.match(line)):
             continue
-        call, given = found[1], [each.strip() for each in found[2].split(",")]
+        call, options = result[1], [each.strip() for each in result[2].split(",")]
         if call == "USE_LENGTH_UNITS":
-            unit = 0.0254 if "INCH" in given[0] else 1e-3
+            unit = 0.0254 if "INCH" in options[0] else 1e-3
         elif call == "SET_G92_OFFSET":
-            offset = unit * np.array([float(each) for each in given[:3]])
+            offset = unit * np.array([float(each) for each in options[:3]])
         elif call == "SELECT_PLANE":
-            plane = given[0].rpartition("_")[2]
+            plane = options[0].rpartition("_")[2]
         elif call == "SET_FEED_RATE":
-            feed = float(given[0]) * unit / 60
+            feed = float(options[0]) * unit / 60
         elif call in ("STRAIGHT_TRAVERSE", "STRAIGHT_FEED"):
-            end = offset + unit * np.array([float(each) for each in given[:3]])
+            end = offset + unit * np.array([float(each) for each in options[:3]])
             kind = "rapid" if call == "STRAIGHT_TRAVERSE" else "line"
             moves.append(Move(kind, end, np.zeros(3), 0.0, feed))
         elif call == "ARC_FEED":
             a, b, n = PLANES[plane]
-            numbers = [float(each) for each in given[:6]]
+            numbers = [float(each) for each in options[:6]]
             end, center = np.zeros(3), here.copy()
             end[[a, b, n]] = offset[[a, b, n]] + unit * np.array([numbers[0], numbers[1], numbers[5]])
             center[[a, b]] = offset[[a, b]] + unit * np.array(numbers[2:4])

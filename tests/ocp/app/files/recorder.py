@@ -12,8 +12,8 @@ def recorder() -> Any:
 
     class Columns:
         @staticmethod
-        def columns(**given: Any) -> dict[str, Any]:
-            return given
+        def columns(**options: Any) -> dict[str, Any]:
+            return options
 
     return SimpleNamespace(
         noted=noted,

@@ -61,16 +61,16 @@ def path() -> Path:
     return program().paths[0]
 
 
-def read_table(**given: Any) -> Waypoints:
+def read_table(**options: Any) -> Waypoints:
     with TemporaryDirectory() as folder:
         (File(folder) / "table.csv").write_text(TABLE)
-        return read_waypoints(**{"file": File(folder) / "table.csv", **given})
+        return read_waypoints(**{"file": File(folder) / "table.csv", **options})
 
 
-def read_motion(**given: Any) -> RawTrajectory:
+def read_motion(**options: Any) -> RawTrajectory:
     with TemporaryDirectory() as folder:
         (File(folder) / "motion.csv").write_text("time,a,b\n0,1,2\n1,2,3\n")
-        return read_trajectory(**{"file": File(folder) / "motion.csv", **given})
+        return read_trajectory(**{"file": File(folder) / "motion.csv", **options})
 
 
 CASES = [
@@ -140,7 +140,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", good_calls(CASES))
-def test_what_is_good_is_taken(case: Case) -> None:
+def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 

@@ -66,12 +66,12 @@ def test_there_are_many_programs_of_many_dialects() -> None:
 @pytest.mark.parametrize("file", GOOD, ids=lambda file: file.stem)
 @pytest.mark.parametrize("tolerance", [2e-5, 2e-4])
 def test_a_program_goes_through_and_its_path_stays_within_the_tolerance(file: File, tolerance: float) -> None:
-    found = read_gcode(file)
-    assert found.paths
-    for cut, smooth in zip(found.cuts, found.smooth(tolerance), strict=True):
-        said = np.fmin(cut.tolerances.min(initial=np.inf, where=~np.isnan(cut.tolerances)), tolerance)
+    result = read_gcode(file)
+    assert result.paths
+    for cut, smooth in zip(result.cuts, result.smooth(tolerance), strict=True):
+        message = np.fmin(cut.tolerances.min(initial=np.inf, where=~np.isnan(cut.tolerances)), tolerance)
         # half a step beside the nearest point, where the curve bends away
-        assert strayed(cut.path, smooth) ** 2 <= (1.001 * max(said, tolerance)) ** 2 + 2 * (STEP / 8) ** 2
+        assert strayed(cut.path, smooth) ** 2 <= (1.001 * max(message, tolerance)) ** 2 + 2 * (STEP / 8) ** 2
         assert smooth.at([0.0, smooth.length]).position[0] == pytest.approx(cut.path.segments[0].start, abs=1e-12)
         assert smooth.curvature_jumps().max(initial=0.0) < 1e-6 * (
             1 + smooth.curvature(smooth.sample_distances()).max()
@@ -79,7 +79,7 @@ def test_a_program_goes_through_and_its_path_stays_within_the_tolerance(file: Fi
 
 
 @pytest.mark.parametrize("file", UNSUPPORTED_CODES, ids=lambda file: file.stem)
-def test_a_program_is_refused_by_line_with_what_to_do(file: File) -> None:
+def test_an_unsupported_program_is_refused_with_line_and_advice(file: File) -> None:
     head = file.read_text(encoding="utf-8").splitlines()[0]
     where, _, words = head.strip("()").removeprefix("refused: ").rpartition(": ")
     with pytest.raises(ProblemError, match=words) as caught:
@@ -173,10 +173,10 @@ def written(
     return "\n".join([*lines, "M2", ""])
 
 
-def shape_of(found: Program) -> list[tuple[float, ...]]:
+def shape_of(result: Program) -> list[tuple[float, ...]]:
     """Of each segment and rapid: ends and centre, sweep, length, feed."""
     rows = []
-    for section in found.sections:
+    for section in result.sections:
         if not isinstance(section, Cut):
             assert not isinstance(section, Pause)
             rows.append((*section.end, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -263,10 +263,10 @@ def test_a_helix_has_the_length_of_its_development(
 ) -> None:
     rise = micrometres * 1e-3
     text = f"G21 F100 G0 X{radius:.12f}\nG{code} X{radius:.12f} Z{rise:.12f} I{-radius:.12f} J0 P{turns}\n"
-    found = program(text)
+    result = program(text)
     expected = np.hypot(2 * np.pi * turns * radius, rise) * MM
-    assert found.length == pytest.approx(expected, rel=1e-9)
-    segment = found.paths[0].segments[0]
+    assert result.length == pytest.approx(expected, rel=1e-9)
+    segment = result.paths[0].segments[0]
     assert np.sign(segment.torsion) == np.sign(rise) * (1 if code == 3 else -1)
 
 
@@ -303,7 +303,7 @@ def test_a_rounded_centre_is_moved_the_least_and_no_gap_is_left(
     st.floats(0, 2 * np.pi), st.floats(-0.02, 0.02), st.floats(-0.09, 0.09), st.sampled_from([2, 3]), st.integers(1, 3)
 )
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
-def test_a_circle_that_nearly_closes_off_its_radius_is_made_of_two_halves(
+def test_a_nearly_closed_circle_with_unequal_radii_becomes_two_halves(
     program: Callable[..., Program], first: float, short: float, off: float, code: int, turns: int
 ) -> None:
     """No one circle near the one that is written goes through both ends."""
@@ -376,15 +376,15 @@ def test_feeds_are_metres_a_second(program: Callable[..., Program]) -> None:
 
 @pytest.mark.parametrize("text", ["G1 X1 F100\n", "F100\nG0 X1\nG1 X2\n"])
 def test_a_unit_that_nobody_says_is_warned_of(program: Callable[..., Program], text: str) -> None:
-    with pytest.warns(ModelWarning, match="neither G20 nor G21; lengths are read as mm") as said:
-        found = program(text)
-    assert len(said) == 1
-    assert found.notes[-1].text.startswith("no G20 or G21")
+    with pytest.warns(ModelWarning, match="neither G20 nor G21; lengths are read as mm") as message:
+        result = program(text)
+    assert len(message) == 1
+    assert result.notes[-1].text.startswith("no G20 or G21")
     one, other = (program(text, unit=unit).paths[0].length for unit in ("mm", "inch"))
-    assert (one, other / one) == pytest.approx((found.paths[0].length, 25.4))
+    assert (one, other / one) == pytest.approx((result.paths[0].length, 25.4))
 
 
-def test_a_path_ends_where_it_turns_back_or_is_given_width(program: Callable[..., Program]) -> None:
+def test_a_path_ends_at_a_reversal_or_gets_a_bulb(program: Callable[..., Program]) -> None:
     text = "G21 F300\nG1 X10\nX4 F200\nG2 X0 Y4 I0 J4\nG3 X4 Y0 I4 J0\n"
     split = program(text)
     assert [len(path.segments) for path in split.paths] == [1, 2, 1]
@@ -400,19 +400,19 @@ def test_home_is_passed_over_at_the_ends_and_gone_to_where_it_is_known(program: 
     with pytest.raises(ProblemError, match="home=") as caught:
         program(between)
     assert caught.value.name == "line 4"
-    found = program(between, home=(0.0, 0.1, 0.2))
-    assert [rapid.end.tolist() for rapid in found.rapids[1:]] == [[0.01, 0.0, 0.002], [0.01, 0.0, 0.2]]
+    result = program(between, home=(0.0, 0.1, 0.2))
+    assert [rapid.end.tolist() for rapid in result.rapids[1:]] == [[0.01, 0.0, 0.002], [0.01, 0.0, 0.2]]
     ends = program("G21 F100\nG91 G28 Z0\nG90 G0 X5\nG1 X10\nG53 G0 Z0\nG28\nM30\n")
     assert len(ends.sections) == 2
     assert [note.lines for note in ends.notes if "machine" in note.text] == [(2, 6), (5,)]
 
 
-def test_notes_say_what_was_passed_over_and_where(program: Callable[..., Program]) -> None:
-    found = program("G21 F100 S9 M3\nG0 X1 T2\nG1 X5 S8\nM8\nG43 H2\nM30\n")
-    said = {note.text.partition(":")[0]: note.lines for note in found.notes}
-    assert said == {"S": (1, 3), "M3": (1,), "T": (2,), "M8": (4,), "G43": (5,), "H": (5,)}
-    assert str(found.notes[0]).startswith("lines 1, 3: S: spindle speed")
-    assert "1 path of 4 mm in all, 1 rapid" in str(found)
+def test_notes_name_ignored_words_with_their_lines(program: Callable[..., Program]) -> None:
+    result = program("G21 F100 S9 M3\nG0 X1 T2\nG1 X5 S8\nM8\nG43 H2\nM30\n")
+    message = {note.text.partition(":")[0]: note.lines for note in result.notes}
+    assert message == {"S": (1, 3), "M3": (1,), "T": (2,), "M8": (4,), "G43": (5,), "H": (5,)}
+    assert str(result.notes[0]).startswith("lines 1, 3: S: spindle speed")
+    assert "1 path of 4 mm in all, 1 rapid" in str(result)
 
 
 def test_block_delete_is_a_switch(program: Callable[..., Program]) -> None:

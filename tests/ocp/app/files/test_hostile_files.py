@@ -54,9 +54,9 @@ def special(what: str, place: Path) -> None:
     elif what == "folder":
         place.mkdir()
     elif what == "socket":
-        with socket.socket(socket.AF_UNIX) as made:
+        with socket.socket(socket.AF_UNIX) as result:
             os.chdir(place.parent)  # names of sockets are short
-            made.bind(place.name)
+            result.bind(place.name)
     else:
         place.symlink_to({"link to a device": "/dev/zero", "link to a terminal": "/dev/tty"}.get(what, "pipe"))
         if what == "link to a pipe":
@@ -67,7 +67,7 @@ def special(what: str, place: Path) -> None:
     "what", ["pipe", "folder", "socket", "link to a device", "link to a pipe", "link to a terminal"]
 )
 @pytest.mark.parametrize("reader", READERS)
-def test_what_is_no_file_is_refused_at_once(
+def test_invalid_files_are_refused_at_once(
     reader: str, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -92,11 +92,11 @@ def test_a_file_that_is_exchanged_between_two_looks_is_refused(tmp_path: Path, m
     good.write_bytes(b"x")
 
     def exchanged(path: Any, *more: Any, **others: Any) -> os.stat_result:
-        found = whole(path, *more, **others)
+        result = whole(path, *more, **others)
         if str(path) == str(good):
             good.unlink()
             os.mkfifo(good)
-        return found
+        return result
 
     monkeypatch.setattr(os, "stat", exchanged)
     with pytest.raises(UnfitFile, match="no file"):
@@ -179,8 +179,8 @@ points:
     for one, other in zip(tree["points"], whole["points"], strict=True):
         assert one["positions"] == [1.0, -2.5, 1000.0, 0.0005] == other["positions"]
         assert str(one["velocities"]) == str([v if v is None else float(v) for v in other["velocities"]])
-    found = read_trajectory(tmp_path / "a.yaml")
-    assert (found.names, found.t.tolist()) == (("a", "2", "yes", "nan"), [0.0, 1.5])
+    trajectory = read_trajectory(tmp_path / "a.yaml")
+    assert (trajectory.names, trajectory.t.tolist()) == (("a", "2", "yes", "nan"), [0.0, 1.5])
 
 
 @pytest.mark.parametrize(
@@ -232,12 +232,12 @@ def test_heads_of_tables_are_read_in_time(line: str, tmp_path: Path) -> None:
 # ---- logs ----------------------------------------------------------------------------------------------------------
 
 
-def packed(path: Path, size: int, said: int) -> None:
+def packed(path: Path, size: int, message: int) -> None:
     """A log with a chunk of zeros, packed by zstd, that says to have another size."""
     builder: Any = RecordBuilder()
     compressor = zstandard.ZstdCompressor().compressobj()
     data = b"".join(compressor.compress(bytes(2**24)) for _ in range(size >> 24)) + compressor.flush()
-    Chunk("zstd", data, 0, 0, 0, said).write(builder)
+    Chunk("zstd", data, 0, 0, 0, message).write(builder)
     path.write_bytes(b"\x89MCAP0\r\n" + builder.end())
 
 
@@ -270,7 +270,7 @@ def run(program: str) -> str:
 # ---- what is written -----------------------------------------------------------------------------------------------
 
 
-def test_a_pipe_in_the_way_of_a_writer_is_not_waited_for(tmp_path: Path) -> None:
+def test_writers_do_not_wait_for_a_pipe(tmp_path: Path) -> None:
     """Leftovers of killed writers are looked at, and a stranger's folder may hold a pipe of such a name."""
     os.mkfifo(tmp_path / "a.csv.01234567.part")
     JointTrajectory(("a",), [0.0], [[1.0]], [[0.0]], [[0.0]]).write_csv(tmp_path / "a.csv")  # type: ignore[arg-type]

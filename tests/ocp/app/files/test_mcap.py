@@ -29,22 +29,22 @@ def motion() -> Plan:
 def messages(file: Path) -> list[tuple[str, int, Any]]:
     with file.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [(channel.topic, note.log_time, told) for _, channel, note, told in reader.iter_decoded_messages()]
+        return [(channel.topic, note.log_time, report) for _, channel, note, report in reader.iter_decoded_messages()]
 
 
 def test_joint_states_and_the_tips_path_are_read_as_they_are(tmp_path: Path) -> None:
     write_mcap(motion(), tmp_path / "a.mcap", 0.03, frame="cell")
-    found = messages(tmp_path / "a.mcap")
+    result = messages(tmp_path / "a.mcap")
     sample = motion().sample(0.03)
-    states = [(time, told) for topic, time, told in found if topic == "/joint_states"]
+    states = [(time, report) for topic, time, report in result if topic == "/joint_states"]
     assert [time for time, _ in states] == np.round(sample.t * 1e9).astype(int).tolist()
-    for number, (time, told) in enumerate(states):
-        assert tuple(told.name) == motion().names
-        assert told.header.stamp.sec * 10**9 + told.header.stamp.nanosec == time
-        np.testing.assert_array_equal(told.position, sample.joints[number])
-        np.testing.assert_array_equal(told.velocity, sample.rates[number])
-        assert not told.effort
-    (path,) = (told for topic, _, told in found if topic == "/tip_path")
+    for number, (time, report) in enumerate(states):
+        assert tuple(report.name) == motion().names
+        assert report.header.stamp.sec * 10**9 + report.header.stamp.nanosec == time
+        np.testing.assert_array_equal(report.position, sample.joints[number])
+        np.testing.assert_array_equal(report.velocity, sample.rates[number])
+        assert not report.effort
+    (path,) = (report for topic, _, report in result if topic == "/tip_path")
     assert path.header.frame_id == "cell"
     assert len(path.poses) == len(sample.t)
     for pose, wanted in zip(path.poses, sample.tip, strict=True):
@@ -92,9 +92,9 @@ def test_messages_are_read_by_their_names_not_by_the_definition_that_a_file_brin
         for time, data in notes:
             writer.add_message(channel, time, data, time)
         writer.finish()
-    found, wanted = (read_trajectory(tmp_path / name) for name in ("b.mcap", "a.mcap"))
-    np.testing.assert_array_equal(found.positions, wanted.positions)
-    assert found.names == motion().names
+    result, wanted = (read_trajectory(tmp_path / name) for name in ("b.mcap", "a.mcap"))
+    np.testing.assert_array_equal(result.positions, wanted.positions)
+    assert result.names == motion().names
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -126,7 +126,7 @@ def test_a_bad_period_leaves_no_file(tmp_path: Path, period: Any) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_something_else_is_no_plan(tmp_path: Path) -> None:
+def test_other_objects_are_no_plans(tmp_path: Path) -> None:
     with pytest.raises(ProblemError) as caught:
         write_mcap("plan", tmp_path / "a.mcap")  # type: ignore[arg-type]
     assert caught.value.name == "plan"

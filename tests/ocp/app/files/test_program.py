@@ -206,13 +206,13 @@ def test_limits_that_a_program_does_not_take_are_named_errors(program: Program, 
 
 def test_a_pause_before_anything_moves_stands_at_the_start(tmp_path: File) -> None:
     (tmp_path / "wait.nc").write_text("G21 G4 P1\nG0 X5\nG4 P2\nM2\n")
-    found = read_gcode(tmp_path / "wait.nc", start=(0.1, 0.2, 0.3)).schedule(LIMITS)
-    at = found.at([0.5, found.duration - 0.5])
+    result = read_gcode(tmp_path / "wait.nc", start=(0.1, 0.2, 0.3)).schedule(LIMITS)
+    at = result.at([0.5, result.duration - 0.5])
     assert at.position == pytest.approx(np.array([[0.1, 0.2, 0.3], [0.005, 0.2, 0.3]]))
     assert not at.speed.any()
     assert not at.tangent.any()
 
 
-def test_the_length_is_that_of_the_cuts(program: Program) -> None:
+def test_the_length_of_a_program_is_that_of_its_cuts(program: Program) -> None:
     assert program.length == pytest.approx(sum(path.length for path in program.paths))
     assert Path.through([(0, 0, 0), (1, 0, 0)]).placed((1, 2, 3)).segments[0].end == pytest.approx([2, 2, 3])

@@ -11,7 +11,7 @@ from tests.ocp.app.files.recorder import recorder
 from tests.ocp.app.files.test_mcap import motion
 
 
-def test_rerun_gets_every_joint_and_the_way_of_the_tip() -> None:
+def test_rerun_receives_every_joint_and_the_path_of_the_tip() -> None:
     module = recorder()
     log_rerun(motion(), module, 0.05, entity="arm")
     sample = motion().sample(0.05)
@@ -27,6 +27,6 @@ def test_rerun_gets_every_joint_and_the_way_of_the_tip() -> None:
     np.testing.assert_array_equal(module.noted["arm/tip_path"][0], sample.tip[:, :3])
 
 
-def test_what_is_no_rerun_is_refused_by_what_it_lacks() -> None:
+def test_modules_that_lack_functions_of_rerun_are_refused_by_name() -> None:
     with pytest.raises(ProblemError, match="send_columns"):
         log_rerun(motion(), object())

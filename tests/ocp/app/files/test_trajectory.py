@@ -63,16 +63,16 @@ def read(folder: Path, text: str | bytes, name: str = "motion.csv", **options: A
     return read_trajectory(file, **options)
 
 
-def same(found: RawTrajectory, rates: bool = True, accelerations: bool = False) -> None:
-    order = [found.names.index(name) for name in NAMES]
-    assert_allclose(found.t, T, atol=1e-9)
-    assert_allclose(found.positions[:, order], Q, atol=1e-12)
+def same(result: RawTrajectory, rates: bool = True, accelerations: bool = False) -> None:
+    order = [result.names.index(name) for name in NAMES]
+    assert_allclose(result.t, T, atol=1e-9)
+    assert_allclose(result.positions[:, order], Q, atol=1e-12)
     if rates:
-        assert found.velocities is not None
-        assert_allclose(found.velocities[:, order], V, atol=1e-12)
+        assert result.velocities is not None
+        assert_allclose(result.velocities[:, order], V, atol=1e-12)
     if accelerations:
-        assert found.accelerations is not None
-        assert_allclose(found.accelerations[:, order], A, atol=1e-12)
+        assert result.accelerations is not None
+        assert_allclose(result.accelerations[:, order], A, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -89,14 +89,14 @@ def test_a_table_of_any_dialect(tmp_path: Path, sign: str, end: str, comma: str,
 def test_units_in_the_head(tmp_path: Path) -> None:
     head = ["t [ms]", "j1 [deg]", "j2 (mm)", "j3[rad]", "j1_vel [deg/s]", "j2_vel [mm/s]", "j3_vel"]
     columns = [1e3 * T, np.degrees(Q[:, 0]), 1e3 * Q[:, 1], Q[:, 2], np.degrees(V[:, 0]), 1e3 * V[:, 1], V[:, 2]]
-    found = read(tmp_path, table(head, columns))
-    same(found)
-    assert len(found.notes) == 5
+    result = read(tmp_path, table(head, columns))
+    same(result)
+    assert len(result.notes) == 5
     with pytest.raises(ProblemError, match="parsecs"):
         read(tmp_path, table(["t", "j1 [parsecs]"], [T, T]))
 
 
-def test_what_the_package_writes(tmp_path: Path) -> None:
+def test_tables_of_the_package_are_read(tmp_path: Path) -> None:
     trajectory = JointTrajectory(NAMES, T, Q, V, A)
     trajectory.write_csv(tmp_path / "a.csv")
     same(read_trajectory(tmp_path / "a.csv"), accelerations=True)
@@ -117,22 +117,22 @@ def test_logs_that_others_write(tmp_path: Path) -> None:
         whole = writer.register_msgdef("trajectory_msgs/msg/JointTrajectory", JOINT_TRAJECTORY)
         for k, t in enumerate(T):
             order = [k % 3, (k + 1) % 3, (k + 2) % 3]  # drivers change it
-            told = {
+            by_name = {
                 "header": {"stamp": stamp(100 + t), "frame_id": "cell"},
                 "name": [NAMES[i] for i in order],
                 "position": Q[k, order].tolist(),
                 "velocity": V[k, order].tolist(),
                 "effort": [],
             }
-            writer.write_message("/joint_states", state, told, log_time=k)
+            writer.write_message("/joint_states", state, by_name, log_time=k)
         gripper = {"header": {"stamp": stamp(100), "frame_id": ""}, "name": ["g"], "position": [1.0]}
         writer.write_message("/joint_states", state, gripper | {"velocity": [0.0], "effort": []})
         header = {"stamp": stamp(0), "frame_id": ""}
         writer.write_message("/plan", whole, {"header": header, "joint_names": list(NAMES), "points": points})
         writer.finish()
-    found = read_trajectory(tmp_path / "log.mcap")
-    same(found)
-    assert any("1 of 12 messages" in note for note in found.notes)
+    trajectory = read_trajectory(tmp_path / "log.mcap")
+    same(trajectory)
+    assert any("1 of 12 messages" in note for note in trajectory.notes)
     same(read_trajectory(tmp_path / "log.mcap", topic="/plan"))
     with pytest.raises(ProblemError, match="/joint_states, /plan"):
         read_trajectory(tmp_path / "log.mcap", topic="/nothing")
@@ -156,15 +156,15 @@ def test_a_message_that_ends_too_early(tmp_path: Path, data: bytes) -> None:
         read_trajectory(tmp_path / "log.mcap")
 
 
-def test_faults_are_kept_and_lines_told(tmp_path: Path) -> None:
-    found = read(tmp_path, "# a comment\ntime,j1\n2,nan\n\n1,\n1,inf,\n")
-    assert found.t.tolist() == [2.0, 1.0, 1.0]
-    assert np.isnan(found.positions[:2, 0]).all()
-    assert np.isinf(found.positions[2, 0])
-    assert found.lines.tolist() == [3, 5, 6]
+def test_faults_are_kept_with_their_lines(tmp_path: Path) -> None:
+    result = read(tmp_path, "# a comment\ntime,j1\n2,nan\n\n1,\n1,inf,\n")
+    assert result.t.tolist() == [2.0, 1.0, 1.0]
+    assert np.isnan(result.positions[:2, 0]).all()
+    assert np.isinf(result.positions[2, 0])
+    assert result.lines.tolist() == [3, 5, 6]
 
 
-def test_a_joint_whose_name_looks_like_something_else(tmp_path: Path) -> None:
+def test_a_joint_whose_name_looks_like_another_quantity(tmp_path: Path) -> None:
     text = "time,t,arm_vel,a\n0,1,2,3\n"
     assert read(tmp_path, text, joints=("t", "arm_vel")).names == ("t", "arm_vel", "a")
     with pytest.raises(ProblemError, match="two columns are the time"):
@@ -193,7 +193,7 @@ def test_a_joint_whose_name_looks_like_something_else(tmp_path: Path) -> None:
         ("no log", "a.mcap", "not a valid log"),
     ],
 )
-def test_what_is_no_trajectory_is_refused(tmp_path: Path, text: str, name: str, words: str) -> None:
+def test_invalid_trajectories_are_refused(tmp_path: Path, text: str, name: str, words: str) -> None:
     with pytest.raises(ProblemError, match=words) as caught:
         read(tmp_path, text, name)
     assert caught.value.name

@@ -54,16 +54,16 @@ def test_columns_are_read_in_any_order_and_by_any_sign(
     names = ["time", "x", "y", "z", "qw", "qx", "qy", "qz"]
     order = rng.permutation(8)
     text = "# a comment\n\n" + table([names[i] for i in order], values[:, order], delimiter) + "# the end\n"
-    found = waypoints(text.replace("\n", "\r\n") if windows else text)
-    assert found.positions == pytest.approx(values[:, 1:4], rel=1e-12)
-    assert found.times == pytest.approx(values[:, 0], rel=1e-12)
-    assert found.orientations is not None
-    assert np.abs((found.orientations * quaternions).sum(axis=1)) == pytest.approx(1, abs=1e-12)
-    assert ((found.orientations[1:] * found.orientations[:-1]).sum(axis=1) >= 0).all()
-    assert found.axes is None
-    assert not found.free_roll
-    assert sorted(found.names) == sorted(names)
-    assert found.lines.tolist() == list(range(4, 4 + count))
+    result = waypoints(text.replace("\n", "\r\n") if windows else text)
+    assert result.positions == pytest.approx(values[:, 1:4], rel=1e-12)
+    assert result.times == pytest.approx(values[:, 0], rel=1e-12)
+    assert result.orientations is not None
+    assert np.abs((result.orientations * quaternions).sum(axis=1)) == pytest.approx(1, abs=1e-12)
+    assert ((result.orientations[1:] * result.orientations[:-1]).sum(axis=1) >= 0).all()
+    assert result.axes is None
+    assert not result.free_roll
+    assert sorted(result.names) == sorted(names)
+    assert result.lines.tolist() == list(range(4, 4 + count))
 
 
 @pytest.mark.parametrize(
@@ -81,31 +81,31 @@ def test_columns_are_read_in_any_order_and_by_any_sign(
     ],
 )
 def test_heads_and_units(waypoints: Callable[..., Waypoints], head: str, scale: float) -> None:
-    found = waypoints(f"{head}\n" + "\n".join(",".join(map(str, row)) for row in POINTS))
-    assert found.positions == pytest.approx(scale * POINTS)
-    assert found.names == ("x", "y", "z")
+    result = waypoints(f"{head}\n" + "\n".join(",".join(map(str, row)) for row in POINTS))
+    assert result.positions == pytest.approx(scale * POINTS)
+    assert result.names == ("x", "y", "z")
 
 
 @pytest.mark.parametrize("head", ["# x y z", "x [m] y [m] z (m)", "#x y z\n"])
 def test_a_head_in_a_comment_or_with_units_between_blanks(waypoints: Callable[..., Waypoints], head: str) -> None:
-    found = waypoints(f"# first a remark\n{head}\n" + "\n".join(" ".join(map(str, row)) for row in POINTS))
-    assert found.positions == pytest.approx(POINTS)
+    result = waypoints(f"# first a remark\n{head}\n" + "\n".join(" ".join(map(str, row)) for row in POINTS))
+    assert result.positions == pytest.approx(POINTS)
 
 
-def test_what_numpy_writes_is_read(tmp_path: File) -> None:
+def test_tables_of_numpy_are_read(tmp_path: File) -> None:
     poses = np.column_stack([POINTS[:, ::-1], [[1.0, 0, 0, 0]] * 3])
     np.savetxt(tmp_path / "numpy.txt", poses, header="z y x qw qx qy qz")
-    found = read_waypoints(tmp_path / "numpy.txt")
-    assert found.positions == pytest.approx(POINTS)
-    assert found.orientations == pytest.approx(poses[:, 3:])
+    result = read_waypoints(tmp_path / "numpy.txt")
+    assert result.positions == pytest.approx(POINTS)
+    assert result.orientations == pytest.approx(poses[:, 3:])
 
 
 def test_a_unit_of_the_caller_holds_where_the_head_says_none(waypoints: Callable[..., Waypoints]) -> None:
     text = table(["x", "y", "z"], 1e3 * POINTS)
     assert waypoints(text, unit="mm").positions == pytest.approx(POINTS)
-    with pytest.warns(ModelWarning, match="is it in millimetres") as said:
+    with pytest.warns(ModelWarning, match="is it in millimetres") as message:
         waypoints(text)
-    assert said[0].message.name == "unit"  # type: ignore[union-attr]
+    assert message[0].message.name == "unit"  # type: ignore[union-attr]
     assert waypoints(table(["x mm", "y mm", "z mm"], 1e3 * POINTS), unit="mm").positions == pytest.approx(POINTS)
     with pytest.raises(ProblemError, match=r"the header says 'x mm', the caller unit='m'; omit unit"):
         waypoints(table(["x mm", "y mm", "z mm"], 1e3 * POINTS), unit="m")
@@ -114,10 +114,10 @@ def test_a_unit_of_the_caller_holds_where_the_head_says_none(waypoints: Callable
 def test_angles_and_times_have_units_too(waypoints: Callable[..., Waypoints]) -> None:
     values = np.column_stack([POINTS, [[0, 0, 0], [0, 0, 90], [0, 90, 0]], [0, 500, 1000]])
     head = ["x", "y", "z", "rx [deg]", "ry [deg]", "rz [deg]", "t [ms]"]
-    found = waypoints(table(head, values))
-    assert found.times == pytest.approx([0, 0.5, 1])
+    result = waypoints(table(head, values))
+    assert result.times == pytest.approx([0, 0.5, 1])
     half = np.sqrt(0.5)
-    assert found.orientations == pytest.approx(np.array([[1, 0, 0, 0], [half, 0, 0, half], [half, 0, half, 0]]))
+    assert result.orientations == pytest.approx(np.array([[1, 0, 0, 0], [half, 0, 0, half], [half, 0, half, 0]]))
     with pytest.warns(ModelWarning, match="is it in degrees"):
         waypoints(table(["x", "y", "z", "rx", "ry", "rz"], values[:, :6]))
 
@@ -144,12 +144,12 @@ def test_a_tool_axis_is_the_z_axis_and_turns_with_the_least_roll(
 ) -> None:
     rng = np.random.default_rng(seed)
     axes = np.array([0, 0, -1.0]) + 0.4 * np.cumsum(rng.normal(size=(6, 3)), axis=0)
-    found = waypoints(table(["x", "y", "z", *names], np.column_stack([rng.normal(size=(6, 3)), axes])))
-    assert found.free_roll
+    result = waypoints(table(["x", "y", "z", *names], np.column_stack([rng.normal(size=(6, 3)), axes])))
+    assert result.free_roll
     unit = axes / np.linalg.norm(axes, axis=1)[:, None]
-    assert found.axes == pytest.approx(unit)
-    assert axes_of(found.orientations) == pytest.approx(unit, abs=1e-12)
-    turns = Rotation.from_quat(found.orientations, scalar_first=True)
+    assert result.axes == pytest.approx(unit)
+    assert axes_of(result.orientations) == pytest.approx(unit, abs=1e-12)
+    turns = Rotation.from_quat(result.orientations, scalar_first=True)
     least = np.arccos(np.clip((unit[1:] * unit[:-1]).sum(axis=1), -1, 1))
     assert (turns[1:] * turns[:-1].inv()).magnitude() == pytest.approx(least, abs=1e-7)
 
@@ -162,26 +162,26 @@ def test_an_axis_that_goes_round_a_cone_comes_back_rolled_by_the_solid_angle(
     angle = np.linspace(0, 2 * np.pi, count)
     cone = [np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle), np.full(count, np.cos(tilt))]
     values = np.column_stack([angle, 0 * angle, 0 * angle, *cone])
-    found = waypoints(table(["x", "y", "z", "ax", "ay", "az"], values))
-    first, *_, last = Rotation.from_quat(found.orientations, scalar_first=True)
+    result = waypoints(table(["x", "y", "z", "ax", "ay", "az"], values))
+    first, *_, last = Rotation.from_quat(result.orientations, scalar_first=True)
     assert (first.inv() * last).as_rotvec() == pytest.approx([0, 0, 2 * np.pi * (1 - np.cos(tilt))], abs=1e-4)
 
 
-def test_a_tool_that_points_down_all_the_way_is_turned_about_x(waypoints: Callable[..., Waypoints]) -> None:
-    found = waypoints(table(["x", "y", "z", "ax", "ay", "az"], [[0, 0, 0, 0, 0, -2], [1, 0, 0, 0, 0, -1]]))
-    assert found.orientations == pytest.approx(np.array([[0, 1, 0, 0], [0, 1, 0, 0]]))
+def test_a_tool_that_always_points_down_is_rotated_about_x(waypoints: Callable[..., Waypoints]) -> None:
+    result = waypoints(table(["x", "y", "z", "ax", "ay", "az"], [[0, 0, 0, 0, 0, -2], [1, 0, 0, 0, 0, -1]]))
+    assert result.orientations == pytest.approx(np.array([[0, 1, 0, 0], [0, 1, 0, 0]]))
 
 
-def test_without_a_head_three_columns_are_a_place_and_seven_are_asked_for(waypoints: Callable[..., Waypoints]) -> None:
+def test_without_a_header_three_columns_are_positions_and_seven_need_names(waypoints: Callable[..., Waypoints]) -> None:
     text = "\n".join(" ".join(map(str, row)) for row in POINTS)
     assert waypoints(text).positions == pytest.approx(POINTS)
     poses = "\n".join("0,0,0,1,0,0,0".replace("0", str(i), 1) for i in range(3))
     with pytest.raises(ProblemError, match=r"line 1, .*no header names the 7 columns; .* columns="):
         waypoints(poses)
     order = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    found = waypoints(poses.replace("1,0,0,0", "0,0,0,1"), columns=order)
-    assert found.orientations == pytest.approx(np.array([[1.0, 0, 0, 0]] * 3))
-    assert found.lines.tolist() == [1, 2, 3]
+    result = waypoints(poses.replace("1,0,0,0", "0,0,0,1"), columns=order)
+    assert result.orientations == pytest.approx(np.array([[1.0, 0, 0, 0]] * 3))
+    assert result.lines.tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize("head", [",0,1,2,3,4,5,6\n", "0,1,2,3,4,5,6,7\n", "no,1,2,3,4,5,6,7\n", ""])
@@ -190,15 +190,15 @@ def test_columns_that_the_caller_names_pass_over_a_head_of_numbers(
 ) -> None:
     """The public benchmark's paths have a row of column numbers and an index before each row."""
     rows = "0,0.45,0.0,0.0,1.0,0.0,0.0,0.0\n1,0.44547737,0.0,0.0,1.0,0.0,0.0,0.0\n"
-    found = waypoints(head + rows, columns=["index", "x", "y", "z", "qw", "qx", "qy", "qz"])
-    assert found.positions == pytest.approx(np.array([[0.45, 0, 0], [0.44547737, 0, 0]]))
-    assert found.names == ("x", "y", "z", "qw", "qx", "qy", "qz")
-    assert found.ignored == ()
+    result = waypoints(head + rows, columns=["index", "x", "y", "z", "qw", "qx", "qy", "qz"])
+    assert result.positions == pytest.approx(np.array([[0.45, 0, 0], [0.44547737, 0, 0]]))
+    assert result.names == ("x", "y", "z", "qw", "qx", "qy", "qz")
+    assert result.ignored == ()
 
 
-def test_what_is_not_read_is_told(waypoints: Callable[..., Waypoints]) -> None:
-    found = waypoints("index,x,y,z,speed,mark\n0,0,0,0,1,a\n1,1,0,0,2,b\n")
-    assert found.ignored == ("speed", "mark")
+def test_ignored_columns_are_reported(waypoints: Callable[..., Waypoints]) -> None:
+    result = waypoints("index,x,y,z,speed,mark\n0,0,0,0,1,a\n1,1,0,0,2,b\n")
+    assert result.ignored == ("speed", "mark")
 
 
 def test_decimal_commas_between_semicolons(waypoints: Callable[..., Waypoints]) -> None:
@@ -218,26 +218,26 @@ def test_the_path_goes_through_the_points_and_turns_the_tool(
     signs = rng.choice([-1.0, 1.0], (count, 1))
     values = np.column_stack([points, signs * np.array(quaternions)])
     double = np.repeat(values, rng.integers(1, 3, count), axis=0)  # the same place twice
-    found = waypoints(table(["x", "y", "z", "qw", "qx", "qy", "qz"], double))
-    path = found.path()
+    result = waypoints(table(["x", "y", "z", "qw", "qx", "qy", "qz"], double))
+    path = result.path()
     assert len(path.segments) == count - 1
     assert path.start == pytest.approx(points[:-1], abs=1e-12)
     assert np.asarray(path.segments[-1].end) == pytest.approx(points[-1], abs=1e-12)
     assert np.abs((path.orientation * np.array(quaternions)[:-1]).sum(axis=1)) == pytest.approx(1, abs=1e-9)
-    smooth = found.smooth(tolerance=1e-3)
+    smooth = result.smooth(tolerance=1e-3)
     ends = smooth.turn([0.0, smooth.length]).quaternion
     assert np.abs((ends * np.array([quaternions[0], quaternions[-1]])).sum(axis=1)) == pytest.approx(1, abs=1e-9)
     assert smooth.at([0.0, smooth.length]).position == pytest.approx(points[[0, -1]], abs=1e-9)
 
 
-def test_points_that_turn_back_are_split_given_width_or_refused_by_line(waypoints: Callable[..., Waypoints]) -> None:
-    found = waypoints("x,y,z\n0,0,0\n1,0,0\n0.5,0,0\n0.5,1,0\n")
+def test_reversals_are_split_given_a_bulb_or_refused_by_line(waypoints: Callable[..., Waypoints]) -> None:
+    result = waypoints("x,y,z\n0,0,0\n1,0,0\n0.5,0,0\n0.5,1,0\n")
     with pytest.raises(ProblemError, match=r"reverses its direction; use paths\(\)") as caught:
-        found.path()
+        result.path()
     assert caught.value.name == "line 3"
-    assert [len(path.segments) for path in found.paths()] == [1, 2]
-    assert len(found.path(reversal=0.01).segments) == 6
-    smooth = found.smooth(1e-3, reversal=0.02)
+    assert [len(path.segments) for path in result.paths()] == [1, 2]
+    assert len(result.path(reversal=0.01).segments) == 6
+    smooth = result.smooth(1e-3, reversal=0.02)
     assert smooth.length == pytest.approx(2.5 + 7 * np.pi / 3 * 0.01, abs=2e-3)
 
 
@@ -285,9 +285,9 @@ def test_a_table_that_is_wrong_is_refused_by_line_or_column(
 def test_a_path_whose_orientation_must_jump_says_where(
     waypoints: Callable[..., Waypoints], rows: list[str], name: str, words: str
 ) -> None:
-    found = waypoints("\n".join(["x,y,z,rx,ry,rz", *rows]))
+    result = waypoints("\n".join(["x,y,z,rx,ry,rz", *rows]))
     with pytest.raises(ProblemError, match=words) as caught:
-        found.path()
+        result.path()
     assert caught.value.name == name
 
 

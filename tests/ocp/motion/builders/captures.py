@@ -98,12 +98,12 @@ def turned(axis: Any, angle: float) -> Array:
     return np.array(ca.DM(quaternion_about(axis / np.linalg.norm(axis), angle))).ravel()
 
 
-def replayed_momentum(asked: dict[str, Any], plan: Solution, samples: int = 41) -> tuple[Array, Array]:
+def replayed_momentum(request: dict[str, Any], plan: Solution, samples: int = 41) -> tuple[Array, Array]:
     """Momentum of chaser and target in MuJoCo along a plan, about their common centre of mass: (M, 6) in each phase.
 
     (Angular, linear). Before the grasp two robots that move beside each other, after it one.
     """
-    one, other = asked["chaser"], asked["target"]
+    one, other = request["chaser"], request["target"]
     begin, after = (plan.phase(name).at_fraction(np.linspace(0, 1, samples)) for name in ("approach", "detumble"))
     start = (begin[name][0] for name in ("base", "target", "joints"))
     carried = np.array(ca.DM(pair_momentum(one, other, *start))).ravel()
@@ -119,10 +119,10 @@ def replayed_momentum(asked: dict[str, Any], plan: Solution, samples: int = 41) 
 def _together(parts: list[tuple[Array, Array, float]]) -> Array:
     """Of momenta (M, 6) about centres (M, 3) of masses."""
     middle = sum(mass * center for _, center, mass in parts) / sum(mass for *_, mass in parts)
-    found = np.sum([momentum for momentum, *_ in parts], axis=0)
+    result = np.sum([momentum for momentum, *_ in parts], axis=0)
     for momentum, center, _ in parts:
-        found[:, :3] += np.cross(center - middle, momentum[:, 3:])
-    return np.asarray(found)
+        result[:, :3] += np.cross(center - middle, momentum[:, 3:])
+    return np.asarray(result)
 
 
 def _momenta(machine: FreeFloating, bases: Array, joints: Array, rates: Array) -> tuple[Array, Array, float]:
@@ -133,7 +133,7 @@ def _momenta(machine: FreeFloating, bases: Array, joints: Array, rates: Array) -
     order = [model.joint(name).dofadr[0] for name in names]
     places = [model.joint(name).qposadr[0] for name in names]
     spatial = np.eye(6)[:, machine.twist_rows]
-    found, centers = [], []
+    result, centers = [], []
     for base, angles, speeds in zip(bases, joints, rates, strict=True):
         frame = machine.world_from_base(base)
         twist = spatial @ np.array(ca.DM(machine.base_twist(base, angles, speeds))).ravel()
@@ -144,6 +144,6 @@ def _momenta(machine: FreeFloating, bases: Array, joints: Array, rates: Array) -
         data.qvel[:3], data.qvel[3:6], data.qvel[order] = twist[3:], turn.T @ twist[:3], speeds
         mujoco.mj_forward(model, data)
         mujoco.mj_subtreeVel(model, data)
-        found.append([*data.subtree_angmom[1], *(machine.robot.total_mass * data.subtree_linvel[1])])
+        result.append([*data.subtree_angmom[1], *(machine.robot.total_mass * data.subtree_linvel[1])])
         centers.append(data.subtree_com[1].copy())
-    return np.array(found), np.array(centers), float(machine.robot.total_mass)
+    return np.array(result), np.array(centers), float(machine.robot.total_mass)

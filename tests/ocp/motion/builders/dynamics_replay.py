@@ -104,8 +104,8 @@ def replay(machine: FixedBase | FreeFloating, plan: Solution, steps: int = 80) -
             if fixed:
                 data.qacc[columns] = second[i]
                 mujoco.mj_inverse(model, data)
-                found = data.qfrc_inverse[columns]
-                worst = max(worst, float(np.abs(found - torques[i]).max()))
+                result = data.qfrc_inverse[columns]
+                worst = max(worst, float(np.abs(result - torques[i]).max()))
             else:  # the base accelerates as it must: forward dynamics give the joints' accelerations back
                 data.qfrc_applied[columns] = torques[i]
                 mujoco.mj_forward(model, data)

@@ -56,7 +56,7 @@ def replay(
         for values in (motion.joints, motion.joint_velocities, motion.joint_torques)
     ]
     tilts: Array = np.zeros(len(times))
-    found = np.zeros(9)
+    result = np.zeros(9)
     for k in range(len(times)):
         joints, velocities, torques = (values[k] for values in planned)
         data.qfrc_applied[:] = 0.0
@@ -68,8 +68,8 @@ def replay(
             force, moment = np.array(wrench.force).ravel(), np.array(wrench.moment).ravel()
             mujoco.mj_applyFT(model, data, force, moment, point, body, data.qfrc_applied)
         mujoco.mj_step(model, data)
-        mujoco.mju_quat2Mat(found, data.qpos[3:7])
-        upright = found.reshape(3, 3)[2] @ turn.T[:, 2]
+        mujoco.mju_quat2Mat(result, data.qpos[3:7])
+        upright = result.reshape(3, 3)[2] @ turn.T[:, 2]
         tilts[k] = np.arccos(np.clip(upright, -1.0, 1.0))
         if tilts[k] > fallen:
             return times[: k + 1], tilts[: k + 1]
@@ -92,9 +92,9 @@ def assert_tips(machine: Standing, motion: StandingMotion, tilt: float, external
 
 
 def _quaternion(matrix: Array) -> Array:
-    found = np.zeros(4)
-    mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix).ravel())
-    return found
+    result = np.zeros(4)
+    mujoco.mju_mat2Quat(result, np.ascontiguousarray(matrix).ravel())
+    return result
 
 
 def _text(values: Array) -> str:

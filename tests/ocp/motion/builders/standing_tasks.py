@@ -154,8 +154,8 @@ def two() -> Standing:
 
 def two_tasks(left: Any, right: Any) -> list[TipTask]:
     """The hands of the two-armed machine by so many m."""
-    ways = {"left_hand": left, "right_hand": right}
-    return [moved_task(two(), TWO_START, by, TWO_HORIZON, link=name, point=GRIP) for name, by in ways.items()]
+    paths = {"left_hand": left, "right_hand": right}
+    return [moved_task(two(), TWO_START, by, TWO_HORIZON, link=name, point=GRIP) for name, by in paths.items()]
 
 
 def sampled(

@@ -74,8 +74,8 @@ def replay(motion: StepsMotion, friction: float, planar: bool = False) -> Replay
         joints, rates, torques = (values[k] for values in planned)
         data.qfrc_applied[velocity] = torques + SERVO * (joints - data.qpos[position]) + SERVO / 20 * rates
         mujoco.mj_step(model, data)
-        found = data.xmat[body].reshape(3, 3)
-        lean[k] = np.arccos(np.clip((np.trace(found.T @ turns[k]) - 1) / 2, -1.0, 1.0))
+        result = data.xmat[body].reshape(3, 3)
+        lean[k] = np.arccos(np.clip((np.trace(result.T @ turns[k]) - 1) / 2, -1.0, 1.0))
         off[k] = np.linalg.norm(data.xpos[body] - root[k])
         held = motion.steps.phases[phase[k]].footholds
         for name, geom in geoms.items():
@@ -135,9 +135,9 @@ def _model(robot: Robot, motion: StepsMotion, soles: dict[str, str], friction: f
 
 
 def _quaternion(matrix: Array) -> Array:
-    found = np.zeros(4)
-    mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix).ravel())
-    return found
+    result = np.zeros(4)
+    mujoco.mju_mat2Quat(result, np.ascontiguousarray(matrix).ravel())
+    return result
 
 
 def _text(values: object) -> str:

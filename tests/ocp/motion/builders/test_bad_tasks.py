@@ -144,14 +144,14 @@ TASK: Bad = INSTANCE | {
     "empty": (),
     "unknown link": TipTask(velocity=[0.0], rows=(3,), link="nobody"),
 }
-ASKED: dict[str, Bad] = {
+REQUEST_VALUES: dict[str, Bad] = {
     "machine": INSTANCE | {"a robot": CHAIN},
     "start_joints": array(3) | NOTHING,
     "horizon": HORIZON,
     "weights": RATES,
     "start_base": but(BASE, "empty"),
 }
-GIVEN = {"machine": ARM, "tasks": FORWARD, "start_joints": START, "horizon": 1.0}
+ARGUMENTS = {"machine": ARM, "tasks": FORWARD, "start_joints": START, "horizon": 1.0}
 BUILT = {"machine": ARM, "tasks": FORWARD, "start": START, "horizon": 1.0}
 STOOD = {"machine": STANDING, "tasks": STILL, "start_joints": UP, "horizon": 0.2}
 EACH: Bad = LIMIT | {"one of them zero": [1.0, 0.0, 1.0], "table of words": [["a"]]}
@@ -252,7 +252,7 @@ VELOCITIES = [
         inverse_kinematics,
         {"machine": ARM, "task": HELD, "starts": 4, "near": START},
         {
-            "machine": ASKED["machine"],
+            "machine": REQUEST_VALUES["machine"],
             "task": TASK | {"velocity": FORWARD},
             "time": FINITE | NOTHING,
             "base": but(BASE, "empty"),
@@ -268,9 +268,9 @@ VELOCITIES = [
     Case(
         "resolve",
         resolve,
-        {**GIVEN, "samples": 5},
+        {**ARGUMENTS, "samples": 5},
         {
-            **ASKED,
+            **REQUEST_VALUES,
             "tasks": TASK,
             "damping": NONNEGATIVE | NOTHING,
             "tolerance": POSITIVE | NOTHING,
@@ -304,7 +304,7 @@ VELOCITIES = [
         minimum_velocity_problem,
         BUILT,
         {
-            **{"start" if name == "start_joints" else name: bad for name, bad in ASKED.items()},
+            **{"start" if name == "start_joints" else name: bad for name, bad in REQUEST_VALUES.items()},
             "tasks": TASK,
             "cyclic": FLAG,
             "limits": but(INSTANCE, "None"),
@@ -320,7 +320,7 @@ STANDINGS = [
         resolve_accelerations,
         {**STOOD, "step": 0.05},
         {
-            "machine": ASKED["machine"] | {"bolted": ARM},
+            "machine": REQUEST_VALUES["machine"] | {"bolted": ARM},
             "tasks": TASK,
             "start_joints": array(3) | NOTHING,
             "horizon": HORIZON,
@@ -342,7 +342,7 @@ STANDINGS = [
         lambda **options: standing_problem(**with_setup(options)),
         {"machine": STANDING, "tasks": STILL, "start": UP, "horizon": 0.2},
         {
-            "machine": ASKED["machine"] | {"bolted": ARM},
+            "machine": REQUEST_VALUES["machine"] | {"bolted": ARM},
             "tasks": TASK,
             "start": array(3) | NOTHING,
             "horizon": HORIZON,
@@ -372,7 +372,7 @@ STANDINGS = [
         solve_standing,
         {"machine": STANDING, "tasks": STILL, "start": UP, "horizon": 0.2},
         {
-            "machine": ASKED["machine"] | {"bolted": ARM},
+            "machine": REQUEST_VALUES["machine"] | {"bolted": ARM},
             "tasks": TASK,
             "setup": but(INSTANCE, "None"),
             "start": array(3) | NOTHING,
@@ -653,7 +653,7 @@ LONG = ("along", "solve_standing", "solve_steps")
 
 
 @pytest.mark.parametrize("case", good_calls(case for case in CASES if case.what not in LONG))
-def test_what_is_good_is_taken(case: Case) -> None:
+def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 

@@ -54,26 +54,26 @@ def planar() -> Solution:
     return solution
 
 
-def gaps(asked: dict[str, Any], plan: Solution) -> tuple[float, float, float]:
+def gaps(request: dict[str, Any], plan: Solution) -> tuple[float, float, float]:
     """Between tip and grasp where the phases meet: greatest entry of the relative twist, of the way, and the turn."""
-    end, one, other = plan.phase("approach").at_fraction(1.0), asked["chaser"], asked["target"]
+    end, one, other = plan.phase("approach").at_fraction(1.0), request["chaser"], request["target"]
     nothing = np.zeros(0)
     tip, grasped = one.tip_pose(end["base"], end["joints"]), other.tip_pose(end["target"], nothing)
     twist = one.tip_twist(end["base"], end["joints"], end["velocities"])
     twist = np.array(ca.DM(twist - other.tip_twist(end["target"], nothing, nothing)))
-    way = np.array(ca.DM(tip.position - grasped.position))
+    path = np.array(ca.DM(tip.position - grasped.position))
     turn = np.array(ca.DM(ca.mtimes(grasped.rotation.T, tip.rotation)))
-    return float(np.abs(twist).max()), float(np.abs(way).max()), float(np.abs(turn - np.eye(3)).max())
+    return float(np.abs(twist).max()), float(np.abs(path).max()), float(np.abs(turn - np.eye(3)).max())
 
 
-def at_rest(asked: dict[str, Any], plan: Solution, samples: int = 41) -> None:
+def at_rest(request: dict[str, Any], plan: Solution, samples: int = 41) -> None:
     """The arm and the base do not move at the end, wheels are within their limits all the way, and hold it all."""
-    one = asked["chaser"]
+    one = request["chaser"]
     arm = [k for k, name in enumerate(one.robot.joint_names) if "wheel" not in name]
     wheels = [k for k in range(one.joint_size) if k not in arm]
     after = plan.phase("detumble")
     assert np.abs(after["velocities"][-1, arm]).max() < 1e-9
-    before, later = replayed_momentum(asked, plan, samples)
+    before, later = replayed_momentum(request, plan, samples)
     assert np.abs(later[-1]).max() > 0.1  # there is something to hold
     fine = np.linspace(0, 1, 501)
     for phase in ("approach", "detumble"):
@@ -83,12 +83,12 @@ def at_rest(asked: dict[str, Any], plan: Solution, samples: int = 41) -> None:
     assert np.abs(before - before[0]).max() < 1e-9
 
 
-def assert_captured(asked: dict[str, Any], plan: Solution, samples: int = 41) -> None:
-    twist, way, turn = gaps(asked, plan)
+def assert_captured(request: dict[str, Any], plan: Solution, samples: int = 41) -> None:
+    twist, path, turn = gaps(request, plan)
     assert twist < 1e-6
-    assert way < 1e-6
+    assert path < 1e-6
     assert turn < 1e-6
-    at_rest(asked, plan, samples)
+    at_rest(request, plan, samples)
     audit = plan.audit()
     assert audit.passed, audit
 
@@ -112,10 +112,10 @@ def test_the_grasp_asks_for_nothing_that_the_dynamics_keep_anyway(planar_base: b
 
     The centre of mass keeps the first, the dynamics the second, and nothing depends on the third.
     """
-    asked = planar_capture() if planar_base else capture(np.array([0.01, 0.02, 0.03]))
-    asked |= {"approach": 10.0, "detumble": 10.0}
-    asked["chaser"] = replace(asked["chaser"], conserved_momentum=np.linspace(-0.2, 0.3, 3 if planar_base else 6))
-    problem = called(capture_problem, **(asked | {"rest": False}))
+    request = planar_capture() if planar_base else capture(np.array([0.01, 0.02, 0.03]))
+    request |= {"approach": 10.0, "detumble": 10.0}
+    request["chaser"] = replace(request["chaser"], conserved_momentum=np.linspace(-0.2, 0.3, 3 if planar_base else 6))
+    problem = called(capture_problem, **(request | {"rest": False}))
     states = {name: variable.symbol for name, variable in problem.declared.states.items()}
     rng = np.random.default_rng(3)
     at = {name: rng.normal(size=symbol.numel()) for name, symbol in states.items()}
@@ -123,8 +123,8 @@ def test_the_grasp_asks_for_nothing_that_the_dynamics_keep_anyway(planar_base: b
     begins = [rng.normal(size=symbol.numel()) for symbol in starts]
     rows = ca.vertcat(*(row.expression for row in problem.declared.end.values()))
     slopes = [ca.jacobian(rows, states[f"approach.{name}"]) for name in ("base", "joints")]
-    found = ca.Function("slopes", [*states.values(), *starts], slopes)(*at.values(), *begins)
-    of_base, of_joints = (np.array(part) for part in found)
+    result = ca.Function("slopes", [*states.values(), *starts], slopes)(*at.values(), *begins)
+    of_base, of_joints = (np.array(part) for part in result)
     place, wheels = (2, [3]) if planar_base else (3, [6, 7, 8])
     assert not of_base[:, :place].any()
     assert not of_joints[:, wheels].any()
@@ -133,21 +133,21 @@ def test_the_grasp_asks_for_nothing_that_the_dynamics_keep_anyway(planar_base: b
         assert of_base[:, 3:] @ at["approach.base"][3:] == pytest.approx(0.0, abs=1e-14)
 
 
-def test_the_wheel_holds_what_the_target_had() -> None:
-    asked, end = planar_capture(), planar().phase("detumble").at_fraction(1.0)
+def test_the_wheel_takes_the_momentum_of_the_target() -> None:
+    request, end = planar_capture(), planar().phase("detumble").at_fraction(1.0)
     spin = 0.15 * 3.0
     assert 0.02 * end["velocities"][-1] == pytest.approx(spin, rel=1e-9)
     begin = planar().phase("approach")
     angle = begin.at_fraction(0.5)["target"][2]
     assert angle == pytest.approx(0.15 * begin.horizon / 2, rel=1e-9)
-    assert asked["target"].base_size == 3
+    assert request["target"].base_size == 3
 
 
-def test_what_the_hand_bears_changes_the_momentum_of_the_target() -> None:
+def test_loads_of_the_hand_change_the_momentum_of_the_target() -> None:
     """Its integral over the detumbling, force and moment about the centre of mass, within the limits of the hand."""
-    asked, after = planar_capture(), planar().phase("detumble")
-    other = asked["target"]
-    pair = FreeFloating(joined(asked["chaser"].robot, other.robot), "planar", conserved_momentum=[0.45, 0, 0])
+    request, after = planar_capture(), planar().phase("detumble")
+    other = request["target"]
+    pair = FreeFloating(joined(request["chaser"].robot, other.robot), "planar", conserved_momentum=[0.45, 0, 0])
     problem = dynamics_problem(
         pair,
         (),
@@ -161,24 +161,24 @@ def test_what_the_hand_bears_changes_the_momentum_of_the_target() -> None:
     body = with_tip(pair, "target")
     states = [variables[name].symbol for name in names]
     arm = body.tip_pose(*states[:2]).position - pair.tip_pose(*states[:2]).position
-    found = ca.vertcat(force, moment - ca.cross(arm, force), body.tip_twist(*states[:3]))
+    result = ca.vertcat(force, moment - ca.cross(arm, force), body.tip_twist(*states[:3]))
     fractions = np.linspace(0, 1, 4001)
     along = after.at_fraction(fractions)
-    values = np.array(ca.Function("f", states, [found]).map(len(fractions))(*(along[name].T for name in names))).T
-    given = simpson(values[:, :6], fractions * after.horizon, axis=0)
+    values = np.array(ca.Function("f", states, [result]).map(len(fractions))(*(along[name].T for name in names))).T
+    options = simpson(values[:, :6], fractions * after.horizon, axis=0)
     spins, speeds = values[:, 6:9], values[:, 9:12]
-    assert given[:3] == pytest.approx(30.0 * (speeds[-1] - speeds[0]), abs=1e-6)
-    assert given[3:] == pytest.approx(3.0 * (spins[-1] - spins[0]), abs=1e-6)
+    assert options[:3] == pytest.approx(30.0 * (speeds[-1] - speeds[0]), abs=1e-6)
+    assert options[3:] == pytest.approx(3.0 * (spins[-1] - spins[0]), abs=1e-6)
     assert spins[0] == pytest.approx([0, 0, 0.15], abs=1e-9)
     assert np.linalg.norm(values[:, :3], axis=1).max() <= GRASP.force * (1 + 1e-6)
 
 
 def test_the_tip_comes_along_the_axis_of_the_cone() -> None:
-    asked, begin = planar_capture(), planar().phase("approach")
+    request, begin = planar_capture(), planar().phase("approach")
     states = begin.at_fraction(np.linspace(0, 1, 201))
     near = 0
     for base, joints, there in zip(states["base"], states["joints"], states["target"], strict=True):
-        tip, grasped = asked["chaser"].tip_pose(base, joints), asked["target"].tip_pose(there, np.zeros(0))
+        tip, grasped = request["chaser"].tip_pose(base, joints), request["target"].tip_pose(there, np.zeros(0))
         place = np.array(ca.DM(ca.mtimes(grasped.rotation.T, tip.position - grasped.position))).ravel()
         if np.linalg.norm(place) < CONE.length:
             near += 1
@@ -198,8 +198,8 @@ def test_a_cone_is_one_near_the_grasp_and_none_far_away() -> None:
 @pytest.mark.parametrize("planar_base", [True, False])
 def test_the_momentum_of_a_pair_that_drifts_is_that_of_both_about_their_common_centre(planar_base: bool) -> None:
     rng = np.random.default_rng(5)
-    asked = planar_capture() if planar_base else capture(np.array([0.01, 0.02, 0.03]))
-    one, other = asked["chaser"], asked["target"]
+    request = planar_capture() if planar_base else capture(np.array([0.01, 0.02, 0.03]))
+    one, other = request["chaser"], request["target"]
     size = len(one.twist_rows)
     own, theirs = rng.normal(size=size), rng.normal(size=size)
     one, other = replace(one, conserved_momentum=own), replace(other, conserved_momentum=theirs)
@@ -218,18 +218,18 @@ def test_the_momentum_of_a_pair_that_drifts_is_that_of_both_about_their_common_c
         whole = np.zeros(6)
         whole[one.twist_rows] = momentum
         total += whole + np.concatenate([np.cross(place - middle, whole[3:]), np.zeros(3)])
-    found = np.array(ca.DM(pair_momentum(one, other, base, there, joints))).ravel()
-    assert found == pytest.approx(total[one.twist_rows], rel=1e-12, abs=1e-12)
+    result = np.array(ca.DM(pair_momentum(one, other, base, there, joints))).ravel()
+    assert result == pytest.approx(total[one.twist_rows], rel=1e-12, abs=1e-12)
 
 
-def test_momentum_that_wheels_cannot_hold_is_refused_with_what_is_missing() -> None:
-    asked = planar_capture() | {"chaser": planar_chaser(0.3)}
+def test_momentum_beyond_the_wheels_is_refused_with_its_deficit() -> None:
+    request = planar_capture() | {"chaser": planar_chaser(0.3)}
     with pytest.raises(ProblemError, match=r"0\.15 N m s are missing") as caught:
-        called(solve_capture, **asked)
+        called(solve_capture, **request)
     assert (caught.value.name, caught.value.limit) == ("momentum", pytest.approx(0.3))
     assert caught.value.value == pytest.approx(0.45)
-    asked |= {"approach": 10.0, "detumble": 10.0}
-    called(capture_problem, **(asked | {"rest": False}))
+    request |= {"approach": 10.0, "detumble": 10.0}
+    called(capture_problem, **(request | {"rest": False}))
 
 
 @cache
@@ -257,10 +257,10 @@ def longer(robot: Robot, share: float) -> Robot:
 @pytest.mark.long
 def test_a_capture_in_another_unit_of_length_is_the_same() -> None:
     share = 10.0
-    asked = planar_capture() | SHORT
-    one, other = asked["chaser"], asked["target"]
+    request = planar_capture() | SHORT
+    one, other = request["chaser"], request["target"]
     momentum = np.asarray(other.conserved_momentum) * np.array([share**2, share, share])
-    asked |= {
+    request |= {
         "chaser": replace(one, robot=longer(one.robot, share)),
         "target": replace(other, robot=longer(other.robot, share), conserved_momentum=momentum),
         "target_base": share * np.array([1.9, 0.3, 0.0]),
@@ -268,20 +268,20 @@ def test_a_capture_in_another_unit_of_length_is_the_same() -> None:
         "grasp": Grasp(force=share * GRASP.force, moment=share**2 * GRASP.moment),
         "cost": Cost(velocity=0.0, effort=share**-4, acceleration=[1.0] * 3 + [0.0], time=0.05),
     }
-    plan = called(solve_capture, **asked)
+    plan = called(solve_capture, **request)
     assert plan.cost == pytest.approx(short().cost, rel=1e-9)
     assert plan.audit().passed
 
 
 def test_a_wheel_is_one_wherever_it_stands_among_the_joints() -> None:
-    asked = planar_capture() | SHORT
-    *arm, wheel = asked["chaser"].robot.joints
-    asked |= {
-        "chaser": replace(asked["chaser"], robot=replace(asked["chaser"].robot, joints=(wheel, *arm))),
+    request = planar_capture() | SHORT
+    *arm, wheel = request["chaser"].robot.joints
+    request |= {
+        "chaser": replace(request["chaser"], robot=replace(request["chaser"].robot, joints=(wheel, *arm))),
         "start": np.roll(PLANAR_START, 1),
         "cost": Cost(velocity=0.0, effort=1.0, acceleration=[0.0] + [1.0] * 3, time=0.05),
     }
-    plan = called(solve_capture, **asked)
+    plan = called(solve_capture, **request)
     assert plan.cost == pytest.approx(short().cost, rel=1e-9)
     assert plan.phase("detumble")["velocities"][-1, 0] == pytest.approx(0.45 / 0.02, rel=1e-9)
 
@@ -298,12 +298,12 @@ def test_three_wheels_hold_the_diagonal_of_their_box_and_no_more() -> None:
 
 def test_a_target_out_of_reach_is_refused_unless_it_drifts_near() -> None:
     """The arm is 1.8 m long, and the centre of mass no farther than 8 kg of it take it; 0.4 m to the grasp."""
-    asked = planar_capture() | {"target_base": [4.5, 0.0, 0.0], "rest": False}
+    request = planar_capture() | {"target_base": [4.5, 0.0, 0.0], "rest": False}
     with pytest.raises(ProblemError, match="are missing") as caught:
-        called(capture_problem, **asked)
+        called(capture_problem, **request)
     assert caught.value.name == "reach"
-    hub = asked["chaser"].robot
-    first = np.array(ca.DM(center_of_mass(hub, PLANAR_START, asked["chaser"].world_from_base(np.zeros(3))))).ravel()
+    hub = request["chaser"].robot
+    first = np.array(ca.DM(center_of_mass(hub, PLANAR_START, request["chaser"].world_from_base(np.zeros(3))))).ravel()
     assert caught.value.value == pytest.approx(np.linalg.norm([4.5, 0.0, 0.0] - first))
     stretched = 1.8 + 0.4 + (4.0 * 0.4 + 3.0 * 1.15 + 1.0 * 1.65) / hub.total_mass
     assert caught.value.limit == pytest.approx(stretched)
@@ -311,7 +311,7 @@ def test_a_target_out_of_reach_is_refused_unless_it_drifts_near() -> None:
     def reach(velocity: float, latest: float) -> None:
         goal = planar_target(velocity=(velocity, 0.0))
         start = State(np.zeros(3), PLANAR_START, np.zeros(4), np.array([4.5, 0.0, 0.0]), latest, 5.0)
-        require_reach(asked["chaser"], goal, start, 5.0)
+        require_reach(request["chaser"], goal, start, 5.0)
 
     reach(-0.1, 40.0)
     for velocity, latest in ((-2.0, 40.0), (-0.1, 10.0), (0.1, 40.0)):  # it passes too early, comes too late, or leaves
@@ -331,8 +331,8 @@ def test_wheels_about_any_axes_hold_their_farthest_sum(count: int) -> None:
 
 
 def test_a_wheel_on_the_arm_holds_its_momentum_to_any_side() -> None:
-    asked = capture(np.zeros(3))
-    robot = with_wheels(asked["chaser"].robot, [[1, 0, 0]], 0.02, momentum=2.0, link="link2", prefix="far")
+    request = capture(np.zeros(3))
+    robot = with_wheels(request["chaser"].robot, [[1, 0, 0]], 0.02, momentum=2.0, link="link2", prefix="far")
     machine, size = FreeFloating(robot), robot.dof
     start = State(machine.base_home(), np.zeros(size), np.zeros(size), machine.base_home(), 50.0, 50.0)
     assert wheel_capacity(machine, Limits().bounds(machine), start) == pytest.approx(4.0 * np.sqrt(3.0) + 2.0)
@@ -350,8 +350,8 @@ def test_wheels_hold_no_more_than_their_motors_give_them_in_the_time() -> None:
     assert wheel_capacity(machine, Limits().bounds(machine), start, False) == np.inf
 
 
-def test_what_cannot_be_captured_is_refused_by_name() -> None:
-    asked = planar_capture()
+def test_impossible_captures_are_refused_by_name() -> None:
+    request = planar_capture()
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"target": target((0.0, 0.0, 0.1)), "target_base": None}, "target"),
         ({"target": planar_chaser()}, "target"),
@@ -360,36 +360,36 @@ def test_what_cannot_be_captured_is_refused_by_name() -> None:
         ({"cone": 0.3}, "cone"),
         ({"target": FreeFloating(planar_chaser().robot, "planar")}, "target"),
     ]
-    for told, name in wrong:
+    for report, name in wrong:
         with pytest.raises(ProblemError) as caught:
-            called(capture_problem, **(asked | told))
+            called(capture_problem, **(request | report))
         assert str(caught.value.name).rpartition(" ")[2] == name
 
 
 @pytest.mark.long
 def test_both_phases_together_cost_less_than_one_after_the_other() -> None:
-    asked = planar_capture()
-    chain = called(chained_capture, **asked)
+    request = planar_capture()
+    chain = called(chained_capture, **request)
     assert planar().cost < sum(plan.cost for plan in chain) * (1 - 1e-4)
 
 
 @pytest.mark.long
-def test_what_drifts_is_caught_and_goes_on_with_the_pair() -> None:
+def test_a_drifting_target_is_captured_and_drifts_on_with_the_arm() -> None:
     """Chaser and target have momenta of their own: at the end nothing turns, and the pair goes on at P / m.
 
     The momentum about the common centre of mass is looked at where intervals end: between them a polynomial says where
     the two centres are, to some 1e-8 m.
     """
-    asked = planar_capture() | {"target": planar_target(velocity=(0.02, -0.01))}
-    asked["chaser"] = replace(asked["chaser"], conserved_momentum=[0.05, 0.9, -0.6])
-    plan = called(solve_capture, **asked)
-    assert_captured(asked, plan, 9)
+    request = planar_capture() | {"target": planar_target(velocity=(0.02, -0.01))}
+    request["chaser"] = replace(request["chaser"], conserved_momentum=[0.05, 0.9, -0.6])
+    plan = called(solve_capture, **request)
+    assert_captured(request, plan, 9)
     times = np.array([0.7, 1.0])
     after = plan.phase("detumble")
     base = after.at_fraction(times)["base"]
     drift = np.array([0.9 + 30 * 0.02, -0.6 - 30 * 0.01]) / 98.2
-    own = asked["chaser"].robot
-    pair = joined(own, asked["target"].robot)
+    own = request["chaser"].robot
+    pair = joined(own, request["target"].robot)
     assert pair.total_mass == pytest.approx(98.2)
     machine = FreeFloating(pair, "planar")
     joints = after.at_fraction(times)["joints"]
@@ -417,7 +417,7 @@ def random_target(seed: int) -> tuple[Array, Array, Array]:
 @pytest.mark.parametrize("seed", range(3))
 def test_bodies_that_tumble_about_any_axis_are_captured(seed: int) -> None:
     spin, inertia, attitude = random_target(seed)
-    asked = capture(spin, inertia)
-    asked["target_base"] = [2.5, 0.2, 0.6, *attitude]
-    plan = called(solve_capture, **asked)
-    assert_captured(asked, plan)
+    request = capture(spin, inertia)
+    request["target_base"] = [2.5, 0.2, 0.6, *attitude]
+    plan = called(solve_capture, **request)
+    assert_captured(request, plan)

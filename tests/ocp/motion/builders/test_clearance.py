@@ -44,8 +44,8 @@ def crane() -> FixedBase:
     return FixedBase(Robot((Link("foot"), Link("boom", collisions=(ball,))), (turn,)))
 
 
-def nearest(around: CollisionScene, pair: int, least: float, asked: float = 0.02) -> ClosestPair:
-    return ClosestPair(around.labels[pair], least, least, 0.5, np.zeros((2, 3)), asked)
+def nearest(around: CollisionScene, pair: int, least: float, request: float = 0.02) -> ClosestPair:
+    return ClosestPair(around.labels[pair], least, least, 0.5, np.zeros((2, 3)), request)
 
 
 def test_covers_gain_what_hulls_lack() -> None:
@@ -59,7 +59,7 @@ def test_covers_gain_what_hulls_lack() -> None:
     )
 
 
-def test_what_came_too_near_is_held_and_what_is_held_farther_by_what_it_missed() -> None:
+def test_colliding_pairs_get_constraints_enlarged_by_their_deficit() -> None:
     around = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5)), Sphere(0.1, (0, 0.5, 0.5))], clearance=0.02)
     assert 0 < MARGIN < 1e-4  # m: what is held apart is not visibly farther than it has to be
     clearance_constraints = ClearanceConstraints(around).holding([0, 1])
@@ -72,7 +72,7 @@ def test_what_came_too_near_is_held_and_what_is_held_farther_by_what_it_missed()
 
 
 @pytest.mark.parametrize("symbols", [ca.SX, ca.MX])
-def test_what_is_declared_is_the_rounded_distance_at_the_time_of_the_surroundings(symbols: Any) -> None:
+def test_declared_distances_are_rounded_distances_at_the_time_of_the_scene(symbols: Any) -> None:
     around = CollisionScene(ARM, [BALL], clearance=0.02)
     pairs = [2, 0]
     clearance_constraints = ClearanceConstraints(around, {2: 0.1, 0: 0.3})
@@ -87,9 +87,9 @@ def test_what_is_declared_is_the_rounded_distance_at_the_time_of_the_surrounding
     b, x, t = ca.SX.sym("b", 0), ca.SX.sym("q", 4), ca.SX.sym("t")
     exact = ca.Function("exact", [x, t], [around.distances(b, x, t), around.placements(b, x, t)])
     rng = np.random.default_rng(1)
-    for posture, time in zip(rng.uniform(-2, 2, (20, 4)), rng.uniform(0, 2, 20), strict=True):
-        value, placed = (np.array(part).ravel() for part in function(posture, time))
-        known, frames = (np.array(part).ravel() for part in exact(posture, 3.0 + 0.5 * time))
+    for configuration, time in zip(rng.uniform(-2, 2, (20, 4)), rng.uniform(0, 2, 20), strict=True):
+        value, placed = (np.array(part).ravel() for part in function(configuration, time))
+        known, frames = (np.array(part).ravel() for part in exact(configuration, 3.0 + 0.5 * time))
         below = known[sorted(pairs)] - value
         assert (below >= -1e-12).all()
         assert (below <= min(3 * ROUNDING, 0.01)).all()
@@ -100,7 +100,7 @@ def test_what_is_declared_is_the_rounded_distance_at_the_time_of_the_surrounding
     )
 
 
-def test_what_moves_by_itself_needs_a_horizon_and_joints_their_limits() -> None:
+def test_moving_obstacles_need_a_horizon_and_joints_their_limits() -> None:
     around = CollisionScene(ARM, [BALL])
     for limit, horizon, name in ((2.9, None, "obstacles"), (3.0, 1.0, "joint1")):
         problem = Problem("free")
@@ -122,20 +122,20 @@ def test_a_ball_that_swings_past_a_post_is_as_near_as_a_chord() -> None:
     rates, seconds = np.full((4, 1), 1.3 / 2.0), np.zeros((4, 1))
     for end, least in ((0.3, 2 * np.sin(0.05) - 0.105), (0.7, -0.105)):
         swing = partial(swung, end=end)
-        found = clearance_of(around, swing, breaks, 2.0, rates * (end + 1.0) / 1.3, seconds, True)
-        assert found.settled
-        assert found.worst is not None
-        assert found.worst.distance == pytest.approx(least, abs=2e-3)
-        assert found.worst.least <= least + 1e-9
-        assert (found.worst.missed > 0) == (least < 0)
-        assert found.worst.time == pytest.approx(2.0 if end < 0.4 else 2.0 * 1.4 / 1.7, abs=0.02)
+        result = clearance_of(around, swing, breaks, 2.0, rates * (end + 1.0) / 1.3, seconds, True)
+        assert result.settled
+        assert result.worst is not None
+        assert result.worst.distance == pytest.approx(least, abs=2e-3)
+        assert result.worst.least <= least + 1e-9
+        assert (result.worst.missed > 0) == (least < 0)
+        assert result.worst.time == pytest.approx(2.0 if end < 0.4 else 2.0 * 1.4 / 1.7, abs=0.02)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_no_proof_claims_more_than_a_fine_sampling_shows(seed: int) -> None:
     """Random machines of 0.1 mm to 100 m, of thin boxes and needles, slides and followers, in 10 ms to 100 s."""
     rng = np.random.default_rng(seed)
-    size, horizon, pieces = 10.0 ** rng.uniform(-4, 1.5), 10.0 ** rng.uniform(-2, 2), int(rng.choice([1, 3, 17]))
+    size, horizon, segments = 10.0 ** rng.uniform(-4, 1.5), 10.0 ** rng.uniform(-2, 2), int(rng.choice([1, 3, 17]))
     robot = random_robot(rng, size)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     obstacles: list[Any] = [
@@ -151,16 +151,16 @@ def test_no_proof_claims_more_than_a_fine_sampling_shows(seed: int) -> None:
         powers = [np.polyval(np.polyder(np.eye(4)[3 - k], order), at) for k in range(4)]
         return np.stack(powers, axis=-1) @ factors
 
-    breaks = np.linspace(0, 1, pieces + 1)
-    within = breaks[:-1, None] + np.linspace(0, 1, 400) / pieces
+    breaks = np.linspace(0, 1, segments + 1)
+    within = breaks[:-1, None] + np.linspace(0, 1, 400) / segments
     rates, seconds = (np.abs(joints(within, k)).max(axis=1) * 1.001 / horizon**k for k in (1, 2))
-    found = clearance_of(around, joints, breaks, horizon, rates, seconds, True)
-    assert found.settled
+    result = clearance_of(around, joints, breaks, horizon, rates, seconds, True)
+    assert result.settled
     times = np.linspace(0, 1, 2001)
     sampled = distances_along(around, np.zeros(0), joints(times), times * horizon).min(axis=0)
     known = dict(zip(around.labels, sampled, strict=True))
-    assert len(found.pairs) == len(known) > 4
-    for near in found.pairs:
+    assert len(result.pairs) == len(known) > 4
+    for near in result.pairs:
         least = known[near.bodies]
         assert near.least <= max(least, 0.0) + 1e-9 * size
         assert (near.distance > 0) >= (least > 0)
@@ -192,14 +192,14 @@ def random_robot(rng: np.random.Generator, size: float) -> Robot:
     return Robot(tuple(links), tuple(joints))
 
 
-def touching(around: CollisionScene, pair: int = 0, least: float = 0.0, name: str = "clearance") -> SolveError:
+def refused_pair(around: CollisionScene, pair: int = 0, least: float = 0.0, name: str = "clearance") -> SolveError:
     """As of a solution that is sound but for the clearance of a pair."""
     proof = Clearance(name, (nearest(around, pair, least),), True, 1)
     audit = SimpleNamespace(clearances={name: proof}, failures=[Finding(name, 0.02 - least, 0.0, 0.5)])
     solution: Any = SimpleNamespace(audit=lambda: audit)
-    found = collision_error(solution.audit(), solution)
-    assert found is not None
-    return found
+    result = collision_error(solution.audit(), solution)
+    assert result is not None
+    return result
 
 
 def test_it_is_planned_anew_until_it_is_clear() -> None:
@@ -210,22 +210,22 @@ def test_it_is_planned_anew_until_it_is_clear() -> None:
         assert clearance_constraints is not None
         seen.append(dict(clearance_constraints.margins))
         if len(seen) < LOOKS:
-            raise touching(around, pair=0, least=0.01)
+            raise refused_pair(around, pair=0, least=0.01)
         return "clear"
 
-    found: Any = solve_with_clearance(ClearanceConstraints(around), run)
-    assert found == "clear"
+    result: Any = solve_with_clearance(ClearanceConstraints(around), run)
+    assert result == "clear"
     margins = [MARGIN + k * (1.5 * 0.01 + MARGIN) for k in range(LOOKS - 1)]
     assert seen == [{}, *({0: pytest.approx(margin)} for margin in margins)]
 
 
-def test_what_cannot_be_kept_clear_names_who_touches_first() -> None:
+def test_unavoidable_collisions_name_the_first_pair() -> None:
     around = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5))], clearance=0.02)
     looks: list[int] = []
 
     def never(clearance_constraints: ClearanceConstraints | None) -> Any:
         looks.append(1)
-        raise touching(around, least=-0.01)
+        raise refused_pair(around, least=-0.01)
 
     with pytest.raises(SolveError, match=r"overlap by 0\.01 m at 0\.5 s") as caught:
         solve_with_clearance(ClearanceConstraints(around), never)
@@ -240,7 +240,7 @@ def test_what_cannot_be_kept_clear_names_who_touches_first() -> None:
     def stuck(clearance_constraints: ClearanceConstraints | None) -> Any:
         if clearance_constraints is not None and clearance_constraints.margins:
             raise SolveError("no way", name="solver")
-        raise touching(around, least=-0.01)
+        raise refused_pair(around, least=-0.01)
 
     with pytest.raises(SolveError, match=r"bodies collide.*separated, no motion was found: no way") as caught:
         solve_with_clearance(ClearanceConstraints(around), stuck)
@@ -254,16 +254,16 @@ def test_what_cannot_be_kept_clear_names_who_touches_first() -> None:
             solve_with_clearance(clearance_constraints, other)
 
     def loose(clearance_constraints: ClearanceConstraints | None) -> Any:
-        raise touching(around)
+        raise refused_pair(around)
 
     with pytest.raises(SolveError, match="bodies collide"):
         solve_with_clearance(None, loose)
 
 
-def test_bodies_touch_where_nothing_else_is_wrong() -> None:
+def test_collisions_are_reported_where_all_else_holds() -> None:
     around = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5))], clearance=0.02)
-    found = touching(around, least=0.01, name="clearance b")
-    assert (found.name, found.value, found.limit, found.time) == ("clearance b", 0.01, 0.0, 0.5)
+    result = refused_pair(around, least=0.01, name="clearance b")
+    assert (result.name, result.value, result.limit, result.time) == ("clearance b", 0.01, 0.0, 0.5)
     sound: Any = SimpleNamespace(clearances={}, failures=[])
     assert collision_error(sound, sound) is None
     also: Any = SimpleNamespace(

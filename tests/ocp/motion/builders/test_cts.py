@@ -32,11 +32,11 @@ def targets_at(t: Any) -> Any:
     return np.array([np.broadcast_to(part, len(t)) for part in falling(np.asarray(t))])
 
 
-def joints_along(rig: Rig, found: Solution, t: Any) -> Any:
+def joints_along(rig: Rig, result: Solution, t: Any) -> Any:
     """Joints of the plan at some times, between the nodes too. Shape (6, samples)."""
     x, phi = ca.SX.sym("x", 5), ca.SX.sym("phi")
     joints = ca.Function("j", [x, phi], [inverse(rig, x, phi, HOME)[0]]).map(len(t))
-    return np.array(joints(targets_at(t), np.asarray(found.at(t)["roll"]).reshape(1, -1)))
+    return np.array(joints(targets_at(t), np.asarray(result.at(t)["roll"]).reshape(1, -1)))
 
 
 def least_gaps(around: CollisionScene, joints: Any) -> Any:
@@ -63,17 +63,17 @@ def plan(rig: Rig = RIG, method: Collocation = SMOOTH, **options: Any) -> Soluti
 
 
 def test_without_weights_on_motion_the_plan_is_the_best_roll_of_each_target() -> None:
-    found = plan(rate_weight=0.0, acceleration_weight=1e-9)
-    inner = (found.t > 1) & (found.t < 9)
-    best = np.array(optimal_inverse(RIG, TUNNEL).map(int(inner.sum()))(targets_at(found.t[inner]), 1.0)[0])[5]
-    np.testing.assert_allclose(found["roll"][inner, 0], best, atol=2e-3)
+    result = plan(rate_weight=0.0, acceleration_weight=1e-9)
+    inner = (result.t > 1) & (result.t < 9)
+    best = np.array(optimal_inverse(RIG, TUNNEL).map(int(inner.sum()))(targets_at(result.t[inner]), 1.0)[0])[5]
+    np.testing.assert_allclose(result["roll"][inner, 0], best, atol=2e-3)
 
 
 def test_rate_and_acceleration_limits_hold_and_bind() -> None:
-    found = plan(method=HELD, rate_limit=0.35, acceleration_limit=0.2, rate_weight=0.0)
-    assert np.abs(found["rate"]).max() == pytest.approx(0.35, abs=1e-6)
-    assert np.abs(found["acceleration"]).max() <= 0.2 + 1e-6
-    assert found.audit().integration_error < 1e-6
+    result = plan(method=HELD, rate_limit=0.35, acceleration_limit=0.2, rate_weight=0.0)
+    assert np.abs(result["rate"]).max() == pytest.approx(0.35, abs=1e-6)
+    assert np.abs(result["acceleration"]).max() <= 0.2 + 1e-6
+    assert result.audit().integration_error < 1e-6
 
 
 def test_planning_ahead_beats_the_roll_that_looks_back() -> None:
@@ -88,20 +88,20 @@ def test_planning_ahead_beats_the_roll_that_looks_back() -> None:
         rolls.append(roll)
     index = index_by_geometry(RIG, TUNNEL, targets_at(times), np.array(rolls))
     greedy = float(np.sum(index[1:] + weight * (np.diff(rolls) / step) ** 2) * step)
-    found = plan(rate_weight=weight, acceleration_weight=1e-9)
-    assert found.cost < 0.95 * greedy
+    result = plan(rate_weight=weight, acceleration_weight=1e-9)
+    assert result.cost < 0.95 * greedy
 
 
-def test_the_plan_goes_round_an_obstacle_on_the_way_of_the_free_roll() -> None:
+def test_the_plan_avoids_an_obstacle_by_its_free_roll() -> None:
     around = CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 6.0]), INCH * np.array([80.0, -4.0, 0.0])),))
     free = optimal_inverse(RIG, TUNNEL).map(101)(targets_at(np.linspace(0, HORIZON, 101)), np.zeros((1, 101)))[0]
     assert least_gaps(around, free).min() < -0.02  # in its midst
     problem = roll_problem(
         RIG, TUNNEL, falling, HORIZON, settings=RollSettings(symbols=ca.SX), obstacles=RollObstacles(around, 0.01)
     )
-    found = solve(problem, SMOOTH)
-    assert least_gaps(around, joints_along(RIG, found, found.t)).min() >= 0.01 - 1e-6
-    assert found.cost <= solve(problem, SMOOTH, guess={"roll": [-1.0]}).cost * (1 + 1e-6)  # the other way round
+    solution = solve(problem, SMOOTH)
+    assert least_gaps(around, joints_along(RIG, solution, solution.t)).min() >= 0.01 - 1e-6
+    assert solution.cost <= solve(problem, SMOOTH, guess={"roll": [-1.0]}).cost * (1 + 1e-6)  # the other way round
 
 
 def course(cost: Any, t: Any, **options: Any) -> Any:
@@ -136,8 +136,8 @@ def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
     around = CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
 
     def mean(weight: float) -> float:
-        found = plan(scene=around, clearance=-np.inf, clearance_weight=weight, acceleration_weight=0.02)
-        return float(least_gaps(around, joints_along(RIG, found, np.linspace(0, HORIZON, 101))).mean())
+        result = plan(scene=around, clearance=-np.inf, clearance_weight=weight, acceleration_weight=0.02)
+        return float(least_gaps(around, joints_along(RIG, result, np.linspace(0, HORIZON, 101))).mean())
 
     assert mean(0.02) > mean(0.0) + 5e-3
 
@@ -147,12 +147,12 @@ def test_joint_limits_hold_along_the_plan() -> None:
     assert joints_along(rig, plan(rig), DENSE)[3].max() == pytest.approx(0.175, abs=1e-4)
 
 
-def test_a_roll_that_a_joint_limit_forbids_all_the_way_is_gone_round() -> None:
+def test_a_roll_that_a_joint_limit_forbids_is_avoided() -> None:
     """Joint 3 forbids roll pi / 2 at every target: near the best roll of each by itself there is no way across."""
     rig = reference_rig(lower=(-9, -3, -3, -3, -3, -9), upper=(9, 3, 0.3, 3, 3, 9))
-    found = plan(rig)
-    assert joints_along(rig, found, DENSE)[2].max() <= 0.3 + 1e-5
-    assert found["roll"][-1, 0] < -3.0
+    result = plan(rig)
+    assert joints_along(rig, result, DENSE)[2].max() <= 0.3 + 1e-5
+    assert result["roll"][-1, 0] < -3.0
 
 
 def test_a_table_of_targets_is_followed_through_its_spline() -> None:
@@ -174,10 +174,10 @@ def test_a_table_of_targets_is_followed_through_its_spline() -> None:
         ({"clearance": np.nan}, "clearance nan"),
     ],
 )
-def test_what_cannot_be_planned_is_named(options: dict[str, Any], message: str) -> None:
-    asked = {"targets": falling, "horizon": HORIZON, "symbols": ca.SX, **options}
+def test_impossible_plans_are_refused_by_name(options: dict[str, Any], message: str) -> None:
+    request = {"targets": falling, "horizon": HORIZON, "symbols": ca.SX, **options}
     with pytest.raises(ProblemError, match=message) as caught:
-        roll_problem(RIG, TUNNEL, **roll_arguments(asked))
+        roll_problem(RIG, TUNNEL, **roll_arguments(request))
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 

@@ -28,7 +28,7 @@ from ocp import (
 )
 from tests.models.robot.pinocchio_robots import ROBOTS, Peer, random_state, swapped, urdf_file
 
-MASS, WAY = 3.0, 0.8
+MASS, DISPLACEMENT = 3.0, 0.8
 
 
 def slider(mass: float = MASS) -> FixedBase:
@@ -60,9 +60,9 @@ def torques_along(
 @pytest.mark.parametrize("name", ["panda", "ur5", "floating manipulator"])
 def test_torques_of_a_floating_arm_are_those_of_pinocchio(name: str) -> None:
     """With the base's twist from a momentum of zero, and its acceleration so that nothing acts on it."""
-    owner, ending, told = ROBOTS[name]
+    owner, ending, report = ROBOTS[name]
     path = urdf_file(owner, ending)
-    robot = Robot.from_urdf(path, **told)
+    robot = Robot.from_urdf(path, **report)
     machine, peer = FreeFloating(robot), Peer.of(path, robot)
     state = random_state(robot, np.random.default_rng(3))
     model, data, columns = peer.model, peer.data, peer.columns
@@ -80,8 +80,8 @@ def test_torques_of_a_floating_arm_are_those_of_pinocchio(name: str) -> None:
     theirs = (inertia @ second + bias)[columns]
     base, q, qd, qdd = (ca.SX.sym("z", n) for n in (7, *[robot.dof] * 3))
     ours = ca.Function("t", [base, q, qd, qdd], [joint_torques(machine, base, q, qd, qdd)])
-    found = np.array(ours(state.base, state.q, state.qd, state.qdd)).ravel()
-    assert found == pytest.approx(theirs, rel=1e-8, abs=1e-8)
+    result = np.array(ours(state.base, state.q, state.qd, state.qdd)).ravel()
+    assert result == pytest.approx(theirs, rel=1e-8, abs=1e-8)
     assert swapped(velocity[:6]).any()
 
 
@@ -101,8 +101,8 @@ def test_a_heavy_base_stands_still() -> None:
 def test_friction_is_against_the_motion() -> None:
     friction = JointFriction([1.0, 2.0, 3.0], 0.5, slip=0.01)
     rates = np.array([1.0, -0.5, 0.0])
-    found = np.array(ca.DM(friction.torques(ca.DM(rates)))).ravel()
-    assert found == pytest.approx([1.5, -1.5, 0.0])
+    result = np.array(ca.DM(friction.torques(ca.DM(rates)))).ravel()
+    assert result == pytest.approx([1.5, -1.5, 0.0])
     near = np.array(ca.DM(friction.torques(ca.DM([0.01, 0, 0])))).ravel()
     assert near[0] == pytest.approx(0.01 + 0.5 * np.tanh(1.0))
 
@@ -113,9 +113,9 @@ def test_friction_is_against_the_motion() -> None:
 @pytest.mark.parametrize("horizon", [1.0, 2.0])
 def test_the_least_effort_of_a_mass_is_known(horizon: float) -> None:
     """12 m^2 d^2 / T^3 from rest to rest, with a force that is linear in time."""
-    problem = dynamics_problem(slider(), (), horizon, start=[0.0], end=[WAY])
+    problem = dynamics_problem(slider(), (), horizon, start=[0.0], end=[DISPLACEMENT])
     plan = solve(problem, Collocation(10, 3))
-    assert plan.cost == pytest.approx(12 * MASS**2 * WAY**2 / horizon**3, rel=1e-8)
+    assert plan.cost == pytest.approx(12 * MASS**2 * DISPLACEMENT**2 / horizon**3, rel=1e-8)
     assert plan.audit().passed
 
 
@@ -123,10 +123,16 @@ def test_the_least_time_of_a_mass_is_known() -> None:
     """2 sqrt(m d / F), full on and then full off."""
     limits = Limits(torque=5.0)
     problem = dynamics_problem(
-        slider(), (), FreeTime(0.1, 9.0, 2.0), start=[0.0], end=[WAY], limits=limits, cost=Cost(velocity=0.0, time=1.0)
+        slider(),
+        (),
+        FreeTime(0.1, 9.0, 2.0),
+        start=[0.0],
+        end=[DISPLACEMENT],
+        limits=limits,
+        cost=Cost(velocity=0.0, time=1.0),
     )
     plan = solve(problem, Collocation(20, 3, control="held"))
-    assert plan.horizon == pytest.approx(2 * np.sqrt(MASS * WAY / 5.0), rel=1e-6)
+    assert plan.horizon == pytest.approx(2 * np.sqrt(MASS * DISPLACEMENT / 5.0), rel=1e-6)
     assert np.abs(MASS * plan["accelerations"]).max() == pytest.approx(5.0, rel=1e-6)
     assert plan.audit().passed
 
@@ -139,33 +145,33 @@ def test_power_is_limited_and_braking_is_free() -> None:
         (),
         FreeTime(0.1, 9.0, 1.5),
         start=[0.0],
-        end=[WAY],
+        end=[DISPLACEMENT],
         limits=Limits(torque=200.0, power=power),
         cost=Cost(velocity=0.0, effort=1e-7, time=1.0),
         setup=DynamicsSetup(end_velocity="free"),
     )
     plan = solve(problem, Collocation(40, 3))
-    least = (1.5 * WAY) ** (2 / 3) * (MASS / (2 * power)) ** (1 / 3)
+    least = (1.5 * DISPLACEMENT) ** (2 / 3) * (MASS / (2 * power)) ** (1 / 3)
     assert least < plan.horizon < 1.01 * least
-    given = MASS * plan["accelerations"] * plan["velocities"]
-    assert given.max() <= power * (1 + 1e-6)
+    options = MASS * plan["accelerations"] * plan["velocities"]
+    assert options.max() <= power * (1 + 1e-6)
     assert plan["power"].max() == pytest.approx(power, rel=1e-6)
 
 
 def test_jerks_that_are_limited_make_a_mass_start_softly() -> None:
     problem = dynamics_problem(
-        slider(), (), 2.0, start=[0.0], end=[WAY], limits=Limits(jerk=8.0), setup=DynamicsSetup(control="jerk")
+        slider(), (), 2.0, start=[0.0], end=[DISPLACEMENT], limits=Limits(jerk=8.0), setup=DynamicsSetup(control="jerk")
     )
     plan = solve(problem, Collocation(20, 3))
     assert plan["accelerations"][[0, -1]] == pytest.approx(0.0, abs=1e-9)
     assert np.abs(plan["jerks"]).max() <= 8.0 * (1 + 1e-6)
-    assert plan.cost > 12 * MASS**2 * WAY**2 / 8.0
+    assert plan.cost > 12 * MASS**2 * DISPLACEMENT**2 / 8.0
 
 
 # ---- laws ------------------------------------------------------------------------------------------------------------
 
 
-def test_what_drives_give_is_kept_or_lost_in_friction() -> None:
+def test_energy_of_actuators_is_kinetic_or_lost_in_friction() -> None:
     """Work of the drives = kinetic + potential energy gained + what friction takes, over a plan that ends moving."""
     friction = JointFriction(0.4)
     machine = FixedBase(arm())
@@ -177,10 +183,10 @@ def test_what_drives_give_is_kept_or_lost_in_friction() -> None:
     assert plan.audit().feasible
     q, qd, qdd = (ca.SX.sym("z", 3) for _ in range(3))
     drive = joint_torques(machine, (), q, qd, qdd, friction=friction)
-    given = ca.dot(drive, qd) - 0.4 * ca.sumsqr(qd)
+    options = ca.dot(drive, qd) - 0.4 * ca.sumsqr(qd)
     inertial = joint_torques(machine, (), q, ca.DM.zeros(3), qd, gravity=(0, 0, 0))
     kinetic = ca.dot(inertial, qd) / 2
-    power, energy = ca.Function("p", [q, qd, qdd], [given]), ca.Function("e", [q, qd], [kinetic])
+    power, energy = ca.Function("p", [q, qd, qdd], [options]), ca.Function("e", [q, qd], [kinetic])
     points, weights = np.polynomial.legendre.leggauss(8)
     nodes = plan.control_interpolant.breaks
     at = (nodes[:-1, None] + np.diff(nodes)[:, None] * (points + 1) / 2).ravel()
@@ -191,15 +197,21 @@ def test_what_drives_give_is_kept_or_lost_in_friction() -> None:
     assert work == pytest.approx(float(energy(end["joints"], end["velocities"])), rel=1e-5)  # the plane is level
 
 
-def test_energy_costs_what_drives_give_alone() -> None:
+def test_the_energy_cost_counts_positive_power_alone() -> None:
     """A mass that is pushed to v, coasts and is braked, which gives nothing back: m v^2 / 2, d = v T - v^2 m / F."""
     push, horizon = 40.0, 2.0
     problem = dynamics_problem(
-        slider(), (), horizon, start=[0.0], end=[WAY], limits=Limits(torque=push), cost=Cost(velocity=0.0, energy=1.0)
+        slider(),
+        (),
+        horizon,
+        start=[0.0],
+        end=[DISPLACEMENT],
+        limits=Limits(torque=push),
+        cost=Cost(velocity=0.0, energy=1.0),
     )
     plan = solve(problem, Collocation(80, 2))
     a = push / MASS
-    fastest = a * (horizon - np.sqrt(horizon**2 - 4 * WAY / a)) / 2
+    fastest = a * (horizon - np.sqrt(horizon**2 - 4 * DISPLACEMENT / a)) / 2
     assert plan.cost == pytest.approx(MASS * fastest**2 / 2, rel=0.02)  # pushes are shorter than the mesh resolves
 
 

@@ -39,7 +39,7 @@ from ocp import (
 )
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics_plan import solve_dynamics
-from tests.ocp.motion.builders.test_dynamics import MASS, WAY, slider, torques_along
+from tests.ocp.motion.builders.test_dynamics import DISPLACEMENT, MASS, slider, torques_along
 
 MACHINE = FixedBase(planar_chain([0.5, 0.4], [2.0, 1.5]))
 START, END = np.array([0.0, 0.3]), np.array([1.0, -0.5])
@@ -48,13 +48,13 @@ LEAST_TIME = Cost(velocity=0.0, time=1.0)
 SOON = FreeTime(0.1, 5.0, 1.0)
 
 
-def demand(at: Array, toward: Array, bent: Array) -> tuple[Array, Array]:
+def demand(at: Array, toward: Array, perturbed: Array) -> tuple[Array, Array]:
     """Torques of a run along a path q(s): a s'' + b s'^2, each (K, n)."""
 
     def torques(rates: Array, second: Array) -> Array:
         return np.asarray(torques_along(MACHINE, {"joints": at, "velocities": rates, "accelerations": second}))
 
-    return torques(0 * at, toward), torques(toward, bent)
+    return torques(0 * at, toward), torques(toward, perturbed)
 
 
 def least_time_along(s: Array, at: Array) -> float:
@@ -104,7 +104,7 @@ def test_a_plan_of_least_time_is_bang_bang_and_holds_its_limits(fastest: Solutio
     assert (shares.min(axis=1) > 0.999).mean() > 0.95
 
 
-def test_a_path_that_is_free_is_faster_than_any_that_is_given(fastest: Solution) -> None:
+def test_a_free_path_is_faster_than_any_fixed_path(fastest: Solution) -> None:
     """The straight path takes longer even in its own least time; along its own path the plan is as fast as can be."""
     s = np.linspace(0, 1, 2001)
     straight = least_time_along(s, START + s[:, None] * (END - START))
@@ -125,22 +125,22 @@ def test_a_path_that_is_free_is_faster_than_toppra_along_the_straight_one(fastes
     toppra.setup_logging("ERROR")
     path = toppra.SplineInterpolator(np.array([0.0, 0.5, 1.0]), np.array([START, (START + END) / 2, END]))
     limit = JointTorqueConstraint(torques, np.stack([-MOST, MOST], axis=1), np.zeros(2))
-    made = TOPPRA([limit], path, gridpoints=np.linspace(0, 1, 201)).compute_trajectory(0, 0)
+    result = TOPPRA([limit], path, gridpoints=np.linspace(0, 1, 201)).compute_trajectory(0, 0)
     s = np.linspace(0, 1, 2001)
-    assert made.duration == pytest.approx(least_time_along(s, START + s[:, None] * (END - START)), rel=1e-2)
-    assert fastest.horizon < 0.97 * made.duration
+    assert result.duration == pytest.approx(least_time_along(s, START + s[:, None] * (END - START)), rel=1e-2)
+    assert fastest.horizon < 0.97 * result.duration
 
 
 @pytest.mark.parametrize(("mesh", "most"), [((2, 2), np.inf), ((1, 3), 2.5)])
-def test_limits_that_no_mesh_holds_at_little_cost_are_held_at_what_it_takes(
+def test_limits_that_no_mesh_meets_are_tightened_at_their_cost(
     mesh: tuple[int, int], most: float, tmp_path: Path
 ) -> None:
     """Three meshes of low degree are too coarse; what the plan costs too much is told, about as a fine one finds it."""
-    asked: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST, velocity=most)}
+    request: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST, velocity=most)}
     effort = Cost(velocity=0.0, effort=1e-4, time=1.0)
-    best = solve_dynamics(MACHINE, (), SOON, start=START, cost=effort, **asked)
+    best = solve_dynamics(MACHINE, (), SOON, start=START, cost=effort, **request)
     method = Collocation(mesh[0], degree=mesh[1], scheme="legendre")
-    plan = solve_dynamics(MACHINE, (), SOON, start=START, cost=effort, method=method, **asked)
+    plan = solve_dynamics(MACHINE, (), SOON, start=START, cost=effort, method=method, **request)
     audit = plan.audit()
     assert audit.feasible
     assert not audit.passed
@@ -153,16 +153,16 @@ def test_limits_that_no_mesh_holds_at_little_cost_are_held_at_what_it_takes(
 
 
 def test_mixtures_lie_between_their_parts(fastest: Solution) -> None:
-    asked: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST)}
-    mixed = solve_dynamics(MACHINE, (), SOON, start=START, cost=Cost(velocity=0.0, effort=1e-3, time=1.0), **asked)
-    easy = solve_dynamics(MACHINE, (), mixed.horizon, start=START, cost=Cost(velocity=0.0, effort=1e-3), **asked)
+    request: dict[str, Any] = {"end": END, "limits": Limits(torque=MOST)}
+    mixed = solve_dynamics(MACHINE, (), SOON, start=START, cost=Cost(velocity=0.0, effort=1e-3, time=1.0), **request)
+    easy = solve_dynamics(MACHINE, (), mixed.horizon, start=START, cost=Cost(velocity=0.0, effort=1e-3), **request)
     assert mixed.audit().passed
     assert mixed.horizon > fastest.horizon
     assert fine(mixed).max() <= 1 + 1e-5
     assert easy.cost + mixed.horizon == pytest.approx(mixed.cost, rel=1e-3)
 
 
-def test_what_is_too_much_is_named() -> None:
+def test_excessive_values_are_refused_by_name() -> None:
     with pytest.raises(SolveError, match="torques of 'joint1' would have to go") as caught:
         solve_dynamics(MACHINE, (), 0.4, start=START, end=END, limits=Limits(torque=MOST), options={"max_iter": 60})
     assert str(caught.value.name).startswith("torques of 'joint")
@@ -177,7 +177,7 @@ def test_a_point_that_is_passed_is_passed_without_a_stop() -> None:
     passed = Goal(joints=[0.5], duration=FreeTime(0.1, 1.0, 0.6), velocity="free")
     last = Goal(joints=[0.8], duration=FreeTime(0.1, 1.0, 0.4))
     plan = solve_dynamics(slider(), [passed, last], start=[0.0], total=1.0)
-    assert plan.cost == pytest.approx(12 * MASS**2 * WAY**2, rel=1e-7)
+    assert plan.cost == pytest.approx(12 * MASS**2 * DISPLACEMENT**2, rel=1e-7)
     first, second = plan.phase("leg 1"), plan.phase("leg 2")
     assert first.horizon + second.horizon == pytest.approx(1.0, abs=1e-9)
     assert first["velocities"][-1] == pytest.approx(second["velocities"][0], abs=1e-8)
@@ -229,7 +229,7 @@ def test_goals_that_do_not_fit_are_refused() -> None:
             dynamics_phases(MACHINE, goals, start=START, **more)
 
 
-def test_what_touches_on_the_way_to_a_goal_is_held_apart_there() -> None:
+def test_colliding_pairs_on_the_path_to_a_goal_are_separated() -> None:
     """The tip goes round a ball in its way, by plain geometry, on the way out and back to where it begins."""
     chain, tip, ball, sizes = planar_chain([0.5, 0.4], [2.0, 1.5]), np.array([0.4, 0.0, 0.0]), 0.06, 0.11
     shape = CollisionShape("sphere", (sizes - ball,), translation=tip)

@@ -27,17 +27,17 @@ MACHINES: dict[str, tuple[Any, Any, float, Cost, int]] = {
 
 
 @pytest.mark.parametrize("name", MACHINES)
-def test_what_the_torques_do_is_the_energy_that_mujoco_finds(name: str) -> None:
+def test_the_work_of_torques_is_the_energy_in_mujoco(name: str) -> None:
     """At the plan's own states, and where its torques alone take a machine that MuJoCo integrates."""
     make, start, horizon, effort, intervals = MACHINES[name]
     machine = make()
     end = start + np.resize(MOVED, len(start)) * (0.5 if machine.base_size else 1.0)
     problem = dynamics_problem(machine, (), horizon, start=start, end=end, cost=effort)
-    found = replay(machine, solve(problem, Collocation(intervals, degree=5, scheme="legendre")))
-    size = np.ptp(found.energy)
+    result = replay(machine, solve(problem, Collocation(intervals, degree=5, scheme="legendre")))
+    size = np.ptp(result.energy)
     assert size > 1e-3
-    assert found.inverse < 1e-8
-    assert np.abs(np.diff(found.energy) - found.work).max() < 1e-8 * size
-    assert np.abs(found.replayed - found.energy).max() < 1e-6 * size
-    assert found.off < 1e-6
-    assert found.momentum < 1e-8
+    assert result.inverse < 1e-8
+    assert np.abs(np.diff(result.energy) - result.work).max() < 1e-8 * size
+    assert np.abs(result.replayed - result.energy).max() < 1e-6 * size
+    assert result.off < 1e-6
+    assert result.momentum < 1e-8

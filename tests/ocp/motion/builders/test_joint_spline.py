@@ -75,8 +75,8 @@ def test_the_torque_is_a_linear_form_of_acceleration_and_squared_speed() -> None
     for k, (v, a) in enumerate(rng.normal(size=(20, 2))):
         rate, acceleration = along.first[k] * v, along.second[k] * v**2 + along.first[k] * a
         whole = inverse_dynamics(machine.robot, *(ca.DM(x) for x in (along.position[k], rate, acceleration)))
-        found = torque.inertia[k] * a + torque.drag[k] * v**2 + torque.rest[k]
-        assert found == pytest.approx(np.array(whole).ravel(), abs=1e-9)
+        result = torque.inertia[k] * a + torque.drag[k] * v**2 + torque.rest[k]
+        assert result == pytest.approx(np.array(whole).ravel(), abs=1e-9)
 
 
 @pytest.mark.parametrize("jerk", [100.0, np.inf])

@@ -15,7 +15,7 @@ from ocp import Collocation, Limits, Problem, ProblemError, Solution, TipTask, m
 from ocp.motion.builders import joint_motion
 from ocp.motion.local.rates import LocalSolution
 from tests.models.robot.trees import numeric, seven_joint_arm
-from tests.ocp.motion.local.test_rates import ASKED, PAPER_START, REFUSED
+from tests.ocp.motion.local.test_rates import PAPER_START, PAPER_TASK, REFUSED
 
 PAPER_COST = 1.735114311245  # backward-shooting minimum principle, horizon 5 s
 ARM_START = np.array([0.3, 0.6, -0.2, 1.2, 0.4, 0.9, -0.3])
@@ -32,14 +32,14 @@ def chain() -> FixedBase:
     return FixedBase(planar_chain([1.0, 0.8, 0.6], [1.0] * 3))
 
 
-def resolved(machine: Machine, *, start: Any, **asked: Any) -> LocalSolution:
+def resolved(machine: Machine, *, start: Any, **request: Any) -> LocalSolution:
     """The local motion under arguments of `minimum_velocity_problem`."""
-    return resolve(machine, start_joints=start, **asked)
+    return resolve(machine, start_joints=start, **request)
 
 
-def audited(machine: Machine, method: Collocation, /, **asked: Any) -> Solution:
+def audited(machine: Machine, method: Collocation, /, **request: Any) -> Solution:
     """The solution of `minimum_velocity_problem`, in which its audit finds no fault."""
-    solution = solve(minimum_velocity_problem(machine, **asked), method)
+    solution = solve(minimum_velocity_problem(machine, **request), method)
     audit = solution.audit()
     assert not audit.failures, str(audit)
     return solution
@@ -128,15 +128,15 @@ def test_an_arm_on_a_fixed_base_does_better_than_instantly() -> None:
 def test_a_spatial_seven_joint_arm_on_a_floating_base_is_planned(rows: tuple[int, ...], horizon: float) -> None:
     machine = FreeFloating(seven_joint_arm(), "spatial")
     velocity = np.array([0.02, -0.03, 0.04, 0.1, -0.1, 0.05])[list(rows)]
-    asked: dict[str, Any] = {"start": ARM_START, "horizon": horizon}
-    asked["tasks"] = TipTask(rows=rows, velocity=velocity)
-    solution = audited(machine, replace(LEGENDRE, intervals=12), **asked)
+    request: dict[str, Any] = {"start": ARM_START, "horizon": horizon}
+    request["tasks"] = TipTask(rows=rows, velocity=velocity)
+    solution = audited(machine, replace(LEGENDRE, intervals=12), **request)
     assert_does_its_task(machine, solution, lambda _: velocity, list(rows))
     np.testing.assert_allclose(np.linalg.norm(solution["base"][:, 3:], axis=1), 1.0, atol=1e-9)
-    assert solution.cost < resolved(machine, **asked).cost[-1]
+    assert solution.cost < resolved(machine, **request).cost[-1]
 
 
-def test_two_slides_share_the_way() -> None:
+def test_two_parallel_slides_share_the_displacement() -> None:
     """Closed form: each moves at v / 2; cost = integral of v^2 / 4."""
     problem = minimum_velocity_problem(
         slides(), TipTask(rows=(3,), velocity=lambda t: [ca.sin(t)]), 2.0, start=(0.0, 0.0)
@@ -195,7 +195,7 @@ def test_where_the_local_motion_breaks_down_the_guess_is_whole() -> None:
         assert np.isfinite([variable.guess(time) for time in np.linspace(0, 3, 31)]).all()
 
 
-def test_tasks_may_begin_and_end_on_the_way() -> None:
+def test_tasks_may_begin_and_end_during_the_motion() -> None:
     """Nothing is asked from 1 s on: the joints stand still, and the cost is that of the task alone."""
     task = TipTask(rows=(3, 4), velocity=(-0.2, 0.1), duration=1.0)
     costs = [
@@ -214,9 +214,9 @@ def test_a_singular_start_is_planned() -> None:
 
 @pytest.mark.parametrize(("changes", "message"), [*REFUSED, ({"guess_damping": 0.0}, "guess_damping must be positive")])
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    asked = {"start" if name == "start_joints" else name: value for name, value in {**ASKED, **changes}.items()}
+    request = {"start" if name == "start_joints" else name: value for name, value in {**PAPER_TASK, **changes}.items()}
     with pytest.raises(ProblemError, match=message) as caught:
-        minimum_velocity_problem(paper_example(), **asked)
+        minimum_velocity_problem(paper_example(), **request)
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 

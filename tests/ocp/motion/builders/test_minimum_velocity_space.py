@@ -45,14 +45,14 @@ def test_a_space_manipulator_follows_a_pose_line_optimally(momentum: Any) -> Non
     machine = FreeFloating(floating_manipulator().robot, conserved_momentum=momentum)
     line = line_from(machine, BASE, MANIPULATOR_START, (0.1, -0.1, 0.05), (1, 2, 0.5), 0.3, 10.0)
     task = TipTask(position=line.position, orientation=line.orientation)
-    asked: dict[str, Any] = {"tasks": task, "start": MANIPULATOR_START, "horizon": 10.0, "start_base": BASE}
-    solution = audited(machine, FINE, **asked)
+    request: dict[str, Any] = {"tasks": task, "start": MANIPULATOR_START, "horizon": 10.0, "start_base": BASE}
+    solution = audited(machine, FINE, **request)
     assert sum(values.shape[1] for values in solution.states.values()) == 14
     assert largest_error(machine, task, solution) < 1e-6
     scale = np.linalg.norm(momentum) if momentum else machine.robot.total_mass * np.abs(solution["rates"]).max()
     assert largest_momentum_error(machine, solution) < 1e-9 * scale
     np.testing.assert_allclose(np.linalg.norm(solution["base"][:, 3:], axis=1), 1.0, atol=1e-9)
-    assert solution.cost < resolved(machine, **asked).cost[-1]
+    assert solution.cost < resolved(machine, **request).cost[-1]
 
 
 def test_a_light_satellite_gains_by_planning_ahead() -> None:
@@ -101,16 +101,16 @@ def test_a_free_start_is_found_by_inverse_kinematics_and_a_velocity_holds_its_po
     solution = audited(ur5(), Collocation(intervals=15, degree=4), tasks=task, horizon=2.0)
     assert largest_error(ur5(), task, solution) < 1e-6
     machine, start = chain(), np.deg2rad([30.0, 40.0, 50.0])
-    asked: dict[str, Any] = {"tasks": TipTask(rows=(3, 4), velocity=(-0.2, 0.1)), "horizon": 3.0}
+    request: dict[str, Any] = {"tasks": TipTask(rows=(3, 4), velocity=(-0.2, 0.1)), "horizon": 3.0}
     costs = []
     for begin in ({"start": start}, {"near": start}):
-        plan = audited(machine, Collocation(intervals=15), **begin, **asked)
+        plan = audited(machine, Collocation(intervals=15), **begin, **request)
         np.testing.assert_allclose(pose(machine, (), plan["joints"][0])[1], pose(machine, (), start)[1], atol=1e-8)
         costs.append(plan.cost)
     assert costs[1] < costs[0]
 
 
-def test_what_closes_by_itself_on_a_floating_base_is_counted() -> None:
+def test_constraints_satisfied_by_a_floating_base_are_counted() -> None:
     """Of the pose 3 combinations do not depend on the base's, of a position its distance from the centre of mass.
 
     On a fixed base all; of rows along the turning tip none.
@@ -146,27 +146,27 @@ def test_a_floating_arm_returns_to_its_start_on_a_closed_path() -> None:
 def test_a_drifting_machine_cannot_return_in_the_world_but_relative_to_its_base() -> None:
     machine = floating_panda((0.0, 0.0, 0.0, 1.0, 0.0, 0.0))
     _, position = pose(machine, BASE, PANDA_START)
-    asked: dict[str, Any] = {"start": PANDA_START, "horizon": 4.0, "start_base": BASE, "cyclic": True}
+    request: dict[str, Any] = {"start": PANDA_START, "horizon": 4.0, "start_base": BASE, "cyclic": True}
     with pytest.raises(ProblemError, match="the linear momentum moves the centre of mass"):
-        minimum_velocity_problem(machine, tasks=TipTask(position=circle(position, 0.05, 4.0)), **asked)
+        minimum_velocity_problem(machine, tasks=TipTask(position=circle(position, 0.05, 4.0)), **request)
     frame = machine.world_from_base(BASE)
     beside = numeric(frame.rotation).T @ (position - numeric(frame.position).ravel())
     task = TipTask(position=circle(beside, 0.05, 4.0), relative_to="satellite")
-    solution = audited(machine, Collocation(intervals=20, degree=4), tasks=task, **asked)
+    solution = audited(machine, Collocation(intervals=20, degree=4), tasks=task, **request)
     assert largest_error(machine, task, solution) < 1e-6
     assert np.abs(solution["joints"][-1] - PANDA_START).max() <= 1e-8
 
 
 def test_cyclic_tasks_that_are_open_are_refused() -> None:
     rotation, position = pose(panda(), (), PANDA_START)
-    asked: dict[str, Any] = {"start": PANDA_START, "horizon": 2.0, "cyclic": True}
+    request: dict[str, Any] = {"start": PANDA_START, "horizon": 2.0, "cyclic": True}
     open_path = TipTask(position=lambda time: ca.vertcat(position[0], position[1], position[2] + 0.01 * time))
     straight, turned = TipTask(velocity=(0.1,), rows=(4,)), TipTask(velocity=(0, 0, 0.3), rows=(0, 1, 2))
     for task, gap in ((open_path, r"0\.02"), (straight, r"0\.2"), (turned, r"0\.6")):
         with pytest.raises(ProblemError, match=f"not closed: it ends {gap} "):
-            minimum_velocity_problem(panda(), tasks=task, **asked)
+            minimum_velocity_problem(panda(), tasks=task, **request)
     turning = TipTask(orientation=rotation, position=position, rows=(0, 1, 2))
-    minimum_velocity_problem(panda(), tasks=turning, **asked)
+    minimum_velocity_problem(panda(), tasks=turning, **request)
 
 
 def test_two_arms_carry_one_thing_while_the_base_stands() -> None:
@@ -180,11 +180,11 @@ def test_two_arms_carry_one_thing_while_the_base_stands() -> None:
         TipTask(position=turn.T @ (there - place), link="right_panda_hand", relative_to="left_panda_hand"),
         TipTask(rows=(0, 1, 2), velocity=(0, 0, 0), link="satellite"),
     ]
-    asked: dict[str, Any] = {"tasks": task, "start": start, "horizon": 3.0}
-    solution = audited(machine, Collocation(intervals=10, degree=4), **asked)
+    request: dict[str, Any] = {"tasks": task, "start": start, "horizon": 3.0}
+    solution = audited(machine, Collocation(intervals=10, degree=4), **request)
     assert largest_error(machine, task, solution) < 1e-6
     np.testing.assert_allclose(solution["base"][:, 3:], np.tile(home[3:], (len(solution.t), 1)), atol=1e-8)
-    assert solution.cost < resolved(machine, **asked).cost[-1] + 1e-9
+    assert solution.cost < resolved(machine, **request).cost[-1] + 1e-9
 
 
 def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> None:
@@ -193,14 +193,14 @@ def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> N
     path = smooth(Path.through(corners), deviation=0.008)
     task = TipTask(position=path_tracks(path, 0.1).position, direction=rotation[:, 2])
     horizon = path.length / 0.1
-    asked: dict[str, Any] = {"tasks": task, "start": UR5_START, "horizon": horizon}
-    local = resolved(ur5(), **asked)
-    assert list(minimum_velocity_problem(ur5(), **asked).declared.signals) == ["targets"]
+    request: dict[str, Any] = {"tasks": task, "start": UR5_START, "horizon": horizon}
+    local = resolved(ur5(), **request)
+    assert list(minimum_velocity_problem(ur5(), **request).declared.signals) == ["targets"]
     edges = np.asarray(path.bounds) / path.length
-    pieces = [np.linspace(a, b, 7)[:-1] for a, b in pairwise(edges)]
-    mesh = (*np.concatenate(pieces).tolist(), 1.0)
+    segments = [np.linspace(a, b, 7)[:-1] for a, b in pairwise(edges)]
+    mesh = (*np.concatenate(segments).tolist(), 1.0)
     method = Collocation(intervals=len(mesh) - 1, degree=4, mesh=mesh)
-    solution = audited(ur5(), method, **asked)
+    solution = audited(ur5(), method, **request)
     assert largest_error(ur5(), task, solution) < 1e-6
     assert solution.cost <= local.cost[-1] * (1 + 1e-7)
     fine = solution.at(np.linspace(0, horizon, 1001))["joints"]
@@ -209,9 +209,9 @@ def test_the_free_roll_of_a_tool_is_planned_along_a_raster_without_a_jump() -> N
 
 def test_weights_and_momentum_cost_less_than_instantly() -> None:
     machine = FreeFloating(paper_example().robot, "planar", conserved_momentum=(5.0, -4.0, 2.0))
-    asked: dict[str, Any] = {"tasks": TipTask(rows=(3, 4), velocity=(-0.4, -0.3)), "start": PAPER_START}
-    asked |= {"horizon": 2.0, "weights": (1.0, 3.0, 0.5)}
-    solution = audited(machine, Collocation(intervals=20, degree=4), **asked)
-    assert solution.cost < resolved(machine, **asked).cost[-1]
+    request: dict[str, Any] = {"tasks": TipTask(rows=(3, 4), velocity=(-0.4, -0.3)), "start": PAPER_START}
+    request |= {"horizon": 2.0, "weights": (1.0, 3.0, 0.5)}
+    solution = audited(machine, Collocation(intervals=20, degree=4), **request)
+    assert solution.cost < resolved(machine, **request).cost[-1]
     with pytest.raises(ProblemError, match="must be positive"):
-        minimum_velocity_problem(machine, **{**asked, "weights": (1.0, 0.0, 1.0)})
+        minimum_velocity_problem(machine, **{**request, "weights": (1.0, 0.0, 1.0)})

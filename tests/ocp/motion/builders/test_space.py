@@ -56,7 +56,7 @@ def test_a_wheel_turns_its_carrier_at_the_least_effort_that_is_known() -> None:
     assert plan.audit().passed
 
 
-def test_momentum_that_is_given_is_kept_by_wheels() -> None:
+def test_wheels_preserve_the_initial_momentum() -> None:
     """A base that tumbles is stopped by its wheels, which then hold the momentum; nothing else has it."""
     momentum = np.array([1.0, -2.0, 1.5, 0.0, 0.0, 0.0])
     machine = body(momentum)
@@ -75,7 +75,7 @@ def test_momentum_that_is_given_is_kept_by_wheels() -> None:
 # ---- laws ----------------------------------------------------------------------------------------------------------
 
 
-def test_what_the_drives_give_is_kinetic_energy() -> None:
+def test_the_work_of_the_actuators_is_kinetic_energy() -> None:
     """Power of motors is the rate of the energy of joints and base together, in any motion, whatever the momentum."""
     carried = np.random.default_rng(9).normal(size=6)
     machine = FreeFloating(wheeled(2), conserved_momentum=carried)
@@ -89,8 +89,8 @@ def test_what_the_drives_give_is_kinetic_energy() -> None:
     rate = ca.jtimes(energy, ca.vertcat(b, q, v), ca.vertcat(machine.base_rate(b, q, v), v, a))
     both = ca.Function("both", [b, q, v, a], [rate, ca.dot(joint_torques(machine, b, q, v, a), v)])
     for seed in range(5):
-        found, given = (float(value) for value in both(*state(machine, seed)))
-        assert found == pytest.approx(given, rel=1e-9, abs=1e-9)
+        result, options = (float(value) for value in both(*state(machine, seed)))
+        assert result == pytest.approx(options, rel=1e-9, abs=1e-9)
 
 
 def turned(plan: Solution) -> float:
@@ -134,8 +134,8 @@ def test_wheels_hold_the_attitude_while_the_arm_works() -> None:
     machine = FreeFloating(wheeled(1))
     start, goal = [0.2, -0.4, 0.9, *[0.0] * 4], [0.9, 0.3, 0.1, *[nan] * 4]
     attitude = TipTask(link="hub", orientation=(1.0, 0.0, 0.0, 0.0))
-    asked: dict[str, Any] = {"end": goal, "setup": DynamicsSetup(end_velocity=[0.0] * 3 + [nan] * 4)}
-    held = solve(dynamics_problem(machine, attitude, 20.0, start=start, **asked), Collocation(20, 5))
+    request: dict[str, Any] = {"end": goal, "setup": DynamicsSetup(end_velocity=[0.0] * 3 + [nan] * 4)}
+    held = solve(dynamics_problem(machine, attitude, 20.0, start=start, **request), Collocation(20, 5))
     assert turned(held) < 1e-9
     assert held.audit().feasible
 
@@ -143,10 +143,10 @@ def test_wheels_hold_the_attitude_while_the_arm_works() -> None:
 def test_turning_that_costs_is_less() -> None:
     chain = planar_chain([0.8, 0.6], [4.0, 3.0], base=Link("hub", 40.0, (0, 0, 0), 4.0 * np.eye(3)))
     machine = FreeFloating(with_wheels(chain, [[0, 0, 1]], 0.02), "planar")
-    asked: dict[str, Any] = {"end": [1.2, 0.3, nan], "setup": DynamicsSetup(end_velocity=[0.0, 0.0, nan])}
+    request: dict[str, Any] = {"end": [1.2, 0.3, nan], "setup": DynamicsSetup(end_velocity=[0.0, 0.0, nan])}
 
     def most(effort: Cost | None) -> float:
-        plan = solve(dynamics_problem(machine, (), 10.0, start=[0.2, -0.9, 0.0], cost=effort, **asked), SHORT)
+        plan = solve(dynamics_problem(machine, (), 10.0, start=[0.2, -0.9, 0.0], cost=effort, **request), SHORT)
         return float(np.abs(plan["base"][:, 2]).max())
 
     assert most(Cost(velocity=0.0, effort=1.0, turning=1e4)) < 0.1 * most(None)
@@ -166,14 +166,14 @@ def test_an_attitude_is_held_at_the_end_whatever_the_sign_of_its_quaternion() ->
     assert plans[0].cost == pytest.approx(plans[1].cost, rel=1e-8)
 
 
-def test_what_does_not_fit_a_spacecraft_is_refused_by_name() -> None:
+def test_arguments_that_do_not_fit_a_spacecraft_are_refused_by_name() -> None:
     machine = hub()
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"end_base": [0.0, 0.0]}, "end_base"),
         ({"wrenches": [Wrench("hub", (1, 0, 0))]}, "wrenches"),
         ({"start_velocity": [0.0, 1.0]}, "start_velocity"),
     ]
-    for told, name in wrong:
+    for report, name in wrong:
         with pytest.raises(ProblemError) as caught:
-            dynamics_problem(machine, (), 5.0, start=[0.0], setup=DynamicsSetup(**told))
+            dynamics_problem(machine, (), 5.0, start=[0.0], setup=DynamicsSetup(**report))
         assert caught.value.name == name

@@ -20,7 +20,7 @@ def at(place: float) -> Foothold:
 
 
 @given(st.lists(st.tuples(st.sampled_from(FEET), st.floats(-1, 1)), min_size=1, max_size=6))
-def test_a_walk_lifts_one_foot_at_a_time_and_sets_it_where_it_is_asked(steps: list[tuple[str, float]]) -> None:
+def test_a_walk_lifts_one_foot_at_a_time_and_places_it_on_its_foothold(steps: list[tuple[str, float]]) -> None:
     start = {name: at(0.1 * k) for k, name in enumerate(FEET)}
     phases = walk(start, [(name, at(place)) for name, place in steps], shift=0.5, swing=0.7)
     assert [phase.seconds for phase in phases] == [0.5, *[0.7, 0.5] * len(steps)]

@@ -87,7 +87,9 @@ def points(problem: Problem, intervals: int) -> Solution:
     ],
     ids=["in_range", "index_half", "index_nine_tenths", "pinned", "none"],
 )
-def test_plans_of_table_1_cost_what_they_should(zmp: Any, cost: float, index: float, speed: float, push: float) -> None:
+def test_plans_of_table_1_have_the_published_cost(
+    zmp: Any, cost: float, index: float, speed: float, push: float
+) -> None:
     """Costs, least index on the dense grid and peak rates: reference computed independently, 80 intervals."""
     solution = held(table_plan(1, zmp))
     assert solution.cost == pytest.approx(cost, rel=2e-3)
@@ -110,7 +112,7 @@ def test_plans_of_table_1_cost_what_they_should(zmp: Any, cost: float, index: fl
 @pytest.mark.parametrize(
     ("zmp", "cost"), [(IN_RANGE, -2.316), (IndexAtLeast(0.9), -2.235), (Pinned(), -2.000)], ids=str
 )
-def test_plans_of_table_2_against_the_spring_cost_what_they_should(zmp: Any, cost: float) -> None:
+def test_plans_of_table_2_against_the_spring_have_the_published_cost(zmp: Any, cost: float) -> None:
     solution = held(table_plan(2, zmp))
     assert solution.cost == pytest.approx(cost, rel=1e-3)
     motion = sampled(machine(), solution, spring())
@@ -139,7 +141,7 @@ def test_a_plan_at_collocation_points_passes_its_audit(zmp: Any) -> None:
 
 
 @pytest.mark.long
-def test_the_audit_of_a_held_plan_finds_its_motion_sound_and_what_it_loses() -> None:
+def test_the_audit_of_a_piecewise_constant_plan_reports_its_loss_alone() -> None:
     """80 held accelerations cost 2e-3 more than free ones, which is beyond what an optimum may lose."""
     solution = held(table_plan(1, IN_RANGE))
     audit = solution.audit(tolerances={"zero moment point": MILLIMETRE, "joints": 1e-6, "tip": 1e-5})
@@ -173,8 +175,8 @@ def test_the_reported_cost_is_that_of_the_sampled_motion_and_local_laws_cost_mor
         "stabilised": {"law": "stabilised", "stabiliser": Stabiliser((3.5, 3.5, 3.5), gradient=1.8)},
     }
     for name, law in laws.items():
-        found = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], HORIZON, step=1e-2, **law)
-        costs[name] = motion_cost(found.motion)
+        result = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], HORIZON, step=1e-2, **law)
+        costs[name] = motion_cost(result.motion)
         assert costs[name] > solution.cost
     assert costs["plain"] == pytest.approx(2.49, rel=0.01)
     assert costs["damped"] == pytest.approx(0.57, rel=0.01)
@@ -237,15 +239,15 @@ def test_jerk_as_control_keeps_the_accelerations_continuous() -> None:
     assert steps < 1.1 * np.abs(solution["jerks"]).max() * HORIZON / 600
 
 
-def test_free_ends_cost_less_than_rest_and_a_given_end_posture_more() -> None:
+def test_free_ends_cost_less_than_rest_and_a_fixed_end_configuration_more() -> None:
     rest = points(table_plan(1, IN_RANGE, tip_level="acceleration"), 12)
     free = points(table_plan(1, IN_RANGE, tip_level="acceleration", end_velocity="free"), 12)
     loose = points(table_plan(1, IN_RANGE, tip_level="acceleration", start_velocity="free", end_velocity="free"), 12)
     assert loose.cost < free.cost < rest.cost
-    posture = (*(rest["joints"][-1, :2] + [0.05, -0.05]), np.nan, np.nan, np.nan)
-    given = held(table_plan(1, IN_RANGE, end=posture), 30)
-    np.testing.assert_allclose(given["joints"][-1, :2], posture[:2], atol=1e-8)
-    assert given.cost > held(table_plan(1, IN_RANGE), 30).cost
+    configuration = (*(rest["joints"][-1, :2] + [0.05, -0.05]), np.nan, np.nan, np.nan)
+    options = held(table_plan(1, IN_RANGE, end=configuration), 30)
+    np.testing.assert_allclose(options["joints"][-1, :2], configuration[:2], atol=1e-8)
+    assert options.cost > held(table_plan(1, IN_RANGE), 30).cost
 
 
 def test_mx_symbols_take_an_interpolant_and_give_the_same_plan() -> None:
@@ -308,13 +310,13 @@ def excess(standing: Standing, solution: Solution, limits: Limits, external: Any
     bounds = limits.bounds(standing)
     sizes = (motion.joint_velocities, motion.joint_accelerations, motion.joint_torques)
     most = {"velocity": bounds.velocity, "acceleration": bounds.acceleration, "torque": bounds.torque}
-    found = {what: float((np.abs(size) - most[what]).max()) for what, size in zip(most, sizes, strict=True)}
+    by_name = {what: float((np.abs(size) - most[what]).max()) for what, size in zip(most, sizes, strict=True)}
     least = 0.1 * standing.weight if limits.vertical_force is None else limits.vertical_force
-    found["vertical force"] = float(least - motion.ground_force[:, 2].min())
-    found["friction"] = float((motion.friction - limits.friction).max())
-    found["joints"] = float(motion.joint_excess.max()) if limits.joints else -np.inf
-    found["foot"] = -float(motion.foot_margin.min())
-    return found
+    by_name["vertical force"] = float(least - motion.ground_force[:, 2].min())
+    by_name["friction"] = float((motion.friction - limits.friction).max())
+    by_name["joints"] = float(motion.joint_excess.max()) if limits.joints else -np.inf
+    by_name["foot"] = -float(motion.foot_margin.min())
+    return by_name
 
 
 @pytest.mark.parametrize("size", some([4, 6], [4]))
@@ -324,9 +326,9 @@ def test_other_machines_hold_tip_and_zero_moment_point_between_the_points(size: 
         settings = with_setup({"zmp": InFoot(0.01), "tip_level": level})
         problem = standing_problem(standing, task, PLANAR_HORIZON, start=planar_start(size), **settings)
         solution = solve(problem, method)
-        found = excess(standing, solution, Limits())
-        assert found.pop("foot") < -0.01 + MILLIMETRE
-        assert max(found.values()) < 1e-6, found
+        result = excess(standing, solution, Limits())
+        assert result.pop("foot") < -0.01 + MILLIMETRE
+        assert max(result.values()) < 1e-6, result
         assert tip_error(standing, sampled(standing, solution), task) < 1e-5
 
 
@@ -364,17 +366,17 @@ def test_a_tightened_plan_holds_its_limits_between_the_points(
     problem = standing_problem(standing, table_task(1), HORIZON, start=STANDING_STARTS[1], **settings)
     method = MultipleShooting(40) if level == "position" else Collocation(20, scheme="legendre")
     solution = tighten(problem, method)
-    found = excess(standing, solution, limits)
-    assert found.pop("foot") < -IN_RANGE.margin + 1e-6
-    assert max(found.values()) < 1e-6, found
+    result = excess(standing, solution, limits)
+    assert result.pop("foot") < -IN_RANGE.margin + 1e-6
+    assert max(result.values()) < 1e-6, result
     assert 0 <= solution.cost - solve(problem, method).cost < 0.02
 
 
 def test_the_fastest_lift_holds_its_limits_between_the_points() -> None:
     solution = tighten(lift_plan(IN_RANGE), MultipleShooting(50))
-    found = excess(machine(), solution, LIFT_LIMITS)
-    assert found.pop("foot") < -IN_RANGE.margin + 1e-6
-    assert max(found.values()) < 1e-6, found
+    result = excess(machine(), solution, LIFT_LIMITS)
+    assert result.pop("foot") < -IN_RANGE.margin + 1e-6
+    assert max(result.values()) < 1e-6, result
     assert solution.horizon == pytest.approx(0.503, rel=2e-3)
     values = solution.at_fraction((np.arange(500) + 0.5) / 500)
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
@@ -405,8 +407,8 @@ def misses(problem: Any, method: Any) -> list[tuple[str, float, float]]:
     with pytest.raises(SolveError) as caught:
         solve(problem, method, options={"max_iter": 60})
     pattern = r"^  (.+) would have to go ([\d.e-]+) beyond its \w+ bound [\d.e-]+(?: at ([\d.e-]+) s)?$"
-    found = re.findall(pattern, str(caught.value), re.MULTILINE)
-    return [(name, float(amount), float(at) if at else np.nan) for name, amount, at in found]
+    result = re.findall(pattern, str(caught.value), re.MULTILINE)
+    return [(name, float(amount), float(at) if at else np.nan) for name, amount, at in result]
 
 
 def lean(horizon: Any, forward: float = 0.9, up: float = 0.5, **changes: Any) -> Any:
@@ -416,7 +418,7 @@ def lean(horizon: Any, forward: float = 0.9, up: float = 0.5, **changes: Any) ->
 
 
 @pytest.mark.parametrize("horizon", [3.0, FreeTime(0.5, 3.0, 2.0)], ids=["fixed", "free"])
-def test_reaching_further_than_the_foot_allows_says_what_fails_when_and_by_how_much(horizon: Any) -> None:
+def test_an_unreachable_target_names_the_violated_limit_its_time_and_size(horizon: Any) -> None:
     """Held 0.9 m ahead at rest the machine leans out of the foot: no way of moving there changes where it ends."""
     name, amount, time = misses(lean(horizon), MultipleShooting(20))[0]
     assert name == "zero moment point[1]"  # the front edge
@@ -433,34 +435,34 @@ def test_the_foot_that_the_error_asks_for_is_enough() -> None:
     assert held(problem, 20).success
 
 
-def test_joints_that_are_too_slow_are_named_for_a_given_time_and_the_time_for_a_free_one() -> None:
-    found = misses(table_plan(1, IN_RANGE, limits=replace(LIMITS, velocity=0.2)), MultipleShooting(20))
-    assert found[0][0].startswith("velocities[")
-    assert 0.2 < found[0][1] < 0.5
-    assert 0 < found[0][2] < HORIZON
+def test_slow_joints_are_named_at_a_fixed_time_and_the_time_is_found_when_free() -> None:
+    result = misses(table_plan(1, IN_RANGE, limits=replace(LIMITS, velocity=0.2)), MultipleShooting(20))
+    assert result[0][0].startswith("velocities[")
+    assert 0.2 < result[0][1] < 0.5
+    assert 0 < result[0][2] < HORIZON
     slow = replace(LIMITS, velocity=0.8)
-    found = misses(lean(FreeTime(0.2, 0.6, 0.5), 0.0, 0.8, limits=slow), MultipleShooting(20))
-    assert found[0][0] == "horizon"
-    assert 0.1 < found[0][1] < 0.6
+    result = misses(lean(FreeTime(0.2, 0.6, 0.5), 0.0, 0.8, limits=slow), MultipleShooting(20))
+    assert result[0][0] == "horizon"
+    assert 0.1 < result[0][1] < 0.6
 
 
 def test_joints_that_are_too_weak_are_named() -> None:
     """Little more than what they take at the start; joint limits are lifted, or a posture beyond them would do."""
     weak = replace(LIMITS, joints=False, torque=(5.0, 205.0, 13.0, 6.0, 2.1))
-    found = misses(table_plan(1, IN_RANGE, limits=weak), MultipleShooting(20))
-    assert found[0][0] == "torques[2]"
-    assert 0.5 < found[0][1] < 10
-    assert 0 <= found[0][2] <= HORIZON
+    result = misses(table_plan(1, IN_RANGE, limits=weak), MultipleShooting(20))
+    assert result[0][0] == "torques[2]"
+    assert 0.5 < result[0][1] < 10
+    assert 0 <= result[0][2] <= HORIZON
 
 
 def test_a_tip_that_cannot_come_to_its_path_is_named() -> None:
     """Within the arm's length, but the joints cannot fold so far: they, or the tip, have to give way."""
-    found = misses(lean(3.0, -0.6, -1.2, zmp=Anywhere()), MultipleShooting(20))
-    assert {name.partition("[")[0] for name, *_ in found} <= {"joints", "tip"}
-    assert found[0][1] > 0.05
+    result = misses(lean(3.0, -0.6, -1.2, zmp=Anywhere()), MultipleShooting(20))
+    assert {name.partition("[")[0] for name, *_ in result} <= {"joints", "tip"}
+    assert result[0][1] > 0.05
 
 
-def test_a_pushed_machine_is_asked_to_stand_where_a_time_dependent_force_lets_it() -> None:
+def test_a_standing_machine_yields_to_a_time_dependent_force() -> None:
     def push(t: Any, tip: Any) -> Any:
         return [machine().tip_wrench((0, 30 * ca.sin(t), -20))]
 

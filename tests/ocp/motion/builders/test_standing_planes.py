@@ -87,10 +87,10 @@ def test_plans_and_laws_are_the_same_in_every_vertical_plane() -> None:
         machine, task = turned(degrees)
         point = resting_point(machine)
         costs.append([planned(machine, task, zmp).cost for zmp in (InFoot(0.01), Pinned(point))])
-        found = [resolve_accelerations(machine, task, START, 0.2, law=law, zmp=point, step=0.01) for law in LAWS]
-        assert all(one.succeeded for one in found)
-        pushes.append([one.motion.joint_accelerations for one in found])
-        for one in found:
+        matches = [resolve_accelerations(machine, task, START, 0.2, law=law, zmp=point, step=0.01) for law in LAWS]
+        assert all(one.succeeded for one in matches)
+        pushes.append([one.motion.joint_accelerations for one in matches])
+        for one in matches:
             np.testing.assert_allclose(one.motion.zero_moment_point, np.broadcast_to(point, (21, 2)), atol=1e-9)
     for other in (1, 2):
         np.testing.assert_allclose(costs[other], costs[0], rtol=1e-5)
@@ -98,7 +98,7 @@ def test_plans_and_laws_are_the_same_in_every_vertical_plane() -> None:
 
 
 @pytest.mark.parametrize("zmp", [InFoot(0.0), IndexAtLeast(0.2), Pinned((0.0, 0.0))], ids=["foot", "index", "pinned"])
-def test_what_pushes_a_planar_machine_sideways_is_felt(zmp: ZmpRule) -> None:
+def test_lateral_forces_on_a_planar_machine_count(zmp: ZmpRule) -> None:
     """The zero moment point is z F / Fz aside, which only a lower tip makes less."""
     machine = planar_machine(SIZE)
 
@@ -157,7 +157,7 @@ def test_a_reference_that_leaves_the_foot_is_refused(zmp: ZmpRule, message: str 
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
-def test_joints_that_tip_and_zero_moment_point_use_up_cannot_be_asked_to_rest() -> None:
+def test_joints_used_by_tip_and_zero_moment_point_cannot_rest() -> None:
     machine, start = planar_machine(3), planar_start(3)
     task, setup = planar_task(3, 0.02, -0.02), StandingSetup(tip_level="acceleration")
     with pytest.raises(ProblemError, match=r"2 rows and 1 of the zero moment point leave the 3 joints no freedom"):

@@ -93,7 +93,7 @@ def test_the_fastest_lift_is_planned_with_linear_accelerations() -> None:
     assert solution.horizon == pytest.approx(0.5003, rel=2e-3)  # the limit of fine meshes, by collocation
 
 
-def test_a_failure_says_what_became_of_every_attempt() -> None:
+def test_a_failure_reports_the_outcome_of_every_attempt() -> None:
     slow = {"limits": replace(LIMITS, velocity=0.2), "options": {"max_iter": 60}}
     message = r"(?s)no standing plan .*\ntip acceleration, 8 intervals: .*velocities\[\d\]"
     with pytest.raises(SolveError, match=message) as caught:
@@ -125,9 +125,9 @@ def test_an_arm_holds_its_hand_level_where_the_local_method_tips(kind: str) -> N
     motion = sampled(arm(), solution, tool)
     assert motion.foot_margin.min() > 0.004
     for joints in motion.joints[:: len(motion.t) // 7]:
-        found, _ = pose(arm(), (), joints)
+        result, _ = pose(arm(), (), joints)
         columns = slice(0, 3) if kind == "orientation" else slice(2, 3)
-        np.testing.assert_allclose(found[:, columns], turn[:, columns], atol=1e-5)
+        np.testing.assert_allclose(result[:, columns], turn[:, columns], atol=1e-5)
     assert_stands(arm(), motion, tool)
     rolled = [pose(arm(), (), joints)[0] @ turn.T for joints in (motion.joints[0], motion.joints[-1])]
     assert (np.abs(rolled[1] - rolled[0]).max() > 1e-3) == (kind == "direction")
@@ -153,37 +153,37 @@ def test_two_arms_stand_where_the_local_method_tips() -> None:
 
 
 @pytest.mark.parametrize(
-    ("level", "method", "cost", "stray"),
+    ("level", "method", "cost", "deviation"),
     [
         ("position", Collocation(40, degree=3, scheme="legendre", control="held"), 2e-3, 3e-3),  # at the nodes alone
         ("acceleration", Collocation(20, degree=3, scheme="legendre"), 1e-8, 1e-4),
     ],
 )
 def test_a_velocity_says_the_same_as_the_position_it_leads_to(
-    level: Any, method: Collocation, cost: float, stray: float
+    level: Any, method: Collocation, cost: float, deviation: float
 ) -> None:
     tasks = (table_task(1), TipTask(velocity=lambda t: [0.0, 0.4 * ca.sin(t)], rows=(4, 5), gain=0.0))
     settings: dict[str, Any] = {"zmp": IN_RANGE, "limits": LIMITS, "setup": StandingSetup(tip_level=level)}
     problems = [standing_problem(machine(), task, HORIZON, start=STANDING_STARTS[1], **settings) for task in tasks]
     led, driven = (solve(problem, method) for problem in problems)
     assert driven.cost == pytest.approx(led.cost, abs=cost)
-    assert tip_error(machine(), sampled(machine(), driven), tasks[0]) < stray
+    assert tip_error(machine(), sampled(machine(), driven), tasks[0]) < deviation
 
 
-def test_a_hand_that_turns_on_its_way_costs_less_with_its_time_law_free() -> None:
+def test_a_rotating_hand_costs_less_with_a_free_time_law() -> None:
     """A pose in a plane over a path parameter, three rows; timed from rest to rest it is one of the ways to run it."""
     standing, start = planar_machine(6), planar_start(6)
     first, place = pose(standing, (), start)
     goal = turned((1, 0, 0), 0.4) @ first, place + np.array([0, 0.25, -0.3])
     line = pose_line((first, place), goal, 1.0, pace="constant")
     task = TipTask(position=line.position, orientation=line.orientation, rows=(0, 4, 5))
-    given = timed(task, lambda t: rest_to_rest(t / PLANAR_HORIZON))
+    options = timed(task, lambda t: rest_to_rest(t / PLANAR_HORIZON))
     cost = {}
-    for along, what in (("time", given), ("parameter", task)):
+    for along, what in (("time", options), ("parameter", task)):
         setup = StandingSetup(along=along)  # type: ignore[arg-type]
-        found = solve_standing(standing, what, PLANAR_HORIZON, start=start, zmp=InFoot(0.01), setup=setup)
-        cost[along] = found.cost
-        for ours, theirs in zip(pose(standing, (), found["joints"][-1]), goal, strict=True):
+        result = solve_standing(standing, what, PLANAR_HORIZON, start=start, zmp=InFoot(0.01), setup=setup)
+        cost[along] = result.cost
+        for ours, theirs in zip(pose(standing, (), result["joints"][-1]), goal, strict=True):
             np.testing.assert_allclose(ours, theirs, atol=1e-5)
     assert cost["parameter"] < cost["time"]
 

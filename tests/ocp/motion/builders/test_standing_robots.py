@@ -63,8 +63,8 @@ class Peered:
             (motion.joint_velocities[k], {}),
             (motion.joint_accelerations[k], {}),
         ):
-            given = {**rest, **dict(zip(robot.joint_names, values, strict=True))}
-            full.append(np.array([given.get(name, 0.0) for name in whole.joint_names]))
+            options = {**rest, **dict(zip(robot.joint_names, values, strict=True))}
+            full.append(np.array([options.get(name, 0.0) for name in whole.joint_names]))
         zero, turn = np.zeros(6), np.asarray(self.machine.rotation)
         state = State(turn, np.asarray(self.machine.translation), full[0], zero, full[1], zero, full[2])
         q = peer.configuration(state)
@@ -75,10 +75,10 @@ class Peered:
         force = numeric(wrench.force).ravel()
         outside = [pinocchio.Force.Zero() for _ in range(peer.model.njoints)]
         outside[tip.parentJoint] = place.actInv(pinocchio.Force(force, np.cross(hand, force)))
-        found = pinocchio.rnea(peer.model, data, q, peer.velocity(state), peer.acceleration(state), outside)
+        result = pinocchio.rnea(peer.model, data, q, peer.velocity(state), peer.acceleration(state), outside)
         names = [whole.joint_names.index(name) for name in robot.joint_names]
-        push, moment = turn @ found[:3], turn @ found[3:6]
-        return found[peer.columns][names], np.concatenate([moment + np.cross(self.machine.translation, push), push])
+        push, moment = turn @ result[:3], turn @ result[3:6]
+        return result[peer.columns][names], np.concatenate([moment + np.cross(self.machine.translation, push), push])
 
 
 def assert_pinocchio_agrees(peered: Peered, motion: StandingMotion, external: Any) -> None:
@@ -115,7 +115,7 @@ def anymal_solution(anymal: Peered) -> Solution:
     return solve(pushing.problem(anymal.machine), pushing.METHOD)
 
 
-def test_tiago_stands_where_instant_resolution_tips_it(tiago: gallery.Results) -> None:
+def test_tiago_stands_where_instantaneous_resolution_tips_it(tiago: gallery.Results) -> None:
     assert not tiago.local.stands
     assert tiago.local.foot_margin.min() < -0.003
     motion = tiago.motion
@@ -133,9 +133,9 @@ def test_pinning_the_zero_moment_point_where_it_starts_makes_tiago_lift_off(tiag
     place = tiago.local.zero_moment_point[0]
     task = gallery.from_rest(gallery.circle(tiago.machine))
     settings: dict[str, Any] = {"law": "augmented", "zmp": place, "external": tiago.external, "step": 5e-3}
-    found = resolve_accelerations(tiago.machine, task, gallery.START, gallery.SECONDS, **settings)
-    assert found.stopped is not None
-    assert found.stopped.reason == "lift_off"
+    result = resolve_accelerations(tiago.machine, task, gallery.START, gallery.SECONDS, **settings)
+    assert result.stopped is not None
+    assert result.stopped.reason == "lift_off"
 
 
 def test_pinocchio_finds_the_loads_of_the_plan_of_tiago(tiago: gallery.Results) -> None:
@@ -156,7 +156,7 @@ def test_tiago_with_its_time_law_free_costs_less(tiago: gallery.Results) -> None
     assert np.abs(errors).max() < 1e-5
 
 
-def test_anymal_stands_where_instant_resolution_tips_it(anymal: Peered, anymal_solution: Solution) -> None:
+def test_anymal_stands_where_instantaneous_resolution_tips_it(anymal: Peered, anymal_solution: Solution) -> None:
     machine = anymal.machine
     settings: dict[str, Any] = {"external": pushing.reaction(machine), "step": 1e-2}
     task = pushing.task(machine)
@@ -221,10 +221,10 @@ def test_limits_that_leave_nothing_are_named(anymal: Peered, name: str, limits: 
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
-@pytest.mark.parametrize(("what", "told"), [("velocity", "velocity"), ("effort", "torque")])
-def test_a_limit_of_0_is_unknown_and_none_holds(anymal: Peered, what: str, told: str) -> None:
+@pytest.mark.parametrize(("what", "message"), [("velocity", "velocity"), ("effort", "torque")])
+def test_a_limit_of_0_is_unknown_and_none_holds(anymal: Peered, what: str, message: str) -> None:
     name = "j2s6s200_joint_3"
-    with pytest.warns(ModelWarning, match=f"gives {name} a {told} limit of 0, which is read as unknown") as caught:
+    with pytest.warns(ModelWarning, match=f"gives {name} a {message} limit of 0, which is read as unknown") as caught:
         unknown = pushing.problem(changed(anymal.machine, name, **{what: 0.0}))
     assert caught[0].message.name == name  # type: ignore[union-attr]
     free = pushing.problem(changed(anymal.machine, name, **{what: np.inf}))
@@ -244,7 +244,7 @@ def test_a_load_that_no_motion_holds_at_the_start_is_named(anymal: Peered) -> No
         pushing.problem(weak, zmp=Pinned((0.0, -0.4)), limits=Limits(acceleration=5.0))
 
 
-def test_a_start_in_a_singular_posture_may_be_left() -> None:
+def test_motions_may_start_in_a_singular_configuration() -> None:
     """The arm of the paper stretched straight up: no local motion leaves there, the first guess is to stay."""
     machine, start = standing_example(), np.array([np.pi / 2, 0.0, 2 * np.pi, 2 * np.pi, 0.0])
     _, y, z = numeric(machine.tip_pose((), start).position).ravel()

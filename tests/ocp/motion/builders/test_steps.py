@@ -32,24 +32,24 @@ FIRM = 0.03  # m: with this much TALOS stands still on the corner of a sole, see
 GROUND: dict[str, Any] = {"limits": Limits(friction=FRICTION)}
 
 
-def planned(steps: Steps, method: Collocation | None = None, **asked: Any) -> tuple[Solution, StepsMotion]:
-    steps = with_margin(steps, **asked)
+def planned(steps: Steps, method: Collocation | None = None, **request: Any) -> tuple[Solution, StepsMotion]:
+    steps = with_margin(steps, **request)
     plan = solve_steps(steps, start=bent(steps), method=method, **GROUND)
     return plan, steps_motion(steps, plan)
 
 
-def with_margin(steps: Steps, **asked: Any) -> Steps:
+def with_margin(steps: Steps, **request: Any) -> Steps:
     """The same steps, the centers of pressure a margin inside the edges."""
-    return replace(steps, **{"margin": MARGIN, **asked})
+    return replace(steps, **{"margin": MARGIN, **request})
 
 
 def assert_stands(motion: StepsMotion, planar: bool, slip: float = 3e-3, lean: float = 0.03) -> None:
     """In the contact simulation it does not fall, feet that are held stay flat and where they are."""
-    found = replay(motion, FRICTION, planar)
-    assert not found.fell
-    assert found.lean.max() < lean
-    assert found.slip < slip
-    assert found.lifted < slip + 2e-3
+    result = replay(motion, FRICTION, planar)
+    assert not result.fell
+    assert result.lean.max() < lean
+    assert result.slip < slip
+    assert result.lifted < slip + 2e-3
 
 
 def assert_feet_hold(steps: Steps, motion: StepsMotion, margin: float = MARGIN) -> None:
@@ -106,7 +106,7 @@ def test_joints_torques_and_bodies_are_those_of_the_robot(step: tuple[Steps, Sol
     np.testing.assert_allclose(total[first, 5][5:-5], steps.robot.total_mass * (9.81 + push[5:-5]), rtol=2e-2)
 
 
-def test_planted_faults_of_steps_are_found(step: tuple[Steps, Solution, StepsMotion]) -> None:
+def test_planted_faults_of_steps_are_detected(step: tuple[Steps, Solution, StepsMotion]) -> None:
     _, plan, _ = step
     first, second, third = plan.phases
     loose, stricter = copy(plan.problem), copy(plan.problem)
@@ -144,9 +144,9 @@ def test_a_machine_of_another_size_takes_the_same_steps_at_the_same_cost() -> No
     for size in (1.0, 3.0):
         unit = np.sqrt(size)
         weights = StepWeights(acceleration=0.01 * unit**3, velocity=0.01 * unit, joint_limits=1 / unit, load=0.0)
-        asked = {**GROUND, "cost": weights}
+        request = {**GROUND, "cost": weights}
         larger = with_margin(resized(steps, size), margin=MARGIN * size, clearance=0.02 * size)
-        plans.append(solve(steps_problem(larger, start=start, **asked), coarse))
+        plans.append(solve(steps_problem(larger, start=start, **request), coarse))
     one, large = plans
     assert large.cost == pytest.approx(one.cost, rel=1e-7)
     for name in ("1 left + right.joints", "2 left.joints", "3 left + right.joints"):
@@ -192,7 +192,7 @@ def test_an_arm_docks_and_then_holds_on_by_its_hand() -> None:
 
 
 @pytest.mark.parametrize("robot", ["planar", pytest.param("talos", marks=pytest.mark.long)])
-def test_the_walk_of_the_pseudo_inverse_keeps_its_feet_on_their_ways_and_falls(robot: str) -> None:
+def test_the_pseudo_inverse_keeps_the_feet_on_their_paths_and_falls(robot: str) -> None:
     """The zero moment point leaves the soles, and the contact simulation falls soon after it did."""
     steps = planar_steps(2, 0.5, 0.6) if robot == "planar" else talos_steps(2, 0.8, 0.8)
     clearance = 0.03
@@ -205,9 +205,9 @@ def test_the_walk_of_the_pseudo_inverse_keeps_its_feet_on_their_ways_and_falls(r
         assert motion.sole_position[name][:, 2].max() == pytest.approx(clearance, abs=1e-7)
     assert motion.margin.min() < -0.1
     out = motion.t[np.flatnonzero(motion.margin < 0)[0]]
-    found = replay(motion, FRICTION, planar=robot == "planar")
-    assert found.fell
-    assert out < found.t[-1] < out + 2.0
+    result = replay(motion, FRICTION, planar=robot == "planar")
+    assert result.fell
+    assert out < result.t[-1] < out + 2.0
 
 
 def test_the_walk_of_the_pseudo_inverse_has_the_least_rates_and_loads() -> None:
@@ -261,14 +261,14 @@ def on_the_corner_of_a_sole(steps: Steps, margin: float, seconds: float) -> Step
     stance = steps.stances[1]
     assert stance.support is not None
     over = np.asarray(stance.support.vertices).min(axis=0) + margin
-    posture = standing_configuration(stance, bent(steps)[steps.order(stance)], over)[None].repeat(2, axis=0)
-    still = np.zeros_like(posture)
+    configuration = standing_configuration(stance, bent(steps)[steps.order(stance)], over)[None].repeat(2, axis=0)
+    still = np.zeros_like(configuration)
     one = Steps(steps.robot, steps.feet, [StancePhase(steps.phases[1].footholds, seconds)])
-    found = sample_stance(one, one.stances[0], (posture, still, still), {})
-    return motion_of(one, [{"t": np.array([0.0, seconds]), "phase": np.zeros(2), **found}])
+    result = sample_stance(one, one.stances[0], (configuration, still, still), {})
+    return motion_of(one, [{"t": np.array([0.0, seconds]), "phase": np.zeros(2), **result}])
 
 
-def test_ground_that_gives_takes_a_centimeter_of_the_margin_at_the_corner_of_a_sole() -> None:
+def test_soft_ground_reduces_the_margin_at_the_corner_of_a_sole() -> None:
     """It is as good as rigid to the plan; in the simulation it sinks by a millimeter, and joints on servos give too."""
     steps = talos_steps(1, 1.0, 1.0)
     least = on_the_corner_of_a_sole(steps, MARGIN, 2.5)
@@ -326,7 +326,7 @@ def test_a_step_that_is_too_fast_is_refused_with_the_time_that_it_takes() -> Non
 
 
 @pytest.mark.long
-def test_steps_that_no_time_makes_possible_are_refused_with_what_would_have_to_give_way() -> None:
+def test_infeasible_steps_are_refused_with_the_constraint_to_relax() -> None:
     steps = planar_steps(1, 0.5, 0.6)
     joints = tuple(replace(joint, effort=3.0) for joint in steps.robot.joints)
     weak = replace(steps, robot=replace(steps.robot, joints=joints))

@@ -66,15 +66,15 @@ def worst(solved: Case) -> float:
     inside = (np.arange(30) + 0.5) / 30
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
     limits, s = solved.limits, motion.distance
-    found: list[Any] = [
+    results: list[Any] = [
         motion.speed / np.max(limits.speed),
         motion.speed**2 * solved.path.curvature(s) / limits.centripetal,
     ]
-    found += [np.abs(motion.acceleration) / limits.acceleration, np.abs(motion.jerk) / limits.jerk]
+    results += [np.abs(motion.acceleration) / limits.acceleration, np.abs(motion.jerk) / limits.jerk]
     if solved.joints is not None:
         moved = joint_motion(solved.joints, motion)[1:]
-        found += [np.abs(v) / b for v, b in zip(moved, limits.of_joints(4), strict=True)]
-    return max(float(value.max()) for value in found)
+        results += [np.abs(v) / b for v, b in zip(moved, limits.of_joints(4), strict=True)]
+    return max(float(value.max()) for value in results)
 
 
 @pytest.mark.parametrize(
@@ -152,10 +152,10 @@ def test_more_intervals_and_no_schedule_give_the_same_minimum(limited: Case, mon
 
 
 @pytest.mark.parametrize("kind", ["cubic", "quintic"])
-def test_centripetal_acceleration_is_kept_where_the_curvature_jumps_too(kind: str) -> None:
-    bent = case(example(kind), LineLimits(1.0, ACCELERATION, 200.0, 5.0))
-    assert worst(bent) < 1.001
-    assert bent.best.duration < bent.plan.duration * (1 + HELD)
+def test_centripetal_limits_hold_at_jumps_of_the_curvature(kind: str) -> None:
+    perturbed = case(example(kind), LineLimits(1.0, ACCELERATION, 200.0, 5.0))
+    assert worst(perturbed) < 1.001
+    assert perturbed.best.duration < perturbed.plan.duration * (1 + HELD)
 
 
 def test_speeds_of_segments_are_kept() -> None:
@@ -176,7 +176,7 @@ def test_random_paths_are_solved_and_bracketed(seed: int) -> None:
     assert alone * (1 - 1e-6) < solved.best.duration < solved.plan.duration * (1 + HELD)
 
 
-def test_tight_joint_limits_far_below_the_asked_speed_are_solved(arm: ScaraPath) -> None:
+def test_joint_limits_far_below_the_requested_speed_are_solved(arm: ScaraPath) -> None:
     tight = case(arm.path, LineLimits(1.0, ACCELERATION, 200.0, 5.0, JointLimits(0.1, 0.2, 1.0)), arm, 60)
     assert worst(tight) < 1.001
     assert tight.best.duration < tight.plan.duration * (1 + HELD)
@@ -207,8 +207,8 @@ def test_tables_are_exact_between_their_breaks_and_jump_at_them() -> None:
 
     function = table(columns, np.array([0.0, 0.3, 1.0]))
     x = np.linspace(0, 1, 4001)
-    found = np.array(function.map(len(x))(x[None])).T
-    assert (np.abs(found - columns(x)).max(axis=0) < 2e-8 * np.abs(columns(x)).max(axis=0)).all()
+    result = np.array(function.map(len(x))(x[None])).T
+    assert (np.abs(result - columns(x)).max(axis=0) < 2e-8 * np.abs(columns(x)).max(axis=0)).all()
     assert np.array(function(0.3))[0, 0] == pytest.approx(np.sin(6.0) + 1, abs=4e-8)
     assert np.array(function(0.3 - 1e-12))[0, 0] == pytest.approx(np.sin(6.0), abs=4e-8)
 

@@ -43,13 +43,13 @@ def test_stretches_tile_the_horizon_and_tasks_are_active_where_they_are(
     times: list[tuple[float, float | None]],
 ) -> None:
     tasks = [interval(each, number) for number, each in enumerate(times)]
-    found = stretches_of(ARM, tasks, HORIZON)
-    assert found[0].begin == 0.0
-    assert found[-1].end == HORIZON
-    assert [a.end for a in found[:-1]] == [b.begin for b in found[1:]]
-    assert all(stretch.duration > 0 for stretch in found)
-    assert len({stretch.suffix for stretch in found}) == len(found)
-    for stretch in found:
+    result = stretches_of(ARM, tasks, HORIZON)
+    assert result[0].begin == 0.0
+    assert result[-1].end == HORIZON
+    assert [a.end for a in result[:-1]] == [b.begin for b in result[1:]]
+    assert all(stretch.duration > 0 for stretch in result)
+    assert len({stretch.suffix for stretch in result}) == len(result)
+    for stretch in result:
         for t in np.linspace(stretch.begin, stretch.end, 9)[1:-1]:
             assert stretch.tasks == tuple(i for i, task in enumerate(tasks) if task.begin < t < task.end)
         assert (stretch.equations is None) == (not stretch.tasks)
@@ -59,15 +59,15 @@ def test_stretches_tile_the_horizon_and_tasks_are_active_where_they_are(
         inside = sorted(t for t in wanted if stretch.begin + 1e-6 < t < stretch.end - 1e-6)
         assert all(np.abs(stretch.breaks - t).min() < 1e-9 for t in inside)
         assert ((stretch.breaks > stretch.begin) & (stretch.breaks < stretch.end)).all()
-    changes = [a.tasks != b.tasks or True in b.new for a, b in pairwise(found)]
+    changes = [a.tasks != b.tasks or True in b.new for a, b in pairwise(result)]
     assert all(changes)
 
 
 @given(shift=st.floats(-1e-9, 1e-9))
 def test_times_that_differ_by_rounding_are_one(shift: float) -> None:
     tasks = [interval((0.0, 4.0)), interval((max(4.0 + shift, 0), 10.0))]
-    found = stretches_of(ARM, tasks, HORIZON)
-    assert [stretch.tasks for stretch in found] == [(0,), (1,)]
+    result = stretches_of(ARM, tasks, HORIZON)
+    assert [stretch.tasks for stretch in result] == [(0,), (1,)]
 
 
 @pytest.mark.parametrize("times", [(0.0, 10.5), (10.0, 11.0), (12.0, None), (10.0, None)])
@@ -99,13 +99,13 @@ def test_the_roll_of_a_tool_about_the_last_joint_is_ignorable() -> None:
         assert joints_of(machine, TipTask(position=PLACE, direction=DOWN, tool_axis=(0, 1, 1))) == []
 
 
-def test_what_lies_behind_the_tip_is_ignorable() -> None:
+def test_joints_beyond_the_tip_are_ignorable() -> None:
     """A task of the second link of a chain says nothing of what comes after it."""
     task = TipTask(velocity=[0.1, 0.2], rows=(3, 4), link="link2", point=(0.8, 0.0, 0.0))
     assert joints_of(ARM, task) == [2]
 
 
-def test_the_first_joint_is_ignorable_for_what_turns_with_it() -> None:
+def test_the_first_joint_is_ignorable_for_quantities_that_rotate_with_it() -> None:
     """Rows along the tip's own axes of a planar arm, and of motion relative to its first link, do not see it."""
     own = TipTask(velocity=[0.1, 0.2], rows=(3, 4), axes="tip")
     assert joints_of(ARM, own) == [0]
@@ -145,10 +145,10 @@ def test_accelerations_hold_a_velocity_that_changes_in_each_stretch_of_the_time(
         bounds=Limits(acceleration=50.0).bounds(machine),
         actuation=Actuation(),
     )
-    found = solve(motion.problem, Collocation(8), options={"max_iter": 60})
+    solution = solve(motion.problem, Collocation(8), options={"max_iter": 60})
     for stretch in motion.stretches:
         fractions = np.linspace(0.0, 1.0, 9)
-        sample, t = found.at_fraction(fractions), stretch.begin + fractions * stretch.duration
+        sample, t = solution.at_fraction(fractions), stretch.begin + fractions * stretch.duration
         joints, rates = sample[f"joints{stretch.suffix}"], sample[f"velocities{stretch.suffix}"]
         twists = [np.array(ca.DM(machine.tip_jacobian((), q))) @ w for q, w in zip(joints, rates, strict=True)]
         wanted = np.column_stack([-0.3 * np.sin(2 * t), 0.1 * t])

@@ -62,46 +62,46 @@ def near(rng: np.random.Generator, start: Array) -> tuple[float, Array, Array]:
 
 
 def test_the_plain_pseudo_inverse_tips_over() -> None:
-    found = table(1)
-    zmp = found.motion.zero_moment_point[:, 1]
-    assert found.stopped is None
+    result = table(1)
+    zmp = result.motion.zero_moment_point[:, 1]
+    assert result.stopped is None
     assert zmp.min() == pytest.approx(-0.066, abs=5e-4)
     assert zmp.max() == pytest.approx(0.250, abs=5e-4)
-    assert found.motion.index.min() == pytest.approx(-5.3, abs=0.05)
-    assert not found.motion.stands
-    assert not found.succeeded
-    assert found.tip_error.max() < 1e-9
-    assert tip_error(machine(), found.motion, table_task(1)) < 1e-9
+    assert result.motion.index.min() == pytest.approx(-5.3, abs=0.05)
+    assert not result.motion.stands
+    assert not result.succeeded
+    assert result.tip_error.max() < 1e-9
+    assert tip_error(machine(), result.motion, table_task(1)) < 1e-9
 
 
 @pytest.mark.parametrize("name", ["augmented", "null_space"])
 def test_pinning_the_zero_moment_point_lifts_off_although_its_index_is_1(name: Any) -> None:
-    found = table(1, law=name)
-    assert found.stopped is not None
-    assert found.stopped.reason == "lift_off"
-    assert found.stopped.time == pytest.approx(1.13, abs=5e-3)
-    assert found.motion.t[-1] == found.stopped.time
-    assert found.motion.ground_force[-1, 2] < 0 < found.motion.ground_force[:-1, 2].min()
-    assert found.motion.index.min() == pytest.approx(1.0, abs=1e-9)
-    assert not found.succeeded
-    assert "lifts off at 1.13" in str(found)
+    result = table(1, law=name)
+    assert result.stopped is not None
+    assert result.stopped.reason == "lift_off"
+    assert result.stopped.time == pytest.approx(1.13, abs=5e-3)
+    assert result.motion.t[-1] == result.stopped.time
+    assert result.motion.ground_force[-1, 2] < 0 < result.motion.ground_force[:-1, 2].min()
+    assert result.motion.index.min() == pytest.approx(1.0, abs=1e-9)
+    assert not result.succeeded
+    assert "lifts off at 1.13" in str(result)
 
 
 def test_carried_on_past_the_lift_off_it_diverges() -> None:
-    found = table(1, law="augmented", stop_at_lift_off=False)
-    assert found.stopped is not None
-    assert found.stopped.reason == "divergence"
-    assert found.stopped.time == pytest.approx(1.26, abs=5e-3)
-    assert np.abs(found.motion.joint_velocities[-1]).max() > 20
-    assert "diverges" in found.stopped.message
+    result = table(1, law="augmented", stop_at_lift_off=False)
+    assert result.stopped is not None
+    assert result.stopped.reason == "divergence"
+    assert result.stopped.time == pytest.approx(1.26, abs=5e-3)
+    assert np.abs(result.motion.joint_velocities[-1]).max() > 20
+    assert "diverges" in result.stopped.message
 
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_the_augmented_and_the_null_space_form_are_equal(number: int) -> None:
     both = [table(number, law=name, stop_at_lift_off=False, speed_limit=5.0) for name in ("augmented", "null_space")]
     for what in ("joints", "joint_velocities", "joint_accelerations"):
-        found = [getattr(solution.motion, what) for solution in both]
-        np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-9)
+        matches = [getattr(solution.motion, what) for solution in both]
+        np.testing.assert_allclose(matches[0], matches[1], rtol=0, atol=1e-9)
     laws = [law(arm(), arm_task(), external=tool, law=name) for name in ("augmented", "null_space")]
     rng = np.random.default_rng(1)
     for _ in range(5):
@@ -112,7 +112,7 @@ def test_the_augmented_and_the_null_space_form_are_equal(number: int) -> None:
 def test_the_augmented_law_is_the_least_acceleration_that_does_both() -> None:
     """(20) by numpy's pseudo-inverse of the stacked rows, on a spatial arm with a wrench at the tool."""
     standing, rng = arm(), np.random.default_rng(2)
-    found = law(standing, arm_task(), external=tool, law="augmented")
+    result = law(standing, arm_task(), external=tool, law="augmented")
     n = standing.joint_size
     q, qd, t = ca.SX.sym("q", n), ca.SX.sym("qd", n), ca.SX.sym("t")
     jacobian = standing.tip_jacobian((), q)[3:6, :]
@@ -124,7 +124,7 @@ def test_the_augmented_law_is_the_least_acceleration_that_does_both() -> None:
     for _ in range(5):
         at = near(rng, ARM_START)
         left, right = (numeric(part) for part in stacked(*at))
-        np.testing.assert_allclose(numeric(found(*at)), np.linalg.pinv(left) @ right, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(numeric(result(*at)), np.linalg.pinv(left) @ right, rtol=1e-8, atol=1e-8)
 
 
 def index_and_slope(q: Any, name: str) -> tuple[Any, Any]:
@@ -162,22 +162,22 @@ def printed_sequence(time: float, q0: Array, qd0: Array, delta: tuple[float, flo
     return plus(G) @ task + first + plus(K4) @ (delta[1] - K5)
 
 
-def test_layers_in_sequence_follow_the_corrected_printed_form_and_do_what_they_are_asked() -> None:
+def test_layers_in_sequence_follow_the_corrected_printed_form_and_their_tasks() -> None:
     layers = (Layer("joint_limits", -0.3), Layer("manipulability", 0.2))
-    found = law(machine(), table_task(1), law="augmented", layers=layers)
+    result = law(machine(), table_task(1), law="augmented", layers=layers)
     q, qd, qdd = (ca.SX.sym(name, 5) for name in ("q", "qd", "qdd"))
     second = []
     for name in ("joint_limits", "manipulability"):
         rate = ca.mtimes(index_and_slope(q, name)[1], qd)
         second.append(ca.jtimes(rate, ca.vertcat(q, qd), ca.vertcat(qd, qdd)))
-    asked = ca.Function("asked", [q, qd, qdd], second)
+    request = ca.Function("asked", [q, qd, qdd], second)
     rng = np.random.default_rng(3)
     for _ in range(5):
         time, q0, qd0 = near(rng, STANDING_STARTS[1])
-        push = numeric(found(time, q0, qd0)).ravel()
+        push = numeric(result(time, q0, qd0)).ravel()
         expected = printed_sequence(time, q0, qd0, (-0.3, 0.2)).ravel()
         np.testing.assert_allclose(push, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
-        np.testing.assert_allclose([float(part) for part in asked(q0, qd0, push)], [-0.3, 0.2], atol=1e-6)
+        np.testing.assert_allclose([float(part) for part in request(q0, qd0, push)], [-0.3, 0.2], atol=1e-6)
 
 
 def test_both_forms_are_equal_on_random_trees_and_starts() -> None:
@@ -195,15 +195,15 @@ def test_both_forms_are_equal_on_random_trees_and_starts() -> None:
         tried += 1
         outside = {"external": lambda t, tip: [standing.tip_wrench(ca.DM(push) * (1 + t) - tip)]}  # noqa: B023
         start = standing.tip_pose((), q0).position[1:3]
-        found = [
+        matches = [
             numeric(law(standing, led(lambda t: start + ca.sin(3 * t)), law=name, **outside)(0.3, q0, qd0))  # noqa: B023
             for name in ("augmented", "null_space")
         ]
-        np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-9 * np.abs(found[0]).max())
+        np.testing.assert_allclose(matches[0], matches[1], rtol=1e-9, atol=1e-9 * np.abs(matches[0]).max())
 
 
 @pytest.mark.parametrize("name", ["arm", "chain"])
-def test_layers_bend_their_indices_as_asked_by_finite_differences(name: str) -> None:
+def test_layers_accelerate_their_indices_as_requested(name: str) -> None:
     """(23)-(34) on other machines: along q + q' t + q'' t^2 / 2 each index curves by its demand."""
     if name == "arm":  # joint limits take the one degree of freedom that a task of two rows leaves on seven joints
         standing, start, rows = arm(), ARM_START, (3, 5)
@@ -212,7 +212,7 @@ def test_layers_bend_their_indices_as_asked_by_finite_differences(name: str) -> 
         start = np.array([2.0, -1.4, 1.2, -0.4, -0.3, 0.2])
     tip = tip_at(standing, start)[[row - 3 for row in rows]]
     layers = (Layer("joint_limits", -0.4), Layer("manipulability", 0.1))
-    found = law(standing, led(lambda t: [tip[0] + 0.1 * ca.sin(t), tip[1]], rows), law="augmented", layers=layers)
+    result = law(standing, led(lambda t: [tip[0] + 0.1 * ca.sin(t), tip[1]], rows), law="augmented", layers=layers)
     middle, width = (standing.robot.lower + standing.robot.upper) / 2, standing.robot.upper - standing.robot.lower
 
     def indices(q: Array) -> Array:
@@ -222,14 +222,14 @@ def test_layers_bend_their_indices_as_asked_by_finite_differences(name: str) -> 
     rng, step = np.random.default_rng(5), 2e-4
     for _ in range(4):
         time, q, qd = near(rng, start)
-        qdd = numeric(found(time, q, qd)).ravel()
+        qdd = numeric(result(time, q, qd)).ravel()
         motion = [indices(q + qd * t + qdd * t**2 / 2) for t in (-step, 0.0, step)]
         curve = (motion[0] - 2 * motion[1] + motion[2]) / step**2
         np.testing.assert_allclose(curve, [-0.4, 0.1], atol=2e-5 * max(1.0, np.abs(qdd).max()))
 
 
 @pytest.mark.parametrize(("name", "sign"), [("joint_limits", -1.0), ("manipulability", 1.0)])
-def test_a_gradient_layer_moves_its_index_the_right_way_without_touching_the_tasks(name: Any, sign: float) -> None:
+def test_a_gradient_layer_improves_its_index_without_disturbing_the_tasks(name: Any, sign: float) -> None:
     plain = law(machine(), table_task(1), law="augmented")
     driven = law(machine(), table_task(1), law="augmented", layers=(Layer(name, sign, "gradient"),))
     q, rng = ca.SX.sym("q", 5), np.random.default_rng(4)
@@ -245,20 +245,20 @@ def test_a_gradient_layer_moves_its_index_the_right_way_without_touching_the_tas
 
 @pytest.mark.parametrize("layer", [Layer("joint_limits", -0.1), Layer("manipulability", 0.05)])
 def test_the_layers_do_not_stop_the_pinned_pendulum_from_falling(layer: Layer) -> None:
-    found = table(1, law="augmented", layers=(layer,))
-    assert found.stopped is not None
-    assert found.stopped.time < 2.0
+    result = table(1, law="augmented", layers=(layer,))
+    assert result.stopped is not None
+    assert result.stopped.time < 2.0
 
 
 def test_the_stabilised_law_stands_on_table_1() -> None:
     """Page: |q'| 0.99, index 1, Fz >= 589 N, no limit violation, by poles (4, 4, 4) and damping 2."""
-    found = table(1, law="stabilised")
-    assert found.succeeded
-    motion = found.motion
+    result = table(1, law="stabilised")
+    assert result.succeeded
+    motion = result.motion
     assert motion.index.min() == pytest.approx(1.0, abs=1e-9)
     assert np.abs(motion.joint_velocities).max() == pytest.approx(0.99, rel=0.05)
     assert motion.ground_force[:, 2].min() >= 589
-    assert found.tip_error.max() < 1e-9
+    assert result.tip_error.max() < 1e-9
 
 
 def test_slower_poles_ask_less_of_the_joints() -> None:
@@ -272,10 +272,10 @@ def test_slower_poles_ask_less_of_the_joints() -> None:
 
 
 def test_the_stabilised_law_fails_on_table_2() -> None:
-    found = table(2, law="stabilised")
-    assert not found.succeeded
-    assert found.failures
-    assert found.failures[0] in str(found)
+    result = table(2, law="stabilised")
+    assert not result.succeeded
+    assert result.failures
+    assert result.failures[0] in str(result)
 
 
 def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_beyond_its_limits() -> None:
@@ -294,23 +294,23 @@ def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_b
               enumerate(standing.robot.joints)]  # fmt: skip
     joints[3] = replace(joints[3], lower=STANDING_STARTS[1][3] - 0.01, upper=STANDING_STARTS[1][3] + 0.01)
     narrow = replace(standing, robot=replace(standing.robot, joints=tuple(joints)))
-    bent = resolve_accelerations(narrow, table_task(1), STANDING_STARTS[1], HORIZON, law="stabilised", step=5e-3)
-    assert bent.stopped is None
-    assert bent.motion.index.min() == pytest.approx(1.0, abs=1e-9)
-    assert bent.motion.stands
-    assert bent.failures == ("joint_limits",)
-    assert "joint_limits" in str(bent)
+    perturbed = resolve_accelerations(narrow, table_task(1), STANDING_STARTS[1], HORIZON, law="stabilised", step=5e-3)
+    assert perturbed.stopped is None
+    assert perturbed.motion.index.min() == pytest.approx(1.0, abs=1e-9)
+    assert perturbed.motion.stands
+    assert perturbed.failures == ("joint_limits",)
+    assert "joint_limits" in str(perturbed)
 
 
 def test_a_tip_that_is_lost_by_long_steps_is_no_success() -> None:
     """Held still by a path that swings faster than the steps see."""
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
-    found = resolve_accelerations(
+    result = resolve_accelerations(
         machine(), led(lambda t: [y, z + 0.02 * ca.sin(40 * t) ** 2]), STANDING_STARTS[1], 0.5,
         step=0.05, null_damping=2.0,
     )  # fmt: skip
-    assert found.tip_error.max() > 1e-3
-    assert "leaves_path" in found.failures
+    assert result.tip_error.max() > 1e-3
+    assert "leaves_path" in result.failures
 
 
 @given(seeds)
@@ -326,29 +326,29 @@ def test_random_machines_stop_for_a_named_reason_or_reach_the_horizon_with_sound
     def path(t: Any) -> list[Any]:
         return [y + 0.1 * ca.sin(t) ** 2, z]
 
-    found = resolve_accelerations(standing, led(path), start, 1.0, law=law, step=1e-2)
-    motion = found.motion
+    result = resolve_accelerations(standing, led(path), start, 1.0, law=law, step=1e-2)
+    motion = result.motion
     assert np.isfinite(np.hstack([motion.joints, motion.joint_velocities, motion.joint_accelerations])).all()
-    if found.stopped is None:
+    if result.stopped is None:
         assert motion.t[-1] == pytest.approx(1.0)
     else:
-        assert found.failures[0] == found.stopped.reason
-        assert f"{found.stopped.time:.4g} s" in found.stopped.message
+        assert result.failures[0] == result.stopped.reason
+        assert f"{result.stopped.time:.4g} s" in result.stopped.message
     sound = (motion.ground_force[:, 2] > 0).all() and (motion.foot_margin >= -1e-9).all()
-    assert found.succeeded <= (sound and (motion.joint_excess <= 1e-9).all() and found.stopped is None)
+    assert result.succeeded <= (sound and (motion.joint_excess <= 1e-9).all() and result.stopped is None)
 
 
 def test_the_pinned_pendulum_obeys_its_equation() -> None:
     """dL/dt = -M g (y_c - p), along the augmented and the stabilised motion alike."""
     for name in ("augmented", "stabilised"):
-        found = table(1, law=name).motion
+        result = table(1, law=name).motion
         standing, inner = machine(), slice(0, 1000)
         q, qd = ca.SX.sym("q", 5), ca.SX.sym("qd", 5)
         total = momentum(standing.robot, q, qd, world_from_base=standing.world_from_base())
         function = ca.Function("spin", [q, qd], [total[0]]).map(1000)
-        spin = numeric(function(found.joints[inner].T, found.joint_velocities[inner].T)).ravel()
-        rate = np.gradient(spin, found.t[inner])
-        expected = -standing.weight * found.center_of_mass[inner, 1]
+        spin = numeric(function(result.joints[inner].T, result.joint_velocities[inner].T)).ravel()
+        rate = np.gradient(spin, result.t[inner])
+        expected = -standing.weight * result.center_of_mass[inner, 1]
         np.testing.assert_allclose(rate[1:-1], expected[1:-1], atol=2e-2)
 
 
@@ -357,9 +357,9 @@ def test_null_space_damping_keeps_the_pseudo_inverse_inside_the_foot() -> None:
 
 
 def test_a_moving_reference_is_followed() -> None:
-    found = table(1, law="augmented", zmp=lambda t: [0.0, 0.05 * ca.sin(3 * t)])
-    t = found.motion.t[:500]
-    np.testing.assert_allclose(found.motion.zero_moment_point[:500, 1], 0.05 * np.sin(3 * t), atol=1e-9)
+    result = table(1, law="augmented", zmp=lambda t: [0.0, 0.05 * ca.sin(3 * t)])
+    t = result.motion.t[:500]
+    np.testing.assert_allclose(result.motion.zero_moment_point[:500, 1], 0.05 * np.sin(3 * t), atol=1e-9)
 
 
 def test_both_integrators_agree_and_rk4_is_of_fourth_order() -> None:
@@ -370,11 +370,11 @@ def test_both_integrators_agree_and_rk4_is_of_fourth_order() -> None:
 
 
 def test_a_spatial_arm_with_a_wrench_at_the_tool_is_resolved_and_tips() -> None:
-    found = resolve_accelerations(arm(), arm_task(), ARM_START, ARM_HORIZON, external=tool, step=2e-3)
-    assert found.stopped is None
-    assert found.tip_error.max() < 1e-9
-    assert found.motion.index.min() < -0.3
-    np.testing.assert_allclose(found.motion.external_force[:, 2], -25 - 20 * found.motion.t, atol=1e-9)
+    result = resolve_accelerations(arm(), arm_task(), ARM_START, ARM_HORIZON, external=tool, step=2e-3)
+    assert result.stopped is None
+    assert result.tip_error.max() < 1e-9
+    assert result.motion.index.min() < -0.3
+    np.testing.assert_allclose(result.motion.external_force[:, 2], -25 - 20 * result.motion.t, atol=1e-9)
 
 
 def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
@@ -384,10 +384,10 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
     def path(t: Any) -> list[Any]:
         return [y + (1.8 - y) * t**2, z * (1 - t**2)]
 
-    found = resolve_accelerations(machine(), led(path), STANDING_STARTS[1], 1.0, stop_at_lift_off=False)
-    assert found.stopped is not None
-    assert found.stopped.reason in ("divergence", "breakdown")
-    assert np.isfinite(found.motion.joint_accelerations).all()
+    result = resolve_accelerations(machine(), led(path), STANDING_STARTS[1], 1.0, stop_at_lift_off=False)
+    assert result.stopped is not None
+    assert result.stopped.reason in ("divergence", "breakdown")
+    assert np.isfinite(result.motion.joint_accelerations).all()
 
 
 @pytest.mark.parametrize(
@@ -445,7 +445,7 @@ def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> No
         (lambda time, tip: machine().tip_wrench((0, 0, 1)), "wrenches must be a list"),
     ],
 )
-def test_what_gives_no_wrenches_is_refused(external: Any, message: str) -> None:
+def test_functions_without_wrenches_are_refused(external: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message):
         resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], 1.0, external=external)
 
@@ -454,14 +454,14 @@ def test_a_force_that_is_no_number_breaks_the_motion_down() -> None:
     def push(time: Any, tip: Any) -> Any:
         return [machine().tip_wrench((0, 0, ca.sqrt(0.1 - time)))]
 
-    found = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], 0.3, external=push, step=0.01)
-    assert found.stopped is not None
-    assert found.stopped.reason == "breakdown"
-    assert found.stopped.time == pytest.approx(0.11)
-    assert np.isfinite(found.motion.ground_force).all()
+    result = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], 0.3, external=push, step=0.01)
+    assert result.stopped is not None
+    assert result.stopped.reason == "breakdown"
+    assert result.stopped.time == pytest.approx(0.11)
+    assert np.isfinite(result.motion.ground_force).all()
 
 
-def test_a_pose_that_takes_all_joints_gives_the_motion_of_the_rates() -> None:
+def test_a_pose_that_fixes_all_joints_determines_the_motion() -> None:
     """Six rows on six joints leave no choice: both levels of one task have the same joint motion."""
     rotation, position = pose(six(), (), SIX_START)
     goal = rotation @ turned((1, 2, 0.5), 0.4), position + np.array([0.02, 0.15, -0.1])
@@ -478,9 +478,9 @@ def test_the_feedback_of_accelerations_closes_a_gap_critically_damped() -> None:
     """e'' + 2 g e' + g^2 e = 0 from rest: e = e0 (1 + g t) exp(-g t)."""
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
     task = TipTask(position=(y + 0.003, z - 0.004), rows=ROWS, gain=3.0, start_gap=0.01)
-    found = resolve_accelerations(machine(), task, STANDING_STARTS[1], 1.0, step=0.01)
-    expected = 0.005 * (1 + 3 * found.motion.t) * np.exp(-3 * found.motion.t)
-    np.testing.assert_allclose(found.tip_error, expected, atol=1e-9)
+    result = resolve_accelerations(machine(), task, STANDING_STARTS[1], 1.0, step=0.01)
+    expected = 0.005 * (1 + 3 * result.motion.t) * np.exp(-3 * result.motion.t)
+    np.testing.assert_allclose(result.tip_error, expected, atol=1e-9)
 
 
 def test_two_tips_are_led_at_once() -> None:

@@ -86,9 +86,9 @@ def assert_none_is_missing(name: str, count: int, searches: int, starts: int) ->
             locked = dict(zip(solver.parameters, values.tolist(), strict=True))
             six = FixedBase(lock_joints(machine.robot, locked)) if locked else machine
             rest = [j for j in range(len(turns)) if j not in numbers]
-            found = dense_search(six, positions[k], rotations[k], starts)
+            outcome = dense_search(six, positions[k], rotations[k], starts)
             here = listed[(np.abs(listed[:, numbers] - values) < 1e-8).all(axis=1)][:, rest]
-            assert distances(found, here, turns[rest]).min(axis=1).max() < 1e-5
+            assert distances(outcome, here, turns[rest]).min(axis=1).max() < 1e-5
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -166,7 +166,7 @@ GEOMETRIES = st.lists(st.tuples(LENGTHS, TWISTS, LENGTHS), min_size=6, max_size=
 CONFIGURATIONS = st.lists(ANGLES, min_size=6, max_size=6)
 
 
-def assert_is_found_again(rows: Any, angles: Any) -> None:
+def assert_is_recovered(rows: Any, angles: Any) -> None:
     machine, joints = denavit_hartenberg(rows), np.array([angles])
     chain, rng = chain_of(machine), np.random.default_rng(0)
     assume(least_singular_values(machine, rng.uniform(-np.pi, np.pi, (50, 6))).max() > 1e-2)  # six degrees of freedom
@@ -175,26 +175,26 @@ def assert_is_found_again(rows: Any, angles: Any) -> None:
     for solver in solvers:
         if solver is None:
             continue
-        found, doubtful = solver.solve(position, rotation, np.zeros((1, 0)))
-        reached = tip_poses(machine, found.joints)
-        np.testing.assert_allclose(reached[0], np.tile(position, (len(found.pose), 1)), atol=1e-9)
-        np.testing.assert_allclose(reached[1], np.tile(rotation, (len(found.pose), 1, 1)), atol=1e-9)
-        certain = not doubtful[0] and not found.singular.any()
+        result, doubtful = solver.solve(position, rotation, np.zeros((1, 0)))
+        reached = tip_poses(machine, result.joints)
+        np.testing.assert_allclose(reached[0], np.tile(position, (len(result.pose), 1)), atol=1e-9)
+        np.testing.assert_allclose(reached[1], np.tile(rotation, (len(result.pose), 1, 1)), atol=1e-9)
+        certain = not doubtful[0] and not result.singular.any()
         if least_singular_values(machine, joints)[0] > 1e-3 and certain:
-            assert distances(joints, found.joints, revolute(machine)).min(initial=np.inf) < 1e-5
+            assert distances(joints, result.joints, revolute(machine)).min(initial=np.inf) < 1e-5
 
 
 @settings(max_examples=6, deadline=None)
 @given(GEOMETRIES, CONFIGURATIONS)
 def test_of_any_geometry_a_regular_configuration_is_found_again(rows: Any, angles: Any) -> None:
-    assert_is_found_again(rows, angles)
+    assert_is_recovered(rows, angles)
 
 
 @pytest.mark.long
 @settings(max_examples=300, deadline=None)
 @given(GEOMETRIES, CONFIGURATIONS)
 def test_of_many_geometries_a_regular_configuration_is_found_again(rows: Any, angles: Any) -> None:
-    assert_is_found_again(rows, angles)
+    assert_is_recovered(rows, angles)
 
 
 @pytest.mark.parametrize("name", some(["UR5", "UR5 calibrated", "CRX", "JACO", "PUMA", "random"], 3))
@@ -289,7 +289,7 @@ def test_the_tool_axis_stays_in_its_cone_and_fills_it(name: str) -> None:
     assert result.parameters[-3:] == ("roll", "azimuth", "tilt")
 
 
-def test_inverse_kinematics_lists_what_the_solver_finds() -> None:
+def test_inverse_kinematics_lists_all_solutions_of_the_solver() -> None:
     for machine in (build("CRX"), build("UR5 calibrated"), ur5()):
         positions, rotations = tip_poses(machine, random_joints(machine, np.random.default_rng(2), 4))
         expected = IkSolver(machine, limits=False)(positions, rotations)
@@ -301,15 +301,15 @@ def test_inverse_kinematics_lists_what_the_solver_finds() -> None:
             assert apart.min(axis=1).max() < 1e-7
 
 
-def test_whole_turns_are_listed_in_all_ways_that_keep_the_limits() -> None:
+def test_all_whole_turns_within_the_limits_are_listed() -> None:
     machine = ur5()
     lower, upper = machine.robot.lower, machine.robot.upper
     position, rotation = tip_poses(machine, np.array([[0.3, -1.2, 1.5, -1.9, -1.55, 0.2]]))
     listed = IkSolver(machine)(position, rotation).joints
     assert ((listed >= lower) & (listed <= upper)).all()
     base = IkSolver(machine, limits=False)(position, rotation).joints
-    ways = [np.floor((upper - one) / TURN) + np.floor((one - lower) / TURN) + 1 for one in base]
-    assert len(listed) == sum(np.prod(each) for each in ways)
+    paths = [np.floor((upper - one) / TURN) + np.floor((one - lower) / TURN) + 1 for one in base]
+    assert len(listed) == sum(np.prod(each) for each in paths)
     assert len(np.unique(listed.round(6), axis=0)) == len(listed)
 
 

@@ -37,30 +37,30 @@ def closed_forms(machine: FixedBase) -> tuple[ClosedForm, ...]:
 
 def random_arm(kind: str, first: int, rng: Any, count: int = 6) -> FixedBase:
     """Axes anywhere, but three of them from the first one on that meet or are parallel."""
-    ways = rng.normal(size=(count, 3))
-    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    paths = rng.normal(size=(count, 3))
+    paths /= np.linalg.norm(paths, axis=1)[:, None]
     places = rng.uniform(-0.5, 0.5, (count, 3))
     three = slice(first, first + 3)
     if kind == "meeting":
-        places[three] = places[first] + rng.uniform(-0.3, 0.3, (3, 1)) * ways[three]
+        places[three] = places[first] + rng.uniform(-0.3, 0.3, (3, 1)) * paths[three]
     elif kind == "parallel":
-        ways[three] = ways[first] * np.array([[1.0], [-1.0], [1.0]])
-    return arm(ways, places, rng.uniform(-0.5, 0.5, 3), Rotation.random(random_state=rng).as_matrix())
+        paths[three] = paths[first] * np.array([[1.0], [-1.0], [1.0]])
+    return arm(paths, places, rng.uniform(-0.5, 0.5, 3), Rotation.random(random_state=rng).as_matrix())
 
 
 def poses(machine: FixedBase, joints: Array) -> tuple[Array, Array]:
     q = ca.SX.sym("q", machine.joint_size)
     pose = machine.tip_pose((), q)
-    found = ca.Function("pose", [q], [ca.vertcat(pose.position, ca.vec(pose.rotation))])
-    rows = np.array(found.map(len(joints))(joints.T)).T
+    result = ca.Function("pose", [q], [ca.vertcat(pose.position, ca.vec(pose.rotation))])
+    rows = np.array(result.map(len(joints))(joints.T)).T
     return rows[:, :3], rows[:, 3:].reshape(-1, 3, 3).transpose(0, 2, 1)
 
 
 def apart(one: Array, others: Array, turns: Any) -> Array:
     """Greatest differences of joints, whole turns not counted."""
-    way = one - others
-    way[..., turns] -= TURN * np.round(way[..., turns] / TURN)
-    return np.asarray(np.abs(way).max(axis=-1))
+    path = one - others
+    path[..., turns] -= TURN * np.round(path[..., turns] / TURN)
+    return np.asarray(np.abs(path).max(axis=-1))
 
 
 def counts(machine: FixedBase, form: ClosedForm, rng: Any, count: int) -> Any:
@@ -68,13 +68,13 @@ def counts(machine: FixedBase, form: ClosedForm, rng: Any, count: int) -> Any:
     joints = rng.uniform(-np.pi, np.pi, (count, machine.joint_size))
     joints[:, ~form.chain.revolute] /= 10
     places, turns = poses(machine, joints)
-    own, found = form.solutions(places, turns, joints[:, list(form.redundant)])
-    again = poses(machine, found)
+    own, result = form.solutions(places, turns, joints[:, list(form.redundant)])
+    again = poses(machine, result)
     assert again[0] == pytest.approx(places[own], abs=1e-9)
     assert again[1] == pytest.approx(turns[own], abs=1e-9)
-    assert (found[:, list(form.redundant)] == joints[own][:, list(form.redundant)]).all()
+    assert (result[:, list(form.redundant)] == joints[own][:, list(form.redundant)]).all()
     for k in range(count):
-        here = found[own == k]
+        here = result[own == k]
         assert apart(joints[k], here, form.chain.revolute).min() < 1e-6
         assert not np.any(np.triu([apart(one, here, form.chain.revolute) < 1e-6 for one in here], 1))
     return np.bincount(own, minlength=count)
@@ -82,28 +82,28 @@ def counts(machine: FixedBase, form: ClosedForm, rng: Any, count: int) -> Any:
 
 @pytest.mark.parametrize("first", range(4))
 @pytest.mark.parametrize("kind", ["meeting", "parallel"])
-def test_of_random_arms_postures_come_in_pairs_at_most_eight_and_lead_to_the_pose(kind: str, first: int) -> None:
+def test_random_arms_have_an_even_number_of_branches_up_to_eight(kind: str, first: int) -> None:
     rng = np.random.default_rng([first, kind == "meeting"])
     for _ in range(3):
         machine = random_arm(kind, first, rng)
         (form,) = closed_forms(machine)
         assert (form.kind, form.triple, form.redundant) == (kind, (first, first + 1, first + 2), ())
-        found = counts(machine, form, rng, 60)
-        assert found.max() <= 8
-        assert not (found % 2).any()  # solutions come and go in pairs
+        result = counts(machine, form, rng, 60)
+        assert result.max() <= 8
+        assert not (result % 2).any()  # solutions come and go in pairs
 
 
 @pytest.mark.parametrize("kind", ["meeting", "parallel"])
-def test_newtons_method_from_many_starts_finds_the_same_postures(kind: str) -> None:
+def test_newtons_method_from_many_starts_finds_the_same_branches(kind: str) -> None:
     rng = np.random.default_rng(5)
     machine = random_arm(kind, 3 if kind == "meeting" else 1, rng)
     (form,) = closed_forms(machine)
     places, turns = poses(machine, rng.uniform(-np.pi, np.pi, (3, 6)))
-    own, found = form.solutions(places, turns, np.zeros((3, 0)))
+    own, result = form.solutions(places, turns, np.zeros((3, 0)))
     for k in range(3):
         task = TipTask(position=places[k], orientation=turns[k])
         others = np.array([one.joints for one in inverse_kinematics(machine, task, starts=200, seed=k)])
-        here = found[own == k]
+        here = result[own == k]
         assert len(here) == len(others)
         assert max(apart(other, here, form.chain.revolute).min() for other in others) < 1e-7
 
@@ -122,7 +122,7 @@ STRAIGHT_ARMS: dict[str, tuple[FixedBase, str]] = {
 
 
 @pytest.mark.parametrize("name", STRAIGHT_ARMS)
-def test_axes_at_right_angles_and_without_offsets_lose_no_posture(name: str) -> None:
+def test_axes_at_right_angles_and_without_offsets_lose_no_branch(name: str) -> None:
     machine, kind = STRAIGHT_ARMS[name]
     (form,) = closed_forms(machine)
     assert form.kind == kind
@@ -152,7 +152,7 @@ def test_a_scara_has_two_elbows_wherever_its_slide_is() -> None:
     assert closed_forms(leaning) == ()
 
 
-def test_other_arms_have_none_and_poses_out_of_reach_no_posture() -> None:
+def test_other_arms_have_no_closed_form_and_unreachable_poses_no_branch() -> None:
     rng = np.random.default_rng(4)
     assert closed_forms(random_arm("", 0, rng)) == ()
     assert closed_forms(random_arm("", 0, rng, 5)) == ()
@@ -165,46 +165,46 @@ def test_other_arms_have_none_and_poses_out_of_reach_no_posture() -> None:
     )
     assert closed_forms(FixedBase(Robot(six.links, tuple(following), tip=six.tip))) == ()
     (form,) = closed_forms(ur5())
-    own, found = form.solutions(np.array([[5.0, 0.0, 0.0]]), np.eye(3)[None], np.zeros((1, 0)))
+    own, result = form.solutions(np.array([[5.0, 0.0, 0.0]]), np.eye(3)[None], np.zeros((1, 0)))
     assert own.shape == (0,)
-    assert found.shape == (0, 6)
+    assert result.shape == (0, 6)
 
 
-def test_branches_keep_limits_are_turned_in_all_ways_and_do_the_task() -> None:
+def test_branches_meet_limits_with_all_turns_and_satisfy_the_task() -> None:
     limit = 3.6  # more than half a turn, so that some angles are there twice
-    ways, places = [Z, Y, Y, X, Y, X], [(0, 0, 0.4), (0.1, 0, 0.4), (0.1, 0, 0.9), *[(0.4, 0, 1.0)] * 3]
-    machine = arm(ways, places, np.array((0.5, 0, 1.0)), limit=limit)
+    paths, places = [Z, Y, Y, X, Y, X], [(0, 0, 0.4), (0.1, 0, 0.4), (0.1, 0, 0.9), *[(0.4, 0, 1.0)] * 3]
+    machine = arm(paths, places, np.array((0.5, 0, 1.0)), limit=limit)
     at, turn = poses(machine, np.array([[3.4, 0.4, 0.9, -3.3, 0.7, 0.3]]))
-    for rolls, told in ((1, {"orientation": turn[0]}), (12, {"direction": 2.0 * turn[0, :, 2]})):
-        equations = bind(machine, TipTask(position=at[0], **told))
+    for rolls, report in ((1, {"orientation": turn[0]}), (12, {"direction": 2.0 * turn[0, :, 2]})):
+        equations = bind(machine, TipTask(position=at[0], **report))
         branches = ik_branches(equations, machine.robot.lower, machine.robot.upper)
         assert branches is not None
         target = np.array(equations.target_function()(0.0)).ravel()
-        found = branches.configurations(target, rolls).joints
-        assert (np.abs(found) <= limit + 1e-9).all()
-        assert max(np.abs(equations.errors(0.0, None, one)).max() for one in found) < 1e-9
-        wrapped = np.remainder(found.round(6), round(TURN, 6))
-        same = [(apart(one, found, slice(None)) < 1e-5).sum() for one in found]
-        twice = 2 ** (np.abs(found) > TURN - limit).sum(axis=1)
+        result = branches.configurations(target, rolls).joints
+        assert (np.abs(result) <= limit + 1e-9).all()
+        assert max(np.abs(equations.errors(0.0, None, one)).max() for one in result) < 1e-9
+        wrapped = np.remainder(result.round(6), round(TURN, 6))
+        same = [(apart(one, result, slice(None)) < 1e-5).sum() for one in result]
+        twice = 2 ** (np.abs(result) > TURN - limit).sum(axis=1)
         assert same == twice.tolist(), wrapped
         if rolls == 1:
-            assert np.abs(found - [3.4, 0.4, 0.9, -3.3, 0.7, 0.3]).max(axis=1).min() < 1e-7
+            assert np.abs(result - [3.4, 0.4, 0.9, -3.3, 0.7, 0.3]).max(axis=1).min() < 1e-7
 
 
-def test_branches_of_a_scara_and_none_of_what_is_not_one_pose() -> None:
+def test_scara_arms_have_branches_of_single_poses_alone() -> None:
     machine = arm(
         [Z] * 4, [(0, 0, 0), (0.3, 0, 0), (0.5, 0, 0), (0.5, 0, 0.1)], np.array((0.6, 0, 0)), prismatic=(3,), limit=3.0
     )
-    told = (machine.robot.lower, machine.robot.upper)
+    report = (machine.robot.lower, machine.robot.upper)
     for rows, orientation in (((3, 4, 5), None), ((2, 3, 4, 5), [np.cos(0.3), 0, 0, np.sin(0.3)])):
         task = TipTask(position=(0.35, 0.1, 0.05), orientation=orientation, rows=rows)
         equations = bind(machine, task)
-        branches = ik_branches(equations, *told)
+        branches = ik_branches(equations, *report)
         assert branches is not None
-        found = branches.configurations(np.array(equations.target_function()(0.0)).ravel(), 16).joints
-        assert len(found) == (2 if orientation else len(found))
-        assert len(found) >= 2
-        assert max(np.abs(equations.errors(0.0, None, one)).max() for one in found) < 1e-9
+        result = branches.configurations(np.array(equations.target_function()(0.0)).ravel(), 16).joints
+        assert len(result) == (2 if orientation else len(result))
+        assert len(result) >= 2
+        assert max(np.abs(equations.errors(0.0, None, one)).max() for one in result) < 1e-9
     place = np.array([0.4, 0.1, 0.3])
     arm_of_six = ur5()
     for other in (TipTask(orientation=np.eye(3)), TipTask(position=place, orientation=np.eye(3), rows=[0, 1, 2, 3, 4])):

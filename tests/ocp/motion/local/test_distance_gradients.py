@@ -98,13 +98,13 @@ def test_distances_along_a_motion_are_those_of_its_samples(few: tuple[CollisionS
     for count in (3, 64, 150):
         samples = list(configurations(around, count, count))
         base, joints, times = (np.array(part) for part in zip(*samples, strict=True))
-        found = distances_along(around, base, joints, times)
+        result = distances_along(around, base, joints, times)
         np.testing.assert_allclose(
-            found[:, pairs].T, np.hstack([np.array(known(*one)[0]) for one in samples]), atol=1e-9
+            result[:, pairs].T, np.hstack([np.array(known(*one)[0]) for one in samples]), atol=1e-9
         )
 
 
-def test_what_is_no_number_stays_none(few: tuple[CollisionScene, list[int], Any]) -> None:
+def test_values_that_are_no_numbers_stay_undefined(few: tuple[CollisionScene, list[int], Any]) -> None:
     around, pairs, function = few
     q = np.zeros(around.machine.joint_size)
     q[0] = np.nan
@@ -121,9 +121,9 @@ def test_threads_may_call_it_at_once(few: tuple[CollisionScene, list[int], Any])
     around, _, function = few
     mapped = function.map(100)
     lots = [list(configurations(around, 100, seed)) for seed in range(4)]
-    given = [[np.array(part).T.reshape(-1, 100) for part in zip(*lot, strict=True)] for lot in lots]
-    known = [mapped.call(each) for each in given]
+    options = [[np.array(part).T.reshape(-1, 100) for part in zip(*lot, strict=True)] for lot in lots]
+    known = [mapped.call(each) for each in options]
     with ThreadPoolExecutor(4) as pool:
-        for found, one in zip(pool.map(mapped.call, given * 5), known * 5, strict=True):
-            for part, other in zip(found, one, strict=True):
+        for result, one in zip(pool.map(mapped.call, options * 5), known * 5, strict=True):
+            for part, other in zip(result, one, strict=True):
                 np.testing.assert_array_equal(np.array(part), np.array(other))

@@ -19,39 +19,41 @@ DOWN = (0.0, 0.0, -1.0)
 LINE = smooth(Path.through([(0.45, -0.15, 0.3), (0.45, 0.1, 0.3), (0.55, 0.15, 0.35)]), deviation=0.01)
 
 
-def task(**given: Any) -> TipTask:
-    return TipTask.along(LINE, 0.1, **{"direction": DOWN, **given})
+def task(**options: Any) -> TipTask:
+    return TipTask.along(LINE, 0.1, **{"direction": DOWN, **options})
 
 
 def followed(
-    machine: Machine, asked: TipTask, joints: Array, *, base: Any = None, steps: int = 64, **given: Any
+    machine: Machine, request: TipTask, joints: Array, *, base: Any = None, steps: int = 64, **arguments: Any
 ) -> LocalMotion:
     robot = machine.robot
     options = {"weights": np.ones(machine.joint_size), "damping": 1e-6, "lower": robot.lower, "upper": robot.upper}
     home = machine.base_home() if base is None else base
-    times = np.union1d(np.linspace(0, asked.duration or 1.0, steps + 1), asked.breaks)
-    return track_tasks(bind(machine, asked), joints, np.tile(home, (len(joints), 1)), times, **{**options, **given})
+    times = np.union1d(np.linspace(0, request.duration or 1.0, steps + 1), request.breaks)
+    return track_tasks(
+        bind(machine, request), joints, np.tile(home, (len(joints), 1)), times, **{**options, **arguments}
+    )
 
 
-def postures(machine: Machine, asked: TipTask, **given: Any) -> Array:
-    return np.array([p.joints for p in inverse_kinematics(machine, asked, seed=1, **{"starts": 12, **given})])
+def start_configurations(machine: Machine, request: TipTask, **options: Any) -> Array:
+    return np.array([p.joints for p in inverse_kinematics(machine, request, seed=1, **{"starts": 12, **options})])
 
 
 def test_poses_are_kept_and_joints_stay_inside_their_limits() -> None:
     for machine in (panda(), ur5()):
-        found = followed(machine, task(), postures(machine, task()))
-        follows = found.pose_error < 1e-6
+        result = followed(machine, task(), start_configurations(machine, task()))
+        follows = result.pose_error < 1e-6
         assert follows.sum() >= len(follows) / 2
         equations = bind(machine, task())
-        for joints in found.joints[follows]:
-            assert np.abs(equations.errors(found.t, None, joints)).max() < 2e-6
-        assert (found.joints >= machine.robot.lower).all()
-        assert (found.joints <= machine.robot.upper).all()
+        for joints in result.joints[follows]:
+            assert np.abs(equations.errors(result.t, None, joints)).max() < 2e-6
+        assert (result.joints >= machine.robot.lower).all()
+        assert (result.joints <= machine.robot.upper).all()
 
 
 def test_each_motion_is_the_one_that_is_followed_alone() -> None:
     """Side by side they do not know of each other."""
-    starts = postures(panda(), task())[:4]
+    starts = start_configurations(panda(), task())[:4]
     together = followed(panda(), task(), starts, damping=0.01)
     for number, start in enumerate(starts):
         alone = followed(panda(), task(), start[None], damping=0.01)
@@ -62,19 +64,21 @@ def test_each_motion_is_the_one_that_is_followed_alone() -> None:
 
 def test_the_cost_is_the_one_of_the_least_rates_at_every_time() -> None:
     """`resolve` integrates the same law with small steps; weights are those of the metric."""
-    (start, *_) = [q for q in postures(panda(), task()) if followed(panda(), task(), q[None]).pose_error[0] < 1e-6]
+    (start, *_) = [
+        q for q in start_configurations(panda(), task()) if followed(panda(), task(), q[None]).pose_error[0] < 1e-6
+    ]
     weights = np.array([9.0, 1, 1, 4, 1, 1, 0.5])
-    found = followed(panda(), task(), start[None], steps=256, weights=weights)
+    result = followed(panda(), task(), start[None], steps=256, weights=weights)
     horizon = task().duration
     local = resolve(panda(), tasks=task(), start_joints=start, horizon=horizon, weights=weights, samples=401)
     assert local.stopped is None
     effort = 0.5 * np.trapezoid((np.asarray(local.joint_rates) ** 2) @ weights, local.t)
-    assert found.cost[0] == pytest.approx(effort, rel=2e-3)
-    np.testing.assert_allclose(found.joints[0, -1], local.joints[-1], atol=2e-3)
+    assert result.cost[0] == pytest.approx(effort, rel=2e-3)
+    np.testing.assert_allclose(result.joints[0, -1], local.joints[-1], atol=2e-3)
 
 
 def test_finer_steps_converge_to_one_motion() -> None:
-    start = postures(panda(), task())[:1]
+    start = start_configurations(panda(), task())[:1]
     ends = [followed(panda(), task(), start, steps=steps).joints[0, -1] for steps in (32, 64, 128, 256)]
     gaps = [np.abs(a - b).max() for a, b in pairwise(ends)]
     # of second order: three quarters of the error go with each halving, where corners let them
@@ -82,13 +86,13 @@ def test_finer_steps_converge_to_one_motion() -> None:
 
 
 def test_rates_are_those_of_the_joints() -> None:
-    start = postures(panda(), task())[:2]
-    found = followed(panda(), task(), start)
-    moved = np.diff(found.joints, axis=1)
-    np.testing.assert_allclose(found.rates[:, :-1] * np.diff(found.t)[:, None], moved, atol=1e-12)
-    np.testing.assert_array_equal(found.rates[:, -1], found.rates[:, -2])
-    cost = np.einsum("kmn,m->k", found.rates[:, :-1] ** 2, np.diff(found.t)) / 2
-    np.testing.assert_allclose(found.cost, cost, rtol=1e-12)
+    start = start_configurations(panda(), task())[:2]
+    result = followed(panda(), task(), start)
+    moved = np.diff(result.joints, axis=1)
+    np.testing.assert_allclose(result.rates[:, :-1] * np.diff(result.t)[:, None], moved, atol=1e-12)
+    np.testing.assert_array_equal(result.rates[:, -1], result.rates[:, -2])
+    cost = np.einsum("kmn,m->k", result.rates[:, :-1] ** 2, np.diff(result.t)) / 2
+    np.testing.assert_allclose(result.cost, cost, rtol=1e-12)
 
 
 def test_a_joint_at_its_limit_stays_there_and_the_others_do_the_task() -> None:
@@ -97,14 +101,14 @@ def test_a_joint_at_its_limit_stays_there_and_the_others_do_the_task() -> None:
     start = np.array([0.3, 0.5, 0.4, 0.3])
     place = numeric(arm.tip_pose((), start).position).ravel()
     line = smooth(Path.through([place, place + np.array([0.1, -0.5, 0.0])]), deviation=0.01)
-    asked = TipTask.along(line, 0.2, rows=(3, 4))
-    free = followed(arm, asked, start[None], lower=np.full(4, -np.inf), upper=np.full(4, np.inf))
+    request = TipTask.along(line, 0.2, rows=(3, 4))
+    free = followed(arm, request, start[None], lower=np.full(4, -np.inf), upper=np.full(4, np.inf))
     assert free.pose_error[0] < 1e-6
     lower, upper = np.full(4, -np.inf), np.full(4, np.inf)
     moves = free.joints[0, :, 0] - start[0]
     assert np.abs(moves).max() > 0.03
     lower[0], upper[0] = start[0] - 0.02, start[0] + 0.02
-    tight = followed(arm, asked, start[None], lower=lower, upper=upper)
+    tight = followed(arm, request, start[None], lower=lower, upper=upper)
     assert tight.pose_error[0] < 1e-6
     assert (tight.joints[0, :, 0] >= lower[0]).all()
     assert (tight.joints[0, :, 0] <= upper[0]).all()
@@ -112,28 +116,28 @@ def test_a_joint_at_its_limit_stays_there_and_the_others_do_the_task() -> None:
     assert tight.cost[0] > free.cost[0]
 
 
-def test_where_the_path_is_lost_is_told() -> None:
+def test_the_end_of_the_reach_along_a_path_is_reported() -> None:
     """A line that leaves the reach of 2.4 m after some time, and comes back."""
     arm = FixedBase(planar_chain([1.0, 0.8, 0.6], [1.0] * 3))
     line = smooth(Path.through([(1.5, -1.0, 0.0), (2.6, 0.0, 0.0), (1.5, 1.0, 0.0)]), deviation=0.01)
-    asked = TipTask.along(line, 0.5, rows=(3, 4))
-    found = followed(arm, asked, postures(arm, asked, starts=4), damping=0.05)
-    assert (found.pose_error > 0.1).all()
-    distance = np.linalg.norm(line.at(np.clip(0.5 * found.worst_time, 0, line.length)).position, axis=1)
+    request = TipTask.along(line, 0.5, rows=(3, 4))
+    result = followed(arm, request, start_configurations(arm, request, starts=4), damping=0.05)
+    assert (result.pose_error > 0.1).all()
+    distance = np.linalg.norm(line.at(np.clip(0.5 * result.worst_time, 0, line.length)).position, axis=1)
     assert (distance > 2.4).all()
-    assert (found.pose_error >= (distance - 2.4) / np.sqrt(2)).all()  # of the larger coordinate
+    assert (result.pose_error >= (distance - 2.4) / np.sqrt(2)).all()  # of the larger coordinate
 
 
 def test_axes_that_may_lean_are_turned_back_only_where_they_lean_too_far() -> None:
-    asked = task(within=0.2)
-    start = postures(panda(), task())[:6]
-    found = followed(panda(), asked, start, damping=0.01)
+    request = task(within=0.2)
+    start = start_configurations(panda(), task())[:6]
+    result = followed(panda(), request, start, damping=0.01)
     free = followed(panda(), TipTask.along(LINE, 0.1), start, damping=0.01)
-    follows = (found.pose_error < 1e-5) & (free.pose_error < 1e-5)
+    follows = (result.pose_error < 1e-5) & (free.pose_error < 1e-5)
     assert follows.any()
     equations, within = bind(panda(), task(within=1e-6)), 0.2
-    for lean, loose in zip(found.joints[follows], free.joints[follows], strict=True):
-        assert equations.cone_violations(found.t, None, lean).max() < within + 1e-3
+    for lean, loose in zip(result.joints[follows], free.joints[follows], strict=True):
+        assert equations.cone_violations(result.t, None, lean).max() < within + 1e-3
         if equations.cone_violations(free.t, None, loose).max() < within - 0.01:
             np.testing.assert_allclose(lean, loose, atol=1e-6)
 
@@ -144,19 +148,19 @@ def test_a_floating_base_goes_where_its_momentum_says(momentum: Any) -> None:
     machine = floating_panda(momentum)
     _, place = pose(machine, machine.base_home(), PANDA_START)
     line = smooth(Path.through([place, place + np.array([0.05, -0.08, 0.06])]), deviation=0.01)
-    asked = TipTask.along(line, 0.05)
-    found = followed(machine, asked, PANDA_START[None], steps=256)
-    local = resolve(machine, tasks=asked, start_joints=PANDA_START, horizon=asked.duration, samples=257)
-    assert found.pose_error[0] < 1e-6
-    np.testing.assert_allclose(found.base[0, -1], local.base[-1], atol=2e-4)
-    np.testing.assert_allclose(found.joints[0, -1], local.joints[-1], atol=2e-4)
-    assert np.abs(found.base[0, -1] - found.base[0, 0]).max() > 1e-3
+    request = TipTask.along(line, 0.05)
+    result = followed(machine, request, PANDA_START[None], steps=256)
+    local = resolve(machine, tasks=request, start_joints=PANDA_START, horizon=request.duration, samples=257)
+    assert result.pose_error[0] < 1e-6
+    np.testing.assert_allclose(result.base[0, -1], local.base[-1], atol=2e-4)
+    np.testing.assert_allclose(result.joints[0, -1], local.joints[-1], atol=2e-4)
+    assert np.abs(result.base[0, -1] - result.base[0, 0]).max() > 1e-3
 
 
-def test_what_runs_away_is_told_as_infinite_and_harms_no_other() -> None:
-    start = postures(panda(), task())[:2]
+def test_diverging_motions_are_infinite_and_affect_no_other() -> None:
+    start = start_configurations(panda(), task())[:2]
     bad = np.vstack([start, np.full(7, np.nan)])
-    found = followed(panda(), task(), bad)
+    result = followed(panda(), task(), bad)
     alone = followed(panda(), task(), start)
-    assert np.isinf(found.pose_error[2])
-    np.testing.assert_allclose(found.joints[:2], alone.joints, atol=1e-9)
+    assert np.isinf(result.pose_error[2])
+    np.testing.assert_allclose(result.joints[:2], alone.joints, atol=1e-9)

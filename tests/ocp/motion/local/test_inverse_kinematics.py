@@ -38,14 +38,16 @@ def assert_poses(machine: Machine, joints: Any, rotation: Any, position: Any, ba
     np.testing.assert_allclose(turn if np.ndim(rotation) == 2 else turn[:, 2], rotation, atol=1e-9)
 
 
-def test_a_six_joint_arm_has_its_eight_postures() -> None:
+def test_a_six_joint_arm_has_its_eight_branches() -> None:
     rotation, position = pose(ur5(), (), UR5_START)
-    found = inverse_kinematics(ur5(), TipTask(position=position, orientation=rotation))
-    assert len(found) == 8
-    assert [posture.quality for posture in found] == sorted((p.quality for p in found), reverse=True)
-    for posture in found:
-        assert_poses(ur5(), posture.joints, rotation, position)
-    nearest = min(np.abs(np.sin((posture.joints - UR5_START) / 2)).max() for posture in found)
+    solutions = inverse_kinematics(ur5(), TipTask(position=position, orientation=rotation))
+    assert len(solutions) == 8
+    assert [configuration.quality for configuration in solutions] == sorted(
+        (p.quality for p in solutions), reverse=True
+    )
+    for configuration in solutions:
+        assert_poses(ur5(), configuration.joints, rotation, position)
+    nearest = min(np.abs(np.sin((configuration.joints - UR5_START) / 2)).max() for configuration in solutions)
     assert nearest < 1e-9
 
 
@@ -88,25 +90,25 @@ def test_iterations_from_equations_and_targets_reach_the_poses(limits: bool) -> 
 
 def test_a_two_link_arm_has_two_elbows_in_closed_form() -> None:
     machine = FixedBase(planar_chain([1.0, 0.7], [1.0, 1.0]))
-    found = inverse_kinematics(machine, TipTask(position=(0.9, 0.6, 0.0), rows=(3, 4)), starts=16)
+    solutions = inverse_kinematics(machine, TipTask(position=(0.9, 0.6, 0.0), rows=(3, 4)), starts=16)
     elbow = np.arccos((0.9**2 + 0.6**2 - 1 - 0.49) / 1.4)
-    assert sorted(np.round([np.remainder(p.joints[1] + np.pi, 2 * np.pi) - np.pi for p in found], 8)) == pytest.approx(
-        [-elbow, elbow], abs=1e-7
-    )
+    assert sorted(
+        np.round([np.remainder(p.joints[1] + np.pi, 2 * np.pi) - np.pi for p in solutions], 8)
+    ) == pytest.approx([-elbow, elbow], abs=1e-7)
 
 
 @settings(max_examples=5)
 @given(seeds, st.booleans())
-def test_what_an_arm_can_do_is_found_within_its_limits(seed: int, free_roll: bool) -> None:
+def test_reachable_poses_are_solved_within_the_limits(seed: int, free_roll: bool) -> None:
     rng = np.random.default_rng(seed)
     robot = panda().robot
     joints = rng.uniform(robot.lower, robot.upper)
     rotation, position = pose(panda(), (), joints)
-    asked: dict[str, Any] = {"direction": rotation[:, 2]} if free_roll else {"orientation": rotation}
-    for posture in inverse_kinematics(panda(), TipTask(position=position, **asked)):
-        assert (posture.joints >= robot.lower).all()
-        assert (posture.joints <= robot.upper).all()
-        assert_poses(panda(), posture.joints, rotation[:, 2] if free_roll else rotation, position)
+    request: dict[str, Any] = {"direction": rotation[:, 2]} if free_roll else {"orientation": rotation}
+    for configuration in inverse_kinematics(panda(), TipTask(position=position, **request)):
+        assert (configuration.joints >= robot.lower).all()
+        assert (configuration.joints <= robot.upper).all()
+        assert_poses(panda(), configuration.joints, rotation[:, 2] if free_roll else rotation, position)
 
 
 def test_the_base_may_float_and_two_arms_may_hold_one_thing() -> None:
@@ -121,9 +123,9 @@ def test_the_base_may_float_and_two_arms_may_hold_one_thing() -> None:
             position=(0.0, 0.0, 0.4), direction=(0.0, 0.0, -1.0), link="right_panda_hand", relative_to="left_panda_hand"
         ),
     ]
-    posture = inverse_kinematics(both, tasks)[0]
-    assert posture.pose_error < 1e-10
-    assert posture.joints.shape == (14,)
+    configuration = inverse_kinematics(both, tasks)[0]
+    assert configuration.pose_error < 1e-10
+    assert configuration.joints.shape == (14,)
 
 
 def test_a_start_that_is_near_is_kept_and_seeds_repeat() -> None:
@@ -135,7 +137,7 @@ def test_a_start_that_is_near_is_kept_and_seeds_repeat() -> None:
     np.testing.assert_array_equal([p.joints for p in one], [p.joints for p in other])
 
 
-def test_the_nearest_miss_is_told_and_pickled() -> None:
+def test_the_nearest_miss_is_reported_and_pickled() -> None:
     machine = FixedBase(planar_chain([1.0, 0.7], [1.0, 1.0]))
     with pytest.raises(Unreachable, match=r"nearest miss is 0\.3 ") as caught:
         inverse_kinematics(machine, TipTask(position=(2.0, 0.0, 0.0), rows=(3, 4)))
@@ -147,7 +149,7 @@ def test_the_nearest_miss_is_told_and_pickled() -> None:
     np.testing.assert_array_equal(again.joints, caught.value.joints)
 
 
-def test_limits_refuse_what_they_forbid_and_name_the_joint() -> None:
+def test_limits_refuse_forbidden_poses_and_name_the_joint() -> None:
     hinge = Joint("hinge", "revolute", "post", "door", lower=-0.5, upper=0.5)
     machine = FixedBase(Robot((Link("post"), Link("door")), (hinge,), tip_translation=(1.0, 0.0, 0.0)))
     task = TipTask(position=(np.cos(1.0), np.sin(1.0), 0.0), rows=(3, 4))

@@ -129,8 +129,8 @@ def test_interpolation_is_exact_at_the_samples_and_of_fourth_order_between() -> 
         coarse = resolve(machine, TipTask(rows=(3, 4), velocity=(-1, -1)), PAPER_START, 2.0, samples=count)
         np.testing.assert_allclose(coarse.at(coarse.t[3])["joints"], coarse.joints[3], atol=1e-15)
         np.testing.assert_allclose(coarse.at(coarse.t[3])["joint_rates"], coarse.joint_rates[3], atol=1e-15)
-        found = np.array([np.concatenate([coarse.at(t)["base"], coarse.at(t)["joints"]]) for t in fine.t])
-        errors.append(np.abs(found - np.hstack([fine.base, fine.joints])).max())
+        values = np.array([np.concatenate([coarse.at(t)["base"], coarse.at(t)["joints"]]) for t in fine.t])
+        errors.append(np.abs(values - np.hstack([fine.base, fine.joints])).max())
     assert 3.3 < np.log2(errors[0] / errors[1]) < 4.7
     np.testing.assert_allclose(fine.at(9.0)["joints"], fine.joints[-1])
     np.testing.assert_allclose(fine.at(-1.0)["joints"], fine.joints[0])
@@ -199,18 +199,18 @@ def test_least_rates_do_the_task_and_have_no_part_in_the_null_space(seed: int, r
     assert np.linalg.norm(damped) < np.linalg.norm(rates)
 
 
-def asked_for(velocity: Any, rows: tuple[int, ...] = (3, 4)) -> dict[str, Any]:
+def velocity_task(velocity: Any, rows: tuple[int, ...] = (3, 4)) -> dict[str, Any]:
     return {"tasks": TipTask(rows=rows, velocity=velocity)}
 
 
-ASKED: dict[str, Any] = {**asked_for((-1.0, -1.0)), "start_joints": PAPER_START, "horizon": 1.0}
+PAPER_TASK: dict[str, Any] = {**velocity_task((-1.0, -1.0)), "start_joints": PAPER_START, "horizon": 1.0}
 REFUSED: list[tuple[dict[str, Any], str]] = [
-    (asked_for((0.0,) * 4, (0, 1, 3, 4)), "fixes 4 rows .* only 3 joints"),
-    (asked_for((0.0, 0.0), (0, 3)), r"rows \[0, 3\]: no joint moves the tip in rows \[0\]"),
-    (asked_for((1.0,)), r"velocity has shape \(1, 1\), expected \(2, 1\)"),
-    (asked_for((1.0, np.nan)), "velocity .* not finite"),
-    (asked_for(lambda t: [t, ca.SX.sym("stranger")]), r"depends on \['stranger'\]"),
-    (asked_for(lambda t: "fast"), "velocity gives 'fast'"),
+    (velocity_task((0.0,) * 4, (0, 1, 3, 4)), "fixes 4 rows .* only 3 joints"),
+    (velocity_task((0.0, 0.0), (0, 3)), r"rows \[0, 3\]: no joint moves the tip in rows \[0\]"),
+    (velocity_task((1.0,)), r"velocity has shape \(1, 1\), expected \(2, 1\)"),
+    (velocity_task((1.0, np.nan)), "velocity .* not finite"),
+    (velocity_task(lambda t: [t, ca.SX.sym("stranger")]), r"depends on \['stranger'\]"),
+    (velocity_task(lambda t: "fast"), "velocity gives 'fast'"),
     ({"start_joints": (0.0, 1.0)}, "start_joints has 2 entries, expected 3"),
     ({"start_joints": (0.0, 1.0, np.inf)}, "start_joints .* not finite"),
     ({"start_joints": "home"}, "start_joints 'home' is not numeric"),
@@ -235,7 +235,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ProblemError, match=message) as caught:
-        resolve(paper_example(), **{**ASKED, **changes})
+        resolve(paper_example(), **{**PAPER_TASK, **changes})
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 

@@ -56,9 +56,13 @@ def test_distances_along_a_motion_are_those_of_the_expression(name: str) -> None
     """Of the kinds with a formula; beside the others, meshes and cylinders, no less than its bound from below."""
     around = CollisionScene(machines()[name], (*OBSTACLES, MOVING))
     base, joints = configurations(around.machine, len(TIMES), 3)
-    found, told, exact = distances_along(around, base, joints, TIMES), known(around, base, joints), by_formula(around)
-    assert_allclose(found[:, exact], told[:, exact], atol=1e-9)
-    assert (found >= told - 1e-9)[found > 0].all()
+    result, report, exact = (
+        distances_along(around, base, joints, TIMES),
+        known(around, base, joints),
+        by_formula(around),
+    )
+    assert_allclose(result[:, exact], report[:, exact], atol=1e-9)
+    assert (result >= report - 1e-9)[result > 0].all()
     assert exact.sum() > 8
 
 
@@ -74,10 +78,10 @@ def test_boxes_that_overlap_are_as_deep_as_the_formula_says() -> None:
     )
     base, joints = configurations(around.machine, len(TIMES), 7)
     joints[:, 0] = np.linspace(-0.1, 0.3, len(TIMES))
-    found, told = distances_along(around, base, joints, TIMES), known(around, base, joints)
+    result, report = distances_along(around, base, joints, TIMES), known(around, base, joints)
     boxes = [all(isinstance(around.bodies[k].shape, Box) for k in pair[:2]) for pair in around.pairs]
-    assert (found[:, boxes] < -0.05).sum() > 10
-    assert_allclose(found[:, boxes], told[:, boxes], atol=1e-9)
+    assert (result[:, boxes] < -0.05).sum() > 10
+    assert_allclose(result[:, boxes], report[:, boxes], atol=1e-9)
 
 
 def test_long_boxes_that_cross_edge_by_edge_are_as_deep_as_the_formula_says() -> None:
@@ -90,39 +94,39 @@ def test_long_boxes_that_cross_edge_by_edge_are_as_deep_as_the_formula_says() ->
     machine = FixedBase(Robot((Link("base"), Link("beam", collisions=(beam,))), (slide,)))
     around = CollisionScene(machine, [Box((2.0, 0.3, 0.25), (0.1, 0.6, 0.33), across @ angles[1])])
     joints = np.linspace(-0.8, 0.8, len(TIMES))[:, None]
-    found = distances_along(around, np.zeros(0), joints, TIMES)
-    assert_allclose(found, known(around, np.zeros((len(TIMES), 0)), joints), atol=1e-9)
-    assert -0.05 < found.min() < -0.01
+    result = distances_along(around, np.zeros(0), joints, TIMES)
+    assert_allclose(result, known(around, np.zeros((len(TIMES), 0)), joints), atol=1e-9)
+    assert -0.05 < result.min() < -0.01
 
 
 @pytest.mark.parametrize("near", [-0.2, 0.0, 0.1, 0.5])
-def test_what_is_not_near_is_told_by_a_number_between(near: float) -> None:
+def test_distances_that_are_not_small_are_bounded_from_both_sides(near: float) -> None:
     """From the least that is asked for up to the distance; what is nearer is exact."""
     around = CollisionScene(machines()["slider"], (*OBSTACLES, MOVING, HalfSpace((3, 0, 4), (0.2, 0.1, 0.3))))
     base, joints = configurations(around.machine, len(TIMES), 4)
     exact = distances_along(around, base, joints, TIMES)
-    found = distances_along(around, base, joints, TIMES, near)
+    result = distances_along(around, base, joints, TIMES, near)
     below = exact < near
-    assert_allclose(found[below], exact[below], atol=1e-12)
-    assert (found[~below] >= near).all()
-    assert (found <= exact + 1e-12).all()
+    assert_allclose(result[below], exact[below], atol=1e-12)
+    assert (result[~below] >= near).all()
+    assert (result <= exact + 1e-12).all()
     assert near <= 0 or below.any()
-    assert (found < exact - 1e-3).any()  # and not all of them were worked out
+    assert (result < exact - 1e-3).any()  # and not all of them were worked out
 
 
-def test_each_pair_that_touches_is_named_where_it_is_nearest_the_deepest_first() -> None:
+def test_colliding_pairs_are_named_at_their_deepest_points_in_order() -> None:
     around = CollisionScene(machines()["arm"], (*OBSTACLES, MOVING), clearance=0.05)
     base, joints = configurations(around.machine, len(TIMES), 5)
     apart = distances_along(around, base, joints, TIMES)
-    found = find_collisions(around, base, joints, TIMES)
-    assert [touch.pair for touch in found] == np.argsort(apart.min(axis=0))[: len(found)].tolist()
-    assert len(found) == (apart.min(axis=0) < 0.05).sum() > 2
-    for touch in found:
-        assert touch.bodies == around.labels[touch.pair]
-        assert touch.distance == pytest.approx(apart[:, touch.pair].min(), abs=1e-12)
-        assert touch.time == TIMES[apart[:, touch.pair].argmin()]
-        assert ("overlap by" if touch.distance < 0 else "apart") in str(touch)
-        assert f"{abs(touch.distance):.3g} m" in str(touch)
+    result = find_collisions(around, base, joints, TIMES)
+    assert [contact.pair for contact in result] == np.argsort(apart.min(axis=0))[: len(result)].tolist()
+    assert len(result) == (apart.min(axis=0) < 0.05).sum() > 2
+    for contact in result:
+        assert contact.bodies == around.labels[contact.pair]
+        assert contact.distance == pytest.approx(apart[:, contact.pair].min(), abs=1e-12)
+        assert contact.time == TIMES[apart[:, contact.pair].argmin()]
+        assert ("overlap by" if contact.distance < 0 else "apart") in str(contact)
+        assert f"{abs(contact.distance):.3g} m" in str(contact)
 
 
 def test_one_base_for_all_samples_is_that_base_at_each() -> None:
@@ -134,7 +138,7 @@ def test_one_base_for_all_samples_is_that_base_at_each() -> None:
     assert np.ptp(each, axis=0).max() > 0.1
 
 
-def test_no_pairs_have_no_distances_and_what_is_no_number_touches() -> None:
+def test_without_pairs_there_are_no_distances_and_nan_counts_as_collision() -> None:
     bare = CollisionScene(FixedBase(armoured_arm(2)))
     assert distances_along(bare, np.zeros(0), np.zeros((3, 2)), np.zeros(3)).shape == (3, 0)
     assert find_collisions(bare, np.zeros(0), np.zeros((3, 2)), np.zeros(3)) == []
@@ -153,7 +157,7 @@ def test_the_hulls_are_the_bodies() -> None:
         assert hull.normal.size == (3 if isinstance(body.shape, HalfSpace) else 0)
 
 
-def test_surroundings_are_those_of_the_machine_with_its_limits() -> None:
+def test_the_scene_contains_the_machine_with_its_limits() -> None:
     machine: Machine = FixedBase(armoured_arm())
     kept, free = CollisionScene(machine, limits=True), CollisionScene(machine, limits=False)
     assert checked_collision_scene(kept, machine) is kept
@@ -194,16 +198,16 @@ def beside_triangles(machine: FixedBase) -> tuple[int, int]:
     low, high = np.maximum(machine.robot.lower, -np.pi), np.minimum(machine.robot.upper, np.pi)
     joints = rng.uniform(low, high, (1000, machine.joint_size))
     pairs = list(around.covers)
-    told = distances_along(around, np.zeros(0), joints, np.zeros(len(joints)))[:, pairs]
-    near = np.flatnonzero(((told > 0) & (told < 0.03)).any(axis=1))[:40]
-    joints, told = joints[near], told[near]
+    report = distances_along(around, np.zeros(0), joints, np.zeros(len(joints)))[:, pairs]
+    near = np.flatnonzero(((report > 0) & (report < 0.03)).any(axis=1))[:40]
+    joints, report = joints[near], report[near]
     q = ca.SX.sym("q", machine.joint_size)
     places = ca.Function("places", [q], [around.placements((), q)])
     held = ca.Function("held", [q], [around.distances((), q, pairs=pairs)])
     meshes = {name: triangles(machine, name.split(" hull ")[0]) for pair in pairs for name in around.labels[pair]}
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     seen, hollow = 0, 0
-    for at, apart in zip(joints, told, strict=True):
+    for at, apart in zip(joints, report, strict=True):
         frames = np.array(places(at)).reshape(-1, 4, 3)
         least = np.array(held(at)).ravel()
         assert (np.minimum(least, 0.0) <= apart + 1e-9).all()  # what is held apart is apart

@@ -50,28 +50,28 @@ class PlanCase:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-ASKED: dict[str, Callable[[], PlanCase]] = {}
+PLAN_CASES: dict[str, Callable[[], PlanCase]] = {}
 
 
-def asked(what: Callable[[], PlanCase]) -> Callable[[], PlanCase]:
-    ASKED[what.__name__] = cache(what)
-    return ASKED[what.__name__]
+def plan_case(what: Callable[[], PlanCase]) -> Callable[[], PlanCase]:
+    PLAN_CASES[what.__name__] = cache(what)
+    return PLAN_CASES[what.__name__]
 
 
-def plan_bare(*asked: Any, **options: Any) -> SolvedPlan:
+def plan_bare(*request: Any, **options: Any) -> SolvedPlan:
     """As `plan`, for laws of motions whatever the links may touch."""
-    found = plan(*asked, scene=False, **options)
-    assert isinstance(found, SolvedPlan)
-    return found
+    result = plan(*request, scene=False, **options)
+    assert isinstance(result, SolvedPlan)
+    return result
 
 
 @cache
 def planned(name: str) -> SolvedPlan:
     """From the start that is the best conditioned."""
-    what = ASKED[name]()
-    found = plan(what.machine, what.tasks, search="start", **what.options)
-    assert isinstance(found, SolvedPlan)
-    return found
+    what = PLAN_CASES[name]()
+    result = plan(what.machine, what.tasks, search="start", **what.options)
+    assert isinstance(result, SolvedPlan)
+    return result
 
 
 def quaternion(axis: Any, angle: float) -> Array:
@@ -93,7 +93,7 @@ def raster(lanes: int, first: Any = (0.45, -0.15, 0.2), size: tuple[float, float
     return smooth(Path.through(np.asarray(first) + corners), deviation=0.002)
 
 
-def bent_seam() -> SmoothPath:
+def curved_seam() -> SmoothPath:
     return smooth(Path.through([(0.45, -0.3, 0.2), (0.45, 0.1, 0.2), (0.65, 0.1, 0.25)]), deviation=0.002)
 
 
@@ -116,12 +116,12 @@ def angled_ur5() -> FixedBase:
 
 
 def angled_ur5_arm() -> Arm:
-    told = UR5.options
-    return Arm.of("ur5", "tool0", offset=(told["tip_rotation"], told["tip_translation"]))
+    report = UR5.options
+    return Arm.of("ur5", "tool0", offset=(report["tip_rotation"], report["tip_translation"]))
 
 
-def panda_peer(**given: Any) -> Arm:
-    return Arm.of("panda", "panda_hand", **given)
+def panda_peer(**options: Any) -> Arm:
+    return Arm.of("panda", "panda_hand", **options)
 
 
 def space_peer() -> Arm:
@@ -143,20 +143,20 @@ def space_tip() -> tuple[Array, Array]:
     return numeric(pose.position).ravel(), numeric(pose.rotation)
 
 
-@asked
+@plan_case
 def three_lanes_panda() -> PlanCase:
     path = raster(3)
     return PlanCase(panda(), TipTask.along(path, 0.05, direction=DOWN), panda_peer(), path, 0.05, DOWN)
 
 
-@asked
+@plan_case
 def three_lanes_ur5() -> PlanCase:
     """The tool's axis is that of the last joint, whose roll is free."""
     path = raster(3)
     return PlanCase(ur5(), TipTask.along(path, 0.05, direction=DOWN), Arm.of("ur5", "tool0"), path, 0.05, DOWN)
 
 
-@asked
+@plan_case
 def three_lanes_space_arm() -> PlanCase:
     position, rotation = space_tip()
     path, axis = raster(3, position, (0.06, 0.1)), rotation[:, 2]
@@ -164,25 +164,25 @@ def three_lanes_space_arm() -> PlanCase:
     return PlanCase(floating_manipulator(), task, space_peer(), path, 0.02, axis, options={"start": SPACE_START})
 
 
-@asked
+@plan_case
 def five_lanes_ur5() -> PlanCase:
     path = raster(5)
     return PlanCase(angled_ur5(), TipTask.along(path, 0.05, direction=DOWN), angled_ur5_arm(), path, 0.05, DOWN)
 
 
-@asked
+@plan_case
 def seam_ur5() -> PlanCase:
-    path, tilted = bent_seam(), (0.0, 0.3, -1.0)
+    path, tilted = curved_seam(), (0.0, 0.3, -1.0)
     return PlanCase(angled_ur5(), TipTask.along(path, 0.03, direction=tilted), angled_ur5_arm(), path, 0.03, tilted)
 
 
-@asked
+@plan_case
 def seam_panda() -> PlanCase:
-    path, tilted = bent_seam(), (0.0, 0.3, -1.0)
+    path, tilted = curved_seam(), (0.0, 0.3, -1.0)
     return PlanCase(panda(), TipTask.along(path, 0.03, direction=tilted), panda_peer(), path, 0.03, tilted)
 
 
-@asked
+@plan_case
 def seam_space_arm() -> PlanCase:
     position, rotation = space_tip()
     corners = position + np.array([[0, 0, 0], [0, 0.1, 0.02], [0.06, 0.12, 0.05]])
@@ -190,14 +190,14 @@ def seam_space_arm() -> PlanCase:
     return PlanCase(floating_manipulator(), TipTask.along(path, 0.01, direction=axis), space_peer(), path, 0.01, axis)
 
 
-@asked
+@plan_case
 def contour_panda() -> PlanCase:
     path = circle((0.5, 0.0, 0.3), 0.1)
     task = TipTask.along(path, 0.1, direction=DOWN)
     return PlanCase(panda(), task, panda_peer(), path, 0.1, DOWN, options={"cyclic": True})
 
 
-@asked
+@plan_case
 def contour_ur5() -> PlanCase:
     path = circle((0.5, 0.1, 0.3), 0.08)
     task = TipTask.along(path, 0.1, direction=DOWN)
@@ -211,14 +211,14 @@ def blended_poses() -> SmoothPath:
     return smooth(Path.through(places, turns), deviation=0.005)
 
 
-@asked
+@plan_case
 def poses_panda() -> PlanCase:
     path = blended_poses()
     task = TipTask.along(path, 0.1, roll="given")
     return PlanCase(panda(), task, panda_peer(), path, 0.1, looks="orientation")
 
 
-@asked
+@plan_case
 def poses_ur5() -> PlanCase:
     """Six rows of six joints: nothing is left but the branch."""
     path = blended_poses()
@@ -226,21 +226,21 @@ def poses_ur5() -> PlanCase:
     return PlanCase(angled_ur5(), task, angled_ur5_arm(), path, 0.1, looks="orientation")
 
 
-@asked
+@plan_case
 def finishing_ur5() -> PlanCase:
     path = raster(3)
     task = TipTask.along(path, 0.05, direction=DOWN, within=CONE)
     return PlanCase(angled_ur5(), task, angled_ur5_arm(), path, 0.05, DOWN, looks="cone")
 
 
-@asked
+@plan_case
 def finishing_panda() -> PlanCase:
     path = raster(3)
     task = TipTask.along(path, 0.05, direction=DOWN, within=CONE)
     return PlanCase(panda(), task, panda_peer(), path, 0.05, DOWN, looks="cone")
 
 
-@asked
+@plan_case
 def two_arms() -> PlanCase:
     """The left hand holds, the right one moves."""
     path = smooth(Path.through([(0.45, 0.0, 0.4), (0.45, -0.2, 0.4), (0.55, -0.2, 0.4)]), deviation=0.002)
@@ -250,39 +250,39 @@ def two_arms() -> PlanCase:
     return PlanCase(pair(), [hold, move], arm, path, 0.05, (0, 1, 0))
 
 
-@asked
+@plan_case
 def helix_ur5() -> PlanCase:
     path = helix((0.5, 0.1, 0.2), 0.06, 0.08, 1.5)
     return PlanCase(angled_ur5(), TipTask.along(path, 0.1, direction=DOWN), angled_ur5_arm(), path, 0.1, DOWN)
 
 
-@asked
+@plan_case
 def helix_panda() -> PlanCase:
     path = helix((0.45, 0.0, 0.3), 0.06, 0.08, 1.5)
     return PlanCase(panda(), TipTask.along(path, 0.1, direction=DOWN), panda_peer(), path, 0.1, DOWN)
 
 
-def on_board(path: SmoothPath, speed: float, looks: str = "axis", **told: Any) -> PlanCase:
+def on_board(path: SmoothPath, speed: float, looks: str = "axis", **report: Any) -> PlanCase:
     """The space arm along a path from where its tip is, its tool as it is then but for what is told."""
     axis = space_tip()[1][:, 2]
     direction = None if looks == "orientation" else axis
-    task = TipTask.along(path, speed, **({"roll": "given"} if direction is None else {"direction": axis}), **told)
+    task = TipTask.along(path, speed, **({"roll": "given"} if direction is None else {"direction": axis}), **report)
     start = {"start": SPACE_START}
     return PlanCase(floating_manipulator(), task, space_peer(), path, speed, direction, looks=looks, options=start)
 
 
-@asked
+@plan_case
 def helix_space_arm() -> PlanCase:
     return on_board(helix(space_tip()[0] - [0.03, 0.0, 0.0], 0.03, 0.03, 1.0), 0.02)
 
 
-@asked
+@plan_case
 def contour_space_arm() -> PlanCase:
     """Closed, but for the joints: the base has turned when the tip is back."""
     return on_board(circle(space_tip()[0] - [0.04, 0.0, 0.0], 0.04), 0.02)
 
 
-@asked
+@plan_case
 def poses_space_arm() -> PlanCase:
     position, rotation = space_tip()
     here = numeric(ca.DM(np.roll(Rotation.from_matrix(rotation).as_quat(), 1))).ravel()
@@ -291,6 +291,6 @@ def poses_space_arm() -> PlanCase:
     return on_board(smooth(Path.through(places, turns), deviation=0.005), 0.02, "orientation")
 
 
-@asked
+@plan_case
 def finishing_space_arm() -> PlanCase:
     return on_board(raster(3, space_tip()[0], (0.04, 0.06)), 0.02, "cone", within=CONE)

@@ -60,11 +60,11 @@ class Arm:
         return [(i, self.model.joints[self.model.getJointId(name)]) for i, name in mine]
 
     def configuration(self, columns: list[tuple[int, Any]], base: Any, joints: Array) -> Array:
-        found = pinocchio.neutral(self.model)
-        found[:7] = pinocchio.SE3ToXYZQUAT(base)
+        result = pinocchio.neutral(self.model)
+        result[:7] = pinocchio.SE3ToXYZQUAT(base)
         for i, joint in columns:
-            found[joint.idx_q : joint.idx_q + joint.nq] = _turn(joint, joints[i])
-        return np.asarray(found)
+            result[joint.idx_q : joint.idx_q + joint.nq] = _turn(joint, joints[i])
+        return np.asarray(result)
 
     def tips(self, plan: Plan, times: Array, bases: list[Any] | None = None) -> tuple[Array, Array]:
         """Positions (M, 3) and rotations (M, 3, 3) in the world."""
@@ -102,17 +102,17 @@ class Arm:
         base = first["base"]
         state = np.concatenate([base[:3], np.roll(base[3:], -1), first["joints"]])
         kinks = plan.horizon * plan.solution.state_interpolant.breaks
-        found: list[Any] = []
+        results: list[Any] = []
         for begin, end in pairwise(kinks):
             last = end == kinks[-1]
             inside = times[(times >= begin) & ((times < end) | last)]
             motion = solve_ivp(rate, (begin, end), state, "DOP853", np.union1d(inside, end), rtol=1e-10, atol=1e-12)
-            found += [_base(at) for at in motion.y.T[: len(inside)]]
+            results += [_base(at) for at in motion.y.T[: len(inside)]]
             state = motion.y[:, -1]
-        return found
+        return results
 
 
-class Stray(NamedTuple):
+class Deviation(NamedTuple):
     """How far a tip is from what it is asked at most: m, and rad where turning is asked."""
 
     position: float
@@ -120,7 +120,7 @@ class Stray(NamedTuple):
     orientation: float
 
 
-def stray(
+def deviation_of(
     plan: Plan,
     arm: Arm,
     path: SmoothPath,
@@ -129,7 +129,7 @@ def stray(
     times: Array,
     direction: Any = None,
     tool_axis: Any = (0.0, 0.0, 1.0),
-) -> Stray:
+) -> Deviation:
     """Between the samples, of a path run along by a distance over time; `direction` in the world, or the path's own."""
     bases = arm.drift(plan, times) if plan.machine.base_size else None
     position, turn = arm.tips(plan, times, bases)
@@ -141,7 +141,7 @@ def stray(
     angle = np.arctan2(np.linalg.norm(np.cross(axis, goal), axis=1), np.einsum("mi,mi->m", axis, goal))
     turned = (wanted.inv() * Rotation.from_matrix(turn)).magnitude()
     off = np.linalg.norm(position - path.at(s).position, axis=1)
-    return Stray(float(off.max()), float(angle.max()), float(turned.max()))
+    return Deviation(float(off.max()), float(angle.max()), float(turned.max()))
 
 
 @cache

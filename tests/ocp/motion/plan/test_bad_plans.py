@@ -91,13 +91,13 @@ ENDLESS = replace(GOOD, duration=None, breaks=())
 
 
 @cache
-def made() -> Plan:
+def valid_plan() -> Plan:
     return plan(**PLANNED)
 
 
-def logged(**given: Any) -> None:
+def logged(**options: Any) -> None:
     with TemporaryDirectory() as folder:
-        write_mcap(**{"plan": made(), "file": f"{folder}/a.mcap", **given})
+        write_mcap(**{"plan": valid_plan(), "file": f"{folder}/a.mcap", **options})
 
 
 PLANE = TipTask(rows=(3, 4), velocity=(0.0, 0.0))
@@ -326,7 +326,7 @@ CASES = [
     ),
     Case("along", path_tracks, {"path": LINE, "speed": 0.2}, {"path": INSTANCE, "speed": POSITIVE}),
     method(
-        made,
+        valid_plan,
         "at",
         {"time": 0.1},
         time=but(FINITE, "empty") | {"before": -1.0, "after": 99.0, "some after": [0.1, 99.0]},
@@ -334,14 +334,14 @@ CASES = [
     Case("write_mcap", logged, {"period": 0.1}, {"plan": INSTANCE, "period": POSITIVE, "frame": TEXT}),
     Case(
         "log_rerun",
-        lambda **given: log_rerun(**{"plan": made(), **given}),
+        lambda **options: log_rerun(**{"plan": valid_plan(), **options}),
         {"rerun": recorder(), "period": 0.1},
         {"plan": INSTANCE, "rerun": INSTANCE, "period": POSITIVE, "entity": TEXT, "timeline": TEXT},
     ),
-    method(made, "sample", {"period": 0.1}, period=POSITIVE),
-    method(made, "table", {"period": 0.1}, period=POSITIVE),
-    method(made, "plot", {}, against=but(INSTANCE, "None"), figure=but(INSTANCE, "None")),
-    method(made, "to_ros", {"period": 0.1}, period=POSITIVE),
+    method(valid_plan, "sample", {"period": 0.1}, period=POSITIVE),
+    method(valid_plan, "table", {"period": 0.1}, period=POSITIVE),
+    method(valid_plan, "plot", {}, against=but(INSTANCE, "None"), figure=but(INSTANCE, "None")),
+    method(valid_plan, "to_ros", {"period": 0.1}, period=POSITIVE),
 ]
 
 
@@ -390,11 +390,11 @@ def limited(most: float) -> FixedBase:
 @pytest.mark.parametrize("what", TASKS)
 def test_tasks_that_do_not_fit_are_refused_by_name(what: str) -> None:
     changes, name = TASKS[what]
-    given = {**PLANNED, "horizon": None, **changes()}
+    options = {**PLANNED, "horizon": None, **changes()}
     if what == "nan on the way":
-        given["horizon"] = 1.0
+        options["horizon"] = 1.0
     with pytest.raises((ProblemError, SolveError)) as caught:
-        plan(**given)
+        plan(**options)
     assert caught.value.name
     if name:
         assert caught.value.name == name
@@ -417,8 +417,8 @@ def test_a_cone_needs_an_axis() -> None:
 # ---- out of reach ----------------------------------------------------------------------------------------------------
 
 
-def leads_to(points: Any, speed: float = 0.5, **given: Any) -> TipTask:
-    return TipTask.along(smooth(Path.through(points), deviation=0.01), speed, **given)
+def leads_to(points: Any, speed: float = 0.5, **options: Any) -> TipTask:
+    return TipTask.along(smooth(Path.through(points), deviation=0.01), speed, **options)
 
 
 def test_a_start_that_is_too_far_says_by_how_much() -> None:
@@ -434,18 +434,18 @@ LEAVING = smooth(Path.through([(1.0, -1.5, 0.0), (2.6, 0.0, 0.0), (1.0, 1.5, 0.0
 
 
 @pytest.mark.parametrize("search", ["start", "configurations"])
-def test_a_path_that_leaves_the_reach_on_its_way_says_when_and_where(search: Any) -> None:
+def test_a_path_out_of_reach_is_reported_with_time_and_place(search: Any) -> None:
     """Out by 0.2 m in the middle of its 4 m, at 4 of 8 s, inside again at the end."""
     task = TipTask.along(LEAVING, 0.5, rows=(3, 4))
     with pytest.raises(Unreachable) as caught:
         plan(ARM, task, search=search)
-    found = caught.value
-    assert found.time is not None
-    place = LEAVING.at(0.5 * found.time).position[0]
+    result = caught.value
+    assert result.time is not None
+    place = LEAVING.at(0.5 * result.time).position[0]
     assert np.linalg.norm(place) == pytest.approx(2.4, abs=1e-5)
-    assert found.distance > 1e-3
-    assert found.angle == 0.0
-    assert str(np.round(place, 6).tolist()) in str(found)
+    assert result.distance > 1e-3
+    assert result.angle == 0.0
+    assert str(np.round(place, 6).tolist()) in str(result)
 
 
 def test_a_path_beyond_the_joint_limits_says_so() -> None:

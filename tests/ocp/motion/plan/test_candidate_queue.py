@@ -60,7 +60,7 @@ def motions(draw: Any) -> Known:
 
 
 @given(motions(), st.integers(1, 2))
-def test_the_plan_is_the_cheapest_of_all_that_pass_and_none_is_solved_that_cannot_be(known: Known, times: int) -> None:
+def test_the_plan_has_the_lowest_cost_and_no_costlier_candidate_is_solved(known: Known, times: int) -> None:
     queue = CandidateQueue(known, SETTINGS)
     count = len(known.coarse)
     queue.run(seeds([*range(count)] * times))
@@ -91,13 +91,13 @@ def test_where_a_motion_is_rejected_the_next_of_those_that_are_one_goes_on_in_it
         queue.plan()
 
 
-def test_of_every_motion_that_is_wanted_each_is_told_once_with_its_cost() -> None:
+def test_every_requested_motion_is_reported_once_with_its_cost() -> None:
     known = Known([1.0, 1.2, 1.4, 30.0], [1.1, 1.3, 1.5, 31.0], [True] * 4)
     queue = CandidateQueue(known, PlannerSettings())
     queue.run(seeds([3, 1, 2, 0, 1]), include_costlier=True)
-    told: Any = queue.plan()
-    assert [one.cost for one in told if one.stage is Stage.AUDITED] == [1.1, 1.3, 1.5]
-    kinds = [one.reason and one.reason.kind for one in told]
+    result: Any = queue.plan()
+    assert [one.cost for one in result if one.stage is Stage.AUDITED] == [1.1, 1.3, 1.5]
+    kinds = [one.reason and one.reason.kind for one in result]
     assert kinds.count(Rejection.DUPLICATE) == 1
     assert kinds.count(Rejection.COSTLIER) == 3
 
@@ -132,9 +132,7 @@ def test_a_coarse_cost_prunes_beyond_twice_the_error_of_the_coarse_mesh(
 
 
 @pytest.mark.parametrize(("share", "refined"), [(0.75, False), (1.25, True)])
-def test_on_the_fine_mesh_a_motion_has_to_be_cheaper_by_more_than_counts_as_the_same(
-    share: float, refined: bool
-) -> None:
+def test_on_the_fine_mesh_a_motion_must_cost_less_by_more_than_the_tolerance(share: float, refined: bool) -> None:
     fine = 2.0 * (1 - share * SETTINGS.same_cost)
     known = Known([1.0, 2.5], [2.0, fine], [True, True])  # the first has passed before the second is solved
     queue = CandidateQueue(known, SETTINGS)
@@ -144,12 +142,12 @@ def test_on_the_fine_mesh_a_motion_has_to_be_cheaper_by_more_than_counts_as_the_
 
 
 @pytest.mark.parametrize(("share", "kind"), [(0.75, Rejection.DUPLICATE), (1.25, Rejection.COSTLIER)])
-def test_where_all_are_wanted_one_that_costs_what_another_does_is_told_as_that(share: float, kind: Rejection) -> None:
+def test_equal_motions_are_reported_as_duplicates(share: float, kind: Rejection) -> None:
     known = Known([1.0, 1.5], [2.0, 2.0 * (1 + share * SETTINGS.same_cost)], [True, True])
     queue = CandidateQueue(known, SETTINGS)
     queue.run(seeds([0, 1]), include_costlier=True)
-    told: Any = queue.plan()
-    assert [one.reason and one.reason.kind for one in told] == [None, kind]
+    result: Any = queue.plan()
+    assert [one.reason and one.reason.kind for one in result] == [None, kind]
     assert Stage.FINE in stages_of(known, 1)  # which may change what it costs
     assert (Stage.REFINED in stages_of(known, 1)) == (kind is Rejection.COSTLIER)
 
@@ -167,19 +165,19 @@ def test_motions_of_one_coarse_cost_are_one_in_whatever_unit(size: float, share:
 def test_where_all_are_wanted_those_are_that_cost_no_more_than_so_many_times_the_best(
     ratio: float, wanted: bool
 ) -> None:
-    dear = 2.0 * SETTINGS.max_cost_ratio * ratio
-    known = Known([2.0, dear], [2.0, dear], [True, True])
+    costly = 2.0 * SETTINGS.max_cost_ratio * ratio
+    known = Known([2.0, costly], [2.0, costly], [True, True])
     CandidateQueue(known, SETTINGS).run(seeds([0, 1]), include_costlier=True)
     assert (Stage.REFINED in stages_of(known, 1)) == wanted
 
 
-def test_after_so_many_failures_what_collides_is_no_longer_repaired_and_what_is_clear_goes_on() -> None:
+def test_after_many_failures_collisions_are_not_repaired_and_clear_motions_continue() -> None:
     count = SETTINGS.max_failures
-    touching = Reason(Rejection.COLLISION, "a link and a box")
+    colliding = Reason(Rejection.COLLISION, "a link and a box")
 
     class Colliding(Known):
         def collision(self, candidate: Candidate) -> Reason | None:
-            return touching if candidate.start[0] in (0, count) else None
+            return colliding if candidate.start[0] in (0, count) else None
 
     costs = [1.0 + k / 10 for k in range(count + 2)]
     known = Colliding(costs, costs, [False] * count + [True, True])
@@ -188,7 +186,7 @@ def test_after_so_many_failures_what_collides_is_no_longer_repaired_and_what_is_
     assert Stage.REFINED in stages_of(known, 0)  # there were none yet
     assert stages_of(known, count) == {Stage.SEED}
     reasons = {int(one.start[0]): one.reason for one in queue.candidates}
-    assert reasons[count] == touching
+    assert reasons[count] == colliding
     assert reasons[count + 1] is None
 
 

@@ -48,7 +48,7 @@ from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.plan.planner import checked_request
 from ocp.motion.result.candidate import Candidate, Rejection
 from tests.models.machines.armoured import armoured_arm
-from tests.ocp.motion.plan.motions import DOWN, bent_seam
+from tests.ocp.motion.plan.motions import DOWN, curved_seam
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.tasks.space_tasks import ur5
 
@@ -57,7 +57,7 @@ pytestmark = pytest.mark.xdist_group("clear plans")  # one process, so that ever
 ARM = FixedBase(armoured_arm())
 START = np.array([0.1, 0.6, 0.1, 1.0, 0.1, 0.8, 0.0])
 SECONDS = 2.0
-WAY = np.array([0.0, 0.5, 0.0])
+DISPLACEMENT = np.array([0.0, 0.5, 0.0])
 
 
 def tip_at(machine: Any, joints: Any) -> np.ndarray:
@@ -74,7 +74,7 @@ def smooth_step(time: Any) -> Any:
     return 10 * s**3 - 15 * s**4 + 6 * s**5
 
 
-def line(machine: Any = ARM, first: Any = FIRST, way: Any = WAY, scale: float = 1.0) -> TipTask:
+def line(machine: Any = ARM, first: Any = FIRST, way: Any = DISPLACEMENT, scale: float = 1.0) -> TipTask:
     del machine
     return TipTask(position=lambda t: ca.DM(scale * first) + smooth_step(t) * ca.DM(scale * way), duration=SECONDS)
 
@@ -92,7 +92,7 @@ def least_apart(result: Plan, obstacles: Any, samples: int = 4001) -> float:
     return float(distances_along(around, base, at.joints, at.t).min())
 
 
-def test_what_does_not_bind_changes_nothing() -> None:
+def test_inactive_limits_change_no_plan() -> None:
     plain, beside = planned(clearance=None), planned(Sphere(0.05, (0.9, 0.9, 0.9)))
     assert_allclose(beside.cost, plain.cost, rtol=1e-9)
     assert "clearance" not in {finding.name for finding in plain.audit().findings}
@@ -101,7 +101,7 @@ def test_what_does_not_bind_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("clearance", [0.0, 0.02])
-def test_what_binds_is_kept_off_and_proven(clearance: float) -> None:
+def test_active_clearances_are_met_and_proven(clearance: float) -> None:
     plain, beside = planned(clearance=None), planned(POST, clearance=clearance)
     assert least_apart(plain, [POST]) < 0
     audit = beside.audit()
@@ -140,15 +140,15 @@ def test_a_moving_obstacle_is_avoided() -> None:
     assert least_apart(plain, [still]) > 0  # where it ends it is in nobody's way
 
 
-def test_the_search_finds_a_posture_that_is_clear() -> None:
-    task = TipTask(position=lambda t: ca.DM(FIRST) + smooth_step(t) * ca.DM(WAY), duration=SECONDS)
+def test_the_search_finds_a_collision_free_configuration() -> None:
+    task = TipTask(position=lambda t: ca.DM(FIRST) + smooth_step(t) * ca.DM(DISPLACEMENT), duration=SECONDS)
     result = plan(ARM, task, scene=Scene(obstacles=[POST], clearance=0.02))
     assert result.audit().passed
     assert least_apart(result, [POST]) >= 0.02 - 1e-6
     assert result.cost < planned(POST, clearance=0.02).cost
 
 
-def test_what_no_task_moves_stands_in_the_middle_of_its_range_or_where_it_is_clear() -> None:
+def test_joints_without_a_task_are_in_mid_range_or_clear() -> None:
     """A flag beside a planar arm, whose middle is in a ball: the arm moves as it does without the ball."""
     arm = planar(np.array([0.4, 0.3, 0.3])).robot
     pole = CollisionShape("capsule", (0.03, 0.2), translation=(0, 0.15, 0), rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -164,7 +164,7 @@ def test_what_no_task_moves_stands_in_the_middle_of_its_range_or_where_it_is_cle
     assert_allclose(beside.cost, free.cost, rtol=1e-6)
 
 
-def test_what_no_task_moves_begins_out_of_the_way_of_what_it_would_hinder() -> None:
+def test_joints_without_a_task_start_clear_of_the_motion() -> None:
     """A flag in the way of a planar arm, clear of it at the start alone: turned aside before, it costs nothing."""
     arm = planar(np.array([0.4, 0.3, 0.3])).robot
     pole = CollisionShape("capsule", (0.03, 0.2), translation=(0, 0.15, 0), rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -246,8 +246,12 @@ def test_a_plan_that_was_saved_is_proven_again(tmp_path: File) -> None:
 
 
 def test_tasks_one_after_the_other_are_proven_stretch_by_stretch() -> None:
-    first = TipTask(position=lambda t: ca.DM(FIRST) + smooth_step(t) * ca.DM(WAY), duration=SECONDS)
-    back = TipTask(position=lambda t: ca.DM(FIRST + WAY) - smooth_step(t) * ca.DM(WAY), begin=3.0, duration=SECONDS)
+    first = TipTask(position=lambda t: ca.DM(FIRST) + smooth_step(t) * ca.DM(DISPLACEMENT), duration=SECONDS)
+    back = TipTask(
+        position=lambda t: ca.DM(FIRST + DISPLACEMENT) - smooth_step(t) * ca.DM(DISPLACEMENT),
+        begin=3.0,
+        duration=SECONDS,
+    )
     ball = MovingObstacle(Sphere(0.05, (0, 0, 0)), lambda t: ca.DM(FIRST) + ca.vertcat(0, 0.25, 0.15 + 0.4 * (4.0 - t)))
     result = plan(ARM, [first, back], start=START, search="start", scene=Scene(obstacles=[ball], clearance=0.01))
     assert result.audit().passed
@@ -271,11 +275,11 @@ def rotation_about_y(angle: float) -> np.ndarray:
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
-def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
+def test_every_motion_along_a_seam_is_clear_or_names_the_collision() -> None:
     machine = torch_ur5()
     around = CollisionScene(machine)
     assert any("tool0" in pair[1] and "upper_arm" in pair[0] for pair in around.labels)
-    result = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN))
+    result = plan(machine, TipTask.along(curved_seam(), 0.03, direction=DOWN))
     assert result.audit().passed
     assert result.audit().clearances["clearance"].settled
     reasons = [one.reason for one in result.candidates if one.reason is not None]
@@ -292,14 +296,14 @@ def test_every_motion_along_a_seam_is_clear_or_says_what_touches() -> None:
         if one.solution is not None and (one.reason is None or one.reason.kind is not Rejection.COLLISION):
             at = one.solution.at_fraction(np.linspace(0, 1, 2001))
             assert distances_along(around, np.zeros(0), at["joints"], np.zeros(2001)).min() >= -1e-6
-    bare = plan(machine, TipTask.along(bent_seam(), 0.03, direction=DOWN), scene=False)
+    bare = plan(machine, TipTask.along(curved_seam(), 0.03, direction=DOWN), scene=False)
     assert bare.cost <= result.cost * (1 + 1e-6)
 
 
 # ---- what cannot be kept clear -----------------------------------------------------------------------------------
 
 
-def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
+def test_pairs_clear_within_limits_are_checked_without_limits() -> None:
     robot = armoured_arm()
     narrow = replace(robot, joints=tuple(replace(joint, lower=-0.3, upper=0.3) for joint in robot.joints))
     within, beyond = (CollisionScene(FixedBase(narrow), limits=limits) for limits in (True, False))
@@ -318,7 +322,7 @@ def test_what_never_touches_within_limits_is_looked_at_without_them() -> None:
     assert wide.audit().passed
 
 
-def test_a_start_that_touches_names_the_pair_and_the_depth() -> None:
+def test_a_colliding_start_names_the_pair_and_the_depth() -> None:
     with pytest.raises(ProblemError, match=r"start: link6 and obstacle 0 overlap by 0\.0") as caught:
         plan(ARM, line(), start=START, scene=Scene(obstacles=[Sphere(0.08, FIRST - (0.1, 0, 0))]))
     assert caught.value.name == "link6 and obstacle 0"
@@ -330,7 +334,11 @@ def test_a_start_that_touches_names_the_pair_and_the_depth() -> None:
 def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> None:
     with pytest.raises(SolveError, match=r"link6 and obstacle 0 overlap by 0\.\d+ m at [12]\.?\d* s") as caught:
         plan(
-            ARM, line(), start=START, search="start", scene=Scene(obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01)
+            ARM,
+            line(),
+            start=START,
+            search="start",
+            scene=Scene(obstacles=[Sphere(0.1, FIRST + DISPLACEMENT)], clearance=0.01),
         )
     assert caught.value.name == "link6 and obstacle 0"
     assert caught.value.value < caught.value.limit == 0.01
@@ -342,21 +350,23 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     )
 
 
-def test_where_no_posture_is_clear_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_collision_free_configuration_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     def alternatives(*_: object) -> None:
         raise AssertionError
 
     monkeypatch.setattr(planner, "_try_alternatives", alternatives)
     with pytest.raises(SolveError, match="; no other configuration is collision-free then: each of the"):
-        plan(ARM, line(), scene=Scene(obstacles=[Sphere(0.1, FIRST + WAY)], clearance=0.01))
+        plan(ARM, line(), scene=Scene(obstacles=[Sphere(0.1, FIRST + DISPLACEMENT)], clearance=0.01))
 
 
-def test_postures_that_touch_are_left_out_or_named() -> None:
+def test_colliding_configurations_are_omitted_or_named() -> None:
     at = TipTask(position=FIRST)
     obstacle = Sphere(0.08, FIRST + np.array([-0.25, 0, 0.15]))
     around = CollisionScene(ARM, [obstacle], 0.01)
     every, clearance_constraints = inverse_kinematics(ARM, at), inverse_kinematics(ARM, at, scene=around)
-    apart = [distances_along(around, np.zeros(0), posture.joints[None], np.zeros(1)).min() for posture in every]
+    apart = [
+        distances_along(around, np.zeros(0), configuration.joints[None], np.zeros(1)).min() for configuration in every
+    ]
     assert len(clearance_constraints) == sum(each >= 0.01 for each in apart) < len(every)
     with pytest.raises(Unreachable, match=r"is in collision.*link6 and obstacle 0 overlap") as caught:
         inverse_kinematics(ARM, at, scene=CollisionScene(ARM, [Sphere(0.2, FIRST)]))
@@ -366,8 +376,8 @@ def test_postures_that_touch_are_left_out_or_named() -> None:
 def test_a_local_motion_tells_how_near_it_comes() -> None:
     around = CollisionScene(ARM, [POST])
     local = resolve(ARM, tasks=line(), start_joints=START, horizon=SECONDS, samples=101, scene=around)
-    told = distances_along(around, np.zeros(0), local.joints, local.t)
-    assert_allclose(local.clearance, told.min(axis=1))
+    report = distances_along(around, np.zeros(0), local.joints, local.t)
+    assert_allclose(local.clearance, report.min(axis=1))
     worst = int(local.clearance.argmin())
     assert local.clearance[worst] < 0
     assert local.nearest[worst] == ("link6", "obstacle 0")
@@ -375,14 +385,14 @@ def test_a_local_motion_tells_how_near_it_comes() -> None:
 
 
 @pytest.mark.long
-def test_builders_take_what_to_stay_clear_of() -> None:
+def test_builders_accept_clearance_constraints() -> None:
     around = CollisionScene(ARM, [POST])
     problem = minimum_velocity_problem(
         ARM, line(), SECONDS, start=START, clearance_constraints=ClearanceConstraints(around)
     )
-    touching = solve(problem, Collocation(16, 4)).audit()
-    assert not touching["clearance"].passed
-    assert not touching.feasible
+    colliding = solve(problem, Collocation(16, 4)).audit()
+    assert not colliding["clearance"].passed
+    assert not colliding.feasible
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
@@ -402,10 +412,10 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_refused(case: str) -> None:
-    given, word = BAD[case]
+def test_invalid_arguments_are_refused(case: str) -> None:
+    options, word = BAD[case]
     with pytest.raises(ProblemError, match=word):
-        plan(ARM, line(), **{"start": START, **given})
+        plan(ARM, line(), **{"start": START, **options})
 
 
 def test_an_obstacle_without_a_place() -> None:
@@ -413,14 +423,14 @@ def test_an_obstacle_without_a_place() -> None:
         Box(size=(0.1, 0.1, 0.1), position=None)
 
 
-def test_a_posture_that_touches_slides_along_its_self_motion_until_it_is_clear() -> None:
+def test_a_colliding_configuration_is_cleared_by_self_motion() -> None:
     """From it alone; the tip stays where it is. What is around the tip's own place leaves none."""
     elbow = np.array(ca.DM(link_frames(ARM.robot, START)["link4"].position)).ravel()
     around = CollisionScene(ARM, [Sphere(0.1, elbow)], 0.01)
     assert distances_along(around, np.zeros(0), START[None], np.zeros(1)).min() < -0.05
-    found = inverse_kinematics(ARM, line(), starts=0, near=START, scene=around)
-    assert_allclose(tip_at(ARM, found[0].joints), FIRST, atol=1e-9)
-    assert distances_along(around, np.zeros(0), found[0].joints[None], np.zeros(1)).min() >= 0.01
+    solutions = inverse_kinematics(ARM, line(), starts=0, near=START, scene=around)
+    assert_allclose(tip_at(ARM, solutions[0].joints), FIRST, atol=1e-9)
+    assert distances_along(around, np.zeros(0), solutions[0].joints[None], np.zeros(1)).min() >= 0.01
     buried = CollisionScene(ARM, [Sphere(0.1, FIRST)])
     with pytest.raises(Unreachable, match="in collision"):
         inverse_kinematics(ARM, line(), starts=0, near=START, scene=buried)

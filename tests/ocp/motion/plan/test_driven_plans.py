@@ -37,17 +37,17 @@ def smooth_task(machine: Machine) -> TipTask:
     return TipTask(position=where, rows=(3, 4), duration=SECONDS)
 
 
-def torques_of(made: Plan, times: int = 3001) -> Array:
+def torques_of(result: Plan, times: int = 3001) -> Array:
     """By the plan's own polynomials. Shape (times, n)."""
-    sample = made.sampled(np.linspace(0, made.horizon, times))
+    sample = result.sampled(np.linspace(0, result.horizon, times))
     here = {"joints": sample.joints, "velocities": sample.rates, "accelerations": sample.accelerations}
-    if made.machine.base_size:
-        here["base"] = made.at(sample.t)["base"]
-    return np.asarray(torques_along(made.machine, here))
+    if result.machine.base_size:
+        here["base"] = result.at(sample.t)["base"]
+    return np.asarray(torques_along(result.machine, here))
 
 
 @pytest.mark.parametrize("machine", [FIXED, pytest.param(FLOATING, marks=pytest.mark.long)], ids=["fixed", "floating"])
-def test_limits_of_torque_hold_and_cost_something_where_they_bind(machine: Machine, tmp_path: Path) -> None:
+def test_active_torque_limits_hold_and_increase_the_cost(machine: Machine, tmp_path: Path) -> None:
     """Loose ones leave the optimum as it is."""
     task = smooth_task(machine)
     free = plan(machine, task, start=START)
@@ -55,19 +55,19 @@ def test_limits_of_torque_hold_and_cost_something_where_they_bind(machine: Machi
     assert loose.cost == pytest.approx(free.cost, rel=1e-4)
     assert np.abs(loose.at(0.7)["joints"] - free.at(0.7)["joints"]).max() < 1e-3
     most = np.abs(torques_of(loose)).max(axis=0) * [0.85, 2.0, 2.0]
-    made = plan(machine, task, start=START, limits=Limits(torque=most))
-    assert made.audit().passed
-    assert "torques" in {finding.name for finding in made.audit().findings}
-    assert free.cost * (1 + 1e-5) < made.cost < 1.2 * free.cost
-    assert (np.abs(torques_of(made)).max(axis=0) <= most + 1e-5).all()
-    assert np.abs(torques_of(made))[:, 0].max() == pytest.approx(most[0], rel=1e-4)
-    made.save(tmp_path / "plan.npz")
+    result = plan(machine, task, start=START, limits=Limits(torque=most))
+    assert result.audit().passed
+    assert "torques" in {finding.name for finding in result.audit().findings}
+    assert free.cost * (1 + 1e-5) < result.cost < 1.2 * free.cost
+    assert (np.abs(torques_of(result)).max(axis=0) <= most + 1e-5).all()
+    assert np.abs(torques_of(result))[:, 0].max() == pytest.approx(most[0], rel=1e-4)
+    result.save(tmp_path / "plan.npz")
     again = Plan.load(tmp_path / "plan.npz")
-    assert again.audit()["torques"].value == made.audit()["torques"].value
-    assert again.at(0.3)["rates"] == pytest.approx(made.at(0.3)["rates"])
+    assert again.audit()["torques"].value == result.audit()["torques"].value
+    assert again.at(0.3)["rates"] == pytest.approx(result.at(0.3)["rates"])
 
 
-def test_accelerations_are_within_their_limits_and_told_otherwise() -> None:
+def test_accelerations_are_within_their_limits_or_reported() -> None:
     task = smooth_task(FIXED)
     free = plan(FIXED, task, start=START)
     most = np.array([0.85, 9.0, 9.0])
@@ -75,13 +75,13 @@ def test_accelerations_are_within_their_limits_and_told_otherwise() -> None:
     demand = ActuatorDemand.of(free, Limits(acceleration=most))
     assert demand is not None
     assert (demand.quantity, demand.joint, demand.allowed, demand.unit) == ("acceleration", "joint1", 0.85, "rad/s^2")
-    made = plan(FIXED, task, start=START, limits=Limits(acceleration=most))
-    assert (np.abs(made.sample(0.001).accelerations).max(axis=0) <= most + 1e-5).all()
-    assert made.cost > free.cost
+    result = plan(FIXED, task, start=START, limits=Limits(acceleration=most))
+    assert (np.abs(result.sample(0.001).accelerations).max(axis=0) <= most + 1e-5).all()
+    assert result.cost > free.cost
 
 
 @pytest.mark.long
-def test_what_no_motion_does_is_named_with_what_it_takes() -> None:
+def test_infeasible_tasks_are_named_with_their_requirement() -> None:
     with pytest.raises(SolveError, match=r"torque of 'joint1' is [\d.]+ N m at [\d.]+ s, 0.05 allowed") as caught:
         plan(FIXED, smooth_task(FIXED), start=START, limits=Limits(torque=0.05))
     assert (caught.value.name, caught.value.limit) == ("joint1", 0.05)

@@ -59,8 +59,8 @@ def seam(whole: Robot, seed: int = 0) -> TipTask:
         place, rotation, _ = _poses(pose_at, middles)
         axis, x, y = (rotation[:, :, (tool + k) % 3] for k in range(3))
         angles = np.repeat(np.arange(4) * np.pi / 4, BATCH)[:, None]
-        way = np.cos(angles) * x + np.sin(angles) * y
-        paths = _follow(pose_at, middles, (place, way, axis), tool)
+        path = np.cos(angles) * x + np.sin(angles) * y
+        paths = _follow(pose_at, middles, (place, path, axis), tool)
         inside = ((paths > arm.lower) & (paths < arm.upper)).all(axis=(1, 2))
         chosen = np.flatnonzero(inside & (np.abs(np.diff(paths, axis=1)).max(axis=(1, 2)) < 0.3))
         for samples in ([4], [0, 8], [*range(9)]):  # most paths collide at one of few samples
@@ -71,7 +71,7 @@ def seam(whole: Robot, seed: int = 0) -> TipTask:
                 clear = np.all(distances > 0, axis=1).reshape(rows.shape[:2])
                 chosen = chosen[clear.all(axis=1)]
         for k in chosen.tolist():
-            first, along = place[k] - LENGTH / 2 * way[k], SPEED * way[k]
+            first, along = place[k] - LENGTH / 2 * path[k], SPEED * path[k]
             return TipTask(
                 position=lambda t, first=first, along=along: ca.DM(first) + t * ca.DM(along),
                 direction=axis[k],
@@ -94,7 +94,7 @@ def _poses(pose_at: Any, joints: Array) -> tuple[Array, Array, Array]:
 
 def _follow(pose_at: Any, middles: Array, seams: tuple[Array, Array, Array], tool: int) -> Array:
     """Return joints along K seams by Newton steps, nan where they do not converge. Shape (K, 9, n)."""
-    place, way, axis = seams
+    place, motion, axis = seams
     across = np.linalg.svd(axis[:, None])[2][:, 1:]
     ends = []
     for sign in (-1, 1):
@@ -102,7 +102,7 @@ def _follow(pose_at: Any, middles: Array, seams: tuple[Array, Array, Array], too
         for share in np.linspace(0, 1, 5)[1:]:
             for _ in range(6):
                 position, rotation, jacobian = _poses(pose_at, joints)
-                gap = place + sign * share * LENGTH / 2 * way - position
+                gap = place + sign * share * LENGTH / 2 * motion - position
                 tilt = np.einsum("kij,kj->ki", across, np.cross(rotation[:, :, tool], axis))
                 rows = np.concatenate([across @ jacobian[:, :3], jacobian[:, 3:]], axis=1)
                 error = np.concatenate([tilt, gap], axis=1)

@@ -70,7 +70,7 @@ def test_limits_of_a_request_beyond_those_of_the_machine_are_no_licence(tmp_path
     assert "may be run" not in report_of_plan(again, 0.01, "fast").html()
 
 
-def test_a_motion_that_was_changed_is_held_against_what_was_asked(tmp_path: Path) -> None:
+def test_a_changed_motion_is_audited_against_its_request(tmp_path: Path) -> None:
     path = tmp_path / "seam.npz"
     planned("seam_ur5").save(path)
     with np.load(path) as archive:
@@ -107,13 +107,13 @@ def test_obstacles_that_stand_or_move_and_the_bodies_of_meshes_are_rebuilt(tmp_p
         Box((0.1, 0.1, 0.1), position=(0, -2, 0)),
     ]
     task = TipTask(rows=(3, 4), velocity=(-0.05, 0.02))
-    found = plan(arm, task, 1.0, start=(0.3, 0.6, 0.5), scene=Scene(obstacles=balls), search="start")
-    found.save(tmp_path / "plan.npz")
+    result = plan(arm, task, 1.0, start=(0.3, 0.6, 0.5), scene=Scene(obstacles=balls), search="start")
+    result.save(tmp_path / "plan.npz")
     again = Plan.load(tmp_path / "plan.npz")
-    assert str(again.audit()) == str(found.audit())
+    assert str(again.audit()) == str(result.audit())
 
 
-def test_a_request_that_calls_python_is_said_when_it_is_saved(tmp_path: Path) -> None:
+def test_a_request_with_python_callbacks_warns_when_it_is_saved(tmp_path: Path) -> None:
     import casadi as ca
 
     class Own(ca.Callback):  # type: ignore[misc]

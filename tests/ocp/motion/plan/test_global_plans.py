@@ -23,29 +23,29 @@ from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur
     [(panda(), PANDA_START, "pose"), pytest.param(ur5(), UR5_START, "axis", marks=pytest.mark.long)],
     ids=["panda", "ur5"],
 )
-def test_the_cheapest_of_all_motions_has_a_bound_near_its_cost(machine, start, rows, tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_the_lowest_cost_motion_has_a_bound_near_its_cost(machine, start, rows, tmp_path) -> None:  # type: ignore[no-untyped-def]
     task = moved(machine, start, rows)
-    found = plan(machine, task, search="global", scene=False)
+    result = plan(machine, task, search="global", scene=False)
     others = plan(machine, task, search="configurations", scene=False)
-    assert found.audit().passed
-    assert found.bound is not None
-    assert 0.98 * found.cost <= found.bound <= found.cost
-    assert found.cost <= others.cost * (1 + 1e-6)
-    assert found.bound <= others.cost
-    assert all(found.bound <= one.cost * (1 + 1e-4) for one in found.candidates if np.isfinite(one.cost))
-    assert f"lower bound {found.bound:.6g}" in str(found)
-    found.save(tmp_path / "plan.npz")
-    assert Plan.load(tmp_path / "plan.npz").bound == found.bound
+    assert result.audit().passed
+    assert result.bound is not None
+    assert 0.98 * result.cost <= result.bound <= result.cost
+    assert result.cost <= others.cost * (1 + 1e-6)
+    assert result.bound <= others.cost
+    assert all(result.bound <= one.cost * (1 + 1e-4) for one in result.candidates if np.isfinite(one.cost))
+    assert f"lower bound {result.bound:.6g}" in str(result)
+    result.save(tmp_path / "plan.npz")
+    assert Plan.load(tmp_path / "plan.npz").bound == result.bound
 
 
 @pytest.mark.long
-def test_from_a_given_start_the_bound_is_of_motions_from_there() -> None:
+def test_from_a_fixed_start_the_bound_is_that_of_motions_from_there() -> None:
     task = moved(panda(), PANDA_START, "pose")
-    found = plan(panda(), task, start=PANDA_START, search="global", scene=False)
+    result = plan(panda(), task, start=PANDA_START, search="global", scene=False)
     free = plan(panda(), task, search="global", scene=False)
-    assert found.bound is not None
-    assert free.cost < found.bound <= found.cost <= found.bound / 0.98
-    assert found["joints"][0] == pytest.approx(PANDA_START, abs=1e-9)
+    assert result.bound is not None
+    assert free.cost < result.bound <= result.cost <= result.bound / 0.98
+    assert result["joints"][0] == pytest.approx(PANDA_START, abs=1e-9)
 
 
 def test_the_bound_follows_weights_and_pace() -> None:
@@ -58,18 +58,16 @@ def test_the_bound_follows_weights_and_pace() -> None:
     assert heavy.bound == pytest.approx(5 * one.bound, rel=0.01)
 
 
-def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_up(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_where_the_lowest_cost_classes_fail_all_others_are_solved(monkeypatch: pytest.MonkeyPatch) -> None:
     machine, start = planar(np.array([0.5, 0.4, 0.3]), 2.5), np.array([0.5, 1.2, -1.4])
-    asked, failed = list[bool](), list[Candidate]()
+    request, failed = list[bool](), list[Candidate]()
 
     def followed(search: AtlasSearch, most: float, every: bool) -> list[np.ndarray]:
-        asked.append(every)
+        request.append(every)
         return motions(search, most, every)
 
     def failing(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:
-        if asked[-1]:
+        if request[-1]:
             return advance(solver, candidate)
         failed.append(candidate)
         return [candidate.rejected(Reason(Rejection.AUDIT, "fails"))]
@@ -77,36 +75,36 @@ def test_where_the_classes_that_may_be_the_cheapest_fail_every_one_is_followed_u
     motions, advance = AtlasSearch.class_representatives, CandidateSolver.advance
     monkeypatch.setattr(AtlasSearch, "class_representatives", followed)
     monkeypatch.setattr(CandidateSolver, "advance", failing)
-    found = plan(machine, moved(machine, start, "place"), search="global", scene=False)
-    assert asked == [False, True]
+    result = plan(machine, moved(machine, start, "place"), search="global", scene=False)
+    assert request == [False, True]
     assert failed
-    assert found.audit().passed
-    assert found.bound is not None
-    assert 0.98 * found.cost <= found.bound <= found.cost
+    assert result.audit().passed
+    assert result.bound is not None
+    assert 0.98 * result.cost <= result.bound <= result.cost
 
 
-def winding(lengths: list[float], start: list[float], ways: list[list[float]], seconds: float) -> Any:
+def winding(lengths: list[float], start: list[float], paths: list[list[float]], seconds: float) -> Any:
     """A planar arm whose tip goes along a line, to one side of it and then to the other, and its task."""
     machine = FixedBase(planar_chain(lengths, np.ones(len(lengths))))
     first = np.array(ca.DM(machine.tip_pose((), np.array(start)).position)).ravel()[:2]
 
     def place(t: Any) -> Any:
         share = t / seconds
-        return ca.DM(first) + share * ca.DM(ways[0]) + ca.sin(2 * np.pi * share) * ca.DM(ways[1])
+        return ca.DM(first) + share * ca.DM(paths[0]) + ca.sin(2 * np.pi * share) * ca.DM(paths[1])
 
     return machine, TipTask(position=place, rows=[3, 4], duration=seconds)
 
 
 def test_the_motion_that_the_search_found_is_solved_where_a_coarse_mesh_loses_it() -> None:
     """Near its reach the arm whips round at last; with a free start a coarse mesh finds nothing but a dearer class."""
-    ways = [[-0.6585, 0.3798], [-0.3619, 0.0052]]
-    machine, task = winding([0.4428, 0.4788, 0.5695], [2.4578, -2.2448, 2.2583], ways, 3.4005)
-    found = plan(machine, task, search="global", scene=False)
-    assert found.audit().passed
-    assert found.bound is not None
-    assert found.bound <= found.cost <= 1.05 * found.bound
-    held = plan(machine, task, start=found.at(0.0)["joints"], scene=False)
-    assert found.cost <= held.cost * (1 + 1e-6)
+    paths = [[-0.6585, 0.3798], [-0.3619, 0.0052]]
+    machine, task = winding([0.4428, 0.4788, 0.5695], [2.4578, -2.2448, 2.2583], paths, 3.4005)
+    result = plan(machine, task, search="global", scene=False)
+    assert result.audit().passed
+    assert result.bound is not None
+    assert result.bound <= result.cost <= 1.05 * result.bound
+    held = plan(machine, task, start=result.at(0.0)["joints"], scene=False)
+    assert result.cost <= held.cost * (1 + 1e-6)
 
 
 def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,37 +122,37 @@ def test_a_bound_above_the_cost_of_a_motion_is_no_bound_and_warned_of(monkeypatc
     with pytest.raises(BoundWarning):
         plan(machine, task, search="global", scene=False)
     with pytest.warns(BoundWarning, match="less than its lower bound") as caught:
-        found = plan(machine, task, search="global", scene=False)
-    assert found.cost == pytest.approx(cost)
-    assert found.bound is None
+        result = plan(machine, task, search="global", scene=False)
+    assert result.cost == pytest.approx(cost)
+    assert result.bound is None
     warning = caught[0].message
     assert isinstance(warning, BoundWarning)
-    assert warning.value == found.cost < warning.limit
+    assert warning.value == result.cost < warning.limit
     with pytest.warns(BoundWarning):
         assert checked_bound(1.0, 0.9) is None
     assert checked_bound(1.0, 1.0 - 1e-12) == 1.0
 
 
-def test_where_the_set_of_postures_is_of_points_branches_are_compared() -> None:
+def test_where_the_solution_set_is_discrete_branches_are_compared() -> None:
     task = moved(ur5(), UR5_START, "pose")
-    found = plan(ur5(), task, search="global", scene=False)
+    result = plan(ur5(), task, search="global", scene=False)
     others = plan(ur5(), task, search="configurations", scene=False)
-    assert found.cost == pytest.approx(others.cost, rel=1e-6)
-    assert found.bound is not None
-    assert 0.98 * found.cost <= found.bound <= found.cost
+    assert result.cost == pytest.approx(others.cost, rel=1e-6)
+    assert result.bound is not None
+    assert 0.98 * result.cost <= result.bound <= result.cost
 
 
-def test_what_cannot_be_searched_is_refused() -> None:
+def test_unsupported_searches_are_refused() -> None:
     task = moved(panda(), PANDA_START, "pose")
     loose = TipTask(position=[0.4, 0.0, 0.4], duration=1.0)
     turning = TipTask(velocity=[0.01, 0.0, 0.0], rows=[3, 4, 5], duration=1.0)
-    for machine, asked, more, words in (
+    for machine, request, more, words in (
         (panda(), loose, {}, "leave 4 degrees of freedom"),
         (panda(), turning, {"start": PANDA_START}, "needs poses"),
         (panda(), task, {"horizon": "free"}, "needs a fixed horizon"),
     ):
         with pytest.raises(ProblemError, match=words):
-            plan(machine, asked, search="global", scene=False, **more)
+            plan(machine, request, search="global", scene=False, **more)
     with pytest.raises(Unreachable):
         plan(panda(), TipTask(position=[3.0, 0.0, 0.4], direction=[0, 0, -1], duration=1.0), search="global")
 
@@ -163,7 +161,7 @@ NONE = np.zeros(2, dtype=bool)
 """No joint turns without end."""
 
 
-def test_instants_are_left_out_until_steps_miss_a_share_of_the_cost() -> None:
+def test_time_samples_are_omitted_up_to_a_share_of_the_cost() -> None:
     t = np.linspace(0, 2, 81)
     bent = np.column_stack([np.abs(t - 1), np.where(t < 1, 0.0, 2 * (t - 1))])
     assert choose_samples(t, bent, np.ones(2), 1e-9, min_steps=2, periodic=NONE) == pytest.approx([0, 1, 2])
@@ -212,8 +210,8 @@ def test_stretches_of_time_are_searched_together(case: str) -> None:
         "round": ([closed], {}),
         "cyclic": ([closed], {"cyclic": True}),
     }[case]
-    found = plan(machine, tasks, search="global", scene=False, **more)  # type: ignore[arg-type]
+    result = plan(machine, tasks, search="global", scene=False, **more)  # type: ignore[arg-type]
     others = plan(machine, tasks, search="configurations", scene=False, **more)  # type: ignore[arg-type]
-    assert found.bound is not None
-    assert found.cost <= others.cost * (1 + 1e-6)
-    assert 0.97 * found.cost <= found.bound <= found.cost
+    assert result.bound is not None
+    assert result.cost <= others.cost * (1 + 1e-6)
+    assert 0.97 * result.cost <= result.bound <= result.cost

@@ -40,7 +40,7 @@ def sampled(plan: Plan) -> Array:
 
 
 @pytest.mark.parametrize("length", [True, False])
-def test_of_the_ways_around_a_box_the_shorter_is_the_plan_and_the_other_a_candidate(length: bool) -> None:
+def test_the_shorter_path_around_a_box_is_the_plan_and_the_longer_a_candidate(length: bool) -> None:
     settings = GoalSettings(search=PathSearchSettings(classes=8))
     plan = plan_to_goal(request_of(BOX, cost=Cost(velocity=0.0, length=1.0) if length else Cost(), settings=settings))
     audit = plan.audit()
@@ -89,7 +89,7 @@ def test_of_goals_in_collision_and_clear_ones_the_clear_ones_are_planned() -> No
     np.testing.assert_allclose(sampled(plan)[-1], [-1.0, 1.5], atol=1e-12)
 
 
-def test_a_closed_wall_is_refused_in_time_with_what_blocks_and_without_a_claim() -> None:
+def test_a_closed_wall_is_refused_in_time_with_the_obstacle_named() -> None:
     wall = Box((0.2, 5.0, 1.0), (0.0, 0.0, 0.0))
     with pytest.raises(SolveError, match="does not prove that there is none") as caught:
         plan_to_goal(request_of(wall, time_limit=1.5))
@@ -97,7 +97,7 @@ def test_a_closed_wall_is_refused_in_time_with_what_blocks_and_without_a_claim()
     assert "ball and obstacle 0 overlap by up to 0.2 m" in str(caught.value)
 
 
-def test_an_unlimited_joint_goes_the_other_way_round_if_an_obstacle_is_in_the_near_one() -> None:
+def test_an_unlimited_joint_avoids_an_obstacle_by_the_larger_angle() -> None:
     arm = Link("arm", 1.0, collisions=(CollisionShape("sphere", (RADIUS,), translation=(1.0, 0.0, 0.0)),))
     joint = Joint("turn", kind="continuous", parent="base", child="arm", axis=(0, 0, 1), velocity=1.0)
     machine = FixedBase(Robot((Link("base"), arm), (joint,), tip="arm"))
@@ -121,11 +121,11 @@ def test_a_plan_is_read_from_its_file_and_audited_again(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sampled(read), sampled(plan))
 
 
-def test_the_same_seed_gives_the_same_plan_and_stages_are_told() -> None:
-    told: list[str] = []
-    first, again = (plan_to_goal(request_of(BOX, seed=3, progress=told.append)) for _ in range(2))
+def test_the_same_seed_gives_the_same_plan_and_stages_are_reported() -> None:
+    results: list[str] = []
+    first, again = (plan_to_goal(request_of(BOX, seed=3, progress=results.append)) for _ in range(2))
     np.testing.assert_array_equal(sampled(first), sampled(again))
-    assert len(told) >= 4
+    assert len(results) >= 4
 
 
 @pytest.mark.parametrize("horizon", [None, 6.0])

@@ -61,7 +61,7 @@ def test_rates_and_accelerations_of_all_phases_are_derivatives_of_the_joints() -
     assert planned.sampled(times).accelerations == pytest.approx(difference, abs=1e-5)
 
 
-def test_a_stop_on_the_way_costs_more_and_a_shared_time_less() -> None:
+def test_an_intermediate_stop_costs_more_and_a_shared_time_less() -> None:
     """Goals with free durations of the same total may be reached at better times."""
     stopping = plan(MACHINE, [replace(GOALS[0], velocity="rest"), GOALS[1]], start=START, cost=COST, scene=False)
     assert stopping.cost > two_goals().cost * (1 + 1e-3)
@@ -162,7 +162,7 @@ def other_machine() -> Machine:
         ({"tasks": [GOALS[0], TipTask(rows=(3,), velocity=[0.1])], "start": START}, "goals", "Goal"),
     ],
 )
-def test_what_does_not_fit_is_named(arguments: dict[str, object], name: str | None, words: str) -> None:
+def test_arguments_that_do_not_fit_are_named(arguments: dict[str, object], name: str | None, words: str) -> None:
     with pytest.raises(ProblemError, match=words) as caught:
         plan(MACHINE, scene=False, **arguments)  # type: ignore[arg-type]
     assert name is None or caught.value.name == name

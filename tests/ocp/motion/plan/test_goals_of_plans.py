@@ -217,7 +217,7 @@ def test_a_goal_in_collision_names_the_bodies() -> None:
         ({"position": (0.5, 0.0, 0.2), "orientation": np.eye(3), "direction": (0, 0, 1)}, "direction"),
     ],
 )
-def test_contradictory_goals_are_refused_when_they_are_made(fields: dict[str, Any], name: str) -> None:
+def test_contradictory_goals_are_refused_at_construction(fields: dict[str, Any], name: str) -> None:
     with pytest.raises(ProblemError) as caught:
         Goal(**fields)
     assert caught.value.name == name

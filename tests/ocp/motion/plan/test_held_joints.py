@@ -139,7 +139,7 @@ def test_the_error_about_freedom_names_the_joints() -> None:
     assert "lock_joints(robot, {NAME: POSITION})" in words
 
 
-def test_a_head_in_the_way_goes_to_the_nearest_free_position() -> None:
+def test_a_blocking_head_is_placed_at_the_nearest_free_position() -> None:
     """In the middle of its range the head touches the tip at the start; turned away it does not."""
     machine = person(torso=0, ball=True)
     line = TipTask(position=lambda t: ca.DM([0.3, 0.25]) - 0.05 * t * ca.DM([0, 1]), duration=DURATION, **PLANE)
@@ -148,7 +148,7 @@ def test_a_head_in_the_way_goes_to_the_nearest_free_position() -> None:
     assert 0 < abs(result.held["head"]) < 1.5
 
 
-def test_a_head_that_blocks_the_way_is_moved_aside() -> None:
+def test_a_head_that_blocks_the_path_is_moved_aside() -> None:
     """The middle of its range is free at the start, but the way leads through it."""
     machine = person(torso=0, ball=True)
     line = TipTask(position=lambda t: ca.DM([0.34, 0.05]) + 0.25 * t * ca.DM([0, 1]), duration=DURATION, **PLANE)
@@ -157,7 +157,7 @@ def test_a_head_that_blocks_the_way_is_moved_aside() -> None:
     assert abs(result.held["head"]) > 0.1
 
 
-def test_a_head_that_blocks_the_way_from_its_given_position_gives_way() -> None:
+def test_a_blocking_head_leaves_its_initial_position() -> None:
     machine = person(torso=0, ball=True)
     line = TipTask(position=lambda t: ca.DM([0.36, 0.0]) + 0.15 * t * ca.DM([0, 1]), duration=DURATION, **PLANE)
     start = inverse_kinematics(machine, line, near=np.array([0.0, 0.2, 1.2, 0.9]), starts=0)[0].joints

@@ -46,8 +46,8 @@ def straight(machine: FixedBase, joints: Array, way: tuple[float, float, float],
     pose = machine.tip_pose((), joints)
     first = np.array(ca.DM(pose.position)).ravel()
     turn = np.array(ca.DM(pose.rotation))
-    given = more or {"orientation": turn}
-    return TipTask(position=lambda t: ca.DM(first) + t / DURATION * ca.DM(way), duration=DURATION, **given)
+    options = more or {"orientation": turn}
+    return TipTask(position=lambda t: ca.DM(first) + t / DURATION * ca.DM(way), duration=DURATION, **options)
 
 
 def three_links(fingers: int) -> FixedBase:
@@ -65,7 +65,7 @@ def names_of(machine: Any, idle: Any) -> list[str]:
     return [name for name, one in zip(machine.robot.joint_names, idle, strict=True) if one]
 
 
-def test_what_moves_a_frame_is_read_from_the_tree() -> None:
+def test_the_joints_that_move_a_frame_follow_from_the_tree() -> None:
     """By path, by a follower on the path, by the reference of a task, by any of several tasks; of every kind."""
     hand = handed(planar_chain([0.4, 0.3], [1.0] * 2), GRIPPER)
     place: dict[str, Any] = {"position": (0.5, 0.1, 0.0), "rows": [3, 4]}
@@ -91,14 +91,14 @@ def test_a_gripper_leaves_the_closed_forms_of_its_arm(arm: Any) -> None:
     assert kinds == expected
     n = bare.joint_size
     task = straight(hand, np.append(PANDA_START if n == 7 else UR5_START, 0.3), (0.1, 0, 0))
-    found = []
+    results = []
     for machine in (hand, bare):
         equations = bind(machine, task)
         branches = ik_branches(equations, machine.robot.lower, machine.robot.upper)
         assert branches is not None
-        found.append(branches.configurations(np.array(equations.target_function()(0.0)).ravel(), 16).joints)
-    np.testing.assert_allclose(found[0][:, :n], found[1], atol=1e-9)
-    np.testing.assert_allclose(found[0][:, n], 0.5)  # the middle of its limits
+        results.append(branches.configurations(np.array(equations.target_function()(0.0)).ravel(), 16).joints)
+    np.testing.assert_allclose(results[0][:, :n], results[1], atol=1e-9)
+    np.testing.assert_allclose(results[0][:, n], 0.5)  # the middle of its limits
 
 
 def test_fingers_cost_nothing_in_a_global_plan_of_a_whole_hand() -> None:
@@ -107,15 +107,15 @@ def test_fingers_cost_nothing_in_a_global_plan_of_a_whole_hand() -> None:
     assert whole.joint_size == 8
     task = straight(panda(), PANDA_START, (0.15, 0.1, -0.05))
     bare = plan(panda(), task, search="global", scene=False)
-    found = plan(whole, task, search="global", scene=False)
-    assert found.cost == pytest.approx(bare.cost, rel=1e-6)
-    assert found.bound == pytest.approx(bare.bound, rel=0.01)
-    assert found.audit().passed
-    np.testing.assert_allclose(found["joints"][:, 7], 0.02, atol=1e-9)
+    result = plan(whole, task, search="global", scene=False)
+    assert result.cost == pytest.approx(bare.cost, rel=1e-6)
+    assert result.bound == pytest.approx(bare.bound, rel=0.01)
+    assert result.audit().passed
+    np.testing.assert_allclose(result["joints"][:, 7], 0.02, atol=1e-9)
 
 
 @pytest.mark.long
-def test_a_given_start_says_where_fingers_stand() -> None:
+def test_a_start_fixes_the_positions_of_fingers() -> None:
     machine = three_links(3)
     start = np.array([0.4, 0.8, -0.5, 2.0, -0.01, -1.0])
     task = straight(machine, start, (-0.1, 0.15, 0), rows=[3, 4])
@@ -129,11 +129,11 @@ def test_a_given_start_says_where_fingers_stand() -> None:
                 return ca.DM(place) + 0.1 * ca.vertcat(ca.sin(np.pi * t), ca.cos(np.pi * t) - 1)
 
             there = TipTask(position=path, rows=[3, 4], duration=DURATION)
-        found = plan(machine, there, start=start, search="global", scene=False, cyclic=cyclic)
+        result = plan(machine, there, start=start, search="global", scene=False, cyclic=cyclic)
         alone = plan(bare, there, start=start[:3], search="global", scene=False, cyclic=cyclic)
-        assert found.cost == pytest.approx(alone.cost, rel=1e-6)
-        assert found.bound == pytest.approx(alone.bound, rel=0.01)
-        np.testing.assert_allclose(found["joints"][:, 3:], np.tile(start[3:], (len(found.t), 1)), atol=1e-9)
+        assert result.cost == pytest.approx(alone.cost, rel=1e-6)
+        assert result.bound == pytest.approx(alone.bound, rel=0.01)
+        np.testing.assert_allclose(result["joints"][:, 3:], np.tile(start[3:], (len(result.t), 1)), atol=1e-9)
 
 
 def test_the_other_arm_stands_still_while_one_works() -> None:
@@ -142,23 +142,23 @@ def test_the_other_arm_stands_still_while_one_works() -> None:
     start = np.array([0.4, 0.8, -0.5])
     task = straight(FixedBase(arm), start, (-0.1, 0.15, 0), rows=[3, 4])
     alone = plan(FixedBase(arm), task, search="global", scene=False)
-    found = plan(
+    result = plan(
         two,
         TipTask(position=task.position, rows=[3, 4], duration=DURATION, link="l_link3", point=arm.tip_translation),
         search="global",
         scene=False,
     )
-    assert found.cost == pytest.approx(alone.cost, rel=1e-6)
-    assert found.bound == pytest.approx(alone.bound, rel=0.01)
-    assert np.ptp(found["joints"][:, 3:], axis=0).max() < 1e-9
+    assert result.cost == pytest.approx(alone.cost, rel=1e-6)
+    assert result.bound == pytest.approx(alone.bound, rel=0.01)
+    assert np.ptp(result["joints"][:, 3:], axis=0).max() < 1e-9
 
 
-def test_postures_that_differ_by_fingers_are_one() -> None:
+def test_configurations_that_differ_by_fingers_count_once() -> None:
     task = straight(ur5(), UR5_START, (0.1, 0.1, 0))
     bare = plan(ur5(), task, scene=False)
-    found = plan(handed(ur5().robot, GRIPPER), task, scene=False)
-    assert len(found.candidates) == len(bare.candidates)
-    assert found.cost == pytest.approx(bare.cost, rel=1e-6)
+    result = plan(handed(ur5().robot, GRIPPER), task, scene=False)
+    assert len(result.candidates) == len(bare.candidates)
+    assert result.cost == pytest.approx(bare.cost, rel=1e-6)
 
 
 def test_fingers_collide_where_they_stand() -> None:
@@ -170,13 +170,13 @@ def test_fingers_collide_where_they_stand() -> None:
     finger = link_frames(machine.robot, free.at(DURATION / 2)["joints"])["left"]
     there = np.array(ca.DM(finger.position)).ravel() + np.array(ca.DM(finger.rotation))[:, 2] * 0.04
     ball = Sphere(0.02, there - np.array([0.0107, 0.0344, 0.0]))
-    found = plan(machine, task, search="global", scene=Scene(obstacles=[ball]))
-    assert found.audit().passed
-    assert np.ptp(found["joints"][:, 3]) < 1e-12
-    assert found.cost == pytest.approx(0.0417135, rel=1e-4)  # with the fingers locked at 0.5 rad
-    assert found.cost > free.cost * 1.01
-    assert found.bound is not None
-    assert found.bound <= found.cost
+    result = plan(machine, task, search="global", scene=Scene(obstacles=[ball]))
+    assert result.audit().passed
+    assert np.ptp(result["joints"][:, 3]) < 1e-12
+    assert result.cost == pytest.approx(0.0417135, rel=1e-4)  # with the fingers locked at 0.5 rad
+    assert result.cost > free.cost * 1.01
+    assert result.bound is not None
+    assert result.bound <= result.cost
 
 
 def test_a_task_of_the_fingers_counts_as_one() -> None:
@@ -185,16 +185,16 @@ def test_a_task_of_the_fingers_counts_as_one() -> None:
     hand = TipTask(link="f0", orientation=np.eye(3), rows=[2], duration=DURATION)
     start = np.array([0.4, 0.8, -0.5])
     tip = straight(three_links(0), start, (-0.1, 0.15, 0), rows=[3, 4])
-    found = plan(machine, [tip, hand], search="global", scene=False)
-    assert found.bound is not None
-    assert np.ptp(found["joints"][:, 3]) > 0.01
+    result = plan(machine, [tip, hand], search="global", scene=False)
+    assert result.bound is not None
+    assert np.ptp(result["joints"][:, 3]) > 0.01
 
 
 def test_waypoints_are_planned_with_a_hand() -> None:
     places = np.array([0.45, 0.1, 0.35]) + np.linspace(0, 1, 12)[:, None] * np.array([0.0, 0.2, 0.05])
     quaternion = np.tile([0.0, 1.0, 0.0, 0.0], (12, 1))
     whole = FixedBase(Robot.from_urdf(PANDA_URDF, tip="panda_hand"))
-    bare, found = (plan(each, Waypoints(places, quaternion, step=0.3), scene=False) for each in (panda(), whole))
-    assert found.cost == pytest.approx(bare.cost, rel=1e-3)
-    assert found.bound == pytest.approx(bare.bound, rel=1e-2)
-    np.testing.assert_allclose(found["joints"][:, 7], 0.02, atol=1e-9)
+    bare, result = (plan(each, Waypoints(places, quaternion, step=0.3), scene=False) for each in (panda(), whole))
+    assert result.cost == pytest.approx(bare.cost, rel=1e-3)
+    assert result.bound == pytest.approx(bare.bound, rel=1e-2)
+    np.testing.assert_allclose(result["joints"][:, 7], 0.02, atol=1e-9)

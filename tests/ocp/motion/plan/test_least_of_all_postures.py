@@ -10,7 +10,7 @@ import pytest
 from ocp import Collocation, inverse_kinematics, minimum_velocity_problem, solve
 from ocp.motion.plan import Plan
 from tests.models.robot.trees import Array
-from tests.ocp.motion.plan.motions import ASKED, plan_bare, planned
+from tests.ocp.motion.plan.motions import PLAN_CASES, plan_bare, planned
 
 pytestmark = pytest.mark.xdist_group("plan seam_ur5")  # one process, so that it is planned once
 
@@ -19,47 +19,47 @@ APART = 0.3
 
 
 @cache
-def cheapest() -> Plan:
-    what = ASKED["seam_ur5"]()
+def lowest_cost_plan() -> Plan:
+    what = PLAN_CASES["seam_ur5"]()
     return plan_bare(what.machine, what.tasks, search="configurations")
 
 
-def other_postures() -> list[Array]:
-    what = ASKED["seam_ur5"]()
+def other_configurations() -> list[Array]:
+    what = PLAN_CASES["seam_ur5"]()
     kept: list[Array] = []
-    for posture in inverse_kinematics(what.machine, what.tasks, starts=10, seed=5):
-        apart = [np.abs((posture.joints - other + np.pi) % (2 * np.pi) - np.pi).max() for other in kept]
+    for configuration in inverse_kinematics(what.machine, what.tasks, starts=10, seed=5):
+        apart = [np.abs((configuration.joints - other + np.pi) % (2 * np.pi) - np.pi).max() for other in kept]
         if not apart or min(apart) > APART:
-            kept.append(posture.joints)
+            kept.append(configuration.joints)
     return kept
 
 
 @pytest.mark.long
-def test_no_posture_leads_to_a_cheaper_seam() -> None:
+def test_no_configuration_leads_to_a_less_costly_seam() -> None:
     """By `minimum_velocity_problem`, the start free along its self-motion, on a mesh of its own."""
-    what, found = ASKED["seam_ur5"](), cheapest()
-    assert found.audit().passed
+    what, result = PLAN_CASES["seam_ur5"](), lowest_cost_plan()
+    assert result.audit().passed
     task = what.tasks
     mesh = Collocation(8, 7).with_nodes_at(task.breaks / task.duration)
     costs = []
-    for joints in other_postures():
+    for joints in other_configurations():
         problem = minimum_velocity_problem(what.machine, task, near=joints)
         motion = solve(problem, mesh, options={"max_iter": 60}, check=False)
         if motion.success:  # or the posture is lost on its way
             costs.append(motion.cost)
     assert len(costs) > 5
-    assert np.ptp(costs) > 0.1 * found.cost
-    assert min(costs) > found.cost * (1 - 1e-6)
-    assert min(costs) == pytest.approx(found.cost, rel=1e-6)
+    assert np.ptp(costs) > 0.1 * result.cost
+    assert min(costs) > result.cost * (1 - 1e-6)
+    assert min(costs) == pytest.approx(result.cost, rel=1e-6)
 
 
 @pytest.mark.long
-def test_every_motion_is_told_with_its_cost_and_why_it_is_not_the_plan() -> None:
-    found, one = cheapest(), planned("seam_ur5")
-    first, *others = found.candidates
-    assert (first.reason, first.cost, first.solution) == (None, found.cost, found.solution)
+def test_every_candidate_is_reported_with_cost_and_reason() -> None:
+    result, one = lowest_cost_plan(), planned("seam_ur5")
+    first, *others = result.candidates
+    assert (first.reason, first.cost, first.solution) == (None, result.cost, result.solution)
     assert len(others) > 10
     assert all(other.reason is not None for other in others)
-    assert all(np.isnan(other.cost) or other.cost > found.cost * (1 - 1e-5) for other in others)
-    assert found.cost <= one.cost * (1 + 1e-6)
+    assert all(np.isnan(other.cost) or other.cost > result.cost * (1 - 1e-5) for other in others)
+    assert result.cost <= one.cost * (1 + 1e-6)
     assert [c.reason for c in one.candidates].count(None) == 1

@@ -52,12 +52,12 @@ def line(first: Array, way: Array, **options: Any) -> TipTask:
 
 
 def test_a_task_on_a_locked_table_is_the_same_task_in_the_world() -> None:
-    robot, first, way = with_table(), np.array([0.0, -0.1, 0.2]), np.array([0.1, 0.2, 0.0])
+    robot, first, path = with_table(), np.array([0.0, -0.1, 0.2]), np.array([0.1, 0.2, 0.0])
     angle, place = 0.4, np.array([0.5, 0.0, 0.1])
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     locked = FixedBase(lock_joints(robot, {"table_turn": angle}))
-    on_table = plan(locked, line(first, way, relative_to="table_table"), scene=False)
-    in_world = plan(locked, line(place + turn @ first, turn @ way), scene=False)
+    on_table = plan(locked, line(first, path, relative_to="table_table"), scene=False)
+    in_world = plan(locked, line(place + turn @ first, turn @ path), scene=False)
     assert on_table.cost == pytest.approx(in_world.cost, rel=1e-5)
 
 

@@ -16,48 +16,48 @@ from ocp.motion.plan import Plan
 from ocp.motion.tasks.tip_task import timed
 from tests.models.robot.trees import Array
 from tests.ocp.motion.plan.motions import DOWN, angled_ur5, angled_ur5_arm, plan_bare
-from tests.ocp.motion.plan.replay import stray
+from tests.ocp.motion.plan.replay import deviation_of
 
 pytestmark = pytest.mark.xdist_group("pace")  # one process, so that every motion is planned once
 
-BENT = smooth(Path.through([(0.45, -0.1, 0.25), (0.45, 0.1, 0.25), (0.55, 0.1, 0.3)]), deviation=0.004)
+CURVED_PATH = smooth(Path.through([(0.45, -0.1, 0.25), (0.45, 0.1, 0.25), (0.55, 0.1, 0.3)]), deviation=0.004)
 FAST = 5.0
 """m/s: faster than any pace that these plans find."""
 UNLIMITED = Limits(velocity=np.full(6, 1e3))
 
 
-def asked(speed: float, **given: Any) -> TipTask:
-    return TipTask.along(BENT, speed, direction=DOWN, **given)
+def task_at(speed: float, **options: Any) -> TipTask:
+    return TipTask.along(CURVED_PATH, speed, direction=DOWN, **options)
 
 
 @cache
 def first() -> Array:
     """Where all these motions start: where the best of a free start does."""
-    return np.asarray(plan_bare(angled_ur5(), asked(0.05), search="start")["joints"][0])
+    return np.asarray(plan_bare(angled_ur5(), task_at(0.05), search="start")["joints"][0])
 
 
 @cache
 def fixed(speed: float) -> Plan:
-    return plan_bare(angled_ur5(), asked(speed), start=first(), search="start")
+    return plan_bare(angled_ur5(), task_at(speed), start=first(), search="start")
 
 
 @cache
 def free(time_cost: float, speed: float = FAST, limited: bool = False) -> Plan:
     limits = None if limited else UNLIMITED
     options: dict[str, Any] = {"search": "start", "cost": Cost(time=time_cost), "start": first(), "limits": limits}
-    return plan_bare(angled_ur5(), asked(speed), "free", **options)
+    return plan_bare(angled_ur5(), task_at(speed), "free", **options)
 
 
-def effort(found: Plan, time_cost: float) -> float:
+def effort(result: Plan, time_cost: float) -> float:
     """What the joint rates cost, by quadrature of what the plan says of them."""
     nodes, weights = np.polynomial.legendre.leggauss(12)
-    share = found.solution.state_interpolant.breaks
-    kinks = found.solution.at_fraction(share)["clock"][:, 0]
+    share = result.solution.state_interpolant.breaks
+    kinks = result.solution.at_fraction(share)["clock"][:, 0]
     half = np.diff(kinks) / 2
     times = (kinks[:-1] + half)[:, None] + half[:, None] * nodes
-    rates = found.at(times.ravel())["rates"].reshape(*times.shape, -1)
+    rates = result.at(times.ravel())["rates"].reshape(*times.shape, -1)
     spent = float(np.einsum("k,g,kgn->", half, weights, rates**2) / 2)
-    assert found.cost == pytest.approx(spent + time_cost * found.horizon, rel=1e-6)
+    assert result.cost == pytest.approx(spent + time_cost * result.horizon, rel=1e-6)
     return spent
 
 
@@ -79,9 +79,9 @@ def test_a_motion_may_be_as_slow_as_one_likes(slower: float) -> None:
 
 def test_a_slow_tip_is_where_its_task_says() -> None:
     """At a tenth of a millimetre a second, most of an hour."""
-    found, speed = fixed(0.05 / 500), 0.05 / 500
-    times = np.linspace(0.0, found.horizon, 402)[:-1] + 1e-3
-    off = stray(found, angled_ur5_arm(), BENT, lambda t: speed * t, times=times, direction=DOWN)
+    result, speed = fixed(0.05 / 500), 0.05 / 500
+    times = np.linspace(0.0, result.horizon, 402)[:-1] + 1e-3
+    off = deviation_of(result, angled_ur5_arm(), CURVED_PATH, lambda t: speed * t, times=times, direction=DOWN)
     assert max(off.position, off.axis) < 1e-6
 
 
@@ -89,9 +89,9 @@ def test_a_gap_is_closed_as_fast_as_the_task_says_however_long_it_lasts() -> Non
     """e' = -gain e of a tip that begins a millimetre beside its place."""
     place = np.array([0.45, -0.1, 0.251])
     task = TipTask(position=place, rows=(5,), gain=2.0, start_gap=0.01, duration=40.0)
-    found = plan_bare(angled_ur5(), task, start=first(), search="start")
+    result = plan_bare(angled_ur5(), task, start=first(), search="start")
     times = np.array([0.0, 0.5, 1.0, 2.0])
-    height = angled_ur5_arm().tips(found, times)[0][:, 2]
+    height = angled_ur5_arm().tips(result, times)[0][:, 2]
     np.testing.assert_allclose(height - place[2], -1e-3 * np.exp(-2.0 * times), atol=1e-6)
 
 
@@ -101,16 +101,16 @@ TIME_COSTS = (0.1, 0.2, 0.4)
 
 
 @pytest.mark.parametrize("time_cost", TIME_COSTS)
-def test_where_nothing_limits_it_effort_is_the_time_cost_at_every_instant(time_cost: float) -> None:
+def test_without_limits_the_effort_equals_the_time_cost_at_all_times(time_cost: float) -> None:
     """A clock that may run as it likes makes the Hamiltonian zero: 1/2 |rates|^2 = time_cost."""
-    found = free(time_cost)
-    assert found.audit().passed
-    rates = found.at(np.linspace(0.0, found.horizon, 201))["rates"]
+    result = free(time_cost)
+    assert result.audit().passed
+    rates = result.at(np.linspace(0.0, result.horizon, 201))["rates"]
     np.testing.assert_allclose((rates**2).sum(axis=1) / 2, time_cost, rtol=3e-3)
-    assert effort(found, time_cost) == pytest.approx(time_cost * found.horizon, rel=1e-6)
+    assert effort(result, time_cost) == pytest.approx(time_cost * result.horizon, rel=1e-6)
 
 
-def test_a_time_cost_four_times_as_high_halves_the_time_and_keeps_the_way() -> None:
+def test_a_time_cost_four_times_as_high_halves_the_time_and_keeps_the_path() -> None:
     one, other = free(0.1), free(0.4)
     assert other.horizon == pytest.approx(one.horizon / 2, rel=1e-6)
     assert other.cost == pytest.approx(2 * one.cost, rel=1e-6)
@@ -120,7 +120,7 @@ def test_a_time_cost_four_times_as_high_halves_the_time_and_keeps_the_way() -> N
     )
 
 
-def test_the_speed_that_is_told_only_says_the_fastest() -> None:
+def test_a_given_speed_is_an_upper_limit() -> None:
     """Twice as fast a task, where neither binds, is the same motion."""
     one, other = free(0.1), free(0.1, 2 * FAST)
     assert other.horizon == pytest.approx(one.horizon, rel=1e-6)
@@ -129,38 +129,40 @@ def test_the_speed_that_is_told_only_says_the_fastest() -> None:
 
 def test_a_task_slower_than_is_best_is_done_at_its_own_speed() -> None:
     """The pace is 1 all along: the plan is that of the fixed horizon, and its time is paid beside it."""
-    slow, found = fixed(0.05), free(1.0, 0.05)
-    assert found.horizon == pytest.approx(slow.horizon, rel=1e-9)
-    assert found.cost == pytest.approx(slow.cost + slow.horizon, rel=1e-6)
+    slow, result = fixed(0.05), free(1.0, 0.05)
+    assert result.horizon == pytest.approx(slow.horizon, rel=1e-9)
+    assert result.cost == pytest.approx(slow.cost + slow.horizon, rel=1e-6)
 
 
 def test_at_the_pace_that_was_found_the_plan_of_a_fixed_horizon_costs_as_much() -> None:
     """The same task with the clock that was found, written as a function of time."""
     time_cost = 0.1
-    found = free(time_cost)
-    breaks = found.solution.state_interpolant.breaks
+    result = free(time_cost)
+    breaks = result.solution.state_interpolant.breaks
     share = np.unique(np.concatenate([np.linspace(a, b, 41) for a, b in pairwise(breaks)]))
-    clock = found.solution.at_fraction(share)["clock"][:, 0]
+    clock = result.solution.at_fraction(share)["clock"][:, 0]
     clock[0] = 0.0
-    run = ca.interpolant("run", "bspline", [clock], share * found.solution.horizon)
-    task = asked(FAST)
-    kinks = found.solution.at_fraction(task.breaks / task.duration)["clock"][:, 0]
+    run = ca.interpolant("run", "bspline", [clock], share * result.solution.horizon)
+    task = task_at(FAST)
+    kinks = result.solution.at_fraction(task.breaks / task.duration)["clock"][:, 0]
     again = plan_bare(
         angled_ur5(),
-        timed(TipTask(position=task.position, direction=task.direction, duration=found.horizon, breaks=kinks), run),
+        timed(TipTask(position=task.position, direction=task.direction, duration=result.horizon, breaks=kinks), run),
         start=first(),
         search="start",
         limits=UNLIMITED,
     )
-    assert again.cost == pytest.approx(effort(found, time_cost), rel=1e-5)
+    assert again.cost == pytest.approx(effort(result, time_cost), rel=1e-5)
 
 
 def test_at_constant_speed_the_same_time_costs_more() -> None:
     """The pace is worth something: the task run evenly in the time that was found."""
-    found = free(0.1)
-    even = plan_bare(angled_ur5(), asked(BENT.length / found.horizon), start=first(), search="start", limits=UNLIMITED)
-    assert even.horizon == pytest.approx(found.horizon)
-    assert even.cost > 1.01 * effort(found, 0.1)
+    result = free(0.1)
+    even = plan_bare(
+        angled_ur5(), task_at(CURVED_PATH.length / result.horizon), start=first(), search="start", limits=UNLIMITED
+    )
+    assert even.horizon == pytest.approx(result.horizon)
+    assert even.cost > 1.01 * effort(result, 0.1)
 
 
 def costs(limited: bool) -> tuple[Array, list[Plan]]:
@@ -173,8 +175,8 @@ def costs(limited: bool) -> tuple[Array, list[Plan]]:
 def test_a_higher_time_cost_is_never_slower_and_the_cost_rises_with_it_by_the_time(limited: bool) -> None:
     """The least of functions linear in the time cost is concave in it, and its slope is the time."""
     prices, plans = costs(limited)
-    times, totals = np.array([found.horizon for found in plans]), np.array([found.cost for found in plans])
-    spent = np.array([effort(found, price) for found, price in zip(plans, prices, strict=True)])
+    times, totals = np.array([plan.horizon for plan in plans]), np.array([plan.cost for plan in plans])
+    spent = np.array([effort(plan, price) for plan, price in zip(plans, prices, strict=True)])
     assert (np.diff(times) < 0).all()
     assert (np.diff(spent) > 0).all()
     slope = np.diff(totals) / np.diff(prices)
@@ -184,12 +186,12 @@ def test_a_higher_time_cost_is_never_slower_and_the_cost_rises_with_it_by_the_ti
 
 def test_towards_least_time_a_joint_or_the_task_itself_is_at_its_limit_everywhere() -> None:
     """Where neither were, that piece could be done faster."""
-    found = free(200.0, 1.0, True)
+    result = free(200.0, 1.0, True)
     most = angled_ur5().robot.velocity
     share = np.linspace(0.0, 1.0, 301)
-    times = found.solution.at_fraction(share)["clock"][:, 0]
-    used = np.abs(found.at(np.clip(times, 0.0, found.horizon))["rates"]) / most
-    pace = found.solution.at_fraction(share)["pace"][:, 0]
+    times = result.solution.at_fraction(share)["clock"][:, 0]
+    used = np.abs(result.at(np.clip(times, 0.0, result.horizon))["rates"]) / most
+    pace = result.solution.at_fraction(share)["pace"][:, 0]
     assert (used <= 1 + 1e-3).all()
     assert (pace >= 1 - 1e-3).all()
     np.testing.assert_array_less(0.97, np.maximum(used.max(axis=1), 1 / pace))

@@ -26,9 +26,9 @@ COUNT = 9
 
 @cache
 def path() -> PathPlan:
-    found = plan(ur5(), Waypoints(*poses(ur5(), UR5_START, COUNT)), scene=Scene())
-    assert isinstance(found, PathPlan)
-    return found
+    result = plan(ur5(), Waypoints(*poses(ur5(), UR5_START, COUNT)), scene=Scene())
+    assert isinstance(result, PathPlan)
+    return result
 
 
 @cache
@@ -36,9 +36,9 @@ def arrays() -> dict[str, Array]:
     return path().arrays("path.npz")
 
 
-def poses_of(found: PathPlan) -> PathPoses:
-    assert found.poses is not None
-    return found.poses
+def poses_of(result: PathPlan) -> PathPoses:
+    assert result.poses is not None
+    return result.poses
 
 
 def with_poses(**poses: Any) -> PathPlan:
@@ -51,8 +51,8 @@ def changed(number: int, joint: int, by: float) -> PathPlan:
     return replace(path(), joints=joints, _audits={})
 
 
-def failures(found: Plan) -> set[str]:
-    return {finding.name.partition(",")[0] for finding in found.audit().failures}
+def failures(result: Plan) -> set[str]:
+    return {finding.name.partition(",")[0] for finding in result.audit().failures}
 
 
 def test_the_path_passes_and_may_be_run() -> None:
@@ -66,22 +66,22 @@ def test_the_path_passes_and_may_be_run() -> None:
 
 
 def test_at_the_velocity_limits_it_is_as_fast_as_its_slowest_joint_of_each_step() -> None:
-    found, velocity = path(), ur5().robot.velocity
-    durations = (np.abs(np.diff(found.joints, axis=0)) / velocity).max(axis=1)
-    np.testing.assert_allclose(found.t, np.r_[0.0, np.cumsum(durations)], atol=1e-12)
-    assert found.horizon == found.t[-1]
-    rates = found.at((found.t[1:] + found.t[:-1]) / 2)["rates"]
+    result, velocity = path(), ur5().robot.velocity
+    durations = (np.abs(np.diff(result.joints, axis=0)) / velocity).max(axis=1)
+    np.testing.assert_allclose(result.t, np.r_[0.0, np.cumsum(durations)], atol=1e-12)
+    assert result.horizon == result.t[-1]
+    rates = result.at((result.t[1:] + result.t[:-1]) / 2)["rates"]
     np.testing.assert_allclose((np.abs(rates) / velocity).max(axis=1), 1.0, rtol=1e-12)
 
 
 def test_between_waypoints_it_is_straight() -> None:
-    found, rng = path(), np.random.default_rng(0)
+    result, rng = path(), np.random.default_rng(0)
     shares, numbers = rng.random(50), rng.integers(0, COUNT - 1, 50)
-    at = found.at(found.t[numbers] + shares * np.diff(found.t)[numbers])
-    before, step = found.joints[numbers], np.diff(found.joints, axis=0)[numbers]
+    at = result.at(result.t[numbers] + shares * np.diff(result.t)[numbers])
+    before, step = result.joints[numbers], np.diff(result.joints, axis=0)[numbers]
     np.testing.assert_allclose(at["joints"], before + shares[:, None] * step, atol=1e-12)
-    np.testing.assert_allclose(at["rates"] * np.diff(found.t)[numbers][:, None], step, atol=1e-12)
-    np.testing.assert_array_equal(found.at(found.t)["joints"], found.joints)
+    np.testing.assert_allclose(at["rates"] * np.diff(result.t)[numbers][:, None], step, atol=1e-12)
+    np.testing.assert_array_equal(result.at(result.t)["joints"], result.joints)
 
 
 def test_a_path_that_stands_still_has_times_that_increase() -> None:
@@ -142,35 +142,35 @@ def test_a_joint_beyond_its_limit_fails_by_the_excess() -> None:
 
 
 def test_the_clearance_between_waypoints_is_proven_and_an_obstacle_there_is_named_with_its_time() -> None:
-    found, machine = path(), path().machine
-    between = (found.t[4] + found.t[5]) / 2
-    ball = Sphere(0.005, found.sampled(between).tip[0, :3])
+    result, machine = path(), path().machine
+    between = (result.t[4] + result.t[5]) / 2
+    ball = Sphere(0.005, result.sampled(between).tip[0, :3])
     scene = CollisionScene(machine, [ball])
-    finding = replace(found, constraints=ClearanceConstraints(scene), _audits={}).audit()["clearance"]
+    finding = replace(result, constraints=ClearanceConstraints(scene), _audits={}).audit()["clearance"]
     assert not finding.passed
     assert "obstacle 0" in finding.note
     assert finding.time is not None
-    times = np.linspace(0.0, found.horizon, 161)
-    nearest = distances_along(scene, np.zeros(0), found.at(times)["joints"], times).min(axis=1)
-    assert distances_along(scene, np.zeros(0), found.at([finding.time])["joints"], np.array([0.0])).min() == (
+    times = np.linspace(0.0, result.horizon, 161)
+    nearest = distances_along(scene, np.zeros(0), result.at(times)["joints"], times).min(axis=1)
+    assert distances_along(scene, np.zeros(0), result.at([finding.time])["joints"], np.array([0.0])).min() == (
         pytest.approx(nearest.min(), abs=1e-3)
     )
     assert f"at {finding.time:.4g} s" in finding.note
-    assert "clearance" not in {row.name for row in replace(found, constraints=None, _audits={}).audit().findings}
+    assert "clearance" not in {row.name for row in replace(result, constraints=None, _audits={}).audit().findings}
 
 
 def test_a_reconfiguration_counts_neither_as_a_step_nor_for_clearance() -> None:
-    found, number = path(), 4
-    steps = np.abs(np.diff(found.joints, axis=0))
-    broken = replace(found, reconfigurations=(number,), _audits={})
+    result, number = path(), 4
+    steps = np.abs(np.diff(result.joints, axis=0))
+    broken = replace(result, reconfigurations=(number,), _audits={})
     np.testing.assert_array_equal(broken.steps, np.delete(steps, number, axis=0).max(axis=0))
-    ball = Sphere(0.005, found.sampled((found.t[number] + found.t[number + 1]) / 2).tip[0, :3])
-    constraints = ClearanceConstraints(CollisionScene(found.machine, [ball]))
-    proofs = [replace(each, constraints=constraints).clearance() for each in (found, broken)]
+    ball = Sphere(0.005, result.sampled((result.t[number] + result.t[number + 1]) / 2).tip[0, :3])
+    constraints = ClearanceConstraints(CollisionScene(result.machine, [ball]))
+    proofs = [replace(each, constraints=constraints).clearance() for each in (result, broken)]
     whole, without = ({pair.bodies: pair for pair in proof.pairs} for proof in proofs if proof)
     assert all(pair.distance >= whole[bodies].distance - 1e-9 for bodies, pair in without.items())
     assert any(pair.distance > whole[bodies].distance + 1e-4 for bodies, pair in without.items())
-    assert not any(found.t[number] < pair.time < found.t[number + 1] for pair in without.values())
+    assert not any(result.t[number] < pair.time < result.t[number + 1] for pair in without.values())
     assert f"after waypoint {number}" in str(broken)
 
 
@@ -196,45 +196,45 @@ def test_obstacles_that_move_are_refused() -> None:
 
 
 def test_the_gap_is_the_share_of_the_cost_above_the_bound() -> None:
-    found = path()
-    assert found.bound is not None
-    assert found.gap == pytest.approx(1 - found.bound / found.cost)
-    assert replace(found, bound=None).gap is None
+    result = path()
+    assert result.bound is not None
+    assert result.gap == pytest.approx(1 - result.bound / result.cost)
+    assert replace(result, bound=None).gap is None
 
 
 @pytest.mark.parametrize("cost", [Cost(velocity=0, length=2, weights=[1.0, 2, 3, 4, 5, 6]), Cost(velocity=0, time=3)])
 def test_the_cost_is_that_of_its_joints(cost: Cost) -> None:
-    found = plan(ur5(), Waypoints(*poses(ur5(), UR5_START, 4)), scene=False, cost=cost)
-    steps = np.abs(np.diff(found["joints"], axis=0))
+    result = plan(ur5(), Waypoints(*poses(ur5(), UR5_START, 4)), scene=False, cost=cost)
+    steps = np.abs(np.diff(result["joints"], axis=0))
     if cost.time:
-        assert found.cost == pytest.approx(cost.time * found.horizon, rel=1e-9)
+        assert result.cost == pytest.approx(cost.time * result.horizon, rel=1e-9)
     else:
-        assert found.cost == pytest.approx(2 * (steps * cost.weights).sum(), rel=1e-12)
+        assert result.cost == pytest.approx(2 * (steps * cost.weights).sum(), rel=1e-12)
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_path_is_read_as_it_was_written(tmp_path: Path) -> None:
-    found = replace(with_poses(step=np.r_[path().steps[:5], 0.7]), reconfigurations=(3,))
-    found.save(tmp_path / "path.npz")
+    result = replace(with_poses(step=np.r_[path().steps[:5], 0.7]), reconfigurations=(3,))
+    result.save(tmp_path / "path.npz")
     again = Plan.load(tmp_path / "path.npz")
     assert isinstance(again, PathPlan)
     for name in ("joints", "t"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
-    for own, stored in zip(poses_of(again), poses_of(found), strict=True):
+        np.testing.assert_array_equal(getattr(again, name), getattr(result, name))
+    for own, stored in zip(poses_of(again), poses_of(result), strict=True):
         np.testing.assert_array_equal(own, stored)
     for name in ("cost", "bound", "gap", "horizon", "reconfigurations", "names"):
-        assert getattr(again, name) == getattr(found, name)
-    assert str(again) == str(found)
-    assert str(again.audit()) == str(found.audit())
-    assert [str(each) for each in again.candidates] == [str(each) for each in found.candidates]
+        assert getattr(again, name) == getattr(result, name)
+    assert str(again) == str(result)
+    assert str(again.audit()) == str(result.audit())
+    assert [str(each) for each in again.candidates] == [str(each) for each in result.candidates]
     again.write_csv(tmp_path / "path.csv", 0.05)
     rows = np.loadtxt(tmp_path / "path.csv", delimiter=",", skiprows=1)
-    np.testing.assert_array_equal(rows[:, 1:7], found.at(rows[:, 0])["joints"])
+    np.testing.assert_array_equal(rows[:, 1:7], result.at(rows[:, 0])["joints"])
 
 
-def test_what_a_file_was_changed_into_is_audited() -> None:
+def test_a_changed_file_is_audited() -> None:
     numbers = arrays()["path.numbers"]
     joints = path().joints.ravel()
     (at,) = (k for k in range(len(numbers)) if np.array_equal(numbers[k : k + len(joints)], joints))

@@ -17,18 +17,18 @@ from ocp.motion.schedule import LineLimits, schedule
 from tests.families import some
 from tests.models.robot.trees import Array
 from tests.ocp.motion.plan.motions import (
-    ASKED,
     CONE,
     DOWN,
     HELD,
+    PLAN_CASES,
     angled_ur5,
-    bent_seam,
+    curved_seam,
     panda_peer,
     plan_bare,
     planned,
     raster,
 )
-from tests.ocp.motion.plan.replay import stray
+from tests.ocp.motion.plan.replay import deviation_of
 from tests.ocp.motion.tasks.space_tasks import panda
 
 CLOSE = 1e-6
@@ -37,7 +37,7 @@ DAILY = (
     *("three_lanes_panda", "seam_ur5", "seam_panda", "contour_panda", "contour_ur5", "contour_space_arm"),
     *("poses_ur5", "finishing_ur5", "two_arms", "helix_ur5", "poses_panda"),
 )
-EACH = some([pytest.param(name, marks=pytest.mark.xdist_group(f"plan {name}"), id=name) for name in ASKED], DAILY)
+EACH = some([pytest.param(name, marks=pytest.mark.xdist_group(f"plan {name}"), id=name) for name in PLAN_CASES], DAILY)
 """One process for each motion, so that it is planned once."""
 every_motion = pytest.mark.parametrize("name", EACH)
 
@@ -52,14 +52,14 @@ def between(plan: Plan, count: int = 401) -> Array:
 
 @every_motion
 def test_the_motion_passes_and_an_independent_replay_agrees(name: str) -> None:
-    what, found = ASKED[name](), planned(name)
-    assert found.audit().passed
-    off = stray(
-        found,
+    what, result = PLAN_CASES[name](), planned(name)
+    assert result.audit().passed
+    off = deviation_of(
+        result,
         what.arm,
         what.path,
         lambda t: what.speed * t,
-        times=between(found),
+        times=between(result),
         direction=what.direction,
         tool_axis=what.tool_axis,
     )
@@ -74,55 +74,55 @@ def test_the_motion_passes_and_an_independent_replay_agrees(name: str) -> None:
 
 @every_motion
 def test_joints_and_rates_keep_the_limits_and_joints_are_the_integral_of_rates(name: str) -> None:
-    found, robot = planned(name), ASKED[name]().machine.robot
-    at = found.at(between(found, 2001))
+    result, robot = planned(name), PLAN_CASES[name]().machine.robot
+    at = result.at(between(result, 2001))
     assert (at["joints"] >= robot.lower - CLOSE).all()
     assert (at["joints"] <= robot.upper + CLOSE).all()
     assert (np.abs(at["rates"]) <= robot.velocity + CLOSE).all()
     nodes, weights = np.polynomial.legendre.leggauss(8)
-    kinks = found.solution.state_interpolant.breaks * found.horizon
+    kinks = result.solution.state_interpolant.breaks * result.horizon
     half = np.diff(kinks) / 2
     times = (kinks[:-1] + half)[:, None] + half[:, None] * nodes
-    rates = found.at(times.ravel())["rates"].reshape(*times.shape, -1)
+    rates = result.at(times.ravel())["rates"].reshape(*times.shape, -1)
     moved = np.einsum("k,g,kgn->kn", half, weights, rates)
-    np.testing.assert_allclose(np.diff(found.at(kinks)["joints"], axis=0), moved, atol=1e-7)
+    np.testing.assert_allclose(np.diff(result.at(kinks)["joints"], axis=0), moved, atol=1e-7)
     spent = np.einsum("k,g,kgn->", half, weights, rates**2) / 2
-    assert found.cost == pytest.approx(spent, rel=1e-6)
+    assert result.cost == pytest.approx(spent, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", [each for each in EACH if each.values[0] in ("contour_panda", "contour_ur5")])
 def test_a_closed_contour_ends_in_the_joints_it_began_with(name: str) -> None:
-    found = planned(name)
-    np.testing.assert_allclose(found["joints"][-1], found["joints"][0], atol=1e-7)
+    result = planned(name)
+    np.testing.assert_allclose(result["joints"][-1], result["joints"][0], atol=1e-7)
 
 
 @pytest.mark.xdist_group("plan contour_space_arm")
 def test_a_closed_contour_of_an_arm_that_floats_turns_its_base() -> None:
     """The joints are not asked to close: they end elsewhere, the tip where it began."""
-    what, found = ASKED["contour_space_arm"](), planned("contour_space_arm")
-    ends = np.array([0.0, found.horizon])
-    position, _ = what.arm.tips(found, ends, what.arm.drift(found, ends))
+    what, result = PLAN_CASES["contour_space_arm"](), planned("contour_space_arm")
+    ends = np.array([0.0, result.horizon])
+    position, _ = what.arm.tips(result, ends, what.arm.drift(result, ends))
     np.testing.assert_allclose(position[1], position[0], atol=CLOSE)
-    assert np.abs(found["joints"][-1] - found["joints"][0]).max() > 1e-3
-    assert np.abs(found["base"][-1] - found["base"][0]).max() > 1e-4
+    assert np.abs(result["joints"][-1] - result["joints"][0]).max() > 1e-3
+    assert np.abs(result["base"][-1] - result["base"][0]).max() > 1e-4
 
 
 @pytest.mark.xdist_group("plan two_arms")
 def test_the_hand_that_holds_stays_while_the_other_moves() -> None:
-    found = planned("two_arms")
-    position, turn = panda_peer(prefix="left_", place=(0.0, 0.3, 0.0)).tips(found, between(found))
+    result = planned("two_arms")
+    position, turn = panda_peer(prefix="left_", place=(0.0, 0.3, 0.0)).tips(result, between(result))
     assert np.abs(position - HELD).max() < CLOSE
     down = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])
     assert (down.inv() * Rotation.from_matrix(turn)).magnitude().max() < CLOSE
-    moves = np.ptp(found["joints"], axis=0)
-    names = np.array([name.startswith("right_") for name in found.names])
+    moves = np.ptp(result["joints"], axis=0)
+    names = np.array([name.startswith("right_") for name in result.names])
     assert moves[names].max() > 0.1
 
 
-def assert_same_way(found: Plan, other: Plan, *, back: bool = False) -> None:
+def assert_same_motion(result: Plan, other: Plan, *, back: bool = False) -> None:
     """The same joints at the same shares of the time, but for full turns."""
     share = np.linspace(0.0, 1.0, 101)
-    one, two = found.at(share * found.horizon)["joints"], other.at(share * other.horizon)["joints"]
+    one, two = result.at(share * result.horizon)["joints"], other.at(share * other.horizon)["joints"]
     apart = one - (two[::-1] if back else two)
     np.testing.assert_allclose(
         apart, np.broadcast_to(2 * np.pi * np.round(apart[0] / (2 * np.pi)), apart.shape), atol=1e-4
@@ -135,9 +135,9 @@ SHORT = smooth(Path.through([(0.45, -0.1, 0.25), (0.45, 0.1, 0.25), (0.55, 0.1, 
 START: dict[str, Any] = {"search": "start"}
 
 
-def short_motion(machine: Any = None, path: Any = SHORT, speed: Any = 0.05, **given: Any) -> Plan:
-    options = {key: given.pop(key) for key in ("cost", "limits", "start") if key in given}
-    task = TipTask.along(path, speed, **{"direction": DOWN, **given})
+def short_motion(machine: Any = None, path: Any = SHORT, speed: Any = 0.05, **arguments: Any) -> Plan:
+    options = {key: arguments.pop(key) for key in ("cost", "limits", "start") if key in arguments}
+    task = TipTask.along(path, speed, **{"direction": DOWN, **arguments})
     return plan_bare(angled_ur5() if machine is None else machine, task, search="start", **options)
 
 
@@ -151,7 +151,7 @@ def test_the_cost_falls_with_time_as_its_inverse(short: Plan) -> None:
     """The same way at a c-th of the speed: rates are divided by c, time is multiplied."""
     slow = short_motion(speed=0.005)
     assert slow.cost == pytest.approx(short.cost / 10, rel=1e-6)
-    assert_same_way(slow, short)
+    assert_same_motion(slow, short)
 
 
 @pytest.mark.long
@@ -163,28 +163,28 @@ def test_the_world_may_be_turned_and_moved_with_all_that_is_in_it(short: Plan) -
     path = smooth(Path.through(corners), deviation=0.004)
     other = short_motion(machine, path, direction=turn.apply(DOWN))
     assert other.cost == pytest.approx(short.cost, rel=1e-6)
-    assert_same_way(other, short)
+    assert_same_motion(other, short)
 
 
 @pytest.mark.xdist_group("plan short")
-def test_the_way_back_costs_what_the_way_there_does(short: Plan) -> None:
+def test_the_reversed_motion_has_the_same_cost(short: Plan) -> None:
     back = smooth(Path.through([(0.55, 0.1, 0.3), (0.45, 0.1, 0.25), (0.45, -0.1, 0.25)]), deviation=0.004)
     other = short_motion(path=back, start=short["joints"][-1])
     free = short_motion(path=back)
     # from that start it is the same motion in reverse; the best start costs no more
     assert other.cost == pytest.approx(short.cost, rel=1e-6)
     assert free.cost <= other.cost * (1 + 1e-6)
-    assert_same_way(other, short, back=True)
+    assert_same_motion(other, short, back=True)
 
 
 @pytest.mark.xdist_group("plan short")
-def test_weights_scale_the_cost_and_a_dear_joint_moves_less(short: Plan) -> None:
+def test_weights_scale_the_cost_and_a_heavily_weighted_joint_moves_less(short: Plan) -> None:
     tripled = short_motion(cost=Cost(weights=np.full(6, 3.0)))
     assert tripled.cost == pytest.approx(3 * short.cost, rel=1e-6)
     heavy = short_motion(cost=Cost(weights=[100.0, 1, 1, 1, 1, 1]))
 
-    def effort(found: Plan) -> float:
-        return float(np.trapezoid(found.at(between(found))["rates"][:, 0] ** 2, between(found)))
+    def effort(result: Plan) -> float:
+        return float(np.trapezoid(result.at(between(result))["rates"][:, 0] ** 2, between(result)))
 
     assert effort(heavy) < effort(short)
     assert heavy.cost >= short.cost * (1 - 1e-6)
@@ -192,14 +192,14 @@ def test_weights_scale_the_cost_and_a_dear_joint_moves_less(short: Plan) -> None
 
 @pytest.mark.long
 @pytest.mark.xdist_group("plan three_lanes_panda")
-def test_what_leaves_more_freedom_is_never_dearer() -> None:
+def test_more_freedom_never_costs_more() -> None:
     """From one start: a held axis, one that leans, none at all; and one that leans further."""
     held = planned("three_lanes_panda")
     start = held["joints"][0]
     costs = [held.cost]
-    for given in ({"within": np.radians(2)}, {"within": np.radians(5)}, {}):
-        asked: dict[str, Any] = {"direction": DOWN, **given} if given else {}
-        task = TipTask.along(raster(3), 0.05, **asked)
+    for options in ({"within": np.radians(2)}, {"within": np.radians(5)}, {}):
+        request: dict[str, Any] = {"direction": DOWN, **options} if options else {}
+        task = TipTask.along(raster(3), 0.05, **request)
         costs.append(plan_bare(panda(), task, start=start, search="start").cost)
     assert (np.diff(costs) < 0).all()
 
@@ -210,7 +210,7 @@ def test_what_leaves_more_freedom_is_never_dearer() -> None:
         [pytest.param(one, marks=pytest.mark.xdist_group(f"plan finishing_{one}")) for one in ("panda", "ur5")], ["ur5"]
     ),
 )
-def test_a_cone_is_cheaper_than_the_axis_held_and_is_used_to_its_edge(robot: str) -> None:
+def test_a_cone_costs_less_than_a_fixed_axis_and_is_used_to_its_edge(robot: str) -> None:
     cone, name = planned(f"finishing_{robot}"), {"panda": "three_lanes_panda"}.get(robot)
     held = (
         planned(name)
@@ -218,7 +218,7 @@ def test_a_cone_is_cheaper_than_the_axis_held_and_is_used_to_its_edge(robot: str
         else plan_bare(angled_ur5(), TipTask.along(raster(3), 0.05, direction=DOWN), search="start")
     )
     assert cone.cost < 0.9 * held.cost
-    what = ASKED[f"finishing_{robot}"]()
+    what = PLAN_CASES[f"finishing_{robot}"]()
     axis = what.arm.tips(cone, between(cone))[1][:, :, 2]
     lean = np.arccos(np.clip(-axis[:, 2], -1, 1))
     assert CONE - 1e-3 < lean.max() < CONE + CLOSE
@@ -228,15 +228,20 @@ def test_a_cone_is_cheaper_than_the_axis_held_and_is_used_to_its_edge(robot: str
 
 
 def test_a_schedule_begins_and_ends_at_rest_on_its_path() -> None:
-    path = bent_seam()
+    path = curved_seam()
     timing = schedule(path, LineLimits(speed=0.1, acceleration=0.2, jerk=2.0))
-    found = short_motion(path=path, speed=timing)
-    assert found.audit().passed
-    assert found.horizon == pytest.approx(timing.duration)
-    ends = found.at([0.0, found.horizon])["rates"]
+    result = short_motion(path=path, speed=timing)
+    assert result.audit().passed
+    assert result.horizon == pytest.approx(timing.duration)
+    ends = result.at([0.0, result.horizon])["rates"]
     assert np.abs(ends).max() < 1e-5
-    off = stray(
-        found, ASKED["seam_ur5"]().arm, path, lambda t: timing.at(t).distance, times=between(found), direction=DOWN
+    off = deviation_of(
+        result,
+        PLAN_CASES["seam_ur5"]().arm,
+        path,
+        lambda t: timing.at(t).distance,
+        times=between(result),
+        direction=DOWN,
     )
     assert max(off.position, off.axis) < CLOSE
 
@@ -258,22 +263,22 @@ def run_since(begin: float, times: Array) -> Array:
 def test_between_two_tasks_joints_go_straight_at_constant_rate() -> None:
     """Each task is kept in its own interval; where nothing is asked the least velocity is the straight line."""
     tasks, paths = two_lines()
-    found = plan_bare(panda(), tasks, search="start")
-    assert found.audit().passed
-    assert found.horizon == pytest.approx(tasks[1].end)
+    result = plan_bare(panda(), tasks, search="start")
+    assert result.audit().passed
+    assert result.horizon == pytest.approx(tasks[1].end)
     for task, path, direction in zip(tasks, paths, (DOWN, (1, 0, -1)), strict=True):
         times = np.linspace(task.begin, task.end, 101)[1:-1]
         distance = partial(run_since, task.begin)
-        off = stray(found, panda_peer(), path, distance, times=times, direction=direction)
+        off = deviation_of(result, panda_peer(), path, distance, times=times, direction=direction)
         assert max(off.position, off.axis) < CLOSE
     times = np.linspace(tasks[0].end, tasks[1].begin, 31)[1:-1]
-    at = found.at(times)
-    rate = (found.at(tasks[1].begin)["joints"] - at["joints"][0]) / (tasks[1].begin - times[0])
+    at = result.at(times)
+    rate = (result.at(tasks[1].begin)["joints"] - at["joints"][0]) / (tasks[1].begin - times[0])
     np.testing.assert_allclose(at["rates"], np.broadcast_to(rate, at["rates"].shape), atol=1e-6)
     assert np.abs(rate).max() > 0.01
 
 
-def test_a_task_in_two_pieces_is_the_same_motion() -> None:
+def test_a_task_in_two_segments_is_the_same_motion() -> None:
     """One task over the whole time, and two that follow each other: their union asks for the same."""
     path = smooth(Path.through([(0.45, -0.1, 0.25), (0.45, 0.1, 0.25)]), deviation=0.004)
     whole = TipTask.along(path, 0.05, direction=DOWN)
@@ -293,7 +298,7 @@ def test_a_task_in_two_pieces_is_the_same_motion() -> None:
 
 
 @pytest.mark.xdist_group("plan short")
-def test_limits_that_bind_are_kept_and_make_the_motion_dearer(short: Plan) -> None:
+def test_active_limits_hold_and_increase_the_cost(short: Plan) -> None:
     most = float(np.abs(short["rates"]).max())
     limited = short_motion(limits=Limits(velocity=0.9 * most))
     assert limited.audit().passed

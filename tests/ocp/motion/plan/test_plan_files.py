@@ -43,34 +43,34 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_saved_plan_is_audited_in_another_process(saved: Path) -> None:
-    found, audit = planned("seam_ur5"), planned("seam_ur5").audit()
+    result, audit = planned("seam_ur5"), planned("seam_ur5").audit()
     done = run(f"""
         from ocp.motion.plan import Plan
         plan = Plan.load({str(saved)!r})
         audit = plan.audit()
         print(audit.passed, repr(plan.cost), plan.names, repr(plan.sample(0.5).tip.tolist()))
     """)
-    assert done.stdout.strip() == (f"{audit.passed} {found.cost!r} {found.names} {found.sample(0.5).tip.tolist()!r}"), (
-        done.stderr
-    )
+    assert done.stdout.strip() == (
+        f"{audit.passed} {result.cost!r} {result.names} {result.sample(0.5).tip.tolist()!r}"
+    ), done.stderr
 
 
 def test_a_plan_is_read_as_it_was_written(saved: Path, tmp_path: Path) -> None:
-    found, again = planned("seam_ur5"), Plan.load(saved)
+    result, again = planned("seam_ur5"), Plan.load(saved)
     assert isinstance(again, SolvedPlan)
     for name in ("joints", "rates"):
-        np.testing.assert_array_equal(again[name], found[name])
-    np.testing.assert_array_equal(again.t, found.t)
-    assert (again.horizon, again.bound, again.parts) == (found.horizon, found.bound, found.parts)
-    assert [told_of(each) for each in again.candidates] == [told_of(each) for each in found.candidates]
-    np.testing.assert_array_equal(again.candidates[0].start, found.candidates[0].start)
+        np.testing.assert_array_equal(again[name], result[name])
+    np.testing.assert_array_equal(again.t, result.t)
+    assert (again.horizon, again.bound, again.parts) == (result.horizon, result.bound, result.parts)
+    assert [description_of(each) for each in again.candidates] == [description_of(each) for each in result.candidates]
+    np.testing.assert_array_equal(again.candidates[0].start, result.candidates[0].start)
     assert again.candidates[0].solution is again.solution
-    assert str(again) == str(found)
+    assert str(again) == str(result)
     again.save(tmp_path / "again.npz")
-    assert Plan.load(tmp_path / "again.npz").cost == found.cost
+    assert Plan.load(tmp_path / "again.npz").cost == result.cost
 
 
-def told_of(candidate: Candidate) -> str:
+def description_of(candidate: Candidate) -> str:
     return repr((candidate.cost, candidate.stage, candidate.reason))
 
 
@@ -83,7 +83,7 @@ def edited(saved: Path, tmp_path: Path, edit: Callable[[Arrays], Arrays]) -> Pat
     return path
 
 
-def told(change: Callable[[dict[str, Any]], Any]) -> Callable[[Arrays], Arrays]:
+def forge_candidate(change: Callable[[dict[str, Any]], Any]) -> Callable[[Arrays], Arrays]:
     """An edit of what is told of the plan."""
 
     def edit(arrays: Arrays) -> Arrays:
@@ -139,43 +139,50 @@ DAMAGES: dict[str, Callable[[Arrays], Arrays]] = {
     "no text": lambda arrays: {**arrays, "plan": np.array([255, 254], dtype=np.uint8)},
     "no JSON": lambda arrays: {**arrays, "plan": np.frombuffer(b"{", dtype=np.uint8)},
     "numbers": lambda arrays: {**arrays, "plan": np.array([1.0, 2.0])},
-    "a list": told(lambda record: [1, 2]),
-    "nothing": told(lambda record: None),
-    **{f"no {name}": told(without(name)) for name in ("request", "parts", "candidates", "bound", "targets")},
-    **{f"a request without {name}": told(without_in_request(name)) for name in ("builder", "arguments", "functions")},
-    "another builder": told(lambda record: {**record, "request": {**record["request"], "builder": "os.system"}}),
-    "no parts at all": told(lambda record: {**record, "parts": []}),
-    "a part too short": told(lambda record: {**record, "parts": [[0.0, 1.0]]}),
-    "a part of words": told(lambda record: {**record, "parts": [["a", "b", ""]]}),
-    "a part of another plan": told(lambda record: {**record, "parts": [[*record["parts"][0][:2], " 7"]]}),
-    "a part that ends before it begins": told(lambda record: {**record, "parts": [[5.0, 1.0, ""]]}),
-    "a part that never ends": told(lambda record: {**record, "parts": [[0.0, math.nan, ""]]}),
-    "parts apart": told(lambda record: {**record, "parts": [[0.0, 5.0, ""], [6.0, 7.0, ""]]}),
-    "another horizon": told(lambda record: {**record, "parts": [[0.0, 2 * record["parts"][0][1], ""]]}),
-    "a candidate of words": told(lambda record: {**record, "candidates": ["abcd"]}),
-    "a candidate of another stage": told(lambda record: {**record, "candidates": [[[0.0], 1.0, 99, None]]}),
-    "a candidate of an unknown reason": told(
+    "a list": forge_candidate(lambda record: [1, 2]),
+    "nothing": forge_candidate(lambda record: None),
+    **{f"no {name}": forge_candidate(without(name)) for name in ("request", "parts", "candidates", "bound", "targets")},
+    **{
+        f"a request without {name}": forge_candidate(without_in_request(name))
+        for name in ("builder", "arguments", "functions")
+    },
+    "another builder": forge_candidate(
+        lambda record: {**record, "request": {**record["request"], "builder": "os.system"}}
+    ),
+    "no parts at all": forge_candidate(lambda record: {**record, "parts": []}),
+    "a part too short": forge_candidate(lambda record: {**record, "parts": [[0.0, 1.0]]}),
+    "a part of words": forge_candidate(lambda record: {**record, "parts": [["a", "b", ""]]}),
+    "a part of another plan": forge_candidate(lambda record: {**record, "parts": [[*record["parts"][0][:2], " 7"]]}),
+    "a part that ends before it begins": forge_candidate(lambda record: {**record, "parts": [[5.0, 1.0, ""]]}),
+    "a part that never ends": forge_candidate(lambda record: {**record, "parts": [[0.0, math.nan, ""]]}),
+    "parts apart": forge_candidate(lambda record: {**record, "parts": [[0.0, 5.0, ""], [6.0, 7.0, ""]]}),
+    "another horizon": forge_candidate(lambda record: {**record, "parts": [[0.0, 2 * record["parts"][0][1], ""]]}),
+    "a candidate of words": forge_candidate(lambda record: {**record, "candidates": ["abcd"]}),
+    "a candidate of another stage": forge_candidate(lambda record: {**record, "candidates": [[[0.0], 1.0, 99, None]]}),
+    "a candidate of an unknown reason": forge_candidate(
         lambda record: {
             **record,
             "candidates": [[[0.0], 1.0, 3, {**Reason(Rejection.AUDIT).record(), "kind": "os.system"}]],
         }
     ),
-    "a candidate of half a reason": told(lambda record: {**record, "candidates": [[[0.0], 1.0, 3, {"kind": "AUDIT"}]]}),
-    "a bound of words": told(lambda record: {**record, "bound": "low"}),
-    "a machine of words": told(lambda record: having(record, "UR5")),
-    "a machine of another kind": told(lambda record: having(record, {**machine_in(record), "kind": "Rig"})),
-    "a machine without a kind": told(lambda record: having(record, {"fields": {}})),
-    "a machine without fields": told(lambda record: having(record, {"kind": "FixedBase"})),
-    "a machine that is a robot": told(lambda record: having(record, machine_in(record)["fields"]["robot"])),
-    "a link less": told(with_links(lambda links: links[:-1])),
-    "a link twice": told(with_links(lambda links: [*links, links[0]])),
-    "a link of words": told(with_links(lambda links: ["hand", *links[1:]])),
-    "links of words": told(with_links(lambda links: "links")),
-    "links a number": told(with_links(lambda links: 3)),
-    "a machine with more": told(with_machine(wings=2)),
-    "a machine without a robot": told(with_machine(robot=None)),
-    "another robot": told(lambda record: having(record, recorded(panda()))),
-    "a machine out of shape": told(with_machine(rotation=[[2, 0, 0], [0, 1, 0], [0, 0, 1]])),
+    "a candidate of half a reason": forge_candidate(
+        lambda record: {**record, "candidates": [[[0.0], 1.0, 3, {"kind": "AUDIT"}]]}
+    ),
+    "a bound of words": forge_candidate(lambda record: {**record, "bound": "low"}),
+    "a machine of words": forge_candidate(lambda record: having(record, "UR5")),
+    "a machine of another kind": forge_candidate(lambda record: having(record, {**machine_in(record), "kind": "Rig"})),
+    "a machine without a kind": forge_candidate(lambda record: having(record, {"fields": {}})),
+    "a machine without fields": forge_candidate(lambda record: having(record, {"kind": "FixedBase"})),
+    "a machine that is a robot": forge_candidate(lambda record: having(record, machine_in(record)["fields"]["robot"])),
+    "a link less": forge_candidate(with_links(lambda links: links[:-1])),
+    "a link twice": forge_candidate(with_links(lambda links: [*links, links[0]])),
+    "a link of words": forge_candidate(with_links(lambda links: ["hand", *links[1:]])),
+    "links of words": forge_candidate(with_links(lambda links: "links")),
+    "links a number": forge_candidate(with_links(lambda links: 3)),
+    "a machine with more": forge_candidate(with_machine(wings=2)),
+    "a machine without a robot": forge_candidate(with_machine(robot=None)),
+    "another robot": forge_candidate(lambda record: having(record, recorded(panda()))),
+    "a machine out of shape": forge_candidate(with_machine(rotation=[[2, 0, 0], [0, 1, 0], [0, 0, 1]])),
 }
 
 
@@ -209,7 +216,7 @@ def test_a_plan_file_is_a_solution_file_too(saved: Path) -> None:
 
 
 def test_nothing_half_written_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = planned("seam_ur5")
+    result = planned("seam_ur5")
     path, table = tmp_path / "plan.npz", tmp_path / "plan.csv"
     path.write_text("before")
     table.write_text("before")
@@ -219,9 +226,9 @@ def test_nothing_half_written_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr("os.fsync", fails)
     with pytest.raises(OSError, match="disk full"):
-        found.save(path)
+        result.save(path)
     with pytest.raises(OSError, match="disk full"):
-        found.write_csv(table)
+        result.write_csv(table)
     assert (path.read_text(), table.read_text()) == ("before", "before")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["plan.csv", "plan.npz"]
 
@@ -230,9 +237,9 @@ def test_a_plan_of_a_machine_of_ones_own_is_not_written(tmp_path: Path) -> None:
     class Own(FixedBase):
         """Not one of models'."""
 
-    found = planned("seam_ur5")
+    result = planned("seam_ur5")
     with pytest.raises(ProblemError, match="Own") as caught:
-        replace(found, machine=Own(found.machine.robot)).save(tmp_path / "own.npz")
+        replace(result, machine=Own(result.machine.robot)).save(tmp_path / "own.npz")
     assert caught.value.name == "machine"
     assert not list(tmp_path.iterdir())
 
@@ -241,42 +248,42 @@ def test_a_plan_of_a_machine_of_ones_own_is_not_written(tmp_path: Path) -> None:
 
 
 def test_a_table_is_read_back_bit_for_bit(tmp_path: Path) -> None:
-    found, path = planned("seam_ur5"), tmp_path / "seam.csv"
-    found.write_csv(path, 0.25)
+    result, path = planned("seam_ur5"), tmp_path / "seam.csv"
+    result.write_csv(path, 0.25)
     with path.open(newline="", encoding="utf-8") as stream:
         head, *rows = csv.reader(stream)
-    names = found.names
+    names = result.names
     assert head == ["time", *names, *(f"{n}.velocity" for n in names), *(f"{n}.acceleration" for n in names)]
-    sample = found.sample(0.25)
+    sample = result.sample(0.25)
     table = np.array([[float(cell) for cell in row] for row in rows])
-    told = np.column_stack([sample.t, sample.joints, sample.rates, sample.accelerations])
-    np.testing.assert_array_equal(table, told)
+    report = np.column_stack([sample.t, sample.joints, sample.rates, sample.accelerations])
+    np.testing.assert_array_equal(table, report)
     np.testing.assert_allclose(np.diff(sample.t)[:-1], 0.25)
-    assert sample.t[-1] == found.horizon
+    assert sample.t[-1] == result.horizon
 
 
 def test_a_message_is_read_back() -> None:
-    found = planned("seam_ur5")
-    message = found.to_ros(0.5)
-    again, made = JointTrajectory.from_ros(json.loads(json.dumps(message))), found.trajectory(0.5)
-    assert again.names == made.names == found.names
-    np.testing.assert_allclose(again.t, made.t, atol=1e-9)
+    result = planned("seam_ur5")
+    message = result.to_ros(0.5)
+    again, instance = JointTrajectory.from_ros(json.loads(json.dumps(message))), result.trajectory(0.5)
+    assert again.names == instance.names == result.names
+    np.testing.assert_allclose(again.t, instance.t, atol=1e-9)
     for kind in ("positions", "velocities", "accelerations"):
-        np.testing.assert_array_equal(getattr(again, kind), getattr(made, kind))
+        np.testing.assert_array_equal(getattr(again, kind), getattr(instance, kind))
 
 
 @pytest.mark.parametrize("name", ["seam_ur5", "seam_space_arm"])
 def test_samples_are_derivatives_of_each_other_and_tips_those_of_the_machine(name: str) -> None:
-    found = planned(name)
-    breaks = found.solution.state_interpolant.breaks * found.horizon
+    result = planned(name)
+    breaks = result.solution.state_interpolant.breaks * result.horizon
     times = (breaks[:-1] + breaks[1:]) / 2
     step = 1e-5
-    before, at, after = (found.sampled(times + shift) for shift in (-step, 0.0, step))
+    before, at, after = (result.sampled(times + shift) for shift in (-step, 0.0, step))
     np.testing.assert_allclose((after.joints - before.joints) / (2 * step), at.rates, atol=2e-6)
     np.testing.assert_allclose((after.rates - before.rates) / (2 * step), at.accelerations, atol=1e-6)
-    base = found.at(times).get("base", np.zeros((len(times), 0)))
+    base = result.at(times).get("base", np.zeros((len(times), 0)))
     for row, place, joints in zip(at.tip, base, at.joints, strict=True):
-        pose = found.machine.tip_pose(place, joints)
+        pose = result.machine.tip_pose(place, joints)
         np.testing.assert_allclose(row[:3], numeric(pose.position).ravel(), atol=1e-12)
         assert np.linalg.norm(row[3:]) == pytest.approx(1)
         turn = numeric(pose.rotation)
@@ -340,7 +347,7 @@ def test_a_machine_is_read_as_it_was_written(kind: str) -> None:
     np.testing.assert_array_equal(numeric(again.base_rate(base, q, qd)), numeric(machine.base_rate(base, q, qd)))
 
 
-def test_what_is_no_machine_is_refused_by_name() -> None:
+def test_invalid_machines_are_refused_by_name() -> None:
     value: Any
     for value in (
         None,

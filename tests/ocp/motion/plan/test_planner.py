@@ -16,9 +16,9 @@ ALONG = TipTask(velocity=(SPEED,), rows=(3,))
 
 def slides(velocity: float = 2.0) -> FixedBase:
     """Along x, 0 to 0.5 m each."""
-    told: dict[str, Any] = {"axis": (1.0, 0.0, 0.0), "lower": 0.0, "upper": MOST, "velocity": velocity}
+    by_name: dict[str, Any] = {"axis": (1.0, 0.0, 0.0), "lower": 0.0, "upper": MOST, "velocity": velocity}
     ends = (("one", "a", "b"), ("two", "b", "c"))
-    joints = tuple(Joint(name, "prismatic", parent, child, **told) for name, parent, child in ends)
+    joints = tuple(Joint(name, "prismatic", parent, child, **by_name) for name, parent, child in ends)
     return FixedBase(Robot((Link("a"), Link("b"), Link("c")), joints))
 
 
@@ -27,54 +27,54 @@ def placed(metres: float) -> TipTask:
     return TipTask(position=lambda time: [0.2 + metres / SECONDS * time, 0.0, 0.0], rows=(3,))
 
 
-def moved(start: Any = (0.1, 0.2), **asked: Any) -> Plan:
-    found = plan(slides(), ALONG, SECONDS, start=start, **asked)
-    assert found.audit().passed
-    return found
+def moved(start: Any = (0.1, 0.2), **request: Any) -> Plan:
+    result = plan(slides(), ALONG, SECONDS, start=start, **request)
+    assert result.audit().passed
+    return result
 
 
 @pytest.mark.parametrize("weights", [(1.0, 1.0), (1.0, 3.0), (0.5, 0.3)])
 def test_each_slide_moves_by_its_share_of_the_weights(weights: tuple[float, float]) -> None:
     """Least sum of w q'^2 / 2 with q1' + q2' = v: q' in inverse proportion to w, cost v^2 / 2 over the sum of 1 / w."""
-    found, inverse = moved(cost=Cost(weights=weights)), 1 / np.array(weights)
-    assert found.cost == pytest.approx(SPEED**2 * SECONDS / 2 / inverse.sum(), rel=1e-7)
-    np.testing.assert_allclose(found["rates"], np.tile(SPEED * inverse / inverse.sum(), (len(found.t), 1)), atol=1e-6)
+    result, inverse = moved(cost=Cost(weights=weights)), 1 / np.array(weights)
+    assert result.cost == pytest.approx(SPEED**2 * SECONDS / 2 / inverse.sum(), rel=1e-7)
+    np.testing.assert_allclose(result["rates"], np.tile(SPEED * inverse / inverse.sum(), (len(result.t), 1)), atol=1e-6)
 
 
 def test_a_slide_near_its_end_goes_as_far_as_it_may_at_a_steady_rate() -> None:
-    found = moved((0.1, 0.45))
-    np.testing.assert_allclose(found["joints"][-1], [0.45, MOST], atol=1e-6)
-    assert found.cost == pytest.approx(((SPEED - 0.05) ** 2 + 0.05**2) / 2, rel=1e-6)
+    result = moved((0.1, 0.45))
+    np.testing.assert_allclose(result["joints"][-1], [0.45, MOST], atol=1e-6)
+    assert result.cost == pytest.approx(((SPEED - 0.05) ** 2 + 0.05**2) / 2, rel=1e-6)
 
 
 def test_a_limit_of_velocity_leaves_the_rest_to_the_other() -> None:
-    found = moved(cost=Cost(weights=(1.0, 3.0)), limits=Limits(velocity=[0.25, 2.0]))
-    np.testing.assert_allclose(found["rates"][:, 0], 0.25, atol=1e-6)
-    assert found.cost == pytest.approx((0.25**2 + 3 * 0.15**2) / 2, rel=1e-6)
+    result = moved(cost=Cost(weights=(1.0, 3.0)), limits=Limits(velocity=[0.25, 2.0]))
+    np.testing.assert_allclose(result["rates"][:, 0], 0.25, atol=1e-6)
+    assert result.cost == pytest.approx((0.25**2 + 3 * 0.15**2) / 2, rel=1e-6)
 
 
 @pytest.mark.parametrize("search", ["start", "configurations", "global"])
 def test_every_search_finds_the_least_cost_from_wherever_the_place_leaves_it(search: Any) -> None:
-    found = plan(slides(), placed(SPEED * SECONDS), SECONDS, search=search)
-    assert found.audit().passed
-    assert found.cost == pytest.approx(SPEED**2 * SECONDS / 4, rel=1e-6)
-    assert found["joints"].sum(axis=1) == pytest.approx(0.2 + SPEED * found.t, abs=1e-6)
+    result = plan(slides(), placed(SPEED * SECONDS), SECONDS, search=search)
+    assert result.audit().passed
+    assert result.cost == pytest.approx(SPEED**2 * SECONDS / 4, rel=1e-6)
+    assert result["joints"].sum(axis=1) == pytest.approx(0.2 + SPEED * result.t, abs=1e-6)
     if search == "global":
-        assert found.bound is not None
-        assert 0.95 * found.cost < found.bound <= found.cost * (1 + 1e-9)
+        assert result.bound is not None
+        assert 0.95 * result.cost < result.bound <= result.cost * (1 + 1e-9)
 
 
 def test_samples_are_as_many_as_periods_fit_each_at_its_own_time() -> None:
-    found = moved()
+    result = moved()
     for count in (1, 3, 7, 10, 49, 1000):
-        sample = found.sample(SECONDS / count)
+        sample = result.sample(SECONDS / count)
         assert len(sample.t) == count + 1
         assert (np.diff(sample.t) > 0.5 * SECONDS / count).all()
         assert sample.t[-1] == SECONDS
-    assert len(found.sample(0.3).t) == 5
+    assert len(result.sample(0.3).t) == 5
 
 
-def test_what_is_out_of_reach_is_told_with_a_time_at_which_it_is() -> None:
+def test_unreachable_tasks_are_reported_with_a_time() -> None:
     """Stretched the slides reach 1 m, at 2 / 3 of the way to 1.4 m."""
     with pytest.raises(Unreachable) as caught:
         plan(slides(), placed(1.2), SECONDS)

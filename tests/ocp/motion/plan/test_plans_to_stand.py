@@ -34,8 +34,8 @@ SHIFT = np.array([0.2, -0.3])
 
 
 def machine(edges: tuple[float, float] = EDGES) -> Standing:
-    given = planar_machine(SIZE)
-    return replace(given, support=rectangle((-0.1, 0.1), edges), most_stable_point=None, half_widths=None)
+    options = planar_machine(SIZE)
+    return replace(options, support=rectangle((-0.1, 0.1), edges), most_stable_point=None, half_widths=None)
 
 
 def first() -> Array:
@@ -62,9 +62,9 @@ def bodies(joints: Array) -> tuple[Array, Array, Array]:
     return ends - along / 2, angles, ends[:, -1]
 
 
-def zero_moment_points(found: Plan, times: Array, step: float = 1e-4) -> tuple[Array, Array]:
+def zero_moment_points(result: Plan, times: Array, step: float = 1e-4) -> tuple[Array, Array]:
     """Where the ground's reaction acts, m, and its vertical force, N, by differences of the rods' places."""
-    before, at, after = (bodies(found.at(times + shift)["joints"]) for shift in (-step, 0.0, step))
+    before, at, after = (bodies(result.at(times + shift)["joints"]) for shift in (-step, 0.0, step))
     pull, turning = ((b - 2 * a + c) / step**2 for b, a, c in zip(before[:2], at[:2], after[:2], strict=True))
     weight = MASSES * (pull[:, :, 1] + GRAVITY)
     y, z = at[0][:, :, 0], at[0][:, :, 1]
@@ -73,50 +73,50 @@ def zero_moment_points(found: Plan, times: Array, step: float = 1e-4) -> tuple[A
     return moment / force, force
 
 
-def inside(found: Plan, count: int = 301) -> Array:
+def inside(result: Plan, count: int = 301) -> Array:
     """Times that are no nodes, s."""
-    return np.linspace(0.0, found.horizon, count + 2)[1:-1] + 1.3e-4
+    return np.linspace(0.0, result.horizon, count + 2)[1:-1] + 1.3e-4
 
 
-def effort(found: Plan) -> float:
+def effort(result: Plan) -> float:
     """The integral of the squared accelerations, from what the plan says of them."""
     nodes, weights = np.polynomial.legendre.leggauss(8)
-    kinks = found.solution.state_interpolant.breaks * found.horizon
+    kinks = result.solution.state_interpolant.breaks * result.horizon
     half = np.diff(kinks) / 2
     times = (kinks[:-1] + half)[:, None] + half[:, None] * nodes
-    second = found.sampled(times.ravel()).accelerations.reshape(*times.shape, -1)
+    second = result.sampled(times.ravel()).accelerations.reshape(*times.shape, -1)
     return float(np.einsum("k,g,kgn->", half, weights, second**2))
 
 
 def test_the_machine_stands_by_newtons_law_and_its_tip_is_where_it_should_be() -> None:
-    found = reached()
-    assert found.audit().passed
-    times = inside(found)
-    place, force = zero_moment_points(found, times)
+    result = reached()
+    assert result.audit().passed
+    times = inside(result)
+    place, force = zero_moment_points(result, times)
     assert (force > 0).all()
     assert EDGES[0] - 1e-4 < place.min()
     assert place.max() < EDGES[1] + 1e-4
-    tips = bodies(found.at(times)["joints"])[2]
+    tips = bodies(result.at(times)["joints"])[2]
     share = np.array([float(rest_to_rest(t / SECONDS)) for t in times])
     begin = tip_at(planar_machine(SIZE), first())[1:]
     assert np.abs(tips - begin - share[:, None] * SHIFT).max() < 1e-5
 
 
 def test_it_begins_and_ends_at_rest_and_keeps_its_limits() -> None:
-    found, robot = reached(), machine().robot
-    assert np.abs(found.at([0.0, found.horizon])["rates"]).max() < 1e-6
-    at = found.at(inside(found))
+    result, robot = reached(), machine().robot
+    assert np.abs(result.at([0.0, result.horizon])["rates"]).max() < 1e-6
+    at = result.at(inside(result))
     assert (at["joints"] > robot.lower - 1e-6).all()
     assert (at["joints"] < robot.upper + 1e-6).all()
     assert (np.abs(at["rates"]) < robot.velocity + 1e-6).all()
-    np.testing.assert_allclose(found["joints"][0], first(), atol=1e-9)
+    np.testing.assert_allclose(result["joints"][0], first(), atol=1e-9)
 
 
 def test_the_cost_is_the_integral_of_squared_accelerations() -> None:
     assert reached().cost == pytest.approx(EFFORT.acceleration * effort(reached()), rel=1e-6)
 
 
-def test_a_narrow_foot_is_used_to_its_edge_and_a_wider_one_is_never_dearer() -> None:
+def test_a_narrow_foot_is_used_to_its_edge_and_a_wider_one_never_costs_more() -> None:
     """Where no edge is reached its place does not matter."""
     wide, wider = reached((-3.0, 3.0)), reached((-6.0, 6.0))
     assert wider.cost == pytest.approx(wide.cost, rel=1e-6)
@@ -134,11 +134,11 @@ def test_twice_the_time_costs_an_eighth_where_the_foot_is_wide() -> None:
     wide, slow = reached((-3.0, 3.0)), reached((-3.0, 3.0), 2 * SECONDS)
     assert slow.cost == pytest.approx(wide.cost / 8, rel=1e-6)
     share = np.linspace(0.0, 1.0, 51)
-    ways = [one.at(share * one.horizon)["joints"] for one in (wide, slow)]
-    np.testing.assert_allclose(ways[1], ways[0], atol=1e-5)
+    paths = [one.at(share * one.horizon)["joints"] for one in (wide, slow)]
+    np.testing.assert_allclose(paths[1], paths[0], atol=1e-5)
 
 
-def test_the_way_back_costs_no_more_than_the_way_there() -> None:
+def test_the_reversed_motion_costs_no_more() -> None:
     """A film of it played backwards stands as well: reactions depend on accelerations and squares of rates."""
     there = reached()
     end = there["joints"][-1]
@@ -148,40 +148,40 @@ def test_the_way_back_costs_no_more_than_the_way_there() -> None:
 
 
 def test_a_machine_in_another_plane_and_place_moves_alike() -> None:
-    given, angle = machine(), np.radians(90.0)
+    options, angle = machine(), np.radians(90.0)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
     shift = np.array([0.4, -0.3, 0.0])
-    corners = given.support.vertices @ turn[:2, :2].T + shift[:2]
-    other = replace(given, rotation=turn @ np.asarray(given.rotation), translation=shift, support=Support(corners))
+    corners = options.support.vertices @ turn[:2, :2].T + shift[:2]
+    other = replace(options, rotation=turn @ np.asarray(options.rotation), translation=shift, support=Support(corners))
     begin = ca.DM(tip_at(other, first())[[0, 2]])
     by = ca.DM([-SHIFT[0], SHIFT[1]])
     task = led(lambda t: begin + by * rest_to_rest(t / SECONDS), (3, 5))
-    found = plan(other, task, SECONDS, start=first(), cost=EFFORT)
-    assert found.cost == pytest.approx(reached().cost, rel=1e-5)
+    result = plan(other, task, SECONDS, start=first(), cost=EFFORT)
+    assert result.cost == pytest.approx(reached().cost, rel=1e-5)
     times = np.linspace(0.0, SECONDS, 51)
-    np.testing.assert_allclose(found.at(times)["joints"], reached().at(times)["joints"], atol=1e-4)
+    np.testing.assert_allclose(result.at(times)["joints"], reached().at(times)["joints"], atol=1e-4)
 
 
 def test_a_start_that_is_searched_stands_and_does_the_same() -> None:
-    found = plan(machine(), moved(first(), SHIFT), SECONDS, search="start", cost=EFFORT)
-    assert found.audit().passed
-    place = zero_moment_points(found, inside(found))[0]
+    result = plan(machine(), moved(first(), SHIFT), SECONDS, search="start", cost=EFFORT)
+    assert result.audit().passed
+    place = zero_moment_points(result, inside(result))[0]
     assert EDGES[0] - 1e-4 < place.min()
     assert place.max() < EDGES[1] + 1e-4
-    tips = bodies(found.at([0.0, SECONDS])["joints"])[2]
+    tips = bodies(result.at([0.0, SECONDS])["joints"])[2]
     begin = tip_at(planar_machine(SIZE), first())[1:]
     np.testing.assert_allclose(tips, [begin, begin + SHIFT], atol=1e-5)
-    assert found.candidates[0].reason is None
+    assert result.candidates[0].reason is None
 
 
-def test_what_moves_at_its_ends_does_not_begin_at_rest() -> None:
+def test_tasks_with_speed_at_their_ends_do_not_begin_at_rest() -> None:
     """A tip at constant speed: joints are free to move at both ends."""
     begin = ca.DM(tip_at(planar_machine(SIZE), first())[1:])
     task = led(lambda t: begin + ca.DM(SHIFT) * t / SECONDS, ROWS)
-    found = plan(machine(), task, SECONDS, start=first(), cost=EFFORT)
-    assert found.audit().passed
-    assert np.abs(found.at([0.0, SECONDS])["rates"]).max(axis=1).min() > 0.05
-    tips = bodies(found.at([0.5, 1.5])["joints"])[2]
+    result = plan(machine(), task, SECONDS, start=first(), cost=EFFORT)
+    assert result.audit().passed
+    assert np.abs(result.at([0.0, SECONDS])["rates"]).max(axis=1).min() > 0.05
+    tips = bodies(result.at([0.5, 1.5])["joints"])[2]
     np.testing.assert_allclose(np.diff(tips, axis=0)[0], SHIFT / SECONDS, atol=2e-5)
 
 
@@ -211,8 +211,8 @@ def test_a_foot_beside_the_plane_in_which_all_moves_is_refused() -> None:
         ("velocity", {"limits": Limits(velocity=[1.0, 2.0])}),
     ],
 )
-def test_what_no_standing_plan_takes_is_refused_by_name(name: str, changes: dict[str, Any]) -> None:
-    given: dict[str, Any] = {"tasks": moved(first(), SHIFT), "horizon": SECONDS, "start": first(), "cost": EFFORT}
+def test_options_unsupported_by_standing_plans_are_refused_by_name(name: str, changes: dict[str, Any]) -> None:
+    options: dict[str, Any] = {"tasks": moved(first(), SHIFT), "horizon": SECONDS, "start": first(), "cost": EFFORT}
     with pytest.raises(ProblemError) as caught:
-        plan(machine(), **{**given, **changes})
+        plan(machine(), **{**options, **changes})
     assert caught.value.name == name

@@ -23,102 +23,102 @@ REACH = 0.45
 
 
 @cache
-def made() -> SegmentedPlan:
+def segmented_plan() -> SegmentedPlan:
     """Two segments, and a motion between them."""
     return in_segments(arm(), line(REACH), scene=False)
 
 
 @cache
 def arrays() -> dict[str, Array]:
-    return made().arrays("line.npz")
+    return segmented_plan().arrays("line.npz")
 
 
 def without_motion() -> SegmentedPlan:
-    change = replace(made().reconfigurations[0], motion=None, failure="the way is barred")
-    return replace(made(), reconfigurations=(change,), _audits={})
+    change = replace(segmented_plan().reconfigurations[0], motion=None, failure="the way is barred")
+    return replace(segmented_plan(), reconfigurations=(change,), _audits={})
 
 
 # ---- values ----------------------------------------------------------------------------------------------------------
 
 
-def test_at_any_time_it_is_the_piece_of_that_time() -> None:
-    first, last = made().segments
-    motion = made().reconfigurations[0].motion
+def test_at_any_time_the_plan_is_the_segment_of_that_time() -> None:
+    first, last = segmented_plan().segments
+    motion = segmented_plan().reconfigurations[0].motion
     assert motion is not None
-    times = np.random.default_rng(0).uniform(0.0, made().horizon, 200)
-    at, sample = made().at(times), made().sampled(times)
+    times = np.random.default_rng(0).uniform(0.0, segmented_plan().horizon, 200)
+    at, sample = segmented_plan().at(times), segmented_plan().sampled(times)
     begins = np.cumsum([0.0, first.horizon, motion.horizon])
-    for begin, piece in zip(begins, (first, motion, last), strict=True):
-        own = (times > begin) & (times < begin + piece.horizon)
+    for begin, segment in zip(begins, (first, motion, last), strict=True):
+        own = (times > begin) & (times < begin + segment.horizon)
         assert own.any()
-        expected = piece.sampled(times[own] - begin)
+        expected = segment.sampled(times[own] - begin)
         np.testing.assert_allclose(at["joints"][own], expected.joints, atol=1e-12)
         np.testing.assert_allclose(at["rates"][own], expected.rates, atol=1e-12)
         np.testing.assert_allclose(sample.accelerations[own], expected.accelerations, atol=1e-9)
         np.testing.assert_allclose(sample.tip[own], expected.tip, atol=1e-12)
-    assert made().horizon == first.horizon + motion.horizon + last.horizon
-    assert made().task_horizon == first.horizon + last.horizon == pytest.approx(SECONDS)
-    assert made().cost == first.cost + last.cost
-    np.testing.assert_array_equal(made().at(made().t[0])["joints"], made()["joints"][0])
+    assert segmented_plan().horizon == first.horizon + motion.horizon + last.horizon
+    assert segmented_plan().task_horizon == first.horizon + last.horizon == pytest.approx(SECONDS)
+    assert segmented_plan().cost == first.cost + last.cost
+    np.testing.assert_array_equal(segmented_plan().at(segmented_plan().t[0])["joints"], segmented_plan()["joints"][0])
 
 
 def test_joints_are_continuous_and_the_ends_belong_to_it() -> None:
-    times = np.linspace(0.0, made().horizon, 4001)
-    joints = made().at(times)["joints"]
+    times = np.linspace(0.0, segmented_plan().horizon, 4001)
+    joints = segmented_plan().at(times)["joints"]
     assert np.abs(np.diff(joints, axis=0)).max() <= 3.0 * (times[1] - times[0]) * (1 + 1e-6)
-    np.testing.assert_array_equal(joints[-1], made().segments[-1]["joints"][-1])
-    for wrong in (-1e-3, made().horizon + 1e-3, np.nan):
+    np.testing.assert_array_equal(joints[-1], segmented_plan().segments[-1]["joints"][-1])
+    for wrong in (-1e-3, segmented_plan().horizon + 1e-3, np.nan):
         with pytest.raises(ProblemError):
-            made().at(wrong)
+            segmented_plan().at(wrong)
 
 
 def test_the_tip_is_where_the_share_of_the_task_says_and_the_task_waits_meanwhile() -> None:
-    change = made().reconfigurations[0]
-    times = np.linspace(0.0, made().horizon, 1001)
-    share = made().task_share(times)
+    change = segmented_plan().reconfigurations[0]
+    times = np.linspace(0.0, segmented_plan().horizon, 1001)
+    share = segmented_plan().task_share(times)
     waiting = (times >= change.time) & (times <= change.time + change.duration)
     np.testing.assert_allclose(share[waiting], change.time / SECONDS, atol=1e-9)
     assert (np.diff(share)[~(waiting[1:] & waiting[:-1])] > 0).all()
     assert (share[0], share[-1]) == (0.0, 1.0)
-    tips = made().sampled(times).tip[~waiting]
+    tips = segmented_plan().sampled(times).tip[~waiting]
     np.testing.assert_allclose(tips[:, 0], 0.6, atol=1e-6)
     np.testing.assert_allclose(tips[:, 1], REACH * (2 * share[~waiting] - 1), atol=1e-6)
-    for target in made().targets:
-        at = made().sampled(np.clip(target.t, 0.0, made().horizon - 1e-12))
+    for target in segmented_plan().targets:
+        at = segmented_plan().sampled(np.clip(target.t, 0.0, segmented_plan().horizon - 1e-12))
         np.testing.assert_allclose(target.position[:-1, :2], at.tip[:-1, :2], atol=1e-6)
 
 
-def test_the_solved_parts_are_those_of_the_pieces() -> None:
-    times = np.linspace(0.0, made().horizon, 101)
-    parts = made().solved_parts(times)
+def test_the_solved_parts_are_those_of_the_segments() -> None:
+    times = np.linspace(0.0, segmented_plan().horizon, 101)
+    parts = segmented_plan().solved_parts(times)
     assert sum(len(local) for _, _, local in parts) == len(times)
     joints = np.concatenate([solution.at(local)["joints" + suffix] for solution, suffix, local in parts if len(local)])
-    np.testing.assert_allclose(joints, made().at(times)["joints"], atol=1e-9)
+    np.testing.assert_allclose(joints, segmented_plan().at(times)["joints"], atol=1e-9)
 
 
 def test_the_gap_is_that_of_the_segments() -> None:
-    first, last = made().segments
+    first, last = segmented_plan().segments
     assert first.bound is not None
     assert last.bound is not None
-    assert made().bound == first.bound + last.bound
-    assert made().gap == pytest.approx(1 - (first.bound + last.bound) / made().cost)
-    assert replace(made(), segments=(first, replace(last, bound=None))).gap is None
+    assert segmented_plan().bound == first.bound + last.bound
+    assert segmented_plan().gap == pytest.approx(1 - (first.bound + last.bound) / segmented_plan().cost)
+    assert replace(segmented_plan(), segments=(first, replace(last, bound=None))).gap is None
 
 
 def test_of_several_segments_there_is_no_one_solution() -> None:
     with pytest.raises(ProblemError, match=r"plan\.pieces\[0\]\.plan\.solution"):
-        _ = made().solution
-    assert len(made().candidates) == sum(len(segment.candidates) for segment in made().segments)
+        _ = segmented_plan().solution
+    assert len(segmented_plan().candidates) == sum(len(segment.candidates) for segment in segmented_plan().segments)
 
 
 # ---- audit -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_audit_is_that_of_all_pieces_at_their_times() -> None:
-    audit = made().audit()
+def test_the_audit_is_that_of_all_segments_at_their_times() -> None:
+    audit = segmented_plan().audit()
     assert audit.passed
-    for number, piece in enumerate(made().pieces, 1):
-        for finding in piece.plan.audit().findings:
+    for number, segment in enumerate(segmented_plan().pieces, 1):
+        for finding in segment.plan.audit().findings:
             own = audit[f"motion {number}: {finding.name}"]
             assert (own.value, own.limit, own.unit, own.verdict) == (
                 finding.value,
@@ -128,18 +128,23 @@ def test_the_audit_is_that_of_all_pieces_at_their_times() -> None:
             )
             assert (own.time is None) == (finding.time is None)
             if finding.time is not None and own.time is not None:
-                assert own.time == piece.begin + finding.time
-    lost = [(audit[f"motion {k}: {COST_LOST}"].value, piece.plan.cost) for k, piece in enumerate(made().pieces, 1)]
+                assert own.time == segment.begin + finding.time
+    lost = [
+        (audit[f"motion {k}: {COST_LOST}"].value, segment.plan.cost)
+        for k, segment in enumerate(segmented_plan().pieces, 1)
+    ]
     assert audit[COST_LOST].value == pytest.approx(sum(a * b for a, b in lost) / sum(b for _, b in lost))
     assert f"at most {audit[COST_LOST].value:.2g} of its cost" in audit.sentence
 
 
 @pytest.mark.parametrize(
-    ("piece", "number"), [("segment 0", 1), ("reconfiguration 0", 2), ("segment 1", 3)], ids=["first", "motion", "last"]
+    ("segment", "number"),
+    [("segment 0", 1), ("reconfiguration 0", 2), ("segment 1", 3)],
+    ids=["first", "motion", "last"],
 )
-def test_a_piece_that_was_changed_fails_by_its_number(piece: str, number: int, tmp_path: Path) -> None:
+def test_a_changed_segment_fails_by_its_number(segment: str, number: int, tmp_path: Path) -> None:
     changes: dict[str, Any] = {
-        name: arrays()[name] + 0.01 for name in (f"{piece}/states/joints", f"{piece}/state_interpolant/values")
+        name: arrays()[name] + 0.01 for name in (f"{segment}/states/joints", f"{segment}/state_interpolant/values")
     }
     np.savez(tmp_path / "forged.npz", **{**arrays(), **changes})
     forged = Plan.load(tmp_path / "forged.npz").audit()
@@ -150,14 +155,14 @@ def test_a_piece_that_was_changed_fails_by_its_number(piece: str, number: int, t
     assert any(finding.name.startswith("joints between motions") for finding in forged.failures)
 
 
-def test_pieces_that_do_not_meet_fail_by_the_jump() -> None:
-    change, first = made().reconfigurations[0], made().segments[0]
-    jumping = replace(made(), reconfigurations=(replace(change, motion=first),), _audits={})
+def test_discontinuous_segments_fail_by_the_jump() -> None:
+    change, first = segmented_plan().reconfigurations[0], segmented_plan().segments[0]
+    jumping = replace(segmented_plan(), reconfigurations=(replace(change, motion=first),), _audits={})
     (finding,) = jumping.audit().failures
     jumps = np.abs([first["joints"][0] - change.before, change.after - first["joints"][-1]])
     assert finding.name.startswith("joints between motions")
     assert finding.value == pytest.approx(jumps.max(), abs=1e-6)
-    assert made().audit()[finding.name.replace("joint1", "joint0")].value < 1e-6
+    assert segmented_plan().audit()[finding.name.replace("joint1", "joint0")].value < 1e-6
 
 
 def test_a_reconfiguration_without_a_motion_fails_with_its_reason() -> None:
@@ -165,14 +170,14 @@ def test_a_reconfiguration_without_a_motion_fails_with_its_reason() -> None:
     assert audit.failures[0].name == "reconfigurations without a motion"
     assert audit.failures[0].note == "the way is barred"
     assert audit.sentence.startswith("must not be run: reconfigurations without a motion")
-    assert without_motion().horizon == made().task_horizon
+    assert without_motion().horizon == segmented_plan().task_horizon
     assert "the way is barred" in str(without_motion())
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("plan", [made, without_motion], ids=["whole", "without a motion"])
+@pytest.mark.parametrize("plan", [segmented_plan, without_motion], ids=["whole", "without a motion"])
 def test_it_is_read_as_it_was_written(plan: Callable[[], SegmentedPlan], tmp_path: Path) -> None:
     plan().save(tmp_path / "line.npz")
     again = Plan.load(tmp_path / "line.npz")

@@ -41,12 +41,12 @@ def line(reach: float) -> TipTask:
 
 
 def in_segments(machine: FixedBase, task: TipTask, **options: Any) -> SegmentedPlan:
-    made = plan(machine, task, search="segments", **options)
-    assert isinstance(made, SegmentedPlan)
-    return made
+    result = plan(machine, task, search="segments", **options)
+    assert isinstance(result, SegmentedPlan)
+    return result
 
 
-def posture(time: Array, reach: float, elbow: int) -> Array:
+def configuration(time: Array, reach: float, elbow: int) -> Array:
     """By the law of cosines. Shape (M, 2)."""
     x, y = 0.6, reach * (2 * time / SECONDS - 1)
     far = np.hypot(x, y)
@@ -59,12 +59,10 @@ def posture(time: Array, reach: float, elbow: int) -> Array:
 def cost(first: float, last: float, reach: float, elbow: int) -> float:
     """Of the one motion that there is on a branch."""
     times = np.linspace(first, last, 4001)
-    return float((np.diff(posture(times, reach, elbow), axis=0) ** 2).sum() / 2 / (times[1] - times[0]))
+    return float((np.diff(configuration(times, reach, elbow), axis=0) ** 2).sum() / 2 / (times[1] - times[0]))
 
 
-def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_least(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_two_links_have_the_branches_as_segments_that_meet_at_least_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     searches, reach, machine = list[TaskSearch](), 0.45, arm()
 
     class Recorded(TaskSearch):
@@ -73,47 +71,49 @@ def test_of_two_links_the_pieces_are_the_branches_and_meet_where_that_costs_leas
             searches.append(self)
 
     monkeypatch.setattr(sequence, "TaskSearch", Recorded)
-    made = in_segments(machine, line(reach), scene=False)
-    assert made.fewest == len(made.reconfigurations) == 1
-    (where,) = made.reconfigurations
-    assert made.start_times == (0.0, where.time)
-    assert made.segments[0].horizon == where.time
-    assert made.task_horizon == pytest.approx(SECONDS)
+    result = in_segments(machine, line(reach), scene=False)
+    assert result.fewest == len(result.reconfigurations) == 1
+    (where,) = result.reconfigurations
+    assert result.start_times == (0.0, where.time)
+    assert result.segments[0].horizon == where.time
+    assert result.task_horizon == pytest.approx(SECONDS)
     spans = [(0.0, where.time, -1), (where.time, SECONDS, 1)]
-    for piece, (begin, end, elbow) in zip(made.segments, spans, strict=True):
-        assert piece.audit().passed
-        expected = posture(begin + piece.t, reach, elbow)
+    for segment, (begin, end, elbow) in zip(result.segments, spans, strict=True):
+        assert segment.audit().passed
+        expected = configuration(begin + segment.t, reach, elbow)
         assert (np.abs(expected) <= HIGH + 1e-6).all()
-        np.testing.assert_allclose(piece["joints"], expected, atol=1e-6)
-        assert piece.cost == pytest.approx(cost(begin, end, reach, elbow), rel=1e-5)
-        assert piece.bound is not None
-        assert piece.bound <= piece.cost
+        np.testing.assert_allclose(segment["joints"], expected, atol=1e-6)
+        assert segment.cost == pytest.approx(cost(begin, end, reach, elbow), rel=1e-5)
+        assert segment.bound is not None
+        assert segment.bound <= segment.cost
     # the elbow may change side at the samples of the search; at none of them that costs less
     inside = [t for t in searches[0].times if all(
-        (np.abs(posture(np.array([t]), reach, elbow)) <= HIGH).all() for elbow in (-1, 1)
+        (np.abs(configuration(np.array([t]), reach, elbow)) <= HIGH).all() for elbow in (-1, 1)
     )]  # fmt: skip
-    assert made.cost == pytest.approx(min(cost(0, t, reach, -1) + cost(t, SECONDS, reach, 1) for t in inside), rel=1e-4)
-    np.testing.assert_allclose(where.before, posture(np.array([where.time]), reach, -1)[0], atol=1e-6)
-    np.testing.assert_allclose(where.after, posture(np.array([where.time]), reach, 1)[0], atol=1e-6)
+    assert result.cost == pytest.approx(
+        min(cost(0, t, reach, -1) + cost(t, SECONDS, reach, 1) for t in inside), rel=1e-4
+    )
+    np.testing.assert_allclose(where.before, configuration(np.array([where.time]), reach, -1)[0], atol=1e-6)
+    np.testing.assert_allclose(where.after, configuration(np.array([where.time]), reach, 1)[0], atol=1e-6)
     assert where.motion is not None
     assert where.duration == pytest.approx(np.abs(where.after - where.before).max() / 3.0)
-    assert made.horizon == pytest.approx(SECONDS + where.duration)
+    assert result.horizon == pytest.approx(SECONDS + where.duration)
     np.testing.assert_allclose(where.motion.at([0.0, where.duration])["joints"], [where.before, where.after], atol=1e-9)
-    assert "1 reconfiguration, the fewest possible" in str(made)
-    assert f"at {where.time:.4g} s the arm reconfigures" in str(made)
+    assert "1 reconfiguration, the fewest possible" in str(result)
+    assert f"at {where.time:.4g} s the arm reconfigures" in str(result)
     with pytest.raises(DeadEnd, match="search='segments'") as refused:
         plan(machine, line(reach), search="global", scene=False)
     assert refused.value.segments == pickle.loads(pickle.dumps(refused.value)).segments == 2
 
 
 @pytest.mark.long
-def test_what_one_motion_does_is_one_piece_and_the_plan() -> None:
-    made = in_segments(arm(), line(0.1), scene=False)
-    assert (len(made.segments), made.reconfigurations, made.fewest) == (1, (), 0)
+def test_a_feasible_task_has_one_segment_equal_to_the_plan() -> None:
+    result = in_segments(arm(), line(0.1), scene=False)
+    assert (len(result.segments), result.reconfigurations, result.fewest) == (1, (), 0)
     alone = plan(arm(), line(0.1), search="global", scene=False)
-    assert made.cost == pytest.approx(alone.cost, rel=1e-9)
-    assert made.horizon == made.task_horizon == SECONDS
-    assert made.solution is made.segments[0].solution
+    assert result.cost == pytest.approx(alone.cost, rel=1e-9)
+    assert result.horizon == result.task_horizon == SECONDS
+    assert result.solution is result.segments[0].solution
 
 
 def with_bodies() -> FixedBase:
@@ -132,12 +132,12 @@ def with_bodies() -> FixedBase:
 
 @pytest.mark.long
 @pytest.mark.parametrize("angle", [0.15, 0.2])
-def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
+def test_a_reconfiguration_avoids_obstacles(angle: float) -> None:
     place = 0.85 * np.array([np.cos(angle), np.sin(angle)])
     machine, ball = with_bodies(), Sphere(0.03, (*place, 0.0))
-    made = in_segments(machine, line(0.45), scene=Scene(obstacles=[ball], clearance=0.01))
-    (where,) = made.reconfigurations
-    assert all(piece.audit().passed for piece in made.segments)
+    result = in_segments(machine, line(0.45), scene=Scene(obstacles=[ball], clearance=0.01))
+    (where,) = result.reconfigurations
+    assert all(segment.audit().passed for segment in result.segments)
     assert where.motion is not None, where.failure
     straight = np.abs(where.after - where.before).max() / 3.0
     assert where.duration > straight
@@ -149,10 +149,10 @@ def test_a_reconfiguration_goes_round_what_is_in_the_way(angle: float) -> None:
     turn = joints.sum(axis=1)
     last = first + LOWER * np.column_stack([np.cos(turn), np.sin(turn)])
     for begin, end in ((0 * first, first), (first, last)):
-        far, way = place - begin, end - begin
-        short = 0.05 / np.linalg.norm(way[0])
-        share = np.clip((far * way).sum(axis=1) / (way**2).sum(axis=1), short, 1 - short)
-        assert np.linalg.norm(far - share[:, None] * way, axis=1).min() >= 0.03 + 0.02 + 0.01 - 1e-6
+        far, path = place - begin, end - begin
+        short = 0.05 / np.linalg.norm(path[0])
+        share = np.clip((far * path).sum(axis=1) / (path**2).sum(axis=1), short, 1 - short)
+        assert np.linalg.norm(far - share[:, None] * path, axis=1).min() >= 0.03 + 0.02 + 0.01 - 1e-6
 
 
 def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
@@ -167,8 +167,8 @@ def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
         assert part.position is not None
         assert task.position is not None
         t = ca.MX.sym("t")
-        for asked, told in ((task.position, part.position), (task.position.rate, part.position.rate)):
-            one, other = (ca.Function("at", [t], [track(t)]).map(7) for track in (asked, told))
+        for request, report in ((task.position, part.position), (task.position.rate, part.position.rate)):
+            one, other = (ca.Function("at", [t], [track(t)]).map(7) for track in (request, report))
             times = np.linspace(begin, last, 7)[None]
             np.testing.assert_allclose(one(times - 0.5), other(times - begin), atol=1e-12)
         inside = [t for t in task.begin + np.asarray(task.breaks) if begin < t < last]
@@ -180,7 +180,7 @@ def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
 def test_a_horizon_of_which_the_task_is_no_part_is_refused() -> None:
     for search in ("segments", "global"):
         with pytest.raises(ProblemError, match="no task is active") as refused:
-            plan(arm(), line(0.1), 1e12, start=posture(np.zeros(1), 0.1, 1)[0], scene=False, search=search)
+            plan(arm(), line(0.1), 1e12, start=configuration(np.zeros(1), 0.1, 1)[0], scene=False, search=search)
         assert refused.value.name == "horizon"
 
 

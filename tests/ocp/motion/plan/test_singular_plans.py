@@ -44,11 +44,11 @@ def test_a_relaxed_motion_does_its_task_within_the_bound() -> None:
     """|S|^2 / 2 integrates to no more than the cost of a motion that does the task, here that of the plan itself."""
     motion = Motion("ur5", "straight", "in", False, 3.0)
     task = motion.task(motion.joints, motion.displacement)
-    made = plan_bare(machine("ur5"), task, start=motion.joints)
-    assert ERRORS in made.solution.controls
+    instance = plan_bare(machine("ur5"), task, start=motion.joints)
+    assert ERRORS in instance.solution.controls
     t = np.linspace(0.0, 3.0, 101)
-    errors = bind(machine("ur5"), task).errors(t, None, made.at(t)["joints"])
-    assert np.abs(errors).max() <= 1e-5 * np.sqrt(2 * made.cost * 3.0)
+    errors = bind(machine("ur5"), task).errors(t, None, instance.at(t)["joints"])
+    assert np.abs(errors).max() <= 1e-5 * np.sqrt(2 * instance.cost * 3.0)
     assert np.abs(errors).max() < 1e-7
 
 
@@ -87,19 +87,19 @@ def test_the_end_of_the_reach_is_the_one_of_a_dense_sweep_for_every_search(
         {"start": np.array(start), "search": "global"},
         {},
     )
-    for asked in searches:
+    for searche in searches:
         with pytest.raises(Unreachable, match="the reach ends") as caught:
-            plan_bare(machine(arm), task, **asked)
-        found = caught.value
-        assert found.time is not None
-        assert found.distance > 0
-        assert np.isfinite(found.angle)
-        ends.append(found.time)
+            plan_bare(machine(arm), task, **searche)
+        outcome = caught.value
+        assert outcome.time is not None
+        assert outcome.distance > 0
+        assert np.isfinite(outcome.angle)
+        ends.append(outcome.time)
     assert np.ptp(ends) < 1e-4
-    options: dict[str, Any] = {"near": found.joints, "starts": 256, "tolerance": 1e-6}
-    for time in found.time - np.geomspace(1e-3, 0.3, 5):
+    options: dict[str, Any] = {"near": outcome.joints, "starts": 256, "tolerance": 1e-6}
+    for time in outcome.time - np.geomspace(1e-3, 0.3, 5):
         assert inverse_kinematics(machine(arm), task, time=float(time), **options)
-    for time in found.time + np.geomspace(1e-3, 0.1, 5):
+    for time in outcome.time + np.geomspace(1e-3, 0.1, 5):
         with pytest.raises(Unreachable):
             inverse_kinematics(machine(arm), task, time=float(time), **options)
 
@@ -108,13 +108,13 @@ def test_a_joint_at_its_limit_ends_the_reach_where_it_says() -> None:
     """Two links whose elbow bends by half a radian at least reach |l1 + l2 exp(i/2)|, a closed form."""
     robot = planar_chain([1.0, 0.8], [1.0, 1.0])
     shoulder, elbow = robot.joints
-    bent = FixedBase(replace(robot, joints=(shoulder, replace(elbow, lower=0.5, upper=2.5))))
+    perturbed = FixedBase(replace(robot, joints=(shoulder, replace(elbow, lower=0.5, upper=2.5))))
     task = TipTask(
         position=lambda t: np.array([1.0, 0.2, 0.0]) + t * np.array([1.0, 0.0, 0.0]), rows=(3, 4), duration=1.0
     )
     farthest = np.sqrt(1.0 + 0.64 + 1.6 * np.cos(0.5))
     with pytest.raises(Unreachable, match=f"'{elbow.name}' is at its limit 0.5 rad") as caught:
-        plan_bare(bent, task)
+        plan_bare(perturbed, task)
     assert caught.value.time == pytest.approx(np.sqrt(farthest**2 - 0.04) - 1.0, abs=1e-5)
     assert (caught.value.name, caught.value.limit) == (elbow.name, 0.5)
     assert caught.value.angle == 0.0
@@ -141,13 +141,13 @@ def turning(angle: float, duration: float) -> TipTask:
 def test_a_tool_that_turns_too_fast_names_joint_time_and_limit(angle: float, duration: float) -> None:
     with pytest.raises(SolveError) as caught:
         plan_bare(machine("panda"), turning(angle, duration), search="start")
-    found, robot = caught.value, machine("panda").robot
-    assert found.name in robot.joint_names
-    assert found.limit is not None
-    assert found.time is not None
-    assert 0 <= found.time <= duration
-    assert "Exceeded" not in str(found)
-    assert "max_iter" not in str(found)
+    outcome, robot = caught.value, machine("panda").robot
+    assert outcome.name in robot.joint_names
+    assert outcome.limit is not None
+    assert outcome.time is not None
+    assert 0 <= outcome.time <= duration
+    assert "Exceeded" not in str(outcome)
+    assert "max_iter" not in str(outcome)
 
 
 @pytest.mark.parametrize("bound", [(-2.0, 2.0), (-0.0175, 3.7525), (-np.inf, 0.5), (0.0, 0.04)])

@@ -33,22 +33,22 @@ from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
 
 START = np.array([0.4, 0.9, -0.6])
 END = np.array([0.2, 1.1, -0.5])
-Said = Literal["zero", "nothing"]
+UnknownLimit = Literal["zero", "nothing"]
 
 
-def urdf(said: Said) -> str:
+def urdf(message: UnknownLimit) -> str:
     """An arm of three links whose file gives positions alone, or 0 of velocity and effort besides."""
     robot = planar_chain([0.5, 0.4, 0.3], [2.0, 1.5, 1.0])
     joints = tuple(replace(joint, lower=-2.5, upper=2.5, velocity=7.0, effort=7.0) for joint in robot.joints)
     text = replace(robot, joints=joints).to_urdf()
-    given = ' effort="0" velocity="0.0"' if said == "zero" else ""
-    changed, count = re.subn(r' effort="7.0" velocity="7.0"', given, text)
+    options = ' effort="0" velocity="0.0"' if message == "zero" else ""
+    changed, count = re.subn(r' effort="7.0" velocity="7.0"', options, text)
     assert count == 3
     return changed
 
 
-def arm(said: Said) -> FixedBase:
-    return FixedBase(Robot.from_urdf(urdf(said)))
+def arm(message: UnknownLimit) -> FixedBase:
+    return FixedBase(Robot.from_urdf(urdf(message)))
 
 
 def task(machine: Machine, duration: float = 1.0) -> TipTask:
@@ -60,10 +60,10 @@ def planned(machine: FixedBase, **options: Any) -> Any:
     return plan(machine, task(machine), **options).cost
 
 
-def in_pieces(machine: FixedBase) -> Any:
-    made = plan(machine, task(machine), search="segments")
-    assert isinstance(made, SegmentedPlan)
-    return [piece.cost for piece in made.segments]
+def plan_segments(machine: FixedBase) -> Any:
+    result = plan(machine, task(machine), search="segments")
+    assert isinstance(result, SegmentedPlan)
+    return [segment.cost for segment in result.segments]
 
 
 def least_velocities(machine: FixedBase) -> Any:
@@ -88,7 +88,7 @@ REQUESTS: dict[str, tuple[Callable[[FixedBase], Any], set[str]]] = {
     "no torques": (partial(planned, start=START, limits=Limits(torque=np.inf)), {"velocity"}),
     "dynamics": (moved, {"velocity", "torque"}),
     "dynamics, own": (partial(moved, limits=Limits(velocity=5.0, torque=200.0)), set()),
-    "pieces": (in_pieces, {"velocity"}),
+    "pieces": (plan_segments, {"velocity"}),
     "inverse kinematics": (lambda machine: str(inverse_kinematics(machine, task(machine))), set()),
     "least velocities": (least_velocities, {"velocity"}),
 }
@@ -96,19 +96,17 @@ REQUESTS: dict[str, tuple[Callable[[FixedBase], Any], set[str]]] = {
 
 
 @pytest.mark.parametrize("request_", REQUESTS.values(), ids=REQUESTS)
-def test_zero_plans_as_no_limit_does_and_is_said_where_it_is_used(
-    request_: tuple[Callable[[FixedBase], Any], set[str]],
-) -> None:
+def test_zero_limits_plan_as_unlimited_and_are_reported(request_: tuple[Callable[[FixedBase], Any], set[str]]) -> None:
     ask, warned = request_
     expected = ask(arm("nothing"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
-        found = ask(arm("zero"))
-    assert found == expected
-    told = [str(warning.message) for warning in caught if issubclass(warning.category, ModelWarning)]
-    assert {re.findall(r"a (\w+) limit of 0", words)[0] for words in told} == warned
-    assert len(told) == len(warned)
-    assert all("joint1, joint2, joint3" in words for words in told)
+        result = ask(arm("zero"))
+    assert result == expected
+    matches = [str(warning.message) for warning in caught if issubclass(warning.category, ModelWarning)]
+    assert {re.findall(r"a (\w+) limit of 0", words)[0] for words in matches} == warned
+    assert len(matches) == len(warned)
+    assert all("joint1, joint2, joint3" in words for words in matches)
 
 
 def test_waypoints_are_passed_whatever_is_unknown() -> None:
@@ -120,8 +118,8 @@ def test_waypoints_are_passed_whatever_is_unknown() -> None:
     poses = [machine.tip_pose((), UR5_START + k * step) for k in range(3)]
     places = np.array([ca.DM(pose.position).full().ravel() for pose in poses])
     turns = quaternion_from_rotation(np.array([ca.DM(pose.rotation).full() for pose in poses]))
-    way = plan(unknown, Waypoints(places, turns), scene=False)
-    assert way.cost == plan(machine, Waypoints(places, turns), scene=False).cost
+    path = plan(unknown, Waypoints(places, turns), scene=False)
+    assert path.cost == plan(machine, Waypoints(places, turns), scene=False).cost
     untimed = pytest.raises(ProblemError, match="a joint with a velocity limit")
     with untimed, pytest.warns(ModelWarning, match="velocity"):
         plan(unknown, Waypoints(places, turns), scene=False, cost=Cost(velocity=0.0, time=1.0))
@@ -140,7 +138,7 @@ def test_a_follower_of_unknown_speed_does_not_slow_its_leader() -> None:
         assert tied.effort.tolist() == [np.inf]
 
 
-def test_what_a_file_says_is_kept_in_the_robot_and_shown_as_no_limit() -> None:
+def test_zero_limits_of_a_file_are_kept_and_shown_as_unlimited() -> None:
     robot = Robot.from_urdf(urdf("zero"))
     assert [(joint.velocity, joint.effort) for joint in robot.moving_joints] == [(0.0, 0.0)] * 3
     assert Robot.from_urdf(robot.to_urdf()).joints[0].velocity == 0.0
@@ -154,5 +152,5 @@ def test_a_joint_with_one_position_keeps_it() -> None:
     machine = arm("zero")
     first, *others = machine.robot.joints
     held = replace(machine, robot=replace(machine.robot, joints=(replace(first, lower=0.4, upper=0.4), *others)))
-    found = plan(held, task(machine, 0.2), start=START, limits=Limits(velocity=np.inf))
-    assert np.abs(found["joints"][:, 0] - 0.4).max() < 1e-8
+    result = plan(held, task(machine, 0.2), start=START, limits=Limits(velocity=np.inf))
+    assert np.abs(result["joints"][:, 0] - 0.4).max() < 1e-8

@@ -30,8 +30,8 @@ def chain(links: int, length: float = 0.5) -> FixedBase:
     return FixedBase(planar_chain([length] * links, [1.0] * links))
 
 
-def in_the_plane(*points: Any, speed: float = 0.1, **given: Any) -> TipTask:
-    return TipTask.along(line(*points, **given), speed, rows=(3, 4))
+def in_the_plane(*points: Any, speed: float = 0.1, **options: Any) -> TipTask:
+    return TipTask.along(line(*points, **options), speed, rows=(3, 4))
 
 
 def no_freedom_left() -> PlanCase:
@@ -56,8 +56,8 @@ def slide() -> PlanCase:
 
 
 def kinova() -> PlanCase:
-    package, ending, told = ROBOTS["anymal-kinova"]
-    whole = Robot.from_urdf(urdf_file(package, ending), **told)
+    package, ending, report = ROBOTS["anymal-kinova"]
+    whole = Robot.from_urdf(urdf_file(package, ending), **report)
     machine = FixedBase(lock_joints(whole, {n: 0.0 for n in whole.joint_names if not n.startswith("j2s6")}))
     turn, at = pose(machine, (), [0.3, 2.5, 1.5, 0.4, 1.0, 0.2])
     corners = at, at + np.array([0.0, 0.1, 0.05]), at + np.array([0.05, 0.15, 0.0])
@@ -112,11 +112,11 @@ MOTIONS: list[Callable[[], PlanCase]] = [
 @pytest.mark.parametrize("make", MOTIONS)
 def test_the_motion_passes_and_does_its_tasks(make: Callable[[], PlanCase]) -> None:
     machine, tasks, options = make()
-    found = plan_bare(machine, tasks, search="start", **options)
-    assert found.audit().passed
+    result = plan_bare(machine, tasks, search="start", **options)
+    assert result.audit().passed
     for task in [tasks] if isinstance(tasks, TipTask) else tasks:
         times = np.linspace(task.begin, task.end, 401)[1:-1]
-        at = found.at(times)
+        at = result.at(times)
         errors = task_errors(machine, task, times, at.get("base"), at["joints"])
         assert np.linalg.norm(errors, axis=1).max() < 1e-6
 
@@ -145,23 +145,23 @@ def test_a_plan_does_not_know_how_large_its_machine_is(scale: float) -> None:
     ],
     ids=["a place", "an axis", "a lean"],
 )
-def test_what_stands_still_costs_nothing(task: TipTask) -> None:
-    found = plan_bare(panda(), task, search="start")
-    assert found.audit().passed
-    assert found.cost < 1e-12
-    np.testing.assert_allclose(found["joints"], found["joints"][:1].repeat(len(found.t), axis=0), atol=1e-6)
+def test_rest_costs_zero(task: TipTask) -> None:
+    result = plan_bare(panda(), task, search="start")
+    assert result.audit().passed
+    assert result.cost < 1e-12
+    np.testing.assert_allclose(result["joints"], result["joints"][:1].repeat(len(result.t), axis=0), atol=1e-6)
     if task.within is not None:
-        assert bind(panda(), task).cone_violations(found.t, None, found["joints"]).max() < 1e-6
+        assert bind(panda(), task).cone_violations(result.t, None, result["joints"]).max() < 1e-6
 
 
-def test_a_velocity_is_done_and_what_it_does_not_need_rests() -> None:
+def test_a_velocity_task_is_met_and_unneeded_joints_rest() -> None:
     """The last joint turns about the axis that the tip lies on: no velocity of the tip needs it."""
-    asked = TipTask(velocity=[0.05, 0.05, 0.0], rows=(3, 4, 5), duration=2.0)
-    found = plan_bare(panda(), asked, start=PANDA_START, search="start")
-    assert found.audit().passed
-    places = [numeric(panda().tip_pose((), q).position).ravel() for q in found.at([0.0, 1.0, 2.0])["joints"]]
+    request = TipTask(velocity=[0.05, 0.05, 0.0], rows=(3, 4, 5), duration=2.0)
+    result = plan_bare(panda(), request, start=PANDA_START, search="start")
+    assert result.audit().passed
+    places = [numeric(panda().tip_pose((), q).position).ravel() for q in result.at([0.0, 1.0, 2.0])["joints"]]
     np.testing.assert_allclose(np.diff(places, axis=0), [[0.05, 0.05, 0.0]] * 2, atol=1e-6)
-    np.testing.assert_allclose(found["joints"][:, 6], PANDA_START[6], atol=1e-9)
+    np.testing.assert_allclose(result["joints"][:, 6], PANDA_START[6], atol=1e-9)
 
 
 def moved_by_a_velocity() -> TipTask:
@@ -175,15 +175,15 @@ def moved_by_a_pose() -> TipTask:
 
 @pytest.mark.parametrize("first", [moved_by_a_velocity, pytest.param(moved_by_a_pose, marks=pytest.mark.long)])
 @pytest.mark.parametrize("rows", [(3, 4, 5), (3,), ()], ids=["the place", "one coordinate", "nothing"])
-def test_to_hold_what_was_reached_costs_nothing_more(first: Callable[[], TipTask], rows: tuple[int, ...]) -> None:
+def test_holding_the_goal_costs_zero(first: Callable[[], TipTask], rows: tuple[int, ...]) -> None:
     """That the tip begins where it is held follows from what it did before: it is not asked twice."""
     _, at = pose(panda(), (), PANDA_START)
     still = [TipTask(position=at + np.array([0.1, 0.1, 0.0]), rows=rows, begin=2.0, duration=2.0)] if rows else []
-    found = plan_bare(panda(), [first(), *still], 4.0, start=PANDA_START, search="start")
-    assert found.audit().passed
+    result = plan_bare(panda(), [first(), *still], 4.0, start=PANDA_START, search="start")
+    assert result.audit().passed
     alone = plan_bare(panda(), first(), start=PANDA_START, search="start")
-    assert found.cost == pytest.approx(alone.cost, rel=1e-6)
-    np.testing.assert_allclose(found.at(4.0)["joints"], alone["joints"][-1], atol=1e-5)
+    assert result.cost == pytest.approx(alone.cost, rel=1e-6)
+    np.testing.assert_allclose(result.at(4.0)["joints"], alone["joints"][-1], atol=1e-5)
 
 
 def test_two_that_follow_each_other_with_a_rest_between_them_are_one_after_the_other() -> None:
@@ -192,15 +192,15 @@ def test_two_that_follow_each_other_with_a_rest_between_them_are_one_after_the_o
     shift = np.array([0.1, 0.1, 0.0])
     before, after = (TipTask(position=p, duration=1.0) for p in (at, at + shift))
     tasks = [before, replace(moved_by_a_velocity(), begin=1.0), replace(after, begin=3.0)]
-    found = plan_bare(panda(), tasks, start=PANDA_START, search="start")
-    assert found.audit().passed
-    tips = [numeric(panda().tip_pose((), q).position).ravel() for q in found.at([1.0, 3.0, 4.0])["joints"]]
+    result = plan_bare(panda(), tasks, start=PANDA_START, search="start")
+    assert result.audit().passed
+    tips = [numeric(panda().tip_pose((), q).position).ravel() for q in result.at([1.0, 3.0, 4.0])["joints"]]
     np.testing.assert_allclose(tips, [at, at + shift, at + shift], atol=1e-6)
-    assert found.cost < plan_bare(panda(), moved_by_a_velocity(), start=PANDA_START, search="start").cost
+    assert result.cost < plan_bare(panda(), moved_by_a_velocity(), start=PANDA_START, search="start").cost
 
 
 @pytest.mark.long
-def test_a_place_that_what_came_before_does_not_lead_to_is_refused_by_name() -> None:
+def test_a_pose_unreachable_from_its_predecessor_is_refused_by_name() -> None:
     _, at = pose(panda(), (), PANDA_START)
     off = TipTask(position=at + np.array([0.1, 0.12, 0.0]), begin=2.0, duration=2.0)
     with pytest.raises(SolveError, match="task position 2") as caught:

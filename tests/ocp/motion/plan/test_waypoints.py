@@ -26,34 +26,34 @@ def poses(machine: FixedBase, joints: Array, count: int) -> tuple[Array, Array]:
     """A bent way from a posture, the hand as it is there."""
     pose = machine.tip_pose((), joints)
     s = np.linspace(0, 1, count)[:, None]
-    way = s * (0.05, 0.1, -0.1) + 0.05 * np.sin(3 * s) * (0.0, 0.0, 1.0)
+    motion = s * (0.05, 0.1, -0.1) + 0.05 * np.sin(3 * s) * (0.0, 0.0, 1.0)
     turn = quaternion_from_rotation(np.array(ca.DM(pose.rotation))[None])[0]
-    return np.array(ca.DM(pose.position)).ravel() + way, np.tile(turn, (count, 1))
+    return np.array(ca.DM(pose.position)).ravel() + motion, np.tile(turn, (count, 1))
 
 
 def path(machine: FixedBase, waypoints: Waypoints, **options: Any) -> PathPlan:
     """As `plan`, for paths of whatever the links may touch."""
-    found = plan(machine, waypoints, **{"scene": False, **options})
-    assert isinstance(found, PathPlan)
-    return found
+    result = plan(machine, waypoints, **{"scene": False, **options})
+    assert isinstance(result, PathPlan)
+    return result
 
 
-def gap(found: PathPlan) -> float:
+def gap(result: PathPlan) -> float:
     """The gap to the bound, which there is."""
-    assert found.gap is not None
-    return found.gap
+    assert result.gap is not None
+    return result.gap
 
 
 @pytest.mark.long
 def test_a_problem_of_the_benchmark_is_solved_by_its_rules_and_shorter_than_published() -> None:
     problem = problem_of("panda__1cube")
-    found = planned(problem)
+    result = planned(problem)
     assert problem.torm_length_rad is not None
-    assert found.cost < problem.torm_length_rad
-    assert 0.0 <= gap(found) <= 0.03
-    assert found.cost == pytest.approx(np.abs(np.diff(found.joints, axis=0)).sum(), rel=1e-12)
-    assert faults("panda__1cube", found.joints) == []
-    assert faults("panda__1cube", found.joints + 1e-3)  # it finds some
+    assert result.cost < problem.torm_length_rad
+    assert 0.0 <= gap(result) <= 0.03
+    assert result.cost == pytest.approx(np.abs(np.diff(result.joints, axis=0)).sum(), rel=1e-12)
+    assert faults("panda__1cube", result.joints) == []
+    assert faults("panda__1cube", result.joints + 1e-3)  # it finds some
 
 
 @pytest.mark.parametrize(
@@ -61,37 +61,37 @@ def test_a_problem_of_the_benchmark_is_solved_by_its_rules_and_shorter_than_publ
     [pytest.param(panda(), PANDA_START, marks=pytest.mark.long), (ur5(), UR5_START)],
     ids=["panda", "ur5"],
 )
-def test_the_way_back_is_as_long_and_weights_count(machine: FixedBase, start: Array) -> None:
+def test_the_reversed_path_is_as_long_and_weights_count(machine: FixedBase, start: Array) -> None:
     places, turns = poses(machine, start, 21)
-    found = path(machine, Waypoints(places, turns))
+    result = path(machine, Waypoints(places, turns))
     back = path(machine, Waypoints(places[::-1], -2.0 * turns[::-1]))
     weighted = Cost(velocity=0.0, length=1.0, weights=np.full(machine.joint_size, 3.0))
     heavy = path(machine, Waypoints(places, turns), cost=weighted)
-    assert back.cost == pytest.approx(found.cost, rel=1e-3)
-    assert heavy.cost == pytest.approx(3 * found.cost, rel=1e-3)
-    for one in (found, back, heavy):
+    assert back.cost == pytest.approx(result.cost, rel=1e-3)
+    assert heavy.cost == pytest.approx(3 * result.cost, rel=1e-3)
+    for one in (result, back, heavy):
         assert 0.0 <= gap(one) <= 0.05
-    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
+    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in result.joints]
     assert np.array(tips) == pytest.approx(places, abs=1e-8)
-    assert (found.steps == np.abs(np.diff(found.joints, axis=0)).max(axis=0)).all()
-    assert "lower bound" in str(found)
+    assert (result.steps == np.abs(np.diff(result.joints, axis=0)).max(axis=0)).all()
+    assert "lower bound" in str(result)
 
 
 @pytest.mark.long
-def test_with_a_joint_more_the_way_is_no_longer_than_with_that_joint_held() -> None:
+def test_an_additional_joint_never_lengthens_the_path() -> None:
     problem, some = problem_of("fetch__square"), slice(0, 60, 2)
-    machine, told = problem.machine, (problem.positions[some], problem.quaternions[some])
+    machine, report = problem.machine, (problem.positions[some], problem.quaternions[some])
     name = machine.robot.joint_names[0]
     middle = (machine.robot.lower[0] + machine.robot.upper[0]) / 2
-    found = path(machine, Waypoints(*told))
-    held = path(FixedBase(lock_joints(machine.robot, {name: middle})), Waypoints(*told))
-    assert found.cost < held.cost
-    assert found.steps[0] > 0
-    tips = np.array([np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints])
-    assert tips == pytest.approx(told[0], abs=1e-8)
+    result = path(machine, Waypoints(*report))
+    held = path(FixedBase(lock_joints(machine.robot, {name: middle})), Waypoints(*report))
+    assert result.cost < held.cost
+    assert result.steps[0] > 0
+    tips = np.array([np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in result.joints])
+    assert tips == pytest.approx(report[0], abs=1e-8)
 
 
-def test_the_length_the_time_and_the_largest_way_are_least_where_they_are_the_cost() -> None:
+def test_length_time_and_largest_displacement_are_least_where_they_are_the_cost() -> None:
     """The sum of the largest displacements is the time at velocity limits of 1."""
     places, turns = poses(panda(), PANDA_START, 21)
     velocity = panda().robot.velocity
@@ -101,25 +101,25 @@ def test_the_length_the_time_and_the_largest_way_are_least_where_they_are_the_co
         "largest": {"cost": timed, "limits": Limits(velocity=1.0)},
         "time": {"cost": timed},
     }
-    found = {cost: path(panda(), Waypoints(places, turns), **options) for cost, options in requests.items()}
+    by_name = {cost: path(panda(), Waypoints(places, turns), **options) for cost, options in requests.items()}
     measures: dict[str, Callable[[Array], float]] = {
-        "length": lambda ways: ways.sum(),
-        "largest": lambda ways: (ways / np.minimum(velocity, 1.0)).max(axis=1).sum(),
-        "time": lambda ways: (ways / velocity).max(axis=1).sum(),
+        "length": lambda paths: paths.sum(),
+        "largest": lambda paths: (paths / np.minimum(velocity, 1.0)).max(axis=1).sum(),
+        "time": lambda paths: (paths / velocity).max(axis=1).sum(),
     }
     for cost, measured in measures.items():
-        by_plan = {name: measured(np.abs(np.diff(one.joints, axis=0))) for name, one in found.items()}
-        assert found[cost].cost == pytest.approx(by_plan[cost], rel=1e-12)
+        by_plan = {name: measured(np.abs(np.diff(one.joints, axis=0))) for name, one in by_name.items()}
+        assert by_name[cost].cost == pytest.approx(by_plan[cost], rel=1e-12)
         assert by_plan[cost] == min(by_plan.values())
-        assert found[cost].bound is not None
-        assert 0.0 <= gap(found[cost]) <= 0.1
-    assert found["time"].horizon == pytest.approx(found["time"].cost, rel=1e-6)
+        assert by_name[cost].bound is not None
+        assert 0.0 <= gap(by_name[cost]) <= 0.1
+    assert by_name["time"].horizon == pytest.approx(by_name["time"].cost, rel=1e-6)
     slow = path(panda(), Waypoints(places, turns), limits=Limits(velocity=velocity / 4), cost=timed)
-    assert slow.cost == pytest.approx(4 * found["time"].cost, rel=1e-3)
+    assert slow.cost == pytest.approx(4 * by_name["time"].cost, rel=1e-3)
 
 
 @pytest.mark.long
-def test_what_stands_in_the_way_makes_it_longer_and_is_kept_clear_of() -> None:
+def test_obstacles_lengthen_the_path_and_are_avoided() -> None:
     places, turns = poses(panda(), PANDA_START, 21)
     free = path(panda(), Waypoints(places, turns), scene=None)
     box = Box((0.1, 0.1, 0.1), (0.25, 0.1, 0.9))
@@ -142,9 +142,9 @@ def test_what_stands_in_the_way_makes_it_longer_and_is_kept_clear_of() -> None:
     assert path(panda(), Waypoints(places[:6], turns[:6])).clearance() is None
 
 
-def test_what_cannot_be_done_is_refused() -> None:
+def test_infeasible_requests_are_refused() -> None:
     places, turns = poses(panda(), PANDA_START, 11)
-    for told, name in (
+    for report, name in (
         ((places[:1], turns[:1]), "positions"),
         ((places[:, :2], turns), "positions"),
         ((places * np.nan, turns), "positions"),
@@ -152,7 +152,7 @@ def test_what_cannot_be_done_is_refused() -> None:
         ((places, turns * 0), "quaternions"),
     ):
         with pytest.raises(ProblemError) as refused:
-            plan(panda(), Waypoints(*told))
+            plan(panda(), Waypoints(*report))
         assert refused.value.name == name
     with pytest.raises(ProblemError) as refused:
         plan(panda(), Waypoints(places, turns, step=0.0))

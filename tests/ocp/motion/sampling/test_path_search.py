@@ -73,7 +73,7 @@ def test_a_window_a_fifth_wider_than_the_ball_is_found_and_a_narrower_one_is_not
         find_paths(closed, start, goal[None], limits=LIMITS, seed=seed, settings=PathSearchSettings(attempts=100))
 
 
-def test_a_clear_straight_motion_to_the_nearest_goal_is_the_path_and_the_goal_is_told() -> None:
+def test_a_clear_straight_motion_to_the_nearest_goal_is_the_path() -> None:
     goals = np.array([[1.5, 1.5], [0.5, 1.0], [-1.0, -1.8]])
     boxes = [Box((0.2, 0.2, 1.0), (1.0, -1.0, 0.0))]
     paths = find_paths(search_of(boxes), np.zeros(2), goals, limits=LIMITS, seed=0)

@@ -20,17 +20,17 @@ def largest(plan: Schedule, joints: JointPath, times: int = 20_001) -> NDArray[n
     """Joint velocity, acceleration and jerk, speed, line acceleration, line jerk and centripetal, over their limits."""
     motion, limits = dense(plan, times), plan.limits
     moved = joint_motion(joints, motion)[1:]
-    found = [
+    matches = [
         float(np.max(np.abs(value) / bound))
         for value, bound in zip(moved, limits.of_joints(len(joints.names)), strict=True)
     ]
-    piece = plan.path.by_piece(limits.speed)
+    segment = plan.path.by_piece(limits.speed)
     sides = np.clip(motion.distance + np.array([[-1e-9], [1e-9]]) * plan.path.length, 0, plan.path.length)
-    at = np.clip(np.searchsorted(plan.path.bounds, sides, side="right") - 1, 0, len(piece) - 1)
-    found += [
-        float((motion.speed / piece[at].max(axis=0)).max()),
+    at = np.clip(np.searchsorted(plan.path.bounds, sides, side="right") - 1, 0, len(segment) - 1)
+    matches += [
+        float((motion.speed / segment[at].max(axis=0)).max()),
         float(np.abs(motion.acceleration).max() / limits.acceleration),
         float(np.abs(motion.jerk).max() / limits.jerk),
         float((motion.speed**2 * plan.path.curvature(motion.distance)).max() / limits.centripetal),
     ]
-    return np.array(found)
+    return np.array(matches)

@@ -74,7 +74,7 @@ SAMPLED = {
     "velocities": np.zeros((2, 2)),
     "accelerations": np.zeros((2, 2)),
 }
-PIECES = {"t": [0.0, 1.0], "distance": [0.0, 0.5], "speed": [0.0, 1.0], "acceleration": [1.0, 1.0], "jerk": [0.0]}
+PROFILE = {"t": [0.0, 1.0], "distance": [0.0, 0.5], "speed": [0.0, 1.0], "acceleration": [1.0, 1.0], "jerk": [0.0]}
 
 
 def plan() -> Schedule:
@@ -143,7 +143,7 @@ CASES = [
     Case(
         "SpeedProfile",
         SpeedProfile,
-        PIECES,
+        PROFILE,
         {
             "t": array(2) | NOTHING | {"falling": [1.0, 0.0]},
             "distance": array(2) | NOTHING,
@@ -268,7 +268,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", good_calls(CASES))
-def test_what_is_good_is_taken(case: Case) -> None:
+def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 

@@ -31,8 +31,8 @@ def test_limits_of_no_size_to_compute_with_are_refused_by_name(which: int, value
 def test_a_limit_of_another_size_is_computed_with(which: int, value: float) -> None:
     of_joints = [*JOINTS]
     of_joints[which] *= value
-    found = schedule(ALONG.path, LineLimits(0.5, 1.0, 10.0, 1.0, JointLimits(*of_joints)), joints=ALONG)
-    assert np.isfinite(found.duration)
+    timed = schedule(ALONG.path, LineLimits(0.5, 1.0, 10.0, 1.0, JointLimits(*of_joints)), joints=ALONG)
+    assert np.isfinite(timed.duration)
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])

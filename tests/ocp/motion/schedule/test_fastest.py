@@ -52,7 +52,7 @@ PANDA = replace(JOINTS, velocity=0.3 * np.asarray(JOINTS.velocity), torque=TORQU
 LENGTH, LINE = 2.0, LineLimits(1.0, 5.0, 200.0)
 
 
-class Drawn:
+class RandomStretch:
     """Joints that are given functions of the distance."""
 
     def __init__(self, **curves: Curve) -> None:
@@ -87,9 +87,11 @@ def seven_phases(limits: LineLimits, length: float = LENGTH) -> float:
     return 2 * ramp_time(v, a, j) + (length - 2 * ramp_distance(0, v, a, j)) / v
 
 
-def swinging(seed: int) -> tuple[Drawn, JointLimits]:
+def swinging(seed: int) -> tuple[RandomStretch, JointLimits]:
     rng = np.random.default_rng(seed)
-    joints = Drawn(**{name: wave(rng.uniform(0.5, 2), rng.uniform(0.5, 4), rng.uniform(0, 6.28)) for name in "abc"})
+    joints = RandomStretch(
+        **{name: wave(rng.uniform(0.5, 2), rng.uniform(0.5, 4), rng.uniform(0, 6.28)) for name in "abc"}
+    )
     return joints, JointLimits(rng.uniform(0.7, 2, 3), rng.uniform(2, 8, 3), rng.uniform(40, 200, 3))
 
 
@@ -98,7 +100,7 @@ def swinging(seed: int) -> tuple[Drawn, JointLimits]:
 def test_a_joint_that_moves_with_the_line_is_as_fast_as_the_line_with_its_limit(kind: str, share: float) -> None:
     """The optimum is known: the line's, with the joint's limit for its own."""
     most = share * getattr(LINE, kind)
-    plan = schedule(straight(), replace(LINE, joints=JointLimits(**{kind: most})), joints=Drawn(a=even()))
+    plan = schedule(straight(), replace(LINE, joints=JointLimits(**{kind: most})), joints=RandomStretch(a=even()))
     best = seven_phases(replace(LINE, **{kind: most}))
     assert best * (1 - 1e-6) <= plan.duration <= best * 1.003
     assert {dip.cause for dip in plan.dips} == {f"joint 'a' {kind}"}
@@ -108,7 +110,7 @@ def test_a_joint_that_moves_with_the_line_is_as_fast_as_the_line_with_its_limit(
 
 
 def test_a_joint_velocity_is_the_line_speed_that_it_leaves() -> None:
-    plan = schedule(straight(), replace(LINE, joints=JointLimits(0.8)), joints=Drawn(a=even(2.0)))
+    plan = schedule(straight(), replace(LINE, joints=JointLimits(0.8)), joints=RandomStretch(a=even(2.0)))
     best = seven_phases(replace(LINE, speed=0.4))
     assert best * (1 - 1e-6) <= plan.duration <= best * 1.003
     assert plan.profile.at_distance(np.linspace(0.3, 1.7, 99)).speed == pytest.approx(0.4, rel=1e-3)
@@ -116,7 +118,7 @@ def test_a_joint_velocity_is_the_line_speed_that_it_leaves() -> None:
 
 @settings(max_examples=20)
 @given(seeds, st.integers(2, 5))
-def test_the_passes_find_what_a_linear_program_finds(seed: int, rows: int) -> None:
+def test_the_passes_equal_a_linear_program(seed: int, rows: int) -> None:
     rng = np.random.default_rng(seed)
     count = 40
     s = np.linspace(0, 1, count + 1)
@@ -134,10 +136,10 @@ def test_the_passes_find_what_a_linear_program_finds(seed: int, rows: int) -> No
             row = np.zeros(count + 1)
             row[k], row[k + 1] = q[k, r] - p[k, r] / (2 * h[k]), p[k, r] / (2 * h[k])
             matrix += [row, -row]
-    found = linprog(-np.ones(count + 1), np.array(matrix), np.ones(len(matrix)), bounds=bounds)
+    result = linprog(-np.ones(count + 1), np.array(matrix), np.ones(len(matrix)), bounds=bounds)
     assert (np.array(matrix) @ x <= 1 + 1e-9).all()
-    assert x.sum() == pytest.approx(-found.fun, rel=2e-2)
-    assert x.sum() <= -found.fun * (1 + 1e-9)
+    assert x.sum() == pytest.approx(-result.fun, rel=2e-2)
+    assert x.sum() <= -result.fun * (1 + 1e-9)
 
 
 @settings(max_examples=50)
@@ -150,9 +152,9 @@ def test_two_jerks_lead_through_any_motion(seed: int) -> None:
     end = integrate_jerk(*middle[1:], second, t)
     assume(min(middle[0], end[0], middle[1], end[1]) > 0)
     states = np.array([[0.0, v, a], [middle[0] + end[0], *end[1:]]]).T
-    made = profile_through(*states)
-    assert made.jerk == pytest.approx([first, second], rel=1e-6, abs=1e-6)
-    assert made.duration == pytest.approx(2 * t, rel=1e-9)
+    result = profile_through(*states)
+    assert result.jerk == pytest.approx([first, second], rel=1e-6, abs=1e-6)
+    assert result.duration == pytest.approx(2 * t, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", some([38, 41], [41]))
@@ -192,7 +194,7 @@ def random_arm(seed: int) -> tuple[ScaraPath, LineLimits]:
 @pytest.mark.parametrize("seed", some(range(3), 1))
 def test_backwards_takes_as_long(seed: int) -> None:
     joints, limits = swinging(seed)
-    back = Drawn(
+    back = RandomStretch(
         **{
             name: lambda n, s, curve=curve: (-1.0) ** n * curve(n, LENGTH - s)
             for name, curve in zip(joints.names, joints.curves, strict=True)
@@ -207,7 +209,7 @@ def test_the_units_of_length_and_time_do_not_matter(seed: int) -> None:
     joints, limits = swinging(seed)
     expected = schedule(straight(), replace(LINE, joints=limits), joints=joints).duration
     for unit in (1e-3, 1e3):
-        scaled = Drawn(
+        scaled = RandomStretch(
             **{
                 name: lambda n, s, curve=curve: curve(n, s / unit) / unit**n  # noqa: B023
                 for name, curve in zip(joints.names, joints.curves, strict=True)
@@ -314,7 +316,7 @@ def test_the_tool_keeps_its_limits_along_each_axis_and_turns_no_faster() -> None
     assert any(dip.cause.startswith("tool acceleration along") for dip in plan.dips)
 
 
-class Loaded(Drawn):
+class Loaded(RandomStretch):
     """Joints that move with the line and lift a load: torque = inertia a + rest, both given."""
 
     def torques(self, distance: Any) -> Any:
@@ -325,7 +327,7 @@ class Loaded(Drawn):
 
 
 @pytest.mark.parametrize("jerk", [200.0, np.inf])
-def test_a_torque_limit_is_what_is_left_beside_the_load(jerk: float) -> None:
+def test_a_torque_limit_is_reduced_by_the_load(jerk: float) -> None:
     joints, most = Loaded(lift=even()), 6.5
     plan = schedule(straight(), replace(LINE, jerk=jerk, joints=JointLimits(torque=most)), joints=joints)
     motion = dense(plan)
@@ -344,7 +346,7 @@ def test_a_torque_that_does_not_hold_the_load_is_refused_by_name_and_place() -> 
     assert caught.value.name == "joint 'lift' torque"
     assert caught.value.time == pytest.approx(1.0, abs=0.05)
     with pytest.raises(ProblemError, match="torques"):
-        schedule(straight(), replace(LINE, joints=JointLimits(torque=9.0)), joints=Drawn(lift=even()))
+        schedule(straight(), replace(LINE, joints=JointLimits(torque=9.0)), joints=RandomStretch(lift=even()))
 
 
 def test_a_dip_names_place_cause_and_amount() -> None:

@@ -64,7 +64,7 @@ def test_rows_are_those_of_a_matrix(seed: int, count: int) -> None:
 
 @settings(max_examples=40)
 @given(seeds, st.integers(1, 90), st.floats(0.1, 1.0), st.floats(0.1, 1.0))
-def test_steps_keep_what_is_positive_so(seed: int, count: int, share: float, of_positive: float) -> None:
+def test_steps_preserve_positive_variables(seed: int, count: int, share: float, of_positive: float) -> None:
     """At most so much of the way to zero, the coefficients less, and the worst of all just so; they change slowly."""
     _, every, _ = random_rows(seed, count)
     rates = np.random.default_rng(seed).normal(size=len(every.interval)) * 10.0 ** np.random.default_rng(seed).uniform(
@@ -92,10 +92,10 @@ def test_a_spline_has_the_values_and_derivatives_of_its_basis(seed: int) -> None
     interval, fraction = rng.integers(0, 8, 30), rng.uniform(0, 1, 30)
     near = np.stack([b[interval + k] for k in range(3)])
     value, first, second = (spline.basis(interval, fraction) * near).sum(axis=1)
-    way = fraction * np.diff(nodes)[interval]
+    path = fraction * np.diff(nodes)[interval]
     assert second == pytest.approx((np.diff(slope) / np.diff(nodes))[interval])
-    assert first == pytest.approx(slope[interval] + way * second)
-    assert value == pytest.approx(x[interval] + way * (slope[interval] + first) / 2)
+    assert first == pytest.approx(slope[interval] + path * second)
+    assert value == pytest.approx(x[interval] + path * (slope[interval] + first) / 2)
 
 
 def from_rest_to_rest(seed: int, count: int) -> Program:
@@ -130,9 +130,9 @@ def test_parts_of_the_fastest_motion_between_the_rest_of_it_are_the_fastest_them
     stays = part.fixed
     assert part.spline.at_nodes(whole[at])[0][0] == pytest.approx(program.spline.at_nodes(whole)[0][at[0]])
     moved = np.where(np.isin(np.arange(len(at)), stays), 1.0, 0.9) * whole[at]
-    found = least_time(part, moved, accuracy=1e-10, center=0.1)
-    assert found[stays] == pytest.approx(whole[at][stays], rel=1e-12)
-    assert found == pytest.approx(whole[at], rel=1e-4, abs=1e-6)
+    result = least_time(part, moved, accuracy=1e-10, center=0.1)
+    assert result[stays] == pytest.approx(whole[at][stays], rel=1e-12)
+    assert result == pytest.approx(whole[at], rel=1e-4, abs=1e-6)
 
 
 @settings(max_examples=40)
@@ -150,7 +150,7 @@ def test_the_jerks_of_a_motion_are_those_at_a_sixth_of_an_interval(slope: float,
     assert errors[0] <= 1e-3
 
 
-def test_what_is_demanded_is_what_dense_samples_demand() -> None:
+def test_demands_equal_those_of_dense_samples() -> None:
     """In every interval, by every limit that comes near: no less; and next to no more where that would matter."""
     path, joints = panda_path(4)
     limits = LineLimits(0.5, 5.0, 200.0, 5.0, JOINTS)

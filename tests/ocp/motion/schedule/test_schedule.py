@@ -81,7 +81,7 @@ def test_rest_to_rest_over_a_line_takes_the_seven_phase_time(length: float) -> N
 
 
 @given(st.floats(0.1, 20), st.floats(0.05, 5), st.floats(1, 1000))
-def test_the_peak_acceleration_has_the_mean_asked(mean: float, speed: float, jerk: float) -> None:
+def test_the_peak_acceleration_has_the_requested_mean(mean: float, speed: float, jerk: float) -> None:
     if 4 * mean**2 / speed >= jerk:
         with pytest.raises(ProblemError, match="needs a jerk"):
             peak_acceleration(mean, speed, 0.99 * jerk)
@@ -100,9 +100,9 @@ changes = st.tuples(*[st.floats(0, 1)] * 2, st.floats(0.05, 2), *[st.floats(-1, 
 """First and last speed over the top one, distance over that of the ramps by the top speed; 10^x of the limits."""
 
 
-def change(drawn: tuple[float, ...]) -> tuple[float, ...]:
+def change(sample: tuple[float, ...]) -> tuple[float, ...]:
     """Distance, first, last, top speed, acceleration and jerk: a distance that is enough, if barely."""
-    first, last, share, x, y = drawn
+    first, last, share, x, y = sample
     acceleration, jerk = 10**x, 10 ** (x + y)
     least = ramp_distance(first, last, acceleration, jerk)
     most = ramp_distance(first, 1, acceleration, jerk) + ramp_distance(1, last, acceleration, jerk)
@@ -110,14 +110,14 @@ def change(drawn: tuple[float, ...]) -> tuple[float, ...]:
 
 
 @given(changes)
-def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ramps_make_it(drawn: Any) -> None:
-    distance, first, last, *limits = change(drawn)
+def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ramps_make_it(sample: Any) -> None:
+    distance, first, last, *limits = change(sample)
     top, acceleration, jerk = limits
-    found = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
+    result = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(ramps, "Ruckig", lambda _: SimpleNamespace(calculate=lambda *_: None))
-        made = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
-    for phases in (found, made):
+        by_ramps = ramps.fastest_motion(distance, first, last, (top, acceleration, jerk))
+    for phases in (result, by_ramps):
         s, v, a = 0.0, first, 0.0
         for t, j in phases:
             assert t > 0
@@ -126,7 +126,7 @@ def test_the_fastest_motion_ends_where_it_must_whether_ruckig_finds_it_or_two_ra
             assert abs(a) <= acceleration * (1 + 1e-9)
             assert min(first, last) - 1e-9 <= v <= top + 1e-9
         assert (s, v, a) == pytest.approx((distance, last, 0.0), abs=1e-8 * (1 + acceleration + distance))
-    assert sum(t for t, _ in made) == pytest.approx(sum(t for t, _ in found), rel=1e-6)
+    assert sum(t for t, _ in by_ramps) == pytest.approx(sum(t for t, _ in result), rel=1e-6)
 
 
 @given(st.floats(0, 5), st.floats(1e-3, 5), st.floats(-1, 2), st.floats(-1, 3))
@@ -138,9 +138,7 @@ def test_the_speed_within_reach_is_the_inverse_of_the_ramps_distance(
 
 
 @given(seeds, st.integers(1, 6))
-def test_pieces_of_any_jerk_have_their_extreme_speeds_among_the_peaks_and_times_and_distances_are_inverse(
-    seed: int, count: int
-) -> None:
+def test_segments_of_constant_jerk_have_extreme_speeds_at_the_peaks_and_invertible_times(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     t, jerk = np.concatenate([[0.0], np.cumsum(rng.uniform(0.1, 1, count))]), rng.normal(size=count)
     states = [(0.0, 20.0, rng.normal())]
@@ -158,14 +156,14 @@ def test_pieces_of_any_jerk_have_their_extreme_speeds_among_the_peaks_and_times_
         assert np.array(value).ravel() == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
-def check_profile(plan: Schedule, asked: NDArray[np.float64], times: int = 20001) -> None:
+def check_profile(plan: Schedule, request: NDArray[np.float64], times: int = 20001) -> None:
     """Rest to rest, continuous to the acceleration, within the limits of the line: ten times finer than 1 ms."""
     profile, limits = plan.profile, plan.limits
     step = np.diff(profile.t)
     assert (step > 0).all()
     ends = (profile.distance, profile.speed, profile.acceleration)
     reached = after(tuple(end[:-1] for end in ends), profile.jerk, step)
-    for end, there, scale in zip(ends, reached, (plan.path.length, asked.max(), limits.acceleration), strict=True):
+    for end, there, scale in zip(ends, reached, (plan.path.length, request.max(), limits.acceleration), strict=True):
         assert end[1:] == pytest.approx(there, abs=1e-9 * scale)
     motion = plan.at(np.linspace(0, plan.duration, times))
     assert [motion.speed[0], motion.speed[-1]] == [0, 0]
@@ -173,8 +171,8 @@ def check_profile(plan: Schedule, asked: NDArray[np.float64], times: int = 20001
     assert (np.diff(motion.distance) >= -1e-12 * plan.path.length).all()
     # on a bound between two pieces the faster one counts
     sides = motion.distance + np.array([[-1e-9], [1e-9]]) * plan.path.length
-    piece = np.clip(np.searchsorted(plan.path.bounds, sides, side="right") - 1, 0, len(asked) - 1)
-    assert (motion.speed <= asked[piece].max(axis=0) * (1 + 1e-9)).all()
+    segment = np.clip(np.searchsorted(plan.path.bounds, sides, side="right") - 1, 0, len(request) - 1)
+    assert (motion.speed <= request[segment].max(axis=0) * (1 + 1e-9)).all()
     assert np.abs(motion.acceleration).max() <= limits.acceleration * (1 + 1e-9)
     assert np.abs(motion.jerk).max() <= limits.jerk * (1 + 1e-9)
     if np.isfinite(limits.centripetal):
@@ -184,7 +182,7 @@ def check_profile(plan: Schedule, asked: NDArray[np.float64], times: int = 20001
 @settings(max_examples=40)
 @given(seeds, st.integers(1, 9), st.sampled_from(["cubic", "quintic"]), st.booleans())
 @hypothesis.example(280, 6, "cubic", True)  # a near-cusp that the last ramp to rest reaches
-def test_random_paths_never_exceed_asked_speed_or_limits(seed: int, count: int, kind: Any, each: bool) -> None:
+def test_random_paths_never_exceed_requested_speed_or_limits(seed: int, count: int, kind: Any, each: bool) -> None:
     rng = np.random.default_rng(seed)
     path = smooth(random_path(rng, count), 10 ** rng.uniform(-3, -0.5), kind=kind)
     speed = 10 ** rng.uniform(-1.5, 0.5, count if each else ())
@@ -241,7 +239,7 @@ def test_centripetal_acceleration_slows_the_blends_only() -> None:
     assert motion.speed[free] == pytest.approx(1.0, abs=1e-9)
 
 
-def test_a_slower_asked_speed_needs_no_dip() -> None:
+def test_a_slower_requested_speed_needs_no_dip() -> None:
     path = example("quintic")
     peak = path.curvature(path.sample_distances(200)).max()
     plan = schedule(path, LineLimits(0.999 * np.sqrt(5.0 / peak), 5.0, 200.0, centripetal=5.0), strict=True)
@@ -283,7 +281,7 @@ def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> No
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("options", "message"),
     [
         ({"speed": []}, "speed"),
         ({"speed": "fast"}, "not numeric"),
@@ -294,9 +292,9 @@ def test_a_speed_or_jerk_that_is_not_positive_is_a_named_error(bad: float) -> No
         ({"joints": 3.0}, "JointLimits"),
     ],
 )
-def test_limits_that_are_none_are_named_errors(given: dict[str, Any], message: str) -> None:
+def test_limits_that_are_none_are_named_errors(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ProblemError, match=message) as caught:
-        replace(LIMITS, **given)
+        replace(LIMITS, **options)
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
@@ -349,8 +347,8 @@ def test_about_the_slowest_place_of_each_run_a_stretch_gets_its_speed(seed: int,
         while last < count - 1 and fast[last + 1]:
             last += 1
         if k == first + most[first : last + 1].argmin():
-            for way in (range(k, first - 1, -1), range(k, last + 1)):
-                for at in way:
+            for path in (range(k, first - 1, -1), range(k, last + 1)):
+                for at in path:
                     if most[at] > SETTINGS.spread * most[k]:
                         break
                     expected[at] = min(speed[at], most[k])

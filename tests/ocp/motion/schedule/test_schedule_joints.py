@@ -94,14 +94,14 @@ def test_joint_motion_has_the_derivatives_of_the_joints_by_time() -> None:
 def test_a_joint_limit_slows_and_is_named_as_the_cause(limits: JointLimits, kind: str) -> None:
     arm = example_arm()
     free = schedule(arm.path, FREE)
-    asked = replace(FREE, joints=limits)
-    plan = schedule(arm.path, asked, joints=arm)
+    request = replace(FREE, joints=limits)
+    plan = schedule(arm.path, request, joints=arm)
     assert plan.duration > free.duration
     used = largest(plan, arm).max()
     assert 0.9 < used <= 1.001  # no slower than need be
     assert any(kind in dip.cause for dip in plan.dips)
     with pytest.raises(ProblemError, match="violates limits"):
-        schedule(arm.path, asked, joints=arm, strict=True)
+        schedule(arm.path, request, joints=arm, strict=True)
 
 
 def test_the_curvature_of_the_joints_counts_at_a_steady_speed_too() -> None:
@@ -122,22 +122,22 @@ def test_limits_that_do_not_bind_change_nothing() -> None:
     assert loose.duration == schedule(arm.path, FREE).duration
 
 
-def test_what_cannot_be_scheduled_is_a_named_error() -> None:
+def test_infeasible_schedules_are_named_errors() -> None:
     arm = example_arm()
     limits = replace(FREE, joints=SLOW)
     with pytest.raises(ProblemError, match="joint limits need the joints"):
         schedule(arm.path, limits)
     with pytest.raises(ProblemError, match="the arm has 4 joints"):
         schedule(arm.path, replace(FREE, joints=JointLimits([1.0, 2.0])), joints=arm)
-    bent = Path((Line((0.3, 0, 0), (0.5, 0, 0)), Arc.through((0.5, 0, 0), (0.5, 0.2, 0), (0.3, 0.4, 0))))
-    cubic = scara_along(ARM, smooth(bent, 0.05, kind="cubic"))
+    perturbed = Path((Line((0.3, 0, 0), (0.5, 0, 0)), Arc.through((0.5, 0, 0), (0.5, 0.2, 0), (0.3, 0.4, 0))))
+    cubic = scara_along(ARM, smooth(perturbed, 0.05, kind="cubic"))
     with pytest.raises(ProblemError, match=r"curvature jumps.*quintic"):
         schedule(cubic.path, limits, joints=cubic)
 
 
-def test_where_the_curvature_jumps_both_sides_are_kept() -> None:
-    bent = Path((Arc.through((0.3, 0.4, 0), (0.5, 0.2, 0), (0.5, 0, 0)), Line((0.5, 0, 0), (0.5, -0.4, 0))))
-    arm = scara_along(ARM, smooth(bent, 0.02, kind="cubic"))
+def test_limits_hold_on_both_sides_of_a_curvature_jump() -> None:
+    perturbed = Path((Arc.through((0.3, 0.4, 0), (0.5, 0.2, 0), (0.5, 0, 0)), Line((0.5, 0, 0), (0.5, -0.4, 0))))
+    arm = scara_along(ARM, smooth(perturbed, 0.02, kind="cubic"))
     limits = LineLimits(9.0, 5.0, 200.0, 2.0, JointLimits(2.0))
     grid, bounds = make_grid(arm.path, limits, arm), arm.path.bounds[1:-1]
     assert grid.distance[grid.jumps] == pytest.approx(bounds, abs=1e-15)
@@ -263,16 +263,16 @@ def test_any_trajectory_comes_back_from_csv_and_message(seed: int, joints: int, 
     rng = np.random.default_rng(seed)
     t = np.cumsum(rng.integers(1, 10**10, samples)) / 1e9
     values = rng.normal(size=(3, samples, joints)) * 10 ** rng.uniform(-300, 300, (3, samples, joints))
-    made = JointTrajectory(tuple(f'joint, "{i}"\n' for i in range(joints)), t, *values)
-    assert equal(JointTrajectory.from_ros(json.loads(json.dumps(made.to_ros()))), made)
+    result = JointTrajectory(tuple(f'joint, "{i}"\n' for i in range(joints)), t, *values)
+    assert equal(JointTrajectory.from_ros(json.loads(json.dumps(result.to_ros()))), result)
 
 
 def test_names_with_commas_come_back_from_csv(tmp_path: File) -> None:
-    made = JointTrajectory(
+    result = JointTrajectory(
         ('a, "b"', "c.positions"), np.array([0.0, 1 / 3]), *np.random.default_rng(1).normal(size=(3, 2, 2))
     )
-    made.write_csv(tmp_path / "t.csv")
-    assert equal(JointTrajectory.read_csv(tmp_path / "t.csv"), made)
+    result.write_csv(tmp_path / "t.csv")
+    assert equal(JointTrajectory.read_csv(tmp_path / "t.csv"), result)
 
 
 @pytest.mark.parametrize(

@@ -38,16 +38,16 @@ def example(horizon: float) -> TipTask:
     "horizon", [each if each == 3.5 else pytest.param(each, marks=pytest.mark.long) for each in EXTREMALS]
 )
 def test_from_the_start_alone_every_extremal_known_of_the_paper_is_found(horizon: float) -> None:
-    found = plan(paper_example(), example(horizon), start=START, search="global", scene=False)
+    result = plan(paper_example(), example(horizon), start=START, search="global", scene=False)
     known = EXTREMALS[horizon]
-    assert found.cost == pytest.approx(known[0], rel=1e-7)
-    costs = np.array([one.cost for one in found.candidates if np.isfinite(one.cost)])
+    assert result.cost == pytest.approx(known[0], rel=1e-7)
+    costs = np.array([one.cost for one in result.candidates if np.isfinite(one.cost)])
     for cost in known:
         assert np.abs(costs / cost - 1).min() < 5e-5  # those told last are of one mesh
-    assert found.bound is None  # exact states in cells prove nothing
-    passing = np.sort([one.cost for one in found.candidates if one.stage is Stage.AUDITED and not is_duplicate(one)])
+    assert result.bound is None  # exact states in cells prove nothing
+    passing = np.sort([one.cost for one in result.candidates if one.stage is Stage.AUDITED and not is_duplicate(one)])
     assert (np.diff(passing) > 1e-5 * passing[:-1]).all()
-    assert found.audit().passed
+    assert result.audit().passed
 
 
 def is_duplicate(candidate: Candidate) -> bool:
@@ -65,18 +65,18 @@ def farthest_from_center() -> float:
 
 
 @pytest.mark.parametrize("search", ["global", "configurations"])
-@pytest.mark.parametrize("told", ["velocity", "place"])
-def test_what_leads_out_of_reach_is_refused_with_the_time_from_which_on_it_does(search: Any, told: str) -> None:
+@pytest.mark.parametrize("report", ["velocity", "place"])
+def test_paths_out_of_reach_are_refused_with_their_time(search: Any, report: str) -> None:
     machine = paper_example()
     first = np.array(ca.DM(machine.tip_pose(np.zeros(3), START).position)).ravel()
     center = np.array(ca.DM(center_of_mass(machine.robot, START))).ravel()
-    way = np.array([0.5, 0.5, 0.0])
+    path = np.array([0.5, 0.5, 0.0])
     task = {
-        "velocity": TipTask(velocity=way[:2], rows=[3, 4], duration=8.0),
-        "place": TipTask(position=lambda t: ca.DM(first) + t * ca.DM(way), rows=[3, 4], duration=8.0),
-    }[told]
+        "velocity": TipTask(velocity=path[:2], rows=[3, 4], duration=8.0),
+        "place": TipTask(position=lambda t: ca.DM(first) + t * ca.DM(path), rows=[3, 4], duration=8.0),
+    }[report]
     times = np.linspace(0.0, 8.0, 8001)
-    gone = times[np.linalg.norm(first - center + np.outer(times, way), axis=1) > farthest_from_center()][0]
+    gone = times[np.linalg.norm(first - center + np.outer(times, path), axis=1) > farthest_from_center()][0]
     with pytest.raises(Unreachable, match="no joint positions put") as caught:
         plan(machine, task, start=START, search=search, scene=False)
     assert caught.value.time == pytest.approx(gone, abs=0.01)
@@ -96,23 +96,23 @@ def test_limits_that_stop_a_motion_are_named() -> None:
 
 
 @pytest.mark.parametrize("momentum", [None, (30.0, 5.0, -5.0)], ids=["at rest", "with momentum"])
-@pytest.mark.parametrize("told", ["velocity", "place"])
-def test_every_way_does_its_task_keeps_limits_and_moves_the_base_as_momentum_has_it(told: str, momentum: Any) -> None:
+@pytest.mark.parametrize("report", ["velocity", "place"])
+def test_every_motion_does_its_task_within_limits_and_conserves_momentum(report: str, momentum: Any) -> None:
     robot = paper_example().robot
     joints = tuple(replace(joint, lower=-2.0, upper=2.0, velocity=1.5) for joint in robot.joints)
     machine = FreeFloating(replace(robot, joints=joints), base="planar", conserved_momentum=momentum)
     first = np.array(ca.DM(machine.tip_pose(np.zeros(3), START).position)).ravel()
-    way = np.array([-0.5, -0.5, 0.0])
-    place = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(way), rows=[3, 4], duration=4.0)
-    task = TipTask(velocity=way[:2], rows=[3, 4], duration=4.0) if told == "velocity" else place
-    asked = checked_request(machine, task, None, start=START, search="global")
+    path = np.array([-0.5, -0.5, 0.0])
+    place = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(path), rows=[3, 4], duration=4.0)
+    task = TipTask(velocity=path[:2], rows=[3, 4], duration=4.0) if report == "velocity" else place
+    request = checked_request(machine, task, None, start=START, search="global")
     b, q, u = (ca.SX.sym(name, 3) for name in "bqu")
     center = ca.Function("center", [b, q], [center_of_mass(machine.robot, q, machine.world_from_base(b))])
     rate = ca.Function("rate", [b, q, u], [machine.base_rate(b, q, u)])
     pushed = np.zeros(2) if momentum is None else np.array(momentum[1:]) / robot.total_mass
-    for (found,) in CellSearch(asked, START[None]).local_motions():
-        count, times = len(found.cost), found.t
-        for base, at, rates in zip(found.base, found.joints, found.rates, strict=True):
+    for (result,) in CellSearch(request, START[None]).local_motions():
+        count, times = len(result.cost), result.t
+        for base, at, rates in zip(result.base, result.joints, result.rates, strict=True):
             assert np.abs(task_errors(machine, place, times, base, at)).max() < 5e-3
             assert (np.abs(at) <= 2.0).all()
             assert np.abs(rates).max() < 1.5 * 1.1  # a limit is kept by the rates that a step begins with
@@ -122,18 +122,18 @@ def test_every_way_does_its_task_keeps_limits_and_moves_the_base_as_momentum_has
             turned = np.array(rate.map(len(times) - 1)(half[0].T, half[1].T, rates[:-1].T)).T
             assert np.abs(np.diff(base, axis=0) - turned * np.diff(times)[:, None]).max() < 5e-3
         assert count >= 1
-        steps = np.diff(found.joints, axis=1) ** 2 / (2 * np.diff(times)[:, None])
-        assert found.cost == pytest.approx(steps.sum(axis=(1, 2)))
+        steps = np.diff(result.joints, axis=1) ** 2 / (2 * np.diff(times)[:, None])
+        assert result.cost == pytest.approx(steps.sum(axis=(1, 2)))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 3])
 def test_paths_past_singularities_that_can_be_done_are_planned(seed: int) -> None:
-    given = passage(seed)
-    found = planned(given)
-    assert isinstance(found, Plan), found
-    assert found.audit().passed
-    assert found.cost < given.cost
+    options = passage(seed)
+    result = planned(options)
+    assert isinstance(result, Plan), result
+    assert result.audit().passed
+    assert result.cost < options.cost
 
 
 def test_tasks_one_after_the_other_are_searched_together() -> None:
@@ -143,19 +143,19 @@ def test_tasks_one_after_the_other_are_searched_together() -> None:
         TipTask(position=lambda t: ca.DM(first) - t * ca.DM([0.4, 0.3, 0.0]), rows=[3, 4], duration=2.0),
         TipTask(position=ca.DM(first) - ca.DM([1.0, 0.4, 0.0]), rows=[3, 4], begin=3.0, duration=1.0),
     ]
-    found = plan(machine, lines, start=START, search="global", scene=False)
+    result = plan(machine, lines, start=START, search="global", scene=False)
     local = plan(machine, lines, start=START, search="start", scene=False)
-    assert found.cost <= local.cost * (1 + 1e-6)
-    assert isinstance(found, SolvedPlan)
-    assert len(found.parts) == 3
+    assert result.cost <= local.cost * (1 + 1e-6)
+    assert isinstance(result, SolvedPlan)
+    assert len(result.parts) == 3
 
 
-def test_of_ways_that_all_fail_a_few_of_each_search_are_tried_and_the_others_are_told(
+def test_of_failing_motions_a_few_of_each_search_are_tried_and_the_others_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     machine, task, tried = paper_example(), example(4.0), list[float]()
-    asked = checked_request(machine, task, None, start=START)
-    sizes = [len(ways[0].cost) for ways in CellSearch(asked, START[None]).local_motions()]
+    request = checked_request(machine, task, None, start=START)
+    sizes = [len(paths[0].cost) for paths in CellSearch(request, START[None]).local_motions()]
 
     def fails(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:
         tried.append(solver.settings.max_refinements)

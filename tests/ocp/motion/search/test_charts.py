@@ -17,7 +17,7 @@ from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 
-SECONDS, INSTANTS, RADIUS = 4.0, 6, 0.05
+SECONDS, TIME_SAMPLES, RADIUS = 4.0, 6, 0.05
 
 
 def planar(lengths: Array, limit: float = 2.8, speed: float = 3.0) -> FixedBase:
@@ -62,15 +62,15 @@ def moved(machine: FixedBase, joints: Array, rows: str) -> TipTask:
 
 
 def sets_of(machine: FixedBase, task: TipTask) -> tuple[SelfMotionManifolds, Array]:
-    equations, times = bind(machine, task), np.linspace(0.0, SECONDS, INSTANTS)
+    equations, times = bind(machine, task), np.linspace(0.0, SECONDS, TIME_SAMPLES)
     robot = machine.robot
     space = JointSpace(machine, robot.lower, robot.upper, np.ones(robot.dof))
     return SelfMotionManifolds(
-        space, equations, np.array(equations.target_function().map(INSTANTS)(times[None])).T
+        space, equations, np.array(equations.target_function().map(TIME_SAMPLES)(times[None])).T
     ), times
 
 
-def found(machine: FixedBase, task: TipTask, times: Array, starts: int, seed: int) -> tuple[Any, Array]:
+def solution_sets(machine: FixedBase, task: TipTask, times: Array, starts: int, seed: int) -> tuple[Any, Array]:
     rows = [
         (k, one.joints)
         for k, t in enumerate(times)
@@ -89,47 +89,47 @@ CASES: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_every_posture_that_inverse_kinematics_finds_lies_in_a_chart(case: str) -> None:
+def test_every_solution_of_inverse_kinematics_lies_in_a_chart(case: str) -> None:
     make, start, rows = CASES[case]
     machine = make()
     task = moved(machine, start, rows)
     sets, times = sets_of(machine, task)
-    charts = sets.cover(*found(machine, task, times, 16, 0), 4 * RADIUS if sets.size == 2 else RADIUS, 50_000)
-    layer, joints = found(machine, task, times, 128, 1000)
+    charts = sets.cover(*solution_sets(machine, task, times, 16, 0), 4 * RADIUS if sets.size == 2 else RADIUS, 50_000)
+    layer, joints = solution_sets(machine, task, times, 128, 1000)
     assert sets.size == machine.joint_size - bind(machine, task).size
     assert not sets.lost
     assert sets.is_covered(charts, layer, joints).all()
 
 
 @pytest.mark.parametrize("case", ["panda pose", "planar 3", "planar 4"])
-def test_postures_in_a_box_do_the_task_but_for_what_is_told_and_stray_with_the_square(case: str) -> None:
+def test_task_errors_of_configurations_in_a_chart_grow_quadratically_within_their_bound(case: str) -> None:
     make, start, rows = CASES[case]
     machine = make()
     sets, times = sets_of(machine, moved(machine, start, rows))
-    layer, joints = found(machine, moved(machine, start, rows), times, 16, 0)
+    layer, joints = solution_sets(machine, moved(machine, start, rows), times, 16, 0)
     rng = np.random.default_rng(0)
     radii = np.full(len(layer), 0.04)
     charts, _ = sets.charts_at(layer, joints, radii)
     place = rng.uniform(-1, 1, (len(layer), sets.size)) * charts.radii[:, None]
     flat = charts.centers + np.einsum("nir,nr->ni", charts.tangents, place)
     on, good = sets.project(layer, flat)
-    stray = np.linalg.norm(charts.deviations, axis=2).max(axis=1)
+    deviation = np.linalg.norm(charts.deviations, axis=2).max(axis=1)
     assert good.all()
     assert np.abs(sets.linearize(layer, on)[0]).max() < 1e-9
-    assert (np.linalg.norm(on - flat, axis=1) <= 1.1 * stray + 1e-9).all()
+    assert (np.linalg.norm(on - flat, axis=1) <= 1.1 * deviation + 1e-9).all()
     half = sets.charts_at(layer, joints, charts.radii / 2, charts.tangents)[0]
-    ratio = stray / np.linalg.norm(half.deviations, axis=2).max(axis=1)
+    ratio = deviation / np.linalg.norm(half.deviations, axis=2).max(axis=1)
     assert np.median(ratio) == pytest.approx(4.0, rel=0.05)
     orthonormal = np.einsum("nir,nis->nrs", charts.tangents, charts.tangents)
     assert np.abs(orthonormal - np.eye(sets.size)).max() < 1e-12
 
 
-def test_halves_cover_what_they_came_from() -> None:
+def test_halves_cover_their_chart() -> None:
     machine = panda()
     task = moved(machine, PANDA_START, "pose")
     sets, times = sets_of(machine, task)
-    charts = sets.cover(*found(machine, task, times, 16, 0), 0.07, 50_000)
-    layer, joints = found(machine, task, times, 64, 99)
+    charts = sets.cover(*solution_sets(machine, task, times, 16, 0), 0.07, 50_000)
+    layer, joints = solution_sets(machine, task, times, 64, 99)
     covered = sets.is_covered(charts, layer, joints)  # not those on small components that the seeds missed
     layer, joints = layer[covered], joints[covered]
     assert covered.mean() > 0.95
@@ -143,7 +143,7 @@ def test_parts_are_of_the_charts_that_they_lie_in() -> None:
     machine = planar(np.array([0.4, 0.3, 0.3, 0.2]), 2.0)
     task = TipTask(position=[0.6, 0.2], rows=[3, 4], duration=1.0)
     sets, times = sets_of(machine, task)
-    charts = sets.cover(*found(machine, task, times, 16, 0), 0.2, 50_000)
+    charts = sets.cover(*solution_sets(machine, task, times, 16, 0), 0.2, 50_000)
     parts = sets.split(charts)
     owners = charts.select(parts.owners)
     assert (parts.low >= owners.low).all()
@@ -152,8 +152,8 @@ def test_parts_are_of_the_charts_that_they_lie_in() -> None:
     middle = (parts.low + parts.high) / 2
     flat = owners.centers + np.einsum("knr,kr->kn", owners.tangents, middle)
     on, good = sets.project(owners.layer, flat)
-    way = sets.space.difference(on, parts.charts.centers) * sets.space.scale
-    place = np.einsum("kn,knr->kr", way, parts.charts.tangents * sets.space.scale[:, None])
+    path = sets.space.difference(on, parts.charts.centers) * sets.space.scale
+    place = np.einsum("kn,knr->kr", path, parts.charts.tangents * sets.space.scale[:, None])
     whole = ((owners.low < 0) & (owners.high > 0)).all(axis=1) & (parts.high - parts.low > 0).all(axis=1)
     assert good.all()
     assert (np.abs(place) <= parts.charts.radii[:, None])[whole].all()
@@ -168,11 +168,9 @@ def test_parts_are_of_the_charts_that_they_lie_in() -> None:
     ],
     ids=["two", "one", "panda"],
 )
-def test_what_lies_in_a_chart_lies_in_its_parts_which_are_hardly_larger_than_half(
-    machine: FixedBase, task: TipTask, radius: float
-) -> None:
+def test_points_of_a_chart_lie_in_its_halves(machine: FixedBase, task: TipTask, radius: float) -> None:
     sets, times = sets_of(machine, task)
-    charts = sets.cover(*found(machine, task, times, 16, 0), radius, 50_000)
+    charts = sets.cover(*solution_sets(machine, task, times, 16, 0), radius, 50_000)
     r, scale = charts.tangents.shape[2], sets.space.scale
     wide = replace(charts, low=np.full((len(charts), r), -1e9), high=np.full((len(charts), r), 1e9))
     parts = sets.split(wide)
@@ -198,38 +196,38 @@ def test_parts_of_a_parabola_reach_its_ends_and_hardly_farther() -> None:
     sets, _ = sets_of(planar(np.array([0.5, 0.4, 0.3])), TipTask(position=[0.6, 0.2], rows=[3, 4], duration=1.0))
     radius, bend = 0.2, 3.0
     sets.space.scale[:] = 1.0
-    tangents, strays = np.zeros((1, 3, 1)), np.zeros((1, 2, 3))
-    tangents[0, 0], strays[0, :, 1] = 1.0, bend * radius**2 / 2
+    tangents, deviations = np.zeros((1, 3, 1)), np.zeros((1, 2, 3))
+    tangents[0, 0], deviations[0, :, 1] = 1.0, bend * radius**2 / 2
     ends = np.array([[-radius]]), np.array([[radius]])
-    whole = Charts(np.zeros(1, dtype=np.intp), np.zeros((1, 3)), tangents, np.array([radius]), *ends, strays)
+    whole = Charts(np.zeros(1, dtype=np.intp), np.zeros((1, 3)), tangents, np.array([radius]), *ends, deviations)
     lean, half = bend * radius / 2, radius / 2
     exact = (half + lean * bend * (radius**2 - half**2) / 2) / np.sqrt(1 + lean**2)
-    for found in sets._split_radii(whole, np.array([[-0.5], [0.5]])):
-        assert exact <= found <= 1.003 * exact
+    for result in sets._split_radii(whole, np.array([[-0.5], [0.5]])):
+        assert exact <= result <= 1.003 * exact
 
 
 def test_boxes_end_at_the_limits_of_the_joints() -> None:
     machine = panda()
     task = moved(machine, PANDA_START, "pose")
     sets, times = sets_of(machine, task)
-    charts = sets.cover(*found(machine, task, times, 16, 0), 0.07, 50_000)
+    charts = sets.cover(*solution_sets(machine, task, times, 16, 0), 0.07, 50_000)
     limits = sets.space.lower, sets.space.upper
-    stray = np.abs(charts.deviations).max(axis=1)
+    deviation = np.abs(charts.deviations).max(axis=1)
     for end, whole in ((charts.low, -charts.radii[:, None]), (charts.high, charts.radii[:, None])):
         at = charts.centers + np.einsum("nir,nr->ni", charts.tangents, end)
         cut = (end != whole).all(axis=1)
         beyond = np.maximum(at - limits[1], limits[0] - at)
-        assert (beyond <= stray + 1e-9).all()
-        assert np.abs((beyond - stray)[cut].max(axis=1)).max() < 1e-9  # and not before
+        assert (beyond <= deviation + 1e-9).all()
+        assert np.abs((beyond - deviation)[cut].max(axis=1)).max() < 1e-9  # and not before
         assert cut.any()
 
 
-def test_what_is_too_much_is_refused() -> None:
+def test_excessive_requests_are_refused() -> None:
     machine = planar(np.array([0.5, 0.4, 0.3]))
     task = moved(machine, np.array([0.5, 1.2, -1.4]), "place")
     sets, times = sets_of(machine, task)
     with pytest.raises(ProblemError, match="more than 10 charts") as refused:
-        sets.cover(*found(machine, task, times, 16, 0), 0.05, 10)
+        sets.cover(*solution_sets(machine, task, times, 16, 0), 0.05, 10)
     assert refused.value.limit == 10
 
 
@@ -237,8 +235,8 @@ def test_joints_that_turn_without_end_come_round() -> None:
     machine = ur5()
     space = JointSpace(machine, machine.robot.lower, machine.robot.upper, np.full(6, 4.0))
     assert space.periodic.tolist() == [True, True, False, True, True, True]
-    way = space.difference(np.full((1, 6), 3.0), np.full((1, 6), -3.0))
-    assert way[0] == pytest.approx([6 - 2 * np.pi, 6 - 2 * np.pi, 6.0, *[6 - 2 * np.pi] * 3])
+    path = space.difference(np.full((1, 6), 3.0), np.full((1, 6), -3.0))
+    assert path[0] == pytest.approx([6 - 2 * np.pi, 6 - 2 * np.pi, 6.0, *[6 - 2 * np.pi] * 3])
     assert space.length(np.ones(6)) == pytest.approx(2 * np.sqrt(6))
     near, _ = space.tree(np.full((1, 6), 3.1)).query(
         space.tree_points(np.full((1, 6), 3.1 - 2 * np.pi) * [1, 1, -1, 1, 1, 1])

@@ -42,7 +42,7 @@ def between(seed: int) -> tuple[FixedBase, TipTask]:
 
 
 @pytest.mark.parametrize("seed", [16, 23, 25, 37, 38])
-def test_what_stops_the_motions_is_told_and_what_gives_way_does_all_else(seed: int) -> None:
+def test_the_obstruction_is_reported_and_the_relaxed_task_is_met(seed: int) -> None:
     machine, task = between(seed)
     with pytest.raises(DeadEnd) as refused:
         plan(machine, task, search="global", scene=False)
@@ -106,7 +106,7 @@ def test_a_tool_that_turns_too_fast_may_lean_instead(seed: int) -> None:
         assert (np.abs(np.diff(give.joints, axis=0)) <= 2.0 * np.diff(give.times)[:, None] + 1e-7).all()
 
 
-def test_of_ways_through_waypoints_the_waypoint_and_the_bodies_are_told() -> None:
+def test_failing_waypoints_are_reported_with_their_bodies() -> None:
     places, turns = poses(panda(), PANDA_START, 21)
     with pytest.raises(DeadEnd) as refused:
         plan(

@@ -41,8 +41,8 @@ def fewest(nodes: list[Array], step: Any, gap: int = 1) -> tuple[int, float]:
     """
     best = [(0, 0.0)] * len(nodes[0])
     for here, there in pairwise(nodes):
-        ways = np.abs(there[:, None] - here)
-        near, length = (ways <= step).all(axis=2), ways.sum(axis=2)
+        paths = np.abs(there[:, None] - here)
+        near, length = (paths <= step).all(axis=2), paths.sum(axis=2)
         jump = (min(best)[0] + 1, min(best)[1])
         if not gap:
             best, jump = [min(one, jump) for one in best], (10**6, np.inf)
@@ -96,34 +96,34 @@ def of_six_joints(seed: int) -> tuple[FixedBase, Array, Array, float, list[Array
 
 
 @pytest.mark.parametrize(("seed", "count"), [(0, 1), (16, 4), (23, 0), (39, 2)])
-def test_of_six_joints_the_pieces_are_those_of_brute_force(seed: int, count: int) -> None:
+def test_segments_of_six_joints_equal_those_of_brute_force(seed: int, count: int) -> None:
     machine, places, quaternions, step, nodes = of_six_joints(seed)
-    found = path(machine, Waypoints(places, quaternions, step, "counted"), False)
+    result = path(machine, Waypoints(places, quaternions, step, "counted"), False)
     expected = fewest(nodes, step)
-    after = found.reconfigurations
+    after = result.reconfigurations
     assert (len(after), expected[0]) == (count, count)
-    assert found.cost == pytest.approx(expected[1], rel=1e-6)
-    assert found.gap is not None
-    assert found.gap >= 0
-    steps = np.abs(np.diff(found.joints, axis=0))
+    assert result.cost == pytest.approx(expected[1], rel=1e-6)
+    assert result.gap is not None
+    assert result.gap >= 0
+    steps = np.abs(np.diff(result.joints, axis=0))
     assert (np.flatnonzero((steps > step + 1e-9).any(axis=1)) == after).all()
-    assert found.cost == pytest.approx(np.delete(steps, after, axis=0).sum(), rel=1e-9)
-    assert (found.steps <= step + 1e-9).all()
-    assert ("reconfigures" in str(found)) == bool(count)
+    assert result.cost == pytest.approx(np.delete(steps, after, axis=0).sum(), rel=1e-9)
+    assert (result.steps <= step + 1e-9).all()
+    assert ("reconfigures" in str(result)) == bool(count)
     if count == 1:
-        assert f"after waypoint {after[0]}" in str(found)
+        assert f"after waypoint {after[0]}" in str(result)
         with pytest.raises(DeadEnd):
             plan(machine, Waypoints(places, quaternions, step), scene=False)
 
 
 def path(machine: FixedBase, waypoints: Waypoints, scene: Scene | Literal[False]) -> PathPlan:
-    found = plan(machine, waypoints, scene=scene)
-    assert isinstance(found, PathPlan)
-    return found
+    result = plan(machine, waypoints, scene=scene)
+    assert isinstance(result, PathPlan)
+    return result
 
 
-def closest(found: PathPlan) -> ClosestPair:
-    proof = found.clearance()
+def closest(result: PathPlan) -> ClosestPair:
+    proof = result.clearance()
     assert proof is not None
     assert proof.worst is not None
     return proof.worst
@@ -159,51 +159,53 @@ def searched(machine: FixedBase, places: Array, step: float) -> AtlasSearch:
 
 
 @pytest.mark.parametrize(("reach", "count"), [(0.45, 1), pytest.param(0.1, 0, marks=pytest.mark.long)])
-def test_where_the_way_waits_pieces_meet_at_an_instant_and_none_are_fewer_or_shorter(reach: float, count: int) -> None:
+def test_segments_meet_at_one_time_where_the_path_waits_and_are_minimal(reach: float, count: int) -> None:
     lengths, high, step = np.array([0.5, 0.3, 0.1]), np.array([0.9, 1.8, 0.3]), 0.4
     machine = limited(planar(lengths), -high, high)
     places = np.column_stack([np.full(COUNT, 0.6), np.linspace(-reach, reach, COUNT)])
     nodes = [reached(lengths, place, 1.8, 900) for place in places]
     nodes = [own[(np.abs(own) <= high).all(axis=1)] for own in nodes]
     search = searched(machine, places, step)
-    found = fewest_segments(search, 0)
-    assert found is not None
-    pieces, bound = found
+    result = fewest_segments(search, 0)
+    assert result is not None
+    segments, bound = result
     expected = fewest(nodes, step, 0)
-    assert (len(pieces) - 1, expected[0]) == (count, count)
-    assert [piece.first for piece in pieces] == [0, *(piece.last for piece in pieces[:-1])]
-    assert pieces[-1].last == COUNT - 1
-    cost = sum(piece.cost for piece in pieces)
+    assert (len(segments) - 1, expected[0]) == (count, count)
+    assert [segment.first for segment in segments] == [0, *(segment.last for segment in segments[:-1])]
+    assert segments[-1].last == COUNT - 1
+    cost = sum(segment.cost for segment in segments)
     assert bound <= min(cost, expected[1] + 1e-9)
     assert cost <= 1.002 * expected[1]
     for gap in (0, 1):
-        assert len(segment_ends(search, gap, ruled_out=bool(gap))) == len(pieces)
-    first, last = pieces[0].first, pieces[0].last
+        assert len(segment_ends(search, gap, ruled_out=bool(gap))) == len(segments)
+    first, last = segments[0].first, segments[0].last
     again = fewest_segments(search, 0, [(first, last)])  # what is barred is no piece, nor what holds it
-    assert again is None or not any(piece.first <= first and last <= piece.last for piece in again[0])
+    assert again is None or not any(segment.first <= first and last <= segment.last for segment in again[0])
 
 
 @pytest.mark.parametrize(("seed", "count"), [(2, 1), (18, 1), (26, 8), (35, 1)])
-def test_with_a_free_direction_no_sequence_of_postures_has_fewer_pieces_or_is_shorter(seed: int, count: int) -> None:
+def test_with_a_free_direction_no_sequence_of_configurations_has_fewer_segments_or_is_shorter(
+    seed: int, count: int
+) -> None:
     search, nodes, step = search_of(seed)
-    found = fewest_segments(search)
-    assert found is not None
-    pieces, bound = found
+    result = fewest_segments(search)
+    assert result is not None
+    segments, bound = result
     expected = fewest(nodes, step)
-    assert (len(pieces) - 1, expected[0]) == (count, count)
-    assert [piece.first for piece in pieces] == [0, *(piece.last + 1 for piece in pieces[:-1])]
-    assert pieces[-1].last == COUNT - 1
-    cost = sum(piece.cost for piece in pieces)
+    assert (len(segments) - 1, expected[0]) == (count, count)
+    assert [segment.first for segment in segments] == [0, *(segment.last + 1 for segment in segments[:-1])]
+    assert segments[-1].last == COUNT - 1
+    cost = sum(segment.cost for segment in segments)
     assert bound <= min(cost, expected[1] + 1e-9)
     assert bound >= 0.97 * cost
     assert cost <= 1.002 * expected[1]
-    for piece in pieces:
-        ways = np.abs(np.diff(piece.joints, axis=0))
-        assert (ways <= step + 1e-9).all()
-        assert piece.cost == pytest.approx(ways.sum(), rel=1e-9)
+    for segment in segments:
+        paths = np.abs(np.diff(segment.joints, axis=0))
+        assert (paths <= step + 1e-9).all()
+        assert segment.cost == pytest.approx(paths.sum(), rel=1e-9)
 
 
-def test_far_apart_parts_of_a_way_are_pieces_as_cheap_and_as_clear_as_by_themselves() -> None:
+def test_distant_parts_of_a_path_are_segments_as_if_planned_alone() -> None:
     problem = problem_of("panda__1cube")
     machine = FixedBase(lock_joints(problem.machine.robot, {"panda_joint4": -1.8}))
     rows, turns = [], []
@@ -214,20 +216,20 @@ def test_far_apart_parts_of_a_way_are_pieces_as_cheap_and_as_clear_as_by_themsel
             turns.append(Rotation.from_matrix(np.array(ca.DM(pose.rotation))).as_quat()[[3, 0, 1, 2]])
     scene = Scene(obstacles=problem.boxes, ignored=problem.ignored)
     exclusive = [path(machine, Waypoints(rows[k : k + 3], turns[k : k + 3], 0.12), scene) for k in (0, 3)]
-    found = path(machine, Waypoints(rows, turns, 0.12, "counted"), scene)
-    assert found.reconfigurations == (2,)
-    assert found.cost == pytest.approx(sum(one.cost for one in exclusive), rel=1e-6)
-    worst, *nearest = (closest(one) for one in (found, *exclusive))
+    result = path(machine, Waypoints(rows, turns, 0.12, "counted"), scene)
+    assert result.reconfigurations == (2,)
+    assert result.cost == pytest.approx(sum(one.cost for one in exclusive), rel=1e-6)
+    worst, *nearest = (closest(one) for one in (result, *exclusive))
     assert worst.distance == pytest.approx(min(one.distance for one in nearest), abs=1e-6)
-    assert not found.t[2] < worst.time < found.t[3]
+    assert not result.t[2] < worst.time < result.t[3]
 
 
-def test_pieces_are_counted_with_one_free_direction_at_most() -> None:
+def test_segments_are_counted_with_one_free_direction_at_most() -> None:
     problem = problem_of("fetch__square")
-    told = (problem.positions[:3], problem.quaternions[:3])
+    report = (problem.positions[:3], problem.quaternions[:3])
     with pytest.raises(ProblemError, match="at most") as refused:
-        plan(problem.machine, Waypoints(*told, reconfigurations="counted"), scene=False)
+        plan(problem.machine, Waypoints(*report, reconfigurations="counted"), scene=False)
     assert refused.value.name == "reconfigurations"
     with pytest.raises(ProblemError, match="reconfigurations") as refused:
-        plan(problem.machine, Waypoints(*told, reconfigurations="few"))  # type: ignore[arg-type]
+        plan(problem.machine, Waypoints(*report, reconfigurations="few"))  # type: ignore[arg-type]
     assert refused.value.name == "reconfigurations"

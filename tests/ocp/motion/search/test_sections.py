@@ -66,9 +66,9 @@ def planned(count: int, weights: tuple[float, ...] | None = None) -> PathPlan:
 
 def path(machine: FixedBase, waypoints: Waypoints, **options: Any) -> PathPlan:
     """As `plan`, for paths of whatever the links may touch."""
-    found = plan(machine, waypoints, scene=False, **options)
-    assert isinstance(found, PathPlan)
-    return found
+    result = plan(machine, waypoints, scene=False, **options)
+    assert isinstance(result, PathPlan)
+    return result
 
 
 def limit_charts(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
@@ -77,38 +77,38 @@ def limit_charts(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     monkeypatch.setattr(waypoints, "_WaypointPlanner", partial(waypoints._WaypointPlanner, settings=own))
 
 
-def test_a_way_keeps_its_poses_and_steps_and_is_no_dearer_than_with_the_lift_held() -> None:
-    machine, found = problem_of("fetch__square").machine, planned(40)
-    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
+def test_a_path_meets_its_poses_and_costs_no_more_than_with_the_lift_fixed() -> None:
+    machine, result = problem_of("fetch__square").machine, planned(40)
+    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in result.joints]
     assert np.array(tips) == pytest.approx(task(40)[0], abs=1e-6)
-    assert (found.steps <= STEP + 1e-9).all()
-    assert found.bound is found.gap is None
-    assert np.ptp(found.joints[:, 0]) > 0.1  # from one value to another
+    assert (result.steps <= STEP + 1e-9).all()
+    assert result.bound is result.gap is None
+    assert np.ptp(result.joints[:, 0]) > 0.1  # from one value to another
     for height in (0.0, 0.2, 0.38):
         arm = FixedBase(lock_joints(machine.robot, {machine.robot.joint_names[0]: height}))
         held = plan(arm, Waypoints(*task(40), step=STEP), scene=False)
-        assert found.cost <= held.cost * (1 + 1e-6)
+        assert result.cost <= held.cost * (1 + 1e-6)
 
 
-def test_what_is_in_reach_at_no_one_height_of_the_lift_is_done_by_lifting() -> None:
+def test_poses_out_of_reach_at_a_fixed_height_are_reached_by_lifting() -> None:
     machine, count = problem_of("fetch__square").machine, 40
     places = np.column_stack([np.full(count, 0.75), np.zeros(count), np.linspace(0.2, 1.4, count)])
     turns = np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
-    found = path(machine, Waypoints(places, turns, step=STEP))
-    assert found.joints[-1, 0] > found.joints[0, 0] + 0.1
+    result = path(machine, Waypoints(places, turns, step=STEP))
+    assert result.joints[-1, 0] > result.joints[0, 0] + 0.1
     for height in (0.0, 0.2, 0.38):
         arm = FixedBase(lock_joints(machine.robot, {machine.robot.joint_names[0]: height}))
         with pytest.raises(Unreachable):
             plan(arm, Waypoints(places, turns, step=STEP), scene=False)
 
 
-def test_back_it_is_as_long_and_heavy_it_is_dearer() -> None:
-    machine, found = problem_of("fetch__square").machine, planned(40)
+def test_the_reversed_path_is_as_long_and_weights_increase_the_cost() -> None:
+    machine, result = problem_of("fetch__square").machine, planned(40)
     places, turns = task(40)
     back = plan(machine, Waypoints(places[::-1], -turns[::-1], step=STEP), scene=False)
-    assert back.cost == pytest.approx(found.cost, rel=0.03)
+    assert back.cost == pytest.approx(result.cost, rel=0.03)
     heavy = planned(40, weights=(100.0, *np.ones(7)))
-    assert np.abs(np.diff(heavy.joints[:, 0])).sum() < np.abs(np.diff(found.joints[:, 0])).sum()
+    assert np.abs(np.diff(heavy.joints[:, 0])).sum() < np.abs(np.diff(result.joints[:, 0])).sum()
 
 
 @pytest.mark.long
@@ -122,15 +122,15 @@ def test_where_there_are_more_charts_than_memory_is_for_fewer_waypoints_are_sear
 ) -> None:
     limit_charts(monkeypatch, 4000)
     machine = problem_of("fetch__square").machine
-    found = plan(machine, Waypoints(*task(40), step=STEP), scene=False)
-    assert found.cost == pytest.approx(planned(40).cost, rel=0.1)
+    result = plan(machine, Waypoints(*task(40), step=STEP), scene=False)
+    assert result.cost == pytest.approx(planned(40).cost, rel=0.1)
     limit_charts(monkeypatch, 10)
     with pytest.raises(ProblemError) as refused:
         plan(machine, Waypoints(*task(40), step=STEP), scene=False)
     assert refused.value.name == "configurations"
 
 
-def test_what_is_in_the_way_is_named_with_the_waypoint() -> None:
+def test_obstacles_are_named_with_the_waypoint() -> None:
     machine = problem_of("fetch__square").machine
     places, turns = task(40)
     box = Box((0.1, 0.1, 0.1), tuple(places[20]))
@@ -149,10 +149,10 @@ def test_what_is_in_the_way_is_named_with_the_waypoint() -> None:
 def test_a_handful_of_waypoints_may_be_as_far_apart_as_one_likes(count: int) -> None:
     places, turns = (rows[:count] for rows in task(40))
     machine = problem_of("fetch__square").machine
-    found = path(machine, Waypoints(places, turns))
-    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in found.joints]
+    result = path(machine, Waypoints(places, turns))
+    tips = [np.array(ca.DM(machine.tip_pose((), q).position)).ravel() for q in result.joints]
     assert np.array(tips) == pytest.approx(places, abs=1e-6)
-    assert found.cost == pytest.approx(np.abs(np.diff(found.joints, axis=0)).sum(), rel=1e-12)
+    assert result.cost == pytest.approx(np.abs(np.diff(result.joints, axis=0)).sum(), rel=1e-12)
 
 
 def test_a_waypoint_out_of_reach_is_named_wherever_it_is_seen_first() -> None:
@@ -189,9 +189,9 @@ def test_where_the_joint_is_held_at_no_value_that_does_the_waypoint_is_named(mon
 
 def test_with_one_free_direction_fewer_waypoints_are_searched_too(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = problem_of("fetch_arm__s").machine
-    found = path(machine, Waypoints(*task(40), step=STEP))
+    result = path(machine, Waypoints(*task(40), step=STEP))
     limit_charts(monkeypatch, 1000)  # there are some 300 at each of 9 waypoints
     again = path(machine, Waypoints(*task(40), step=STEP))
-    assert again.cost == pytest.approx(found.cost, rel=0.02)
+    assert again.cost == pytest.approx(result.cost, rel=0.02)
     assert again.gap is not None
     assert again.gap >= 0

@@ -36,7 +36,7 @@ def armed() -> FixedBase:
 
 MACHINE = armed()
 SETS, TIMES = sets_of(MACHINE, moved(MACHINE, START, "place"))
-INSTANTS = [TimeSample(SETS, k) for k in range(len(TIMES))]
+TIME_SAMPLES = [TimeSample(SETS, k) for k in range(len(TIMES))]
 
 
 def slid(way: float) -> Array:
@@ -65,11 +65,11 @@ def tight(obstacle: Any = None, later: float = 0.0) -> Array:
     far, bounds = np.full((len(TIMES) - 1, robot.dof), 1.0), (robot.lower, robot.upper)
     cost = PathLength(np.ones(robot.dof))
     return shorten_path(
-        followed(), INSTANTS, Steps(TIMES + later, cost, far), bounds=bounds, scene=around, widths=(0.1, 1e-3)
+        followed(), TIME_SAMPLES, Steps(TIMES + later, cost, far), bounds=bounds, scene=around, widths=(0.1, 1e-3)
     )
 
 
-def drawn(
+def random_problem(
     start: Array = START, cost: Any = None, far: Any = 1.0, lower: Any = -9.0, upper: Any = 9.0, times: Any = TIMES
 ) -> Array:
     """The way from a start drawn tight, whatever is around."""
@@ -78,7 +78,7 @@ def drawn(
     bounds = np.maximum(robot.lower, lower), np.minimum(robot.upper, upper)
     cost = cost or PathLength(np.ones(robot.dof))
     return shorten_path(
-        followed(start), INSTANTS, Steps(times, cost, steps), bounds=bounds, scene=None, widths=(0.1, 1e-3)
+        followed(start), TIME_SAMPLES, Steps(times, cost, steps), bounds=bounds, scene=None, widths=(0.1, 1e-3)
     )
 
 
@@ -92,51 +92,51 @@ def middle_of_the_last_link(joints: Array) -> Array:
 
 
 def test_it_is_no_longer_and_does_its_task() -> None:
-    found = tight()
-    assert length(found) < 0.99 * length(followed())
-    error = SETS.linearize(np.arange(len(TIMES)), found)[0]
+    result = tight()
+    assert length(result) < 0.99 * length(followed())
+    error = SETS.linearize(np.arange(len(TIMES)), result)[0]
     assert_allclose(error, 0.0, atol=1e-9)
 
 
 def test_from_all_along_a_valley_it_leads_to_its_bottom() -> None:
     """Ways up to 2 rad from the cheapest one, which is farther than the postures beside them reach at once."""
-    least = length(drawn())
-    for way in (-0.5, -1.0, -1.5):
-        assert length(drawn(slid(way))) == pytest.approx(least, rel=3e-3)
+    least = length(random_problem())
+    for path in (-0.5, -1.0, -1.5):
+        assert length(random_problem(slid(path))) == pytest.approx(least, rel=3e-3)
 
 
 @pytest.mark.parametrize("weight", [1e-4, 1e4])
 def test_the_unit_of_the_cost_does_not_matter(weight: float) -> None:
-    assert_allclose(drawn(cost=PathLength(np.full(3, weight))), drawn(), atol=1e-12)
+    assert_allclose(random_problem(cost=PathLength(np.full(3, weight))), random_problem(), atol=1e-12)
 
 
 def test_when_a_motion_begins_does_not_matter_nor_how_long_it_takes() -> None:
     """With the squares of the rates for cost, which is larger in less time, by the same factor everywhere."""
-    found = drawn(cost=SquaredRates(np.ones(3)))
-    energies = [float((np.diff(path, axis=0) ** 2).sum()) for path in (found, drawn(), followed())]
+    result = random_problem(cost=SquaredRates(np.ones(3)))
+    energies = [float((np.diff(path, axis=0) ** 2).sum()) for path in (result, random_problem(), followed())]
     assert energies[0] < min(energies[1:])
     for times in (TIMES + 1e3, 2.0 * TIMES):
-        assert_allclose(drawn(cost=SquaredRates(np.ones(3)), times=times), found, atol=1e-9)
+        assert_allclose(random_problem(cost=SquaredRates(np.ones(3)), times=times), result, atol=1e-9)
 
 
-def test_limits_of_joints_and_of_their_steps_are_kept_and_met() -> None:
-    free = drawn()
+def test_limits_of_joints_and_of_their_steps_hold_and_are_reached() -> None:
+    free = random_problem()
     assert free[:, 1].min() < -1e-3
     assert free[:, 0].max() > 1.1
     for low, high in (((-9.0, 0.2, -9.0), 9.0), (-9.0, (0.9, 9.0, 9.0))):
-        kept = drawn(lower=low, upper=high)
+        kept = random_problem(lower=low, upper=high)
         assert (kept >= np.array(low)).all()
         assert (kept <= np.array(high)).all()
         assert length(free) < length(kept) < length(followed())
         assert min(np.abs(kept - low).min(), np.abs(kept - high).min()) < 0.02
     steps = np.abs(np.diff(free, axis=0)).max(axis=0)
-    short = drawn(far=(1.0, 1.0, 0.9 * steps[2]))
+    short = random_problem(far=(1.0, 1.0, 0.9 * steps[2]))
     assert np.abs(np.diff(short, axis=0)).max(axis=0)[2] <= 0.9 * steps[2] + 1e-9
     assert length(free) < length(short) < length(followed())
 
 
 @pytest.mark.parametrize("later", [0.0, 20.0])
-def test_what_moves_is_in_the_way_where_it_is_then(later: float) -> None:
+def test_moving_obstacles_collide_at_their_time(later: float) -> None:
     """A ball that is far away while the arm moves, and in its way at other times, before or after 10 s."""
     half = tight()[len(TIMES) // 2]
     beside, away = np.append(middle_of_the_last_link(half), 0.04), np.array([0.0, 0.0, 9.0])

@@ -30,7 +30,7 @@ from ocp.motion.search.value import GraphSettings, _bound_charts, _bound_with_re
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.search.test_charts import planar
 
-SECONDS, INSTANTS = 3.0, 6
+SECONDS, TIME_SAMPLES = 3.0, 6
 
 
 def reached(lengths: Array, at: Array, limit: float, count: int) -> Array:
@@ -39,15 +39,15 @@ def reached(lengths: Array, at: Array, limit: float, count: int) -> Array:
     x, y = (at[k] - lengths[0] * turn(first) for k, turn in enumerate((np.cos, np.sin)))
     cosine = (x**2 + y**2 - lengths[1] ** 2 - lengths[2] ** 2) / (2 * lengths[1] * lengths[2])
     good = np.abs(cosine) <= 1
-    found = []
+    results = []
     for side in (1.0, -1.0):
         last = side * np.arccos(cosine[good])
         second = np.arctan2(y[good], x[good]) - np.arctan2(
             lengths[2] * np.sin(last), lengths[1] + lengths[2] * np.cos(last)
         )
         second = np.remainder(second - first[good] + np.pi, 2 * np.pi) - np.pi
-        found.append(np.column_stack([first[good], second, last]))
-    both = np.vstack(found)
+        results.append(np.column_stack([first[good], second, last]))
+    both = np.vstack(results)
     return np.asarray(both[(np.abs(both) <= limit).all(axis=1)])
 
 
@@ -55,8 +55,8 @@ def brute_force(nodes: list[Array], cost: StepCost, seconds: float, limit: Array
     """The least cost over all sequences of nodes."""
     value = np.zeros(len(nodes[-1]))
     for here, there in zip(nodes[-2::-1], nodes[:0:-1], strict=True):
-        way = there[None] - here[:, None]
-        steps = np.where((np.abs(way) <= limit).all(axis=2), cost.evaluate(way, seconds), np.inf)
+        path = there[None] - here[:, None]
+        steps = np.where((np.abs(path) <= limit).all(axis=2), cost.evaluate(path, seconds), np.inf)
         value = (steps + value).min(axis=1)
     return float(value.min())
 
@@ -68,18 +68,18 @@ def random_case(seed: int) -> tuple[FixedBase, Array, Array, Array]:
     machine = planar(lengths)
     joints = rng.uniform(-2.0, 2.0, 3)
     first = np.array(ca.DM(machine.tip_pose((), joints).position)).ravel()[:2]
-    way = rng.normal(size=2)
-    way *= rng.uniform(0.1, 0.4) / np.linalg.norm(way)
+    path = rng.normal(size=2)
+    path *= rng.uniform(0.1, 0.4) / np.linalg.norm(path)
     bend = rng.normal(size=2) * 0.1
-    s = np.linspace(0, 1, INSTANTS)[:, None]
-    places = first + s * way + 4 * s * (1 - s) * bend
+    s = np.linspace(0, 1, TIME_SAMPLES)[:, None]
+    places = first + s * path + 4 * s * (1 - s) * bend
     reach = lengths.sum()
     places *= np.minimum(1.0, 0.97 * reach / np.linalg.norm(places, axis=1).max())
     return machine, lengths, places, rng.uniform(0.5, 2.0, 3)
 
 
 def search_of(machine: FixedBase, places: Array, cost: StepCost) -> AtlasSearch:
-    times = np.linspace(0, SECONDS, INSTANTS)
+    times = np.linspace(0, SECONDS, TIME_SAMPLES)
     task = TipTask(position=[*places[0]], rows=[3, 4])
     equations = bind(machine, task)
     targets = np.array([np.r_[place, 0.0, 0.0, 0.0, 0.0] for place in places])
@@ -94,7 +94,9 @@ def search_of(machine: FixedBase, places: Array, cost: StepCost) -> AtlasSearch:
         return np.array([one.joints for one in inverse_kinematics(machine, at, starts=16, seed=k)])
 
     limits = robot.velocity * np.diff(times)[:, None]
-    return AtlasSearch(space, [TimeSample(sets, k) for k in range(INSTANTS)], Steps(times, cost, limits), seeds=seeds)
+    return AtlasSearch(
+        space, [TimeSample(sets, k) for k in range(TIME_SAMPLES)], Steps(times, cost, limits), seeds=seeds
+    )
 
 
 @pytest.mark.parametrize("kind", [SquaredRates, PathLength, LargestMotion])
@@ -103,7 +105,7 @@ def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> Non
     machine, lengths, places, weights = random_case(seed)
     cost = kind(weights)
     nodes = [reached(lengths, place, 2.8, 700) for place in places]
-    seconds = SECONDS / (INSTANTS - 1)
+    seconds = SECONDS / (TIME_SAMPLES - 1)
     least = brute_force(nodes, cost, seconds, machine.robot.velocity * seconds)
     search = search_of(machine, places, cost)
     path, bound = search.solve(np.inf)
@@ -116,7 +118,7 @@ def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> Non
     assert 0.97 * steps <= bound <= min(steps, least) * (1 + 1e-9)
 
 
-def test_in_charts_that_limits_cut_a_posture_is_found_that_keeps_them() -> None:
+def test_charts_cut_by_limits_have_a_configuration_within_them() -> None:
     """Where the end of the box lies beyond a limit, as it may where the set bends, nearer to its middle."""
     _, lengths, places, weights = random_case(4)
     search, beyond = search_of(planar(lengths, 2.0), places, SquaredRates(weights)), 0
@@ -126,21 +128,21 @@ def test_in_charts_that_limits_cut_a_posture_is_found_that_keeps_them() -> None:
             for end in (box.low[0], box.high[0]):
                 at = box.centers + (box.tangents @ end[:, None])[:, :, 0]
                 there, good = search.samples[k].manifolds.project(np.array([k]), at)
-                found = search.project_in_box(k, box, end)
-                if found is not None:
-                    assert search.space.within(found)
-                    assert search.samples[k].manifolds.linearize(np.array([k]), found[None])[0] == pytest.approx(
+                result = search.project_in_box(k, box, end)
+                if result is not None:
+                    assert search.space.within(result)
+                    assert search.samples[k].manifolds.linearize(np.array([k]), result[None])[0] == pytest.approx(
                         0, abs=1e-9
                     )
                 if good[0] and search.space.within(there)[0]:
-                    assert found == pytest.approx(there[0])
+                    assert result == pytest.approx(there[0])
                 else:
-                    beyond += found is not None
+                    beyond += result is not None
     assert beyond > 0
 
 
 @pytest.mark.parametrize("seed", [0, 13])
-def test_what_is_found_and_its_bound_grow_with_the_weights(seed: int) -> None:
+def test_cost_and_bound_grow_with_the_weights(seed: int) -> None:
     machine, _, places, weights = random_case(seed)
     (path, bound), (other, more) = (
         search_of(machine, places, PathLength(own)).solve(np.inf) for own in (weights, 100 * weights)
@@ -152,33 +154,33 @@ def test_what_is_found_and_its_bound_grow_with_the_weights(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [5, 10])
-def test_of_every_class_dearer_ones_are_told_beside_those_that_may_be_the_cheapest(seed: int) -> None:
+def test_costlier_motions_are_reported_beside_the_lowest_cost_classes(seed: int) -> None:
     machine, _, places, weights = random_case(seed)
     search = search_of(machine, places, SquaredRates(weights))
     path, _ = search.solve(np.inf)
     assert path is not None
-    told, every = (
-        [search.path_cost(way) for way in search.class_representatives(np.inf, each)] for each in (False, True)
+    report, every = (
+        [search.path_cost(motion) for motion in search.class_representatives(np.inf, each)] for each in (False, True)
     )
-    assert told == sorted(told)
+    assert report == sorted(report)
     assert every == sorted(every)
-    assert told[0] <= 1.02 * search.path_cost(path)  # one of a few is drawn from chart to chart, not tight
-    assert every[0] <= told[0] * 1.01
-    assert len(every) > len(told)
-    assert every[-1] > 1.1 * told[-1]
+    assert report[0] <= 1.02 * search.path_cost(path)  # one of a few is drawn from chart to chart, not tight
+    assert every[0] <= report[0] * 1.01
+    assert len(every) > len(report)
+    assert every[-1] > 1.1 * report[-1]
 
 
 def flat_charts(rng: np.random.Generator, count: int, scale: Array, free: int, half: float) -> Charts:
     """Charts of sets that lie flat, their boxes cut at random."""
     n = len(scale)
-    ways = np.linalg.qr(rng.normal(size=(count, n, free)))[0] / scale[:, None]
+    paths = np.linalg.qr(rng.normal(size=(count, n, free)))[0] / scale[:, None]
     ends = rng.uniform(0.0, half, (2, count, free))
     flat, none = np.zeros((count, len(_rim(free)), n)), np.zeros(count, dtype=np.intp)
-    return Charts(none, np.zeros((count, n)), ways, np.full(count, half), -ends[0], ends[1], flat)
+    return Charts(none, np.zeros((count, n)), paths, np.full(count, half), -ends[0], ends[1], flat)
 
 
 @pytest.mark.parametrize(("kind", "free"), [(SquaredRates, 1), (SquaredRates, 2), (PathLength, 1), (LargestMotion, 1)])
-def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free: int) -> None:
+def test_lower_bounds_of_a_step_are_below_it_and_tight(kind: Any, free: int) -> None:
     rng = np.random.default_rng(3)
     count, n, seconds, half = 200, 4, 0.7, 0.2
     weights = rng.uniform(0.5, 2.0, n)
@@ -198,8 +200,8 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
 
     def costs(place: Array) -> Array:
         start = delta - np.einsum("pnr,pr->pn", out.tangents, place)
-        ways = start[:, None] + np.einsum("pnr,pgr->pgn", into.tangents, there)
-        return np.asarray((cost.evaluate(ways, seconds) + cost_to_go).min(axis=1))
+        paths = start[:, None] + np.einsum("pnr,pgr->pgn", into.tangents, there)
+        return np.asarray((cost.evaluate(paths, seconds) + cost_to_go).min(axis=1))
 
     def somewhere() -> Array:
         return np.asarray(out.low + (out.high - out.low) * rng.uniform(size=(count, free)))
@@ -207,8 +209,8 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
     for _ in range(8):
         place, other = somewhere(), somewhere()
         value, slope = steps.at(place)
-        way = other - place
-        below = value + (slope * way).sum(axis=1) + np.einsum("pa,pab,pb->p", way, steps.curve, way) / 2
+        path = other - place
+        below = value + (slope * path).sum(axis=1) + np.einsum("pa,pab,pb->p", path, steps.curve, path) / 2
         assert (below <= costs(other) + 1e-9).all()
         assert (value <= costs(place) + 1e-9).all()
         if kind is not SquaredRates:
@@ -219,26 +221,24 @@ def test_what_is_below_a_step_is_nowhere_above_it_and_touches_it(kind: Any, free
 
 
 @pytest.mark.parametrize(("kind", "free"), [(SquaredRates, 1), (SquaredRates, 2), (PathLength, 1), (LargestMotion, 1)])
-def test_what_is_below_a_step_is_so_where_the_sets_bend_away_from_their_charts_and_a_cubic_more(
-    kind: Any, free: int
-) -> None:
+def test_lower_bounds_of_a_step_hold_on_curved_solution_sets(kind: Any, free: int) -> None:
     rng = np.random.default_rng(5)
     count, n, seconds, half = 100, 4, 0.7, 0.2
     weights = rng.uniform(0.5, 2.0, n)
     cost, scale = kind(weights), np.sqrt(weights) if kind is SquaredRates else np.ones(n)
     rim = np.broadcast_to(half * _rim(free), (count, len(_rim(free)), free))
 
-    def bent() -> tuple[Charts, Any]:
+    def curved_charts() -> tuple[Charts, Any]:
         """Charts, and how far the sets are from places (P, g, r) on them. Shape (P, g, n)."""
         bends, cubes = rng.normal(size=(count, n, free, free)), 0.02 * rng.normal(size=(count, n, free))
 
-        def stray(at: Array) -> Array:
+        def deviation(at: Array) -> Array:
             cubic = np.einsum("pna,pga->pgn", cubes, (at / half) ** 3)
             return np.asarray(np.einsum("pga,pnab,pgb->pgn", at, bends, at) / 2 + cubic)
 
-        return replace(flat_charts(rng, count, scale, free, half), deviations=stray(rim)), stray
+        return replace(flat_charts(rng, count, scale, free, half), deviations=deviation(rim)), deviation
 
-    (out, away), (into, beyond) = bent(), bent()
+    (out, away), (into, beyond) = curved_charts(), curved_charts()
     after = QuadraticBounds(rng.normal(size=count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
     delta = 0.3 * rng.normal(size=(count, n))
     steps = cost.lower_bounds(
@@ -253,36 +253,34 @@ def test_what_is_below_a_step_is_so_where_the_sets_bend_away_from_their_charts_a
         start = np.einsum("pnr,pr->pn", out.tangents, other) + away(other[:, None])[:, 0]
         costs = (cost.evaluate(delta[:, None] + ends - start[:, None], seconds) + cost_to_go).min(axis=1)
         value, slope = steps.at(place)
-        way = other - place
-        below = value + (slope * way).sum(axis=1) + np.einsum("pa,pab,pb->p", way, steps.curve, way) / 2
+        path = other - place
+        below = value + (slope * path).sum(axis=1) + np.einsum("pa,pab,pb->p", path, steps.curve, path) / 2
         gaps.append(costs - below)
     assert np.min(gaps) >= -1e-9
 
 
 @pytest.mark.parametrize(("free", "order"), [(1, 3.9), (2, 2.5)])
-def test_what_is_lost_of_steps_between_sets_that_bend_is_of_higher_order_than_the_curvature_that_is_told(
-    free: int, order: float
-) -> None:
+def test_losses_of_steps_between_curved_sets_are_of_higher_order(free: int, order: float) -> None:
     """Of parallel charts whose sets bend across them by quadratics, which are told apart from all that strays."""
 
     def lost(half: float) -> Array:
         rng = np.random.default_rng(6)
         count, n, seconds = 100, 4, 0.7
         weights = rng.uniform(0.5, 2.0, n)
-        ways = np.linalg.qr(rng.normal(size=(count, n, n)))[0] / np.sqrt(weights)[:, None]
-        along, across, none = ways[:, :, :free], ways[:, :, free:], np.zeros(count, dtype=np.intp)
+        paths = np.linalg.qr(rng.normal(size=(count, n, n)))[0] / np.sqrt(weights)[:, None]
+        along, across, none = paths[:, :, :free], paths[:, :, free:], np.zeros(count, dtype=np.intp)
         rim, box = np.broadcast_to(half * _rim(free), (count, len(_rim(free)), free)), np.full((count, free), half)
 
-        def bent() -> tuple[Charts, Any]:
+        def curved_charts() -> tuple[Charts, Any]:
             bends = 0.2 * rng.normal(size=(count, n - free, free, free))
             bends = np.einsum("pnc,pcab->pnab", across, bends + bends.transpose(0, 1, 3, 2))
 
-            def stray(at: Array) -> Array:
+            def deviation(at: Array) -> Array:
                 return np.asarray(np.einsum("pga,pnab,pgb->pgn", at, bends, at) / 2)
 
-            return Charts(none, np.zeros((count, n)), along, box[:, 0], -box, box, stray(rim)), stray
+            return Charts(none, np.zeros((count, n)), along, box[:, 0], -box, box, deviation(rim)), deviation
 
-        (out, away), (into, beyond) = bent(), bent()
+        (out, away), (into, beyond) = curved_charts(), curved_charts()
         after = QuadraticBounds(np.zeros(count), rng.normal(size=(count, free)), np.zeros((count, free, free)))
         delta, cost = 0.3 * rng.normal(size=(count, n)), SquaredRates(weights)
         steps = cost.lower_bounds(
@@ -307,7 +305,7 @@ def test_what_is_lost_of_steps_between_sets_that_bend_is_of_higher_order_than_th
 
 
 @pytest.mark.parametrize(("kind", "free"), [(SquaredRates, 1), (SquaredRates, 2), (PathLength, 1), (LargestMotion, 1)])
-def test_bounds_on_a_chart_are_above_no_step_from_it_nor_with_what_is_known_of_the_rest(kind: Any, free: int) -> None:
+def test_bounds_on_a_chart_are_below_all_steps_from_it(kind: Any, free: int) -> None:
     rng = np.random.default_rng(11)
     groups, each, n, seconds, half = 40, 5, 4, 0.7, 0.2
     count = groups * each
@@ -324,7 +322,7 @@ def test_bounds_on_a_chart_are_above_no_step_from_it_nor_with_what_is_known_of_t
         delta, CurvedCharts(out, *out.curvature()), CurvedCharts(into, *into.curvature()), after, seconds=seconds
     )
     starts = np.arange(0, count, each)
-    found, boxes, gaps = (
+    result, boxes, gaps = (
         _bound_charts(steps, out, starts, np.full(groups, np.inf), GraphSettings()),
         out.select(starts),
         [],
@@ -338,13 +336,13 @@ def test_bounds_on_a_chart_are_above_no_step_from_it_nor_with_what_is_known_of_t
         places = np.repeat(place, each, axis=0)
         costs = steps.at(places)[0]
         assert (whole <= costs + rest.at(places) + 1e-9).all()
-        gaps.append(costs.reshape(groups, each).min(axis=1) - found.at(place))
+        gaps.append(costs.reshape(groups, each).min(axis=1) - result.at(place))
     assert np.min(gaps) >= -1e-9
     assert np.median(np.min(gaps, axis=0)) < 0.02  # of costs of about 0.4
 
 
 @pytest.mark.parametrize("kind", [SquaredRates, PathLength])
-def test_steps_that_are_not_looked_at_change_no_bound(kind: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pruned_steps_change_no_bound(kind: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """All steps to every chart that limits allow, beside those that are thought to be worth it."""
     machine, _, places, weights = random_case(4)
     search = search_of(machine, places, kind(weights))
@@ -352,7 +350,7 @@ def test_steps_that_are_not_looked_at_change_no_bound(kind: Any, monkeypatch: py
     some = [graph.cost_to_go(), graph.cost_to_come()]
     monkeypatch.setattr("ocp.motion.search.value._least_of_groups", lambda high, group: np.full(len(high), np.inf))
     whole = [graph.cost_to_go(), graph.cost_to_come()]
-    for k in range(INSTANTS):
+    for k in range(TIME_SAMPLES):
         for few, every in zip(some, whole, strict=True):
             assert graph.minima(few[k], k) == pytest.approx(graph.minima(every[k], k), rel=0.02, abs=1e-9)
     low = [float(graph.minima(each[0][0], 0).min()) for each in (some, whole)]
@@ -364,7 +362,7 @@ def test_steps_that_are_not_looked_at_change_no_bound(kind: Any, monkeypatch: py
 def test_with_the_rest_known_the_bounds_hold_for_all_motions_below_a_cost(kind: Any, seed: int) -> None:
     """Cheap motions of a fine grid, each through the charts that its postures lie in."""
     machine, lengths, places, weights = random_case(seed)
-    cost, seconds, rng = kind(weights), SECONDS / (INSTANTS - 1), np.random.default_rng(seed)
+    cost, seconds, rng = kind(weights), SECONDS / (TIME_SAMPLES - 1), np.random.default_rng(seed)
     search = search_of(machine, places, cost)
     graph = search.full_graph()
     nodes = [reached(lengths, place, float(machine.robot.upper[0]), 400) for place in places]
@@ -375,19 +373,19 @@ def test_with_the_rest_known_the_bounds_hold_for_all_motions_below_a_cost(kind: 
     cost_to_go = graph.cost_to_go(max_cost=most)
     passed = graph.cost_to_come(cost_to_go, most)
     again = graph.cost_to_go(passed, most)
-    left = sum(int(np.isfinite(graph.cost_through(passed, again, k)).sum()) for k in range(INSTANTS))
+    left = sum(int(np.isfinite(graph.cost_through(passed, again, k)).sum()) for k in range(TIME_SAMPLES))
     assert left < sum(map(len, graph.layers))
     for first in rng.permutation(np.flatnonzero(value[0] < most))[:40].tolist():
         path = [first]
-        for k in range(INSTANTS - 1):
+        for k in range(TIME_SAMPLES - 1):
             steps = cost.evaluate(nodes[k + 1] - nodes[k][path[-1]], seconds) + value[k + 1]
             path.append(int(steps.argmin()))
         total = float(value[0][first])
         for k, at in enumerate(path):
             charts = graph.layers[k]
-            way = search.space.difference(nodes[k][at], charts.centers) * search.space.scale
-            flat = np.einsum("kn,knr->kr", way, charts.tangents * search.space.scale[:, None])
-            normal = np.sqrt(np.maximum((way**2).sum(axis=1) - (flat**2).sum(axis=1), 0.0))
+            motion = search.space.difference(nodes[k][at], charts.centers) * search.space.scale
+            flat = np.einsum("kn,knr->kr", motion, charts.tangents * search.space.scale[:, None])
+            normal = np.sqrt(np.maximum((motion**2).sum(axis=1) - (flat**2).sum(axis=1), 0.0))
             within = ((flat >= charts.low) & (flat <= charts.high)).all(axis=1) & (normal <= 0.2 * charts.radii)
             assert within.any()
             for bounds, cost_of in ((again[k], value[k][at]), (passed[k], total - value[k][at])):
@@ -406,10 +404,10 @@ def test_a_bound_leans_as_what_it_bounds_from_end_to_end_and_where_that_bends_up
         return np.asarray((places * (slope + bend / 2 * places)).sum(axis=1))
 
     sides = [side * half * np.eye(free)[axis] for axis in range(free) for side in (-1.0, 1.0)]
-    found = _secant_slopes([value(place) for place in (np.zeros_like(half), *sides)], half)
+    result = _secant_slopes([value(place) for place in (np.zeros_like(half), *sides)], half)
     # of the lines below a parabola at its ends and its middle the flattest; of one that bends down the chord
     flattest = np.sign(slope) * np.maximum(np.abs(slope) - bend * half / 2, 0.0)
-    np.testing.assert_allclose(found, flattest if bend > 0 else slope, atol=1e-12)
+    np.testing.assert_allclose(result, flattest if bend > 0 else slope, atol=1e-12)
 
 
 @pytest.mark.parametrize("free", [1, 2])

@@ -55,8 +55,8 @@ def two_pandas(momentum: Any = None) -> FreeFloating:
 @cache
 def floating_manipulator() -> FreeFloating:
     """The published seven-joint manipulator on its own base."""
-    package, ending, told = ROBOTS["floating manipulator"]
-    return FreeFloating(Robot.from_urdf(urdf_file(package, ending), **told))
+    package, ending, report = ROBOTS["floating manipulator"]
+    return FreeFloating(Robot.from_urdf(urdf_file(package, ending), **report))
 
 
 def pose(machine: Machine, base: Any, joints: Any) -> tuple[Array, Array]:

@@ -39,12 +39,12 @@ def test_tasks_that_name_links_need_no_tip() -> None:
     fork = FixedBase(replace(arm, joints=(*arm.joints[:-1], branch), tip=None, tip_translation=(0.0, 0.0, 0.0)))
     end = (1.0, 0.0, 0.0)
     task = TipTask(rows=(3, 4), velocity=(0.1, 0.2), link="link3", point=end)
-    told, found = (
+    report, result = (
         resolve(machine, start_joints=[0.3, 0.5, -0.7], horizon=1.0, tasks=task)
         for machine in (with_tip(fork, "link3", end), fork)
     )
-    np.testing.assert_array_equal(found.joints, told.joints)
-    np.testing.assert_array_equal(found.tip_in_world, told.tip_in_world)
+    np.testing.assert_array_equal(result.joints, report.joints)
+    np.testing.assert_array_equal(result.tip_in_world, report.tip_in_world)
     with pytest.raises(ProblemError, match=r"no tip.*leaves \['link2', 'link3'\]"):
         bind(fork, TipTask(rows=(3, 4), velocity=(0.1, 0.2)))
 
@@ -74,8 +74,8 @@ def test_rows_along_any_axes_are_followed_with_momentum_on_board(axes: Any) -> N
             "base": numeric(machine.world_from_base(base).rotation),
             "tip": pose(machine, base, joints)[0],
         }[axes]
-        found = np.concatenate([turn.T @ twist[:3], turn.T @ twist[3:]])
-        np.testing.assert_allclose(found[rows], TWIST[rows], atol=1e-9)
+        result = np.concatenate([turn.T @ twist[:3], turn.T @ twist[3:]])
+        np.testing.assert_allclose(result[rows], TWIST[rows], atol=1e-9)
 
 
 def test_a_pose_line_is_followed_and_the_drift_is_fed_back() -> None:
@@ -124,9 +124,9 @@ def test_a_free_roll_leaves_the_tool_axis_where_it_is_wanted() -> None:
         np.testing.assert_allclose(np.cross(spin, turn[:, 2]), change, atol=1e-7)
     # of all motions that do it the least: no smaller rates with another roll
     equations = bind(ur5(), task)
-    found = np.linalg.pinv(numeric(equations.jacobian(np.zeros(0), local.joints[3])))
+    result = np.linalg.pinv(numeric(equations.jacobian(np.zeros(0), local.joints[3])))
     right = equations.right(np.zeros(0), local.joints[3], equations.target_function()(local.t[3]))
-    np.testing.assert_allclose(local.joint_rates[3], (found @ numeric(right)).ravel(), atol=1e-9)
+    np.testing.assert_allclose(local.joint_rates[3], (result @ numeric(right)).ravel(), atol=1e-9)
 
 
 def test_the_base_is_held_still_by_a_task_of_the_root_link() -> None:
@@ -228,7 +228,7 @@ def test_quaternion_and_matrix_tracks_say_the_same() -> None:
     np.testing.assert_allclose(targets[0][9:].ravel(), [0, 0, 0.4], atol=1e-12)
 
 
-def test_errors_are_told_for_any_motion() -> None:
+def test_errors_are_reported_for_any_motion() -> None:
     rotation, position = pose(panda(), (), PANDA_START)
     task = TipTask(position=position, orientation=rotation, rows=(2, 3))
     errors = task_errors(panda(), task, [0.0, 1.0], None, [PANDA_START, PANDA_START])
@@ -278,7 +278,7 @@ def test_tasks_that_do_not_fit_the_machine_are_refused(task: Any, message: str) 
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
-def test_a_tool_axis_pointing_the_other_way_is_no_start() -> None:
+def test_an_opposite_tool_axis_is_no_start() -> None:
     rotation, position = pose(ur5(), (), UR5_START)
     with pytest.raises(ProblemError, match=r"'tool0' is .* away from where its task begins"):
         resolve(ur5(), tasks=TipTask(position=position, direction=-rotation[:, 2]), start_joints=UR5_START, horizon=1.0)
@@ -384,5 +384,5 @@ def test_the_manipulability_of_two_arms_is_the_product_of_their_singular_values(
     equations = bind(machine, [TipTask(velocity=np.zeros(len(rows)), rows=rows, link=hand) for hand in hands])
     for joints in rng.uniform(-2, 2, size=(3, 14)):
         values = np.linalg.svd(numeric(equations.jacobian(ca.DM(0, 1), joints)), compute_uv=False)
-        found = equations.manipulability(ca.DM(0, 1), ca.DM(joints))
-        np.testing.assert_allclose(float(found), values.prod(), rtol=1e-9)
+        result = equations.manipulability(ca.DM(0, 1), ca.DM(joints))
+        np.testing.assert_allclose(float(result), values.prod(), rtol=1e-9)

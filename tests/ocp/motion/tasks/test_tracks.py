@@ -64,14 +64,14 @@ def inner(tracks: PathTracks) -> Array:
 
 
 @every_track
-def test_tracks_say_what_the_path_says(kind: str) -> None:
+def test_tracks_equal_their_path(kind: str) -> None:
     tracks, distance, _ = TRACKS[kind]
     times = np.append(inner(tracks), [0.0, tracks.duration])
     s = np.clip(distance(times), 0, PATH.length)
     turn = Rotation.from_quat(np.roll(PATH.turn(s).quaternion, -1, axis=1)).as_matrix()
     np.testing.assert_allclose(numbers(tracks.position, times), PATH.at(s).position, atol=1e-9)
-    found = numbers(tracks.orientation, times).reshape(-1, 3, 3).transpose(0, 2, 1)
-    np.testing.assert_allclose(found, turn, atol=1e-9)
+    result = numbers(tracks.orientation, times).reshape(-1, 3, 3).transpose(0, 2, 1)
+    np.testing.assert_allclose(result, turn, atol=1e-9)
     np.testing.assert_allclose(numbers(tracks.axis(AXIS), times), turn @ AXIS, atol=1e-9)
 
 
@@ -98,7 +98,7 @@ def test_rates_are_derivatives_inside_and_one_sided_at_the_ends(kind: str) -> No
 
 
 @every_track
-def test_the_line_speed_is_what_was_asked_and_breaks_are_where_pieces_meet(kind: str) -> None:
+def test_the_line_speed_is_the_requested_one_and_breaks_are_at_segment_ends(kind: str) -> None:
     tracks, distance, speed = TRACKS[kind]
     times = inner(tracks)
     rates = numbers(rate_of(tracks.position), times)
@@ -134,12 +134,12 @@ def test_a_task_that_begins_later_is_the_same_later() -> None:
     assert later.end == pytest.approx(1.5 + PATH.length / SPEED)
 
 
-def test_the_task_of_a_path_takes_what_the_path_says_of_the_tool() -> None:
+def test_the_task_of_a_path_has_its_tool_orientation() -> None:
     plain = smooth(Path.through([(0, 0, 0), (1, 0, 0)]), deviation=0.01)
     bare, held = TipTask.along(plain, 0.1), TipTask.along(plain, 0.1, direction=(0, 0, -1))
-    free, given = TipTask.along(PATH, 0.1), TipTask.along(PATH, 0.1, roll="given")
+    free, options = TipTask.along(PATH, 0.1), TipTask.along(PATH, 0.1, roll="given")
     lean = TipTask.along(PATH, 0.1, within=0.2)
-    assert [task.size for task in (bare, held, free, given, lean)] == [3, 5, 5, 6, 3]
+    assert [task.size for task in (bare, held, free, options, lean)] == [3, 5, 5, 6, 3]
     assert (bare.direction, bare.orientation) == (None, None)
     assert free.orientation is None
-    assert given.direction is None
+    assert options.direction is None
