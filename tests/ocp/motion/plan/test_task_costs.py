@@ -10,7 +10,7 @@ import pinocchio
 import pytest
 
 from models import FixedBase, Joint, Link, Robot, planar_chain
-from models.arrays import Array
+from models.checks import Array
 from ocp import Cost, Limits, Plan, ProblemError, TipTask, joint_torques, plan
 
 TWO, THREE = FixedBase(planar_chain([0.5, 0.4], [2.0, 1.5])), FixedBase(planar_chain([0.5, 0.4, 0.3], [2.0, 1.5, 1.0]))
