@@ -15,11 +15,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+import ocp
 from models import FixedBase, Link, Robot, VisualShape, attach_tool, with_load
 from models.checks import Array
-from ocp import Audit, Collocation, Cost, Goal, Solution, TipTask, inverse_kinematics, joint_torques
+from ocp import Audit, Cost, Goal, Solution, TipTask, inverse_kinematics, joint_torques
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
-from ocp.motion.builders.dynamics_plan import SolveSettings, solve_dynamics
 from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.panda import HOME
@@ -34,7 +34,6 @@ PICK, PLACE = (0.6, -0.7, 0.06), (0.6, 0.7, 0.26)
 ABOVE = 0.15  # m, of the points above the load and its place
 WAY, DOWN, ACROSS = 1.6, 0.4, 1.6  # durations of legs, s
 EFFORT = Cost(velocity=0.0, effort=1.0, acceleration=2.0)
-SETTINGS = SolveSettings(Collocation(6, degree=5, scheme="legendre"))
 FINE = 81  # times of a leg
 HANDED = ("lift", "carry", "set down")
 """Legs with the load in hand."""
@@ -158,10 +157,11 @@ def legs(known: bool) -> list[Goal]:
 
 
 def plan(coarse: bool = False) -> PickAndPlace:
-    """Both plans, audited; on one mesh only, `coarse` or not."""
+    """Both plans, audited; `coarse` changes nothing."""
     plans, motions, audits = {}, {}, {}
     for name in KINDS:
-        plans[name] = solve_dynamics(arm(), legs(name == "load known"), start=HOME, cost=EFFORT, settings=SETTINGS)
+        goals = legs(name == "load known")
+        plans[name] = ocp.plan(arm(), goals, start=HOME, cost=EFFORT, scene=False).solution
         motions[name], audits[name] = motion_of(plans[name]), plans[name].audit()
     return PickAndPlace(plans, motions, audits)
 

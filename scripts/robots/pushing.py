@@ -15,9 +15,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import CollisionScene, Footprint, Standing, Wrench, footprint, with_load
+import ocp
+from models import Footprint, Standing, Wrench, footprint, with_load
 from models.machines.standing import External
-from ocp import ClearanceConstraints, Collocation, Problem, TipTask, resolve_accelerations, solve
+from ocp import Collocation, Problem, Scene, TipTask, resolve_accelerations
 from ocp.motion.builders.standing.problem import StandingSetup, standing_problem
 from ocp.motion.tasks.limits import InFoot, Limits
 from scripts.robots import standing
@@ -47,6 +48,7 @@ LOAD = 1.0  # kg
 PUSH = (0.0, -60.0, 0.0)  # of the hand on what resists, N
 MARGIN = 0.01  # m
 FRICTION = 0.7
+LIMITS = Limits(friction=FRICTION, zmp=InFoot(MARGIN))
 VIEW = (24.0, -38.0)  # deg
 METHOD = Collocation(24, degree=3, scheme="legendre")
 
@@ -79,19 +81,15 @@ def task(machine: Standing) -> TipTask:
     return standing.from_rest(reach(machine), SECONDS)
 
 
-def problem(
-    machine: Standing, *, along: Any = "time", clearance_constraints: ClearanceConstraints | None = None, **changes: Any
-) -> Problem:
-    """The plan to be made, at a given time law or with the time law left to the plan ("parameter").
+def problem(machine: Standing, *, along: Any = "time", **changes: Any) -> Problem:
+    """The problem without collisions, at a given time law or with the time law left to the plan ("parameter").
 
     Args:
         changes: Of the other arguments of standing_problem.
     """
-    setup = StandingSetup(
-        external=reaction(machine), tip_level="acceleration", along=along, clearance_constraints=clearance_constraints
-    )
+    setup = StandingSetup(external=reaction(machine), tip_level="acceleration", along=along)
     hand = task(machine) if along == "time" else reach(machine)
-    options: dict[str, Any] = {"zmp": InFoot(MARGIN), "limits": Limits(friction=FRICTION), **changes}
+    options: dict[str, Any] = {"zmp": InFoot(MARGIN), "limits": LIMITS, **changes}
     return standing_problem(machine, hand, SECONDS, start=START, setup=setup, **options)
 
 
@@ -102,7 +100,8 @@ def plan(coarse: bool = False) -> StandingExample:
     local = resolve_accelerations(
         machine, task(machine), START, SECONDS, external=pressed, step=5e-3, stop_at_lift_off=False
     ).motion
-    solution = solve(problem(machine, clearance_constraints=ClearanceConstraints(CollisionScene(machine))), METHOD)
+    options: dict[str, Any] = {"limits": LIMITS, "scene": Scene(wrenches=pressed)}
+    solution = ocp.plan(machine, task(machine), SECONDS, start=START, **options).solution
     motion = standing.sampled(machine, solution, pressed)
     found = standing.Results(ANYMAL.path, machine, ground, solution, motion, local, pressed)
     return StandingExample(ANYMAL.name, found, task(machine), solution.audit())

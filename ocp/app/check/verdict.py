@@ -315,7 +315,7 @@ def check_trajectory(
         else:
             place: Scene = require.instance("scene", Scene() if scene is None else scene, Scene)
             unchecked += _missing_meshes(robot, place.folders) if place.missing == "skip" else []
-            collisions = CollisionScene(with_wide_limits(machine, motion), **vars(place))
+            collisions = CollisionScene(with_wide_limits(machine, motion), **place.collision_options)
             add(clearance_rows(collisions, motion, bases if collisions.obstacles else None))
     suspicions: list[Fault] = []
     if not unit_known and not any(fault.kind == "units" and fault.name == "time" for fault in faults):

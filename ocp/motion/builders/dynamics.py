@@ -1,12 +1,7 @@
-"""Joint torques, and motions of fixed and free-floating arms within actuator limits.
+"""Motions of fixed and free-floating arms within actuator limits, with accelerations or jerks as the control.
 
-Joint accelerations (or jerks) are the control. The joint torques follow from inverse dynamics,
-
-    tau = M(q) q'' + h(q, q') - (external forces) + d q' + c tanh(q' / w),
-
-with viscous friction d and Coulomb friction c, smoothed below the speed w. A floating base conserves momentum: it moves
-as the joints make it move, and the torques are those of the joints alone. No mass matrix is inverted, and torque limits
-are ordinary path constraints (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
+The joint torques follow from inverse dynamics (see `torques`). No mass matrix is inverted, and torque limits are
+ordinary path constraints (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
 
 `ocp.motion.builders.dynamics_plan` declares motions to several goals, and with changing loads, as phases.
 """

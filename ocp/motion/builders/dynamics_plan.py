@@ -48,7 +48,8 @@ from ocp.solution import Guess, Solution
 from ocp.tightening import WARM_START_OPTIONS, largest_excess, solve_at_switches, tighten
 
 __all__ = [
-    "SolveSettings", "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of", "phase_names",
+    "POINTS", "SolveSettings", "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of",
+    "phase_names",
     "solve_dynamics", "within_limits",
 ]  # fmt: skip
 

@@ -324,7 +324,6 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     ends_at, error_cost = None, 0
     if stretch.equations is not None:
         error, error_cost = motion.task_errors(stretch)
-        slack = slack + error
         required = np.ones(stretch.equations.size, dtype=bool)
         slopes = _slopes(stretch, motion.setup.base, motion.setup.reference)
         if known is not None:
@@ -334,7 +333,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         if second is not None:
             derivatives = [(joints, rates), (rates, second), (place, machine.base_rate(place, joints, rates))]
         free = not begins or motion.setup.free
-        _declare_tasks(motion, stretch, (place, joints, rates), pace, slack, free, required, derivatives)
+        _declare_tasks(motion, stretch, (place, joints, rates), pace, slack + error, free, required, derivatives)
         placed = np.concatenate([is_holonomic(part) for part in stretch.equations.bound]).astype(bool)
         ends_at = slopes[stretch.equations.pose_rows | (placed & (begins | ~required))]
     if machine.base_size:
@@ -485,8 +484,7 @@ def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
 
     A rank found there holds everywhere but on a set of measure zero. Shape (size, base_size + joint_size).
     """
-    equations = stretch.equations
-    assert equations is not None
+    equations: Any = stretch.equations
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))
     error = equations.error(b, q, equations.target_function()(stretch.begin))
     fixed, at, rows = equations.holding(b, q, base, reference), 0, []

@@ -1,4 +1,12 @@
-"""Joint torques of a machine, and motions whose controls are accelerations: limits of actuators, and costs."""
+"""Joint torques of a machine, and motions whose controls are accelerations: limits of actuators, and costs.
+
+The joint torques follow from inverse dynamics,
+
+    tau = M(q) q'' + h(q, q') - (external forces) + d q' + c tanh(q' / w),
+
+with viscous friction d and Coulomb friction c, smoothed below the speed w. A floating base conserves momentum: it moves
+as the joints make it move, and the torques are those of the joints alone.
+"""
 
 from __future__ import annotations
 

@@ -95,7 +95,8 @@ class CandidateQueue:
         Args:
             solver: Solver of the candidates.
             settings: Settings of the planner.
-            include_costlier: Whether all batches include costlier motions, see `run`.
+            include_costlier: Whether all batches include costlier motions, see `run`, and motions of the same cost,
+                since another cost will rank them.
         """
         self.solver, self.settings, self._began = solver, settings, time.thread_time()
         self._always_costlier = include_costlier
@@ -189,7 +190,8 @@ class CandidateQueue:
         for motion in self._motions:
             assert motion.first.solution is not None
             gain, slack = motion.first.cost - candidate.cost, self.settings.same_cost * motion.first.cost
-            if gain <= slack and (gain >= -slack or self.solver.same_path(candidate.solution, motion.first.solution)):
+            is_same = gain >= -slack and not self._always_costlier
+            if gain <= slack and (is_same or self.solver.same_path(candidate.solution, motion.first.solution)):
                 return motion
         self._motions.append(_Motion(candidate))
         return None
@@ -205,7 +207,7 @@ class CandidateQueue:
             return Reason(Rejection.COSTLIER, "by far, judged by its local motion") if too_costly else None
         audited = self._include_costlier and self._audits < settings.max_failures
         if audited and candidate.cost <= settings.max_cost_ratio * best:
-            return Reason(Rejection.DUPLICATE) if stage > Stage.FINE and self._has_passed(candidate.cost) else None
+            return Reason(Rejection.DUPLICATE) if stage > Stage.FINE and self._has_passed(candidate) else None
         if stage < Stage.FINE and candidate.cost > best * (1 + self._coarse_error):
             return self.solver.collision(candidate) or Reason(Rejection.COSTLIER, "on a coarse mesh")
         if stage >= Stage.FINE and candidate.cost >= best * (1 - settings.same_cost):
@@ -216,10 +218,13 @@ class CandidateQueue:
             return Reason(Rejection.NOT_TRIED, f"{self._failures} candidates before it failed")
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
-    def _has_passed(self, cost: float) -> bool:
-        """Return whether a candidate of this cost passed."""
-        tolerance = self.settings.same_cost
-        return any(c.passed and abs(cost - c.cost) <= tolerance * c.cost for c in self.candidates)
+    def _has_passed(self, candidate: Candidate) -> bool:
+        """Return whether a candidate of the same cost passed, of the same motion if all motions are needed."""
+        passed = [c for c in self.candidates if c.passed]
+        same = [c for c in passed if abs(candidate.cost - c.cost) <= self.settings.same_cost * c.cost]
+        if not self._always_costlier or candidate.solution is None:
+            return bool(same)
+        return any(c.solution is not None and self.solver.same_path(candidate.solution, c.solution) for c in same)
 
     def _take(self, previous: Candidate, advanced: Candidate) -> None:
         """Store or push the result of an advance."""
@@ -230,7 +235,7 @@ class CandidateQueue:
             if advanced.reason.kind is not Rejection.COLLISION and self._failures < self.settings.max_failures:
                 self._replace(advanced)
         elif advanced.stage >= self.solver.last:
-            repeated = self._has_passed(advanced.cost)
+            repeated = self._has_passed(advanced)
             self.candidates.append(advanced.rejected(Reason(Rejection.DUPLICATE)) if repeated else advanced)
         else:
             if previous.stage is Stage.SEED:

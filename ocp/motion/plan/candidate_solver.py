@@ -98,13 +98,13 @@ class CandidateSolver(Solver):
         return [advanced, *self._free_start(advanced)]
 
     def with_own_cost(self) -> CandidateSolver:
-        """Return the solver whose last stage is the solve at the cost of the request."""
+        """Return the solver that also solves at the cost of the request."""
         solver = copy(self)
         solver.last = Stage.ACTUATED
         return solver
 
     def own_cost(self, candidate: Candidate) -> float:
-        """Return the cost of the request for the motion of an audited candidate."""
+        """Return the cost that the request has for the motion of an audited candidate."""
         assert self.request.cost is not None
         return cost_of_motion(self.plan([candidate]), self.request.cost)
 
@@ -205,7 +205,7 @@ class CandidateSolver(Solver):
         if np.isnan(self._start(candidate)).any() and audit.feasible and audit.optimal is None:
             start = solution[joints_name][0]
             fixed = self._declare(candidate, start, self.reference)
-            current_mesh = _mesh_of(mesh, solution)
+            current_mesh = mesh.with_mesh(solution.state_interpolant.breaks)
             options = self._options(fixed, current_mesh, solution.cost, {})
             fixed_solution = solve(fixed.problem, current_mesh, guess=solution, options=options)
             fixed_solution = self._refine_for_tasks(fixed, mesh, fixed_solution, check=True)
@@ -344,7 +344,7 @@ class CandidateSolver(Solver):
         if _refinable_failures(audit):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RefinementWarning)
-                current, plan = _mesh_of(mesh, solution), (solution, audit)
+                current, plan = mesh.with_mesh(solution.state_interpolant.breaks), (solution, audit)
                 options = self._options(motion, current, solution.cost, self.settings.fine_options)
                 solution, audit = refine_from(motion.problem, current, plan, options=options, check=check)
             if not _refinable_failures(audit):
@@ -401,9 +401,9 @@ class CandidateSolver(Solver):
 
     def same_path(self, solution: Solution, reference: Solution) -> bool:
         """Return whether two motions are the same but for mesh errors and full turns of joints."""
-        fractions = np.linspace(0.0, 1.0, self.settings.compared_samples)
+        samples = np.linspace(0.0, 1.0, self.settings.compared_samples)
         names = [f"joints{stretch.suffix}" for stretch in self.motion.stretches]
-        paths = [np.hstack([each.at_fraction(fractions)[name] for name in names]) for each in (solution, reference)]
+        paths = [np.hstack([each.at_fraction(samples)[name] for name in names]) for each in (solution, reference)]
         difference = paths[0] - paths[1]
         turns = 2 * np.pi * np.round(difference[0] / (2 * np.pi))
         return bool(np.abs(difference - turns).max() <= self.settings.same_path)
@@ -489,10 +489,6 @@ class CandidateSolver(Solver):
 
 def _is_separated(candidate: Candidate) -> bool:
     return candidate.constraints is not None and bool(candidate.constraints.margins)
-
-
-def _mesh_of(mesh: Collocation, solution: Solution) -> Collocation:
-    return mesh.with_mesh(solution.state_interpolant.breaks)
 
 
 def _refinable_failures(audit: Audit) -> list[Finding]:

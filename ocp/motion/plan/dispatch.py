@@ -62,24 +62,26 @@ def plan(
 
     Args:
         machine: A machine on a fixed or floating base, or standing, see `plan_to_stand`.
-        tasks: Tasks of its tips, each from its `begin` for its `duration`; or waypoints, which an arm on a fixed base
-            whose joints exceed the rows of a pose by at most two passes by the shortest joint path.
+        tasks: Tasks of its tips, each from its `begin` for its `duration`; goals, which are reached one after the
+            other; or waypoints, which an arm on a fixed base whose joints exceed the rows of a pose by at most two
+            passes by the shortest joint path. Goals and tasks in one sequence are done one after the other, tasks at
+            once in an inner sequence, and a motion of its own leads to each task (see `plan.sequence`).
         horizon: s; None: until the last task ends. "free": the tasks may be done more slowly than they say, never
             faster; their pace is planned together with the self-motion, for the least sum of duration and joint rates.
         start: Joints at the start, rad or m, shape (n,), or a `Start` with the configuration of a floating base; None:
             any joints that do the first tasks, which are searched. Joints that move no task frame, such as a gripper's,
             are held there, or at the nearest free position, see `Plan.held`.
         cyclic: Whether the joints end where they start.
-        cost: Weights of the cost. For tip tasks, `velocity` with the `weights` of the joints, and `time` if the horizon
-            is free (1 if `cost` is None), in (rad/s)^2: the larger, the closer to the least time. For waypoints,
+        cost: Weights of the cost. For tip tasks all its terms, the `time` only if the horizon is free (1 if `cost` is
+            None), in (rad/s)^2: the larger, the closer to the least time. For waypoints,
             `length`, the sum of all joint displacements with the `weights` of the joints, or `time`, s, by the
             velocity limits. `Weights` for a standing machine. None: half the squared joint velocities, the length of a
             path through waypoints, the squared torques of a motion to several goals.
         limits: Limits of joint positions and rates; the robot's own if None. Limits of acceleration, jerk, torque or
             power, if given, hold at all times together with the robot's own torque limits, at the same cost (see
             `plan.actuators`). Rates are then continuous. A machine starts or ends at rest only if its tasks require it.
-        scene: Obstacles, and the clearance that is kept from them and between links; None: the links of the machine do
-            not touch. False: collisions are not checked.
+        scene: Obstacles, the clearance that is kept from them and between links, and external wrenches; None: the links
+            of the machine do not touch. False: collisions are not checked.
         search: "start": from the given start, or from the best conditioned solution of inverse kinematics.
             "configurations": from all solutions of inverse kinematics; each may slide along its self-motion.
             "global": among all motions in the tasks' own time. On a fixed base, the plan has a lower `bound`; the tasks
@@ -130,6 +132,11 @@ def _plan(
 ) -> Plan:
     """Hand the arguments of `plan` to the planner of the tasks."""
     options: dict[str, Any] = {"cost": cost, "limits": limits, "seed": seed}
+    wrenches = scene.wrenches if isinstance(scene, Scene) else None
+    if wrenches is not None and (not isinstance(machine, Standing) or isinstance(tasks, Steps)):
+        words = "scene: wrenches act on a machine that stands and does tasks; for an arm on a fixed base, give them in "
+        words += "DynamicsSetup(wrenches=...) of dynamics_problem"
+        raise ProblemError(words, name="wrenches", value=wrenches)
     if isinstance(tasks, Waypoints):
         _check_unused("a path through waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
         arm = require.instance("machine", machine, FixedBase)
@@ -161,7 +168,7 @@ def _plan(
         return plan_sequence(machine, goals, horizon, constraints=constraints, **options)
     options |= {"search": search, "cyclic": cyclic}
     if isinstance(machine, Standing):
-        return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, **options)
+        return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, wrenches=wrenches, **options)
     request = checked_request(machine, tasks, horizon, **options)
     return plan_request(replace(request, clearance_constraints=constraints))
 
@@ -239,7 +246,8 @@ def plan_problem(
         return _goal_problem(machine, goals, horizon, start=start, cost=own, **shared)
     _, joints, base = Start.of(start, machine)
     if isinstance(machine, Standing):
-        setup = StandingSetup(clearance_constraints=constraints)
+        wrenches = scene.wrenches if isinstance(scene, Scene) else None
+        setup = StandingSetup(external=wrenches, clearance_constraints=constraints)
         options: dict[str, Any] = {"start": joints, "weights": own, "limits": limits, "setup": setup}
         return standing_problem(machine, goals, horizon, **options)
     weights = None if own is None else require.instance("cost", own, Cost).joint_weights(machine.joint_size)

@@ -14,7 +14,14 @@ from ocp.console import report, time_left
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup
-from ocp.motion.builders.dynamics_plan import dynamics_phases, machines_of, phase_names, within_limits
+from ocp.motion.builders.dynamics_plan import (
+    POINTS,
+    SolveSettings,
+    dynamics_phases,
+    machines_of,
+    phase_names,
+    within_limits,
+)
 from ocp.motion.builders.space.capture import Capture, solve_capture
 from ocp.motion.builders.standing.plan import solve_steps
 from ocp.motion.builders.standing.stances import Steps
@@ -34,6 +41,8 @@ from ocp.solution import Solution
 
 __all__ = ["goal_configurations", "plan_capture", "plan_goal", "plan_sequence", "plan_steps", "with_joints"]
 
+PHASE_INTERVALS = 40
+"""Intervals of the first mesh of all phases together; one phase begins with no more than a motion of its own."""
 REGION_SAMPLES = 8
 """Random places of the tip in the region of a goal, besides its centre."""
 
@@ -93,7 +102,8 @@ def plan_sequence(
         return dynamics_phases(motors, resolved, start=joints, total=total, limits=own_limits, cost=cost, setup=own)
 
     limited = {name: (each, own_limits) for name, each in zip(phase_names(resolved), machines, strict=True)}
-    solution = within_limits(declare, constraints, limited)
+    mesh = replace(POINTS, intervals=min(POINTS.intervals, -(-PHASE_INTERVALS // len(resolved))))
+    solution = within_limits(declare, constraints, limited, settings=SolveSettings(mesh))
     return _phased(motors, solution, joints)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -231,7 +231,7 @@ class Cost:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Obstacles around a machine and the distance that it keeps from them and between its own links.
+    """Obstacles around a machine, the distance that it keeps from them and between its own links, and external forces.
 
     The values are checked when a motion is planned in the scene, together with the machine; see
     `models.CollisionScene`.
@@ -243,6 +243,8 @@ class Scene:
         srdf: SRDF file whose disabled pairs are ignored; None for none.
         folders: Folders of the robot's meshes.
         missing: "raise" if a mesh is missing, or "skip" to leave it out.
+        wrenches: External wrenches on a standing machine, a function of time (s) and tip position (m) that returns a
+            sequence of `Wrench`, for example `tip_spring`; None for none.
     """
 
     obstacles: Any = ()
@@ -251,3 +253,9 @@ class Scene:
     srdf: Any = None
     folders: Any = ()
     missing: Literal["raise", "skip"] = "raise"
+    wrenches: Callable[[Any, Any], Sequence[Any]] | None = None
+
+    @property
+    def collision_options(self) -> dict[str, Any]:
+        """Arguments of `models.CollisionScene` besides the machine and its limits, by name."""
+        return {name: value for name, value in vars(self).items() if name != "wrenches"}
