@@ -192,7 +192,7 @@ class Checks:
         return value
 
     def each(self, label: str, values: Any, kind: type[_Kind]) -> tuple[_Kind, ...]:
-        """Return instances of a class, none or more, as a tuple."""
+        """Return a list as a tuple; raise an error unless all entries are instances of a class."""
         try:
             check_entries(values)
             items = tuple(values)

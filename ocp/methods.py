@@ -267,7 +267,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Comparison of several solutions of one problem.
+    """Comparison of the solutions of one problem by several methods, with the audit of each.
 
     Attributes:
         problem: Name of the problem.

@@ -122,7 +122,7 @@ def refine(
     arguments = {"parameters": parameters, "options": options, "solver": settings.solver}
     with time_limited(time_limit):
         first = _first(problem, method, {**arguments, "guess": guess}, settings, time_limit)
-        return _refined(problem, method, first, tolerance, arguments, settings)[0]
+        return _refine_mesh(problem, method, first, tolerance, arguments, settings)[0]
 
 
 def refine_from(
@@ -134,10 +134,10 @@ def refine_from(
     :func:`ocp.methods.solve`.
     """
     arguments = {"options": options, "check": check}
-    return _refined(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings())
+    return _refine_mesh(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings())
 
 
-def _refined(
+def _refine_mesh(
     problem: Problem,
     method: DirectMethod,
     first: tuple[Solution, Audit],
@@ -145,7 +145,7 @@ def _refined(
     arguments: dict[str, Any],
     settings: RefinementSettings,
 ) -> tuple[Solution, Audit]:
-    """Return the last of the plans and its audit, with the RefinementWarning of `refine`."""
+    """Refine the mesh until a plan is accurate enough; return the last plan and its audit, or warn."""
     solution, audit = first
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
@@ -212,7 +212,7 @@ def _first(
     settings: RefinementSettings,
     time_limit: float | None,
 ) -> tuple[Solution, Audit]:
-    """Return the plan on the first mesh, and its audit; raise SolveError at the time limit or if the solve fails."""
+    """Solve on the first mesh and audit the plan; raise SolveError at the time limit or if the solve fails."""
     solution = solve(problem, method, **arguments)
     try:
         return solution, judge(problem, solution, **settings.limits)

@@ -155,7 +155,7 @@ def largest_excess(problem: Problem, solution: Solution) -> float:
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """Return the largest excess, in words and as the details of an error; see :func:`_excess`."""
+    """Describe the largest excess over a bound as a sentence and as the attributes of an error; see :func:`_excess`."""
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)

@@ -88,7 +88,7 @@ class ConstraintCheck(NamedTuple):
         return ca.logic_and(self.pitch, self.pitch_angles)
 
     def angles(self) -> Expression:
-        """Return whether joints 2 to 5, and 6, are within limits."""
+        """Return whether joints 2 to 6 are within their limits."""
         return ca.logic_and(self.pitch_angles, self.yaw_angles)
 
     def slide(self) -> Expression:
@@ -113,7 +113,7 @@ class ArcEndLevel(NamedTuple):
 
 
 def limit_code(joint: int, upper: bool) -> int:
-    """Return the code in ACTIVE of a limit of joint 1..6."""
+    """Return the number that stands for the lower or upper limit of joint 1..6 in ACTIVE."""
     return 3 + 2 * (joint - 1) + int(upper)
 
 
@@ -203,7 +203,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
     def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Add the level of q2 with this sine and cosine, relevant only if joint 3 allows it."""
+        """Add a value of q2 at which an arc may end, valid only if joint 3 is within its limits there."""
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
@@ -227,7 +227,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
 
 
 def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
-    """Return four points near the rolls with a value of cos q2, in any branch, to be polished by `polish_to_value`.
+    """Return four approximate rolls, as (cos, sin), at which cos q2 has a value; `polish_to_value` makes them exact.
 
     They are roots of the squared equation. It is smooth near a stretched pitch link, where cos q2 is not; near yaw 0 it
     has nearly double roots, where cos q2 has simple ones.
@@ -249,7 +249,7 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
-    """Return the values of sin q4 at which an arc may end."""
+    """Return the values of sin q4 at which an arc of feasible rolls may end, each with the code of the active limit."""
     sines: list[tuple[Expression, int]] = []
     for sign in (-1, 1):
         if _allows(rig, 4, sign * np.pi / 2):
@@ -312,7 +312,10 @@ def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expressi
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return output 0 or 2 of the chart minus a value, with its derivative by roll, for `polish`."""
+    """Return the function of the roll, as (cos, sin), that `polish` sets to zero: a chart output minus a value.
+
+    The output is 0 or 2; the function also returns its derivative by the roll.
+    """
 
     def function(c: Expression, s: Expression) -> Point:
         values = chart(target, c, s)
@@ -371,7 +374,7 @@ def slide_points(rig: Rig, upper: bool) -> Any:
 
 
 def checked_gain(rate_weight: float) -> float:
-    """Return w4 / (2 pi); raise a ModelError for a weight that is negative or not finite."""
+    """Return the weight of the roll rate over 2 pi; raise ModelError if it is negative or not finite."""
     return require.nonnegative("rig: rate_weight", rate_weight) / FULL_TURN
 
 

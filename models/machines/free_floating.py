@@ -379,7 +379,7 @@ def _require_planar(robot: Robot) -> None:
 
 
 def _require_inertia(robot: Robot, rows: list[int]) -> None:
-    """Raise ModelError if the momentum in these rows does not determine the base motion.
+    """Raise ModelError if the robot lacks the inertia by which conserved momentum determines the base motion.
 
     Only the ratios of the inertias matter, not the units of mass and length.
     """

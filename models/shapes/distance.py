@@ -218,7 +218,7 @@ class StoppedGradients:
         self._values: list[Expression] = []
 
     def __call__(self, value: Expression) -> Expression:
-        """Return a symbol that stands for a value, which may contain other symbols."""
+        """Return a new symbol that replaces an expression, so that derivatives treat it as a constant."""
         if not isinstance(value, ca.MX) or value.is_constant():
             return value
         self._symbols.append(ca.MX.sym("stopped", value.shape))

@@ -248,7 +248,7 @@ class _Lever(NamedTuple):
     arm: float
 
     def moved(self, half: Array) -> Array:
-        """Return a bound of the change of distance when the entry changes by up to `half`, rad or m."""
+        """Return the largest change of the distance when the joint moves by at most `half`, rad or m."""
         turned = np.minimum(abs(self.ratio) * half, np.pi)
         return np.asarray(2 * self.arm * np.sin(turned / 2) if self.arm else abs(self.ratio) * half)
 
@@ -308,7 +308,7 @@ class _PairClassifier:
         return self._placed[key]
 
     def _pose(self, part: str) -> Poses:
-        """Return the poses of a rigid part in the root's at the first configurations."""
+        """Return the poses of a rigid part in the frame of the root at the first configurations."""
         if part not in self._poses:
             q = self.configurations[: SETTINGS.first_configurations]
             step = self.parts.step.get(part)
@@ -347,7 +347,7 @@ class _BodyPair:
         return None if colliding.any() or not self._proves_apart(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
-        """Return NEVER for hulls that are apart on a grid of two joints, refined where they are closest.
+        """Return NEVER if the hulls are apart at all points of a joint grid, refined where they are closest.
 
         Returns ALWAYS for hulls that overlap on the whole first grid, else None.
         """

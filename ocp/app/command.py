@@ -104,13 +104,13 @@ def _run(options: argparse.Namespace) -> int:
     except BrokenPipeError:
         raise
     except (ModelError, ProblemError, AuditError, OSError) as error:
-        return _refused(options, error, 2)
+        return _report_error(options, error, 2)
     except SolveError as error:
-        return _refused(options, error, 1)
+        return _report_error(options, error, 1)
 
 
-def _refused(options: argparse.Namespace, error: Exception, status: int) -> int:
-    """Print an error, with --json also as JSON, and return the exit status."""
+def _report_error(options: argparse.Namespace, error: Exception, status: int) -> int:
+    """Print an error message, with --json also as JSON, and return the exit status."""
     message = str(error)
     if isinstance(error, OSError) and error.filename is not None:
         message = f"{PART.sub('', str(error.filename))}: {error.strerror}"

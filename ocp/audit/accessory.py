@@ -155,7 +155,7 @@ class AccessoryProblem:
 
     @property
     def control_scale(self) -> float:
-        """Curvature of the cost over the full values of the controls, in units of cost."""
+        """Second-order change of the cost when every control changes by its own value, in units of cost."""
         return float(self.along.share @ np.sum(np.abs(self._curves[:, self.nx + 1 :]) * self.along.u**2, axis=1)) / 2
 
     def _constraints(self) -> None:

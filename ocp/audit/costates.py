@@ -26,7 +26,7 @@ __all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "end_limits", "interval_en
 
 
 class Ends(NamedTuple):
-    """The conditions at the ends of a plan.
+    """Residuals of the optimality conditions at start and end of a plan, with the multipliers there.
 
     Attributes:
         transversality: Residual of the costates at the ends that no multiplier explains, in units of cost.
@@ -166,7 +166,7 @@ def interval_end_costates(along: Linearisation) -> tuple[np.ndarray, np.ndarray]
 
 
 class Backwards:
-    """The costate equation over every interval, backwards, with the multipliers of the controls as feedback."""
+    """Backward integration of the costate equation over every interval, with the control multipliers as feedback."""
 
     def __init__(self, along: Linearisation, multipliers: np.ndarray, across: np.ndarray) -> None:
         self.along = along

@@ -136,7 +136,9 @@ class _Multipliers:
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
            share: Any = 1.0) -> _Multipliers:  # fmt: skip
-        """Add both sides of ``chosen`` limits (M, m), bool, with derivatives (M, m, n) in variables of sizes (n,).
+        """Add a multiplier for each side of the ``chosen`` limits (M, m), bool, whose derivatives are (M, m, n).
+
+        The variables have the sizes (n,).
 
         A multiplier per unit of s costs its gap times the ``share`` (M,) of its point.
         """

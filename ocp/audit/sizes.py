@@ -328,7 +328,7 @@ def row_changes(
     p: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of one kind at K samples, and their changes when a single entry of states or controls changes.
+    """Return the constraint rows of one kind at K samples, and their changes with each single state or control.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.

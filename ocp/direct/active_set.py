@@ -39,7 +39,7 @@ to a limit that is active without a multiplier, and of the residual of linear sy
 
 @dataclass(frozen=True)
 class Conditions:
-    """First and second derivatives of a program at a plan, in units of the solver.
+    """First and second derivatives of a nonlinear program at a solution, in the scaled variables of the solver.
 
     Attributes:
         hessian: Hessian of the Lagrangian, both triangles. Shape (n, n).

@@ -91,7 +91,7 @@ class Interpolants:
 
     @cached_property
     def mapped(self) -> Any:
-        """``values`` of all intervals side by side."""
+        """Function ``values``, mapped over all intervals."""
         return self.values.map("curves", "serial", self.variables.shape[1], [2, 3], [])
 
 

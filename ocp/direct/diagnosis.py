@@ -355,7 +355,7 @@ class _Soft:
     def conflicts(
         self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float, units: np.ndarray
     ) -> list[Conflict]:
-        """Return the conflicts, the largest share first, in ``units`` of rows and variables."""
+        """Return the violated constraints; the largest violation, in ``units`` of its row or variable, comes first."""
         low, high = both_bounds(arguments)
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}

@@ -219,7 +219,7 @@ class Prepared:
         elastic = None if attempts[-1].is_final else self._elastic(first)
         remaining = self._max_iterations - sum(attempt.outcome.iterations for attempt in attempts[1:])
         if elastic is not None and check and remaining > 0:
-            start = "elastic plan", elastic.plan, self._all_names
+            start = "elastic plan", elastic.plan, self._variable_names
             attempts.append(self._attempt(*start, arguments, bounds, self._short_solver))
             if attempts[-1].plan is not None:
                 return attempts[-1].plan
@@ -282,7 +282,7 @@ class Prepared:
             p = form.parameter_vector(guess.parameters)
             limits_of_guess = self._known.relaxed(self.transcription.arguments(p, bounds_to_solve(form, p)))
             v, lam = guess.variables, guess.multipliers
-            scales = self._scales(v, self._all_names, bounds, arguments["p"])
+            scales = self._scales(v, self._variable_names, bounds, arguments["p"])
             cost, rows = self.program.numbers.values(v, p)
             start = Outcome(v, cost, rows, lam, guess.status, "", 0, 0.0)
             sides = active_sides(self.program, start, limits_of_guess, scales)
@@ -306,7 +306,7 @@ class Prepared:
 
     @cached_property
     def _short_solver(self) -> tuple[Any, Any]:
-        """The solver with fewer iterations, for alternative starts, and its progress."""
+        """The solver with fewer iterations, used for alternative starts, and its progress display."""
         return self._built_solver({**self._options, "max_iter": min(STARTS.iterations, self._max_iterations)})
 
     def _attempt(
@@ -353,8 +353,8 @@ class Prepared:
         return scales
 
     @property
-    def _all_names(self) -> set[str]:
-        """Names of all variables, as a plan has values for them, see :func:`sizes_along`."""
+    def _variable_names(self) -> set[str]:
+        """Names of all states and controls, and "horizon"."""
         return {*self.formulation.states, *self.formulation.controls, "horizon"}
 
     def _solution(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:

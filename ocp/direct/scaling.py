@@ -349,7 +349,7 @@ class Predetermined:
         return result
 
     def checked(self, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Outcome:
-        """Check an outcome against the removed limits; if one is violated, it is no success.
+        """Check an outcome against the limits that scaling removed; mark it infeasible if one is violated.
 
         Args:
             scales: Units in which violations are judged.

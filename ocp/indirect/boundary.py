@@ -91,7 +91,7 @@ class BoundaryProblem:
         return z, data, y_start[: form.nx, :] - data[of["ends"]][form.nx : 2 * form.nx]
 
     def _chain(self, state: Any, data: Any, arcs: ControlArcs, total: int) -> tuple[list[Any], Any]:
-        """Return y at all nodes from the end to the start, integrated backwards from an end state."""
+        """Integrate y = [x; lambda] backwards from an end state; return its values at the nodes, the last one first."""
         form, of = self.form, self._data(arcs)
         horizon = data[of["horizon"]]
         gradient = ca.gradient(form.terminal, form.x)

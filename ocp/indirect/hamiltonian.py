@@ -129,7 +129,10 @@ class Hamiltonian:
     # ---- the equations that make H stationary in the smooth controls, and their solution ----------------------
 
     def _solve(self) -> tuple[Any, str]:
-        """Return the function (x, lam, t, T, p, bang, guess) -> w, and the kind of its solution."""
+        """Return the function that computes the optimal controls and multipliers w, and how it does so.
+
+        Its arguments are (x, lam, t, T, p, bang, guess).
+        """
         form, n, m = self.form, len(self.smooth), len(self.form.path)
         sym = form.sym
         self._check_linear()

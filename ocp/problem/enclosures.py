@@ -219,7 +219,7 @@ FRAME_ENTRIES = 12
 
 
 class PrescribedMotion:
-    """The bodies of separated pairs whose frames depend on time alone.
+    """Bodies of separated pairs that move as a function of time alone, such as moving obstacles.
 
     Args:
         separation: The pairs. placements: Their frames, possibly in other symbols. time: The symbol of time.
@@ -236,7 +236,7 @@ class PrescribedMotion:
         what = f"separation {separation.name!r}"
         parts = [placements[k : k + FRAME_ENTRIES] for k in range(0, placements.numel(), FRAME_ENTRIES)]
         frames = [k for k, part in enumerate(parts) if ca.depends_on(part, time)]
-        rows = [_of_time(f"{what}: frame {k}", parts[k], time, parameters, values) for k in frames]
+        rows = [_as_function_of_time(f"{what}: frame {k}", parts[k], time, parameters, values) for k in frames]
         self._enclosures = Enclosures(ca.vertcat(*rows), time, what) if rows else None
         hulls = list(separation.hulls.values())
         covered = CoveredPairs(separation.pairs, separation.covers)
@@ -293,8 +293,8 @@ class PrescribedMotion:
         return displacements, deviations
 
 
-def _of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]) -> Any:
-    """Return a frame with the values of its parameters inserted."""
+def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]) -> Any:
+    """Return a frame as an expression of time alone, with numbers for its parameters; raise if it depends on states."""
     known = {identity(symbol) for symbol in ca.symvar(ca.vertcat(time, *parameters))}
     others = [symbol for symbol in ca.symvar(frame) if identity(symbol) not in known]
     if others and ca.depends_on(frame, ca.vertcat(*map(ca.vec, others))):

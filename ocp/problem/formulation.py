@@ -432,7 +432,7 @@ class Formulation:
 
 
 def entries_of(declared: Declarations) -> list[Any]:
-    """Return all declared parts as one list."""
+    """Return the declared states, controls, parameters, constraints and costs as one list."""
     pools = [getattr(declared, kind.name) for kind in fields(declared)]
     return [entry for pool in pools for entry in (pool.values() if isinstance(pool, dict) else [pool])]
 

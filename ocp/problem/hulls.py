@@ -134,7 +134,7 @@ class HullPairs:
             self._axes = np.where(lengths[:, :, None] > 0, edges / np.maximum(lengths, 1e-300)[:, :, None], np.eye(3))
 
     def points(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> list[np.ndarray]:
-        """Return points of both bodies in the frame of observation. Shapes (K, m, 3), (K, l, 3)."""
+        """Return the points of both bodies of each pair in the pair's reference frame. Shapes (K, m, 3), (K, l, 3)."""
         rotations, positions = frames
         turn, origin = rotations[at, self._observer[row]], positions[at, self._observer[row]]
         points = []
@@ -195,8 +195,9 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows of pairs (K,), the pairs first, and to which of the K each belongs: places, rows. Shape (R,)
-        each.
+        """Return which of the K pairs each row belongs to, and the indices of the rows. Shape (R,) each.
+
+        The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow.
         """
         counts = self._counts[pair]
         place = np.repeat(np.arange(len(pair)), counts)
@@ -446,7 +447,7 @@ class Separation:
         return tuple((names[first], names[second]) for first, second, _ in self.pairs)
 
     def of(self, pairs: Sequence[int]) -> Separation:
-        """Return the separation of some of the pairs."""
+        """Return a separation constraint for some of the pairs only."""
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
         covers = {row: self.covers[pair] for row, pair in enumerate(keep) if pair in self.covers}

@@ -213,8 +213,8 @@ def _contains_multiple(x: Interval, first: float, step: float) -> Any:
     return np.floor((x.high + slack - first) / step) >= np.ceil((x.low - slack - first) / step)
 
 
-def _wave(function: Callable[[Any], Any], crest: float) -> Callable[..., Interval]:
-    """Return the rule of a sinusoid of amplitude 1 with a crest at an angle."""
+def _sinusoid_rule(function: Callable[[Any], Any], crest: float) -> Callable[..., Interval]:
+    """Return the interval rule of sine or cosine, whose maximum is at the angle `crest`."""
 
     def rule(x: Interval) -> Interval:
         ends = function(x.low), function(x.high)
@@ -332,8 +332,8 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "EXPM1": _rising(np.expm1),
     "LOG": _rising(np.log, low=0.0),
     "LOG1P": _rising(np.log1p, low=-1.0),
-    "SIN": _wave(np.sin, tau / 4),
-    "COS": _wave(np.cos, 0.0),
+    "SIN": _sinusoid_rule(np.sin, tau / 4),
+    "COS": _sinusoid_rule(np.cos, 0.0),
     "TAN": _tangent,
     "ASIN": _rising(np.arcsin, -1.0, 1.0),
     "ACOS": _falling(np.arccos, -1.0, 1.0),

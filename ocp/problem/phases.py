@@ -262,7 +262,7 @@ class _PhaseInserter:
         self._replace(parameter.symbol, symbol)
 
     def _duration(self) -> tuple[Any, float | None]:
-        """Return the duration, and its number, None if it has none."""
+        """Return the duration as an expression and as a number; None instead of the number if it is free."""
         horizon = self.problem.declared.horizon
         assert horizon is not None
         if horizon.fixed:

@@ -450,7 +450,7 @@ class Problem:
 
     @property
     def _reader(self) -> ExpressionReader:
-        """The reader of values in this problem's symbols; ends and bounds may use the parameters declared so far."""
+        """Reader of values as expressions of this problem; bounds may use the parameters declared so far."""
         return ExpressionReader(self.symbols, tuple(v.symbol for v in self.declared.parameters.values()))
 
     def _horizon_symbol(self) -> list[Any]:

@@ -231,7 +231,7 @@ def _read_pattern(shape: Any) -> Any:
 
 
 def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return the function that finds the cell of a table for a number."""
+    """Return CasADi's function `low`: the index of the table interval that contains a number."""
     table, modes = _floats(record["table"], finite=True), ("linear", "exact", "binary")
     count, mode = _whole(record["count"], "count", 0, MAX_ENTRIES), _whole(record["mode"], "mode", 0, 2)
     if len(table) < 2 or (np.diff(table) < 0).any():

@@ -332,7 +332,7 @@ class Engine:
         return not self._running
 
     def room(self) -> int:
-        """Return how many chunks of jobs may be sent now: one for each idle thread of the workers.
+        """Return the number of chunks of jobs that may be sent now: one for each idle thread of the workers.
 
         No more are sent, because a worker that ends loses all its jobs, running or not.
         """
@@ -377,7 +377,7 @@ class Engine:
         return [outcome for future, jobs in finished for outcome in self._outcomes(future, jobs)]
 
     def _outcomes(self, future: Any, jobs: list[Job]) -> list[Outcome]:
-        """Return the outcomes of a chunk."""
+        """Wait for a chunk of jobs and return their outcomes; jobs of a lost worker have none."""
         try:
             payloads = [Payload(*each) for each in future.result(timeout=self.settings.patience)]
         except WorkerFailure:

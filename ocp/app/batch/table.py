@@ -230,7 +230,7 @@ def read_batch(folder: str | os.PathLike[str]) -> Batch:
 
 
 def entry(task: Any, name: str) -> Any:
-    """Return an entry of a task."""
+    """Return a named entry of a task; raise ProblemError if it is missing."""
     if not isinstance(task, dict) or name not in task:
         raise require.unknown("entry of a task", name, task if isinstance(task, dict) else ())
     return task[name]

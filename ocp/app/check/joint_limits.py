@@ -53,7 +53,7 @@ ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^
 
 
 class RowVerdict(StrEnum):
-    """Verdict on a row."""
+    """Verdict on one row of the table of a check."""
 
     OK = "ok"
     FAILED = "FAILED"

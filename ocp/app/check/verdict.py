@@ -149,7 +149,7 @@ FAULT_ORDER = {
 
 @dataclass(frozen=True)
 class Interpretation:
-    """How a controller and the reader of a trajectory file interpret its numbers.
+    """Conventions of a trajectory file: interpolation, time unit, wrapped angles and order of the columns.
 
     Attributes:
         rule: Interpolation of the controller, "linear", "cubic" or "quintic". None: the highest that the data allow; a
@@ -405,7 +405,7 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
 def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
     """Return the check of a plan between the times at which its rates jump, where no acceleration is defined."""
     if isinstance(plan, ConsecutivePlans):
-        return _worst([_check_piece(piece, sample.t, name) for piece in plan.pieces])
+        return _worst([_check_segment(piece, sample.t, name) for piece in plan.pieces])
     if isinstance(plan, PathPlan):  # constant rates between waypoints
         joints = tuple(replace(joint, effort=np.inf) for joint in plan.machine.robot.joints)
         times = np.union1d(sample.t, plan.t)
@@ -415,8 +415,8 @@ def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
     return _check_samples(plan.machine, plan.machine.robot, values, name)
 
 
-def _check_piece(piece: Piece, times: Array, name: str) -> Check:
-    """Return the check of one motion of consecutive ones at those of the times that it covers, and at its ends."""
+def _check_segment(piece: Piece, times: Array, name: str) -> Check:
+    """Return the check of one segment of a motion at its ends and at the given times that lie inside it."""
     plan, local = piece.plan, times - piece.begin
     inside = local[(local > 0) & (local < plan.horizon)]
     sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))

@@ -152,7 +152,7 @@ class Program:
 
     @property
     def rapids(self) -> tuple[Rapid, ...]:
-        """The rapids of the program."""
+        """Rapid moves (G0) of the program."""
         return tuple(each for each in self.sections if isinstance(each, Rapid))
 
     @property

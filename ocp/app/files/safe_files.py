@@ -109,7 +109,7 @@ def split_cells(line: str, delimiter: str) -> list[str]:
 
 
 def is_number(cell: str) -> bool:
-    """Return whether `float` reads a cell."""
+    """Return whether the text of a cell is a number."""
     try:
         float(cell)
     except ValueError:

@@ -58,7 +58,7 @@ class Buffers:
 
 
 class Page(NamedTuple):
-    """A page.
+    """A web page that plays a motion.
 
     Attributes:
         text: HTML.
@@ -103,7 +103,7 @@ def build_page(
     head += b" " * (-len(head) % 4)
     data_bytes = len(head).to_bytes(4, "little") + head + b"".join(buffers.parts)
     data = base64.b64encode(gzip.compress(data_bytes, 9, mtime=0)).decode()
-    text = _filled(name, shown[0], data)
+    text = _fill_template(name, shown[0], data)
     size, most = len(text.encode()), PAGE_SETTINGS.most_bytes
     if size > most:
         words = f"the page has {size / 1e6:.3g} MB, at most {most / 1e6:g} are allowed; show fewer motions"
@@ -111,8 +111,8 @@ def build_page(
     return Page(text, missing)
 
 
-def _filled(title: str, first: Animation, data: str) -> str:
-    """Return the text of the page."""
+def _fill_template(title: str, first: Animation, data: str) -> str:
+    """Return the HTML text of the page: the template with title, style, scripts and data inserted."""
     source = files("ocp.app.view").joinpath("page")
     text = source.joinpath("page.html").read_text(encoding="utf-8")
     script = "\n".join(source.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)

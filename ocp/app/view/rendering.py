@@ -119,7 +119,7 @@ class Camera(NamedTuple):
         return cls(eye @ axes, axes, size)
 
     def seen(self, points: Any) -> tuple[Array, Array]:
-        """Return the pixels of points (..., 3), from the upper left corner of the picture, (..., 2), and depths, m."""
+        """Project points (..., 3): return their pixels from the upper left corner, (..., 2), and their depths, m."""
         x, y, z = np.moveaxis((np.asarray(points, dtype=float) - self.eye) @ self.axes.T, -1, 0)
         depth = np.maximum(-z, 1e-9)
         width, height = self.size
@@ -342,7 +342,7 @@ class _Sun:
 
     @classmethod
     def on(cls, mesh: _Mesh, camera: Camera) -> _Sun:
-        """Return the sun for a scene and a camera."""
+        """Return the light of a scene with its shadow map, from a direction relative to the camera."""
         back = camera.axes[2]
         azimuth, elevation = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
         to_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])

@@ -98,7 +98,7 @@ class ClearanceConstraints:
         return replace(self, margins={**margins, **self.margins})
 
     def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
-        """Return these constraints with the violating pairs separated, by their violation more."""
+        """Return the constraints with the margin of each violating pair increased by its violation."""
         return replace(self, margins=widened(self.margins, self.scene.labels, proofs))
 
     def declare(
@@ -167,7 +167,7 @@ class Separating(Protocol):
     """Constraints that separate pairs of bodies by margins."""
 
     def widened(self, proofs: Sequence[Clearance]) -> Self:
-        """Return these constraints with the violating pairs separated, by their violation more."""
+        """Return the constraints with the margin of each violating pair increased by its violation."""
 
 
 def widened(

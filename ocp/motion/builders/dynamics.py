@@ -203,7 +203,7 @@ class _Ends:
 
     @property
     def end(self) -> Array:
-        """Return the end of the joints' guess. Shape (n,)."""
+        """Return the joints at the end of the guess; those without an end value stay at the start. Shape (n,)."""
         return np.where(np.isnan(self.last), self.start, self.last)
 
     def quintic(self, duration: float, order: int) -> Any:

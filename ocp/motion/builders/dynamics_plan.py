@@ -314,7 +314,7 @@ def solve_dynamics(
 
 
 def _check_end_velocity(setup: DynamicsSetup) -> None:
-    """Raise ProblemError if the setup has the velocity at the end, which goals give themselves."""
+    """Raise ProblemError if the setup prescribes an end velocity, because every goal has its own."""
     if setup.end_velocity != "rest":
         words = "end_velocity: every goal has its own; set Goal(velocity=...)"
         raise ProblemError(words, name="end_velocity", value=setup.end_velocity)

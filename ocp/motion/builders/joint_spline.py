@@ -70,7 +70,7 @@ class _Along(NamedTuple):
 
 
 class _Torques(NamedTuple):
-    """Coefficients of the torques inertia a + drag v^2 + rest. Shape (M, n) each."""
+    """Joint torques along a path as inertia a + drag v^2 + rest, with speed v and acceleration a. Shape (M, n) each."""
 
     inertia: Array
     drag: Array

@@ -155,7 +155,7 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 
 def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Return the demands over their limits at unit line speed, and the powers p of the speed: v^p demand <= 1.
+    """Return each demand at unit line speed over its limit, and the power p of its growth with speed: v^p demand <= 1.
 
     The rows are the centripetal acceleration, then velocity, acceleration and jerk of each joint. Shapes (C, M), (C,).
     """

@@ -199,7 +199,7 @@ class ToolMotionSetup:
 
     @property
     def free(self) -> bool:
-        """Whether the start is free, with the tips where their tasks begin."""
+        """Whether the start configuration is free, except that the tips are at the start poses of their tasks."""
         return self.start is None or bool(np.isnan(self.start).any())
 
 
@@ -426,7 +426,7 @@ def _declare_tasks(
     required: NDArray[np.bool_] | None = None,
     derivatives: Sequence[tuple[Any, Any]] | None = None,
 ) -> None:
-    """Constrain a stretch to its tasks, with base, joints and rates as symbols.
+    """Declare the task constraints of a stretch in the symbols of base, joints and rates.
 
     `closure` is the deviation of a closed task. If `free`, the tasks that begin here must be at their start poses,
     except in rows that are not `required`, (size,), to which the stretch before leads. With `derivatives`, of states by

@@ -141,7 +141,7 @@ def declare_actuators(
     pace: Any,
     suffix: str = "",
 ) -> tuple[Any, Any, Any]:
-    """Declare velocities as states and accelerations within the limits; return them, and the cost of a second.
+    """Declare velocities and accelerations within the limits; return both and the running cost (per second).
 
     The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
     "power" where these are limited or weighted.

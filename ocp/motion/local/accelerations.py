@@ -314,7 +314,7 @@ def resolve_accelerations(
     stop_at_lift_off: bool = True,
     speed_limit: float = 20.0,
 ) -> AccelerationSolution:
-    """Simulate a law from the start to the horizon, or until it fails.
+    """Simulate a resolved-acceleration law from the start to the horizon, or until it fails.
 
     Args:
         machine: A Standing machine.

@@ -100,7 +100,7 @@ class SymbolicAxis(NamedTuple):
 
     @classmethod
     def of(cls, direction: Array, point: Array, revolute: bool) -> SymbolicAxis:
-        """Return a constant axis."""
+        """Return a symbolic axis with numeric direction and point."""
         return cls(expression(direction), expression(point), revolute)
 
     def moved(self, motion: Frame) -> SymbolicAxis:

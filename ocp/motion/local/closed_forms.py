@@ -259,7 +259,7 @@ class ClosedForm(PoseSolver):
 
 
 class _SymbolicLoop(NamedTuple):
-    """A loop of joint motions that multiply to a goal, as expressions.
+    """The closure equation of an arm as expressions: the product of its joint motions equals a goal pose.
 
     Attributes:
         symbols: Positions of the redundant joints, rows of the rotation of the tip, its position. Shape (k + 12,).
@@ -408,7 +408,10 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Return the angles with cosine cos + sine sin = value, or the nearest, as their middle and half their distance."""
+    """Solve cosine cos(q) + sine sin(q) = value: the two roots are the first result plus and minus the second.
+
+    Without a root, return the angle that comes nearest to the value.
+    """
     share = value / ca.fmax(ca.hypot(cosine, sine), TINY)
     return ca.atan2(sine, cosine), ca.acos(ca.fmin(ca.fmax(share, -1.0), 1.0))
 

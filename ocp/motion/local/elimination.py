@@ -117,7 +117,7 @@ class Axis(NamedTuple):
         return self if len(self.point) == 1 else Axis(self.direction[chosen], self.point[chosen], self.revolute)
 
     def moved(self, motion: Motion) -> Axis:
-        """Return the axes moved by a motion."""
+        """Return the axes transformed by a rigid motion."""
         return Axis(motion.rotate(self.direction), motion.at(self.point), self.revolute)
 
     def by(self, position: Array) -> Motion:
@@ -396,7 +396,7 @@ def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening)
         distance[np.abs(rotation + 1) < ELIMINATION.real] = np.inf  # a prismatic joint at infinity
     pose, column = np.nonzero(distance < ELIMINATION.real)
     upper, vector = np.abs(values[pose, column]) > 1, vectors[pose, :, column]
-    half, other, residual = _angles_of(np.where(upper[:, None], vector[:, 12:], vector[:, :12]).reshape(-1, 4, 3))
+    half, other, residual = _factor_angles(np.where(upper[:, None], vector[:, 12:], vector[:, :12]).reshape(-1, 4, 3))
     away, simple = distance[pose, column], residual < ELIMINATION.simple
     least = np.bincount(pose[simple & (away < ELIMINATION.surely_real)], minlength=len(distance))
     mixed = np.bincount(pose[~simple & (away < ELIMINATION.probably_real)], minlength=len(distance))
@@ -404,12 +404,12 @@ def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening)
     angles[:, opening.roles] = np.column_stack([np.angle(rotation[pose, column]), half, other])
     middle = np.where(revolute[2:5], angles, size * np.tan(angles / 2))
     free = np.empty((len(pose), SIX))
-    free[:, [(opening.first + i) % SIX for i in range(SIX)]] = _complete(loop, pose, middle)
+    free[:, [(opening.first + i) % SIX for i in range(SIX)]] = _all_positions(loop, pose, middle)
     return _Candidates(pose, free, least, mixed > 0, (condition < ELIMINATION.regular) | (ranks < opening.rank))
 
 
-def _angles_of(vectors: Array) -> tuple[Array, Array, Array]:
-    """Return both angles of products (K, 4, 3) of (cos h/2, sin h/2, cos 3h/2, sin 3h/2) and (1, cos h, sin h).
+def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
+    """Return the angles g and h of products (K, 4, 3) of (cos g/2, sin g/2, cos 3g/2, sin 3g/2) and (1, cos h, sin h).
 
     The third result is the largest deviation from such products, of which the largest is 1.
     """
@@ -431,8 +431,8 @@ def _angles_of(vectors: Array) -> tuple[Array, Array, Array]:
     return angle, other_angle, np.abs(residual).max(axis=(1, 2), initial=0.0)
 
 
-def _complete(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
-    """Return the positions (K, 6) of all joints of a loop for those of z, a and b (K, 3).
+def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
+    """Return the positions (K, 6) of all joints of a loop from those of its middle joints z, a and b (K, 3).
 
     The motions of x and y are found from e_x^-1 (G p, G l) = e_y (p', l'), which is linear in their cosines and sines.
     """

@@ -121,7 +121,7 @@ class IkSolver:
         Args:
             machine: Machine on a fixed base.
             link, point: Link of the tip, and its origin in the frame of the link, (3,), m; None: the tip of the robot.
-            free: What of the orientation is open. ROLL: the angle about `tool_axis`; CONE: also the direction of this
+            free: Part of the orientation that the task leaves free. ROLL: the angle about `tool_axis`; CONE: also the direction of this
                 axis, within a cone; ROTATION: all.
             tool_axis: In the frame of the tip. Shape (3,).
             within: Half-angle of the cone, rad, between 0 and pi.
@@ -180,13 +180,13 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class PreparedArm:
-    """A prepared arm, see `IkSolver`.
+    """Arm prepared for repeated inverse kinematics, see `IkSolver`.
 
     Attributes:
         arm: Solver of the arm.
-        free: What of the orientation is open.
+        free: Part of the orientation that the task leaves free.
         tool_axis: Axis of the roll in the frame of the tip.
-        sampled_angles: Number of open angles that are sampled.
+        sampled_angles: Number of free angles that are sampled.
         within: Half-angle of the cone, rad.
         names: Names of the joints.
     """
@@ -274,7 +274,7 @@ class PreparedArm:
         return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
 
     def _rotations(self, shares: Array) -> Array:
-        """Return rotations of the tip in its own frame at shares of the open angles. Shape (S, 3, 3)."""
+        """Return rotations of the tip in its own frame at fractions (0 to 1) of the free angles. Shape (S, 3, 3)."""
         rolled = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return np.asarray(rolled.as_matrix())

@@ -141,7 +141,7 @@ def resolve(
     checked_tasks(equations, base, joints, duration)
     require.nonnegative("damping", damping)
     require.positive("tolerance", tolerance)
-    times = _times(samples, duration)
+    times = _sample_times(samples, duration)
     if damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
         words = (
             f"{rows_dependent} is singular at the start joints {joints.tolist()}; "
@@ -177,8 +177,8 @@ def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any
     return ca.mtimes(weighted, solve_spd(square, velocity))
 
 
-def _times(samples: Any, horizon: float) -> Array:
-    """Return the times of the samples, checked."""
+def _sample_times(samples: Any, horizon: float) -> Array:
+    """Return the sample times of a count or an array of times; raise ProblemError unless they cover the horizon."""
     if not isinstance(samples, list | tuple | np.ndarray):
         count = real(samples)
         if not (2 <= count <= INPUT_LIMITS.count and count == int(count)):

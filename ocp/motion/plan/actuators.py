@@ -61,7 +61,7 @@ def without_actuators(limits: Limits) -> Limits:
 
 
 def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
-    """Return the cost of the motion of a plan by the trapezoidal rule, without the joints that it holds."""
+    """Return the cost of the motion of a plan by the trapezoidal rule; joints that the plan holds do not count."""
     machine = hold_joints(plan.machine, plan.held) if plan.held else plan.machine
     sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
     free = [name not in plan.held for name in plan.names]

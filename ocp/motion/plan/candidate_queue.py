@@ -219,7 +219,7 @@ class CandidateQueue:
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, candidate: Candidate) -> bool:
-        """Return whether a candidate of the same cost passed, of the same motion if all motions are needed."""
+        """Return whether a candidate of equal cost has passed; if all motions are needed, also of equal path."""
         passed = [c for c in self.candidates if c.passed]
         same = [c for c in passed if abs(candidate.cost - c.cost) <= self.settings.same_cost * c.cost]
         if not self._always_costlier or candidate.solution is None:

@@ -176,7 +176,7 @@ class CandidateSolver(Solver):
         return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
-        """Separate the bodies that collide on the fine mesh; without collisions refine it for tips and joint limits."""
+        """Separate the bodies that collide on the fine mesh; if none do, refine the mesh for tips and joint limits."""
         if collisions := self.collisions(candidate):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
@@ -311,7 +311,7 @@ class CandidateSolver(Solver):
     def _options(
         self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return options of a solve with separated bodies: an initial barrier parameter in proportion to the cost.
+        """Return solver options for a problem with separated bodies: the cost bounds the initial barrier parameter.
 
         An interior-point method with barrier parameter mu leads to a point whose cost exceeds the least one by mu for
         each limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier
@@ -444,7 +444,7 @@ class CandidateSolver(Solver):
 
     @property
     def no_clear_configuration(self) -> bool:
-        """Whether at some time no configuration that does the tasks is collision-free."""
+        """Whether at some time every configuration that satisfies the tasks is in collision."""
         return any(isinstance(value, Unreachable) for value in self._clear_counts.values())
 
     def _count_clear_at(self, time: float) -> int | Unreachable | None:
@@ -475,7 +475,7 @@ class CandidateSolver(Solver):
         return SolveError(words, error.solution, error.conflicts, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, with the others."""
+        """Return the first candidate as a plan that also stores the other candidates."""
         best, parts = candidates[0], parts_of(self.motion.stretches)
         assert best.solution is not None
         if self.request.time_cost is not None:

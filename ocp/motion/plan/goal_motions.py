@@ -201,7 +201,7 @@ def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
 
 
 def synchronised_candidates(task: GoalTask) -> list[Candidate]:
-    """Return the audited fastest motion to a goal without obstacles if it is clear of them; a list of at most one.
+    """Return the fastest motion without obstacles, audited, if it happens to be collision-free; else no motion.
 
     No motion is faster unless torques slow it down.
     """
@@ -217,7 +217,7 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
             if task.motions.are_clear(samples[:-1], samples[1:]).all():
                 joints = np.array([task.start, task.goals[goal]])
                 path = JointPath(joints, goal, path_length(samples, task.scale))
-                return [_ProblemOf(task, path, motion, None).candidate("synchronises the joints")]
+                return [_PathProblem(task, path, motion, None).candidate("synchronises the joints")]
     return []
 
 
@@ -230,7 +230,7 @@ def _fastest(task: GoalTask, path: JointPath) -> Candidate:
         for _ in range(task.request.settings.margins):
             with time_limited(task.request.settings.search_share * time_left()):
                 motion = fastest_motion_near(limits, path.joints, settings)
-            candidate = _ProblemOf(task, path, motion, None).candidate("is a locally fastest spline")
+            candidate = _PathProblem(task, path, motion, None).candidate("is a locally fastest spline")
             task.report(f"path of length {path.length:.4g}: {candidate}")
             if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:
                 break
@@ -259,7 +259,7 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
     is_free = request.horizon is None and request.cost.time > 0
     shortest = min((motion.duration for _, motion in motions), default=0.0)
     fixed = settings.spare * shortest if request.horizon is None else float(request.horizon)
-    problems = [_ProblemOf(task, path, motion, None if is_free else fixed) for path, motion in motions]
+    problems = [_PathProblem(task, path, motion, None if is_free else fixed) for path, motion in motions]
     stopping = [(problem, problem.stopping()) for problem in problems]
     for problem, candidate in sorted(stopping, key=lambda pair: (not pair[1].passed, pair[1].cost)):
         enough = attains_bound(task, candidate) or (candidate.passed and (problem.path.length == 0 or task.is_fastest))
@@ -278,8 +278,8 @@ def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _ProblemOf:
-    """Motions within actuator limits along one path.
+class _PathProblem:
+    """Problem of moving along one path within actuator limits.
 
     Attributes:
         task: Checked request.
@@ -334,7 +334,7 @@ class _ProblemOf:
         return _audited(self.task, self.motion.solution(problem, method), self.path)
 
     def smooth(self) -> Candidate:
-        """Return the audited motion without stops that a solver finds from the path."""
+        """Solve for a motion without stops, with the path as the guess, and return it with its audit."""
         task, joints = self.task, self.path.joints
         settings, duration = task.request.settings, self.horizon_guess
         times = np.linspace(0.0, duration, settings.guess_times)

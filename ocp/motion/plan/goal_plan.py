@@ -104,7 +104,9 @@ def _checked(request: GoalRequest) -> GoalTask:
             kept.append(joints)
     if not kept:
         raise errors[0]
-    turned = [shifted for goal in kept for shifted in _turned(space, bounds, start, goal, request.settings.turns)]
+    turned = [
+        shifted for goal in kept for shifted in _equivalent_goals(space, bounds, start, goal, request.settings.turns)
+    ]
     return GoalTask(request, bounds, start, np.array(turned), scale, motions, space, TorqueLimits(machine, bounds))
 
 
@@ -125,8 +127,8 @@ def _collision(scene: Any, name: str, collision: Any) -> ProblemError:
     return ProblemError(words, name=f"{first} and {second}", value=collision.distance, limit=scene.clearance)
 
 
-def _turned(space: JointSpace, bounds: JointBounds, start: Array, goal: Array, turns: int) -> list[Array]:
-    """Return a goal with its joints of more than two turns at the nearest turn to the start, and at further ones."""
+def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal: Array, turns: int) -> list[Array]:
+    """Return the goal with joints shifted by full turns within their limits, the nearest to the start first."""
     nearest = start + space.difference(goal, start)
     shifts = []
     for joint in range(len(goal)):

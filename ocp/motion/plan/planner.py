@@ -212,7 +212,7 @@ def _check_dead_end(search: TaskSearch) -> None:
 def _search_cells(
     queue: CandidateQueue, solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array
 ) -> None:
-    """Run the motions of a floating machine that a search over exact states finds, and its local motions.
+    """Solve candidates from a cell search over the states of a floating machine, and from its local motions.
 
     Raises:
         Unreachable, DeadEnd: As in `CellSearch`, if no local motion leads to a plan either.

@@ -154,7 +154,7 @@ class _Sequence:
         self.state = _State.end_of(plan, self.request.smooth)
 
     def _joints_near(self, goal: Goal) -> Array | None:
-        """Return the joints of a goal as far as they are known, the others as they are before it."""
+        """Return the joint values of a goal; joints that the goal leaves open keep their current values."""
         if goal.joints is None or self.state.joints is None:
             return self.state.joints
         joints = floats(goal.joints).ravel()

@@ -74,7 +74,7 @@ class Reason:
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Reason:
-        """Return the reason of a record, which is not trusted.
+        """Return the reason stored in a record; its values are checked because files are not trusted.
 
         Raises:
             KeyError, TypeError, ValueError: The record is damaged.

@@ -78,7 +78,7 @@ TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingO
 
 
 def _machine_of(arguments: Mapping[str, Any]) -> Machine:
-    """Return the machine of a motion by the arguments of its builder."""
+    """Return the machine among the arguments of a problem builder."""
     if "steps" in arguments:
         steps: Steps = arguments["steps"]
         return steps.stances[0]
@@ -139,7 +139,7 @@ def declared_motion(
     actuation: Actuation | None = None,
     relaxed: bool = False,
 ) -> ToolMotion:
-    """Declare the problem of a motion, which keeps its origin.
+    """Declare the optimal control problem of a request; the result remembers how to declare it again.
 
     Args:
         request: The request.

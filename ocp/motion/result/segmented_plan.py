@@ -166,7 +166,7 @@ class ConsecutivePlans(Plan):
     # ---- audit -------------------------------------------------------------------------------------------------------
 
     def _audit(self, **settings: Any) -> Audit:
-        """Return the findings of the audits of all pieces, of the joints between them, and of the cost lost."""
+        """Audit all segments and the junctions between them, and sum up the suboptimality of the segments."""
         findings: list[Finding] = []
         undecided, clearances, losses = "", dict[str, Clearance](), list[float]()
         for piece in self.pieces:

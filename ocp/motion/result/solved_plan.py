@@ -80,7 +80,7 @@ class SolvedPlan(Plan):
 
     @property
     def t(self) -> Array:
-        """Times of the plan's own grid, with both copies of the times between parts. Shape (M,), s."""
+        """Times of the plan's grid, s; a time between two parts occurs twice. Shape (M,)."""
         if CLOCK in self.solution.states:
             return np.asarray(self.solution[CLOCK][:, 0])
         share = self.solution.t / self.solution.horizon
@@ -320,8 +320,8 @@ class PhasedPlan(SolvedPlan):
         return {name: self.solution.phase(name) for name in self.phases}
 
     @cached_property
-    def _orders(self) -> dict[str, NDArray[np.intp]]:
-        """Places of the joints of the first machine among those of each phase, by phase. Shape (n,)."""
+    def _joint_indices(self) -> dict[str, NDArray[np.intp]]:
+        """Indices of the joints of the first machine in the joint vector of each phase, by phase. Shape (n,)."""
         orders = {}
         for name, machine in zip(self.phases, self.machines, strict=True):
             joints = list(machine.robot.joint_names)
@@ -346,7 +346,7 @@ class PhasedPlan(SolvedPlan):
 
     def _in_order(self, part: Part, name: str, values: Array) -> Array:
         """Return values of joints in the order of the first machine."""
-        return values if name == "base" else values[:, self._orders[part.suffix]]
+        return values if name == "base" else values[:, self._joint_indices[part.suffix]]
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
         poses = np.full((len(times), 7), np.nan)
@@ -354,7 +354,7 @@ class PhasedPlan(SolvedPlan):
         which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(begins) - 1)
         for number in np.unique(which):
             machine, rows = self.machines[number], which == number
-            order = np.argsort(self._orders[self.phases[number]])
+            order = np.argsort(self._joint_indices[self.phases[number]])
             poses[rows] = tip_poses(machine, bases[rows], joints[rows][:, order])
         return poses
 

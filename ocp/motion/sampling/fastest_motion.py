@@ -265,7 +265,10 @@ class _Search:
         return BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
 
     def _fix_ends(self) -> None:
-        """Set the free control points, and the others as `fixed` + T `moving`: at rest, or at a constant velocity."""
+        """Fix the control points that the end conditions determine, as `fixed` + T `moving`; the others are free.
+
+        A joint is at rest at an end, or has a given velocity there and no acceleration.
+        """
         free = np.ones((self.count, self.size), dtype=bool)
         self.fixed, self.moving = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
         away = np.append(0.0, np.cumsum(-1 / self.derivatives[1].diagonal()))[: self.degree]  # equal at both ends
@@ -281,7 +284,7 @@ class _Search:
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
     def guess(self, path: Array) -> tuple[Array, float]:
-        """Return control points along a path, and a duration that keeps the limits if both ends are at rest."""
+        """Return initial control points along a path, and a duration that respects the rate limits from rest to rest."""
         p, ramp = self.degree, self.settings.ramp
         at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
         top = 1 / (1 - ramp)
@@ -297,7 +300,7 @@ class _Search:
         return points, duration if duration > 0 else 1.0
 
     def evaluate(self, points: Array, duration: float) -> _State:
-        """Return the state of control points, of which the free ones count, and a duration."""
+        """Evaluate the constraints of a motion, given its duration and its free control points."""
         inner = points.ravel()[self.free]
         points = (self.fixed + duration * self.moving).ravel()
         points[self.free] = inner
@@ -392,7 +395,7 @@ class _Search:
         return bool(worst)
 
     def motion(self, state: _State) -> ConstantJerkMotion:
-        """Return the motion of a state."""
+        """Return an iterate as a motion of constant jerk."""
         duration = state.duration
         joints, rates = (self._values(self.breaks[:-1], order) @ state.points for order in (0, 1))
         accelerations = (self.derivatives[2] @ state.points)[: len(self.breaks) - 1] / duration**2

@@ -118,7 +118,7 @@ def connect(
         tree, other = trees[growing], trees[1 - growing]
         samples = lower + (upper - lower) * random.random((settings.batch, len(lower)))
         parents = tree.nearest(samples, search.scale)
-        nodes = _towards(tree.nodes[parents], samples, step, search.scale)
+        nodes = _step_towards(tree.nodes[parents], samples, step, search.scale)
         clear = search.motions.are_clear(tree.nodes[parents], nodes)
         new = tree.add(nodes[clear], parents[clear])
         if len(new):
@@ -133,8 +133,8 @@ def connect(
     return None
 
 
-def _towards(starts: Array, targets: Array, step: float, scale: Array) -> Array:
-    """Return configurations at most a step away from the starts (K, n), towards the targets."""
+def _step_towards(starts: Array, targets: Array, step: float, scale: Array) -> Array:
+    """Move configurations (K, n) towards their targets by at most one step, as in a random tree."""
     length = np.linalg.norm((targets - starts) * scale, axis=1, keepdims=True)
     return np.where(length <= step, targets, starts + (targets - starts) * (step / np.maximum(length, step)))
 
@@ -148,7 +148,7 @@ def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step
     places = np.arange(len(new))
     while len(places):
         starts = tree.nodes[new]
-        ends = _towards(starts, targets[places], step, search.scale)
+        ends = _step_towards(starts, targets[places], step, search.scale)
         clear = search.motions.are_clear(starts, ends)
         places, parents, ends = places[clear], new[clear], ends[clear]
         new = tree.add(ends, parents)

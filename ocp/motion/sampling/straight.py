@@ -173,7 +173,7 @@ class StraightMotions:
             middle = np.concatenate([middle[kept] - shift, middle[kept] + shift])
 
     def _frames_on(self, lines: tuple[Array, Array], motion: Indices, places: Array) -> Frames:
-        """Return the frames of the bodies at places, shares from 0 to 1, of motions (K,)."""
+        """Return the frames of the bodies on straight motions (K,), each at a fraction from 0 to 1 of its length."""
         starts, ends = lines[0][motion], lines[1][motion]
         return self._frames(starts + places[:, None] * (ends - starts))
 

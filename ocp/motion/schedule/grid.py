@@ -107,7 +107,7 @@ class Grid:
         return rows.take(slice(count)), rows.take(right)
 
     def parts(self) -> list[tuple[int, int]]:
-        """Return the first and last nodes of parts of bounded length."""
+        """Split the nodes into blocks of bounded size; return the first and last node of each."""
         ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]
         return list(pairwise(ends))
 

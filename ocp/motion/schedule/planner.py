@@ -126,10 +126,9 @@ def _refined(
 
 
 def _unresolved(length: float, s: Array, permitted: Array, requested: Array, acceleration: float) -> NDArray[np.bool_]:
-    """Return which intervals do not resolve the permitted speed where it matters.
+    """Return which intervals are too coarse for the permitted speed where it limits the motion.
 
-    It matters where it is near or below the requested speed and a motion slow enough in the neighbourhood can get near
-    it.
+    It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.
     """
     low = np.minimum(permitted[:-1], permitted[1:])
     gain = 2 * acceleration * (s - s[0])

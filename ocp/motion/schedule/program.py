@@ -251,7 +251,7 @@ class _BandSolver:
         raise np.linalg.LinAlgError("the equations of a step are not positive definite")
 
     def solve(self, right: Array) -> Array:
-        """Return the solution for a right side."""
+        """Solve the factorised linear system for a right-hand side."""
         return np.asarray(scipy.linalg.lapack.dpbtrs(self.factors, right, lower=1)[0])
 
 
@@ -295,7 +295,7 @@ class _Constraints:
         self.middles = INTERIOR.block * np.arange(self.blocks.max() + 1) + (INTERIOR.block - 1) / 2
 
     def evaluate(self, b: Array) -> tuple[Array, Array]:
-        """Return violations and scales of the constraints; update the tangents of the rows of jerk at b."""
+        """Return violations and scales of the constraints at b, and linearise the jerk constraints there."""
         coefficients, sharp = self._coefficients(b), self.alone + self.jerk
         at = _weighted_sum(self.square, [each[self.jerk :] for each in coefficients])
         root = self.sharp / np.sqrt(at)
@@ -397,7 +397,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
     gap, size = constraints.evaluate(b)
     slack = np.maximum(-gap, 0.1 * size)
     slack[:count] = b[1:-1]
-    multiplier = center * _time(spline.share, cost_weights, b)[0] / len(gap) / slack
+    multiplier = center * _travel_time(spline.share, cost_weights, b)[0] / len(gap) / slack
 
     def solve(right: Array) -> Array:
         """Return the change of the coefficients."""
@@ -418,7 +418,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
             gap, size = constraints.evaluate(b)
             np.maximum(slack, -gap, out=slack)
             violation = _violations(gap, slack, size, count)
-        time, slope, *curvature = _time(spline.share, cost_weights, b)
+        time, slope, *curvature = _travel_time(spline.share, cost_weights, b)
         mean, worst = float(slack @ multiplier) / len(gap), float(violation.max())
         if not np.isfinite(mean + worst) or mean * len(gap) > INTERIOR.diverged * time:
             break
@@ -481,14 +481,17 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
 
 def _violations(gap: Array, slack: Array, size: Array, count: int) -> Array:
-    """Return violations beyond the slacks over the bounds; zero for the first `count`, which stay positive."""
+    """Return the relative violations that the slacks leave; zero for the first `count` rows, which always hold."""
     violation = (gap + slack) / size
     violation[:count] = 0.0
     return np.asarray(violation)
 
 
-def _time(share: Array, weights: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
-    """Return the time, its gradient and the three diagonals of its Hessian, from weights at the nodes."""
+def _travel_time(share: Array, weights: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
+    """Return the travel time, its gradient and the bands of its Hessian (main and two upper diagonals).
+
+    `weights` are the path lengths that the quadrature points represent.
+    """
     x = b[:-1] + share * np.diff(b)
     times = weights / np.sqrt(x)
     first, second = -0.5 * times / x, 0.75 * times / (x * x)

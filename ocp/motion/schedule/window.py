@@ -177,7 +177,7 @@ class EnforcedRows:
         return cls(margins, times, held, np.ones((len(HELD), count)))
 
     def part(self, first: int, last: int) -> EnforcedRows:
-        """Return a view of some intervals."""
+        """Return a view of the intervals from `first` up to `last`."""
         part = slice(first, last)
         return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
 
@@ -205,7 +205,7 @@ class EnforcedRows:
         self.hold_jerk(jerks)
 
     def hold_jerk(self, jerks: Array) -> None:
-        """Enforce some row of jerk in every interval, since otherwise the second derivative is unbounded there."""
+        """Enforce at least one jerk limit in every interval; without one the second derivative is unbounded there."""
         first = self.held.shape[3] - jerks.shape[1]
         sign, free = np.nonzero(~self.held[:, :, :, first:].any(axis=(0, 3)))
         self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
@@ -352,7 +352,7 @@ def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[Lin
 def _fine_usage(
     window: Window, profile: SpeedProfile, intervals: NDArray[np.intp], f: Array, known: Array, torques: bool
 ) -> Array:
-    """Return the largest usage in each direction in some intervals, from closely spaced places. Shape (2, B, R).
+    """Return the largest use of each limit, in both directions, by dense samples of some intervals. Shape (2, B, R).
 
     Args:
         window, profile: As for `limit_usage`.

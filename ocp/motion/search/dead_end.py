@@ -250,7 +250,7 @@ class _Propagation:
             self._record(successor, j[chosen], self.joints[k][i[chosen]] + displacement[chosen], i[chosen])
 
     def _record(self, k: int, charts: Indices, joints: Array, parents: Indices) -> None:
-        """Record configurations that do the task within limits and have more clearance than the recorded ones."""
+        """Record configurations that satisfy the task and the limits with more clearance than the recorded ones."""
         search = self.search
         sample, required = search.samples[k], self.required
         if k == 0 and search.start is not None:
@@ -339,7 +339,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
 
 
 def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return configurations reached last (M, n), their targets (M, n), and whether these do the task (M,).
+    """Return the last reached configurations (M, n), targets at the next sample (M, n), and which targets are valid.
 
     Targets are the projection of each configuration to the next sample, and the configurations there which keep all
     limits but are too far away.

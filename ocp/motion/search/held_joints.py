@@ -204,7 +204,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
 
 
 def moved_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return the request with those held joints elsewhere that move a body of a collision, clear of a local motion.
+    """Return the request with held joints moved to where they no longer cause the reported collision.
 
     Args:
         whole: Request before joints were held.

@@ -85,7 +85,10 @@ class JointSpace:
         return scipy.spatial.cKDTree(self.tree_points(joints, layer), boxsize=periods)
 
     def tree_points(self, joints: Array, layer: Indices | None = None) -> Array:
-        """Return the coordinates of configurations (M, n) in the tree; layers lie MAX_STEP apart. Shape (M, 1 + n)."""
+        """Return the coordinates of configurations (M, n) in the nearest-neighbour tree. Shape (M, 1 + n).
+
+        The first coordinate separates configurations of different layers by MAX_STEP.
+        """
         wrapped = joints.copy()
         wrapped[:, self.periodic] = np.remainder(wrapped[:, self.periodic], FULL_TURN)
         return np.column_stack([np.zeros(len(joints)) if layer is None else MAX_STEP * layer, wrapped * self.scale])

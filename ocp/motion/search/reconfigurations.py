@@ -86,7 +86,10 @@ def fewest_segments(
     segments = dict[Span, Segment | None]()
 
     def best_chain(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
-        """Return the best chain by costs or bounds of known segments, with or without bounds of the others."""
+        """Return the lowest-cost chain of segments, by the costs or the lower bounds of the solved ones.
+
+        Segments not solved yet count with their lower bounds if `bounded`, and are left out otherwise.
+        """
         costs = {span: np.inf if s is None else s.bound if bounds else s.cost for span, s in segments.items()}
         return _best_chain(*ranges, gap, (lower_bounds if bounded else {}) | costs)
 
@@ -148,7 +151,7 @@ def segment_ends(
 
 
 def _is_barred(span: Span, gap: int, barred: Collection[Span]) -> bool:
-    """Return whether a span has no segment: it is empty, or contains a barred span."""
+    """Return whether no segment can cover a span: the span is empty, or contains one known to be infeasible."""
     return (span[0] == span[1] and not gap) or any(span[0] <= bar[0] and bar[1] <= span[1] for bar in barred)
 
 
@@ -290,7 +293,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return the path found and the best paths on which the joint keeps a value, by rising cost; the bound is 0."""
+        """Return the best path, and the best one for each constant joint value, by rising cost; the bound is 0."""
         count = len(self.samples)
         paths = [path for path in (self.find_path(np.inf)[1],) if path is not None]
         for value in range(len(self._values)):

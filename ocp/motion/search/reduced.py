@@ -41,7 +41,7 @@ __all__ = ["LimitSide", "ReducedKinematics", "TaskKinematics", "check_floating_r
 
 
 class LimitSide(IntEnum):
-    """Limits of a joint: of its position, and of its rate."""
+    """One of the four limits of a joint: lowest and highest position, lowest and highest rate."""
 
     LOW = 0
     HIGH = 1

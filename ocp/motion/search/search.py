@@ -313,7 +313,7 @@ class AtlasSearch:
         return 1 - self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
 
     def _solve(self, max_cost: float) -> tuple[Array | None, float]:
-        """As `solve`, for paths whose steps all cost at most `max_cost`."""
+        """Return the best path and a lower bound, as `solve`, among paths whose steps each cost at most `max_cost`."""
         target = self._target_share
         layers, best_path = self.find_path(max_cost)
         if not layers:

@@ -237,7 +237,7 @@ def _nearest_places(
 
 @dataclass(frozen=True, eq=False)
 class SquaredRateBounds:
-    """Bounds of steps and of the cost after them, by the starting place t in the box `start_box`.
+    """Lower bounds of the cost of steps and of what follows, as functions of the start t in the box `start_box`.
 
     The bound is least + slope . t + t . level . t / 2, plus the minimum over t' in the box `end_box` of
     v . v / (2 dt) + after . t' + t' . after_curve . t' / 2. Here v = projection - rotation . t + t' is the step along
@@ -312,7 +312,7 @@ class Homogeneous(StepCost):
         """Return the gradients of the cost at displacements (P, n)."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return bounds (P,) of the cheapest steps into charts, multipliers (P, n) (gradients), and places (P, 1)."""
+        """Return lower bounds (P,) of the cost of steps into charts, gradients there (P, n), and minimisers (P, 1)."""
         count = len(delta)
         if not target.tangents.shape[2]:
             return self.evaluate(delta, 1.0) + after.least, self.gradient(delta), np.zeros((count, 0))

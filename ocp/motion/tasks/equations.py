@@ -336,7 +336,7 @@ class TaskEquations:
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def holding(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return pose at (at_base, at_joints) minus pose at (base, joints) in the rows of the velocity tasks.
+        """Return the pose error of the velocity tasks at (base, joints) against the pose at (at_base, at_joints).
 
         For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
         """

@@ -45,7 +45,7 @@ class InFoot:
             raise ProblemError(words, name="margin", value=self.margin, limit=0.0)
 
     def check(self, machine: Standing) -> None:
-        """Raise ProblemError if no point of the support has the margin."""
+        """Raise ProblemError if the support polygon is too small for the margin."""
         directions, support = machine.moving_directions, machine.support
         half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
         largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
@@ -196,7 +196,7 @@ def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool)
 
 
 def check_rule(machine: Standing, zmp: ZmpRule, horizon: float) -> None:
-    """Raise ProblemError if a rule has the wrong type, leaves the support, or cannot be met in it."""
+    """Raise ProblemError if a rule for the zero moment point has the wrong type or leaves the support polygon."""
     if not isinstance(zmp, ZmpRule):
         words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
         raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))

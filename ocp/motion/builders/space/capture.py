@@ -341,7 +341,7 @@ class _Capture:
 
     @property
     def arm(self) -> Array:
-        """Return 1 for joints and 0 for wheels, whose angles each phase counts from zero. Shape (n,)."""
+        """Return 1 for arm joints and 0 for reaction wheels, whose angles start from zero in each phase. Shape (n,)."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 

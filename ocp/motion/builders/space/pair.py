@@ -62,7 +62,7 @@ def joined(chaser: Robot, target: Robot) -> Robot:
 
 
 def checked_pair(chaser: Any, target: Any) -> Robot:
-    """Return the robot of both, see `joined`.
+    """Check a chaser and its target and return both as one robot, see `joined`.
 
     Raises:
         ProblemError: Machines of other kinds, without tips, with links of the same name, or a target with joints.
@@ -106,7 +106,7 @@ def pair_momentum(
 
 
 def motion_of(problem: Problem) -> tuple[Any, Any, Any]:
-    """Return the symbols of base, joints and velocities."""
+    """Return the state symbols of a problem: base, joints and velocities."""
     states = problem.declared.states
     return states["base"].symbol, states["joints"].symbol, states["velocities"].symbol
 

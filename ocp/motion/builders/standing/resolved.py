@@ -98,7 +98,7 @@ class StepsMotion:
         return np.asarray(np.where(self.held(foot), needed, np.nan))
 
     def summary(self) -> dict[str, float]:
-        """Return the extreme values by name."""
+        """Return duration, smallest margins and largest loads of the motion by name, with their units."""
         soles = [name for name, foot in self.steps.feet.items() if foot.sole is not None]
         return {
             "duration_s": float(self.t[-1]),
@@ -156,7 +156,7 @@ def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion
 def sample_stance(
     steps: Steps, stance: Stance, motion: tuple[Array, ...], foot_loads: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return the quantities of `StepsMotion` for a motion in one stance, by name. Shape (M, ...) each.
+    """Evaluate the quantities of `StepsMotion` along a motion in one stance; return them by name. Shape (M, ...) each.
 
     Args:
         motion: q, q', q'' in the stance's order. Shape (M, n) each.

@@ -354,7 +354,7 @@ def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]
 
 
 def _configuration(steps: Steps, stance: Stance, near: Array, over: Array) -> Array:
-    """Return a standing configuration in the robot's order."""
+    """Return a balanced configuration of a stance near a given one, with the joints in the order of the robot."""
     joints = standing_configuration(stance, near[steps.order(stance)], over)
     return np.asarray(steps.in_order(stance, joints[None])[0])
 
