@@ -84,7 +84,7 @@ class ConstraintCheck(NamedTuple):
         return ca.logic_and(self.pitch_joints(), ca.logic_and(self.yaw, self.yaw_angles))
 
     def pitch_joints(self) -> Expression:
-        """Return whether the pitch link reaches and joints 4, 5 and 6 are within limits."""
+        """Return whether the target is within reach of the pitch link and joints 4, 5 and 6 are within limits."""
         return ca.logic_and(self.pitch, self.pitch_angles)
 
     def angles(self) -> Expression:
@@ -167,7 +167,7 @@ def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expressi
 
 
 def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return the ends of the feasible arcs by all constraints but the limits of joint 1, among meaningless points."""
+    """Return points that include all ends of the feasible arcs, except those by the limits of joint 1."""
     ends = closed_form_ends(rig, target, branch)
     chart = yaw_chart(rig, branch)
     for level in yaw_levels(rig, target, branch):
@@ -182,7 +182,7 @@ def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
 
 
 def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return the arc ends by joints 4, 5 and 6 and by the reach of the pitch link, accurate to rounding."""
+    """Return the arc ends that have a closed form: limits of joints 4, 5 and 6, and the reach of the pitch link."""
     axle, e_c, _ = corner_circle(rig, target)
     ends = []
     for sine, code in _pitch_sines(rig, target, branch):
@@ -198,7 +198,7 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
 
 
 def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel]:
-    """Return the values of cos q2 at which an arc may end: by joints 2 and 3 and by the reach of the yaw link."""
+    """Return the values of cos q2 at which an arc may end: limits of joints 2 and 3, and the reach of the yaw link."""
     levels = []
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
@@ -295,12 +295,12 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 
 def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Return the point polished until cos q2 (output 0 of the chart) or q1 (output 2) takes a value."""
+    """Return the point moved by Newton steps until cos q2 (output 0 of the chart) or q1 (output 2) has a value."""
     return polish(point, chart_residual(chart, target, output, value))
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the point polished until cos q2 takes a value, on its feasible side by a bound of the rounding errors.
+    """Return the point moved by Newton steps until cos q2 has a value, on the feasible side of it despite rounding.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     holds above the value, -1 if below.
@@ -334,7 +334,7 @@ def _not_zero(x: Expression) -> Expression:
 
 
 def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
-    """Return the Function of the target -> arc ends by one limit of joint 1, among meaningless points.
+    """Return the Function of the target -> points that include all arc ends by one limit of joint 1.
 
     Output shape (2, 8): rows cosine and sine of the roll.
     """
@@ -348,7 +348,7 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
 
 
 def slide_points(rig: Rig, upper: bool) -> Any:
-    """Return the Function of the target -> points near the arc ends by one limit of joint 1. Output shape (2, 8)."""
+    """Return the Function of the target -> approximate arc ends by one limit of joint 1. Output shape (2, 8)."""
     limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
@@ -379,7 +379,7 @@ def checked_gain(rate_weight: float) -> float:
 
 
 def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:
-    """Return the roll of a point of the circle, in the turn nearest to the previous roll or in that of the limits."""
+    """Return the roll angle of a point of the circle, in the turn of the previous roll or in that of the limits."""
     angle = ca.atan2(s, c)
     if rig.limited(6):
         return nearest_turn(angle, rig.middle_and_half(6)[0])
@@ -435,7 +435,7 @@ def minimize_convex(
 
 
 def _inflections(f: Harmonics, gain: float, start: Expression, end: Expression) -> list[Expression]:
-    """Return the rolls with I1'' = -2 gain in the window, which separate convex and concave parts, and others."""
+    """Return the rolls with I1'' = -2 gain in the window, between which I2 is convex or concave."""
     bend = f.derivative().derivative()
     points = roots(bend._replace(a0=2 * gain))
     return [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in points]

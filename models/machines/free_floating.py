@@ -236,7 +236,7 @@ class FreeFloating:
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Return the momentum of a motion, as by `momentum`, less the conserved one: zero if the motion is possible.
+        """Return the momentum of a motion minus the conserved momentum; zero for a motion that is possible.
 
         The motion is given by the rates of base configuration and joints.
         """

@@ -226,7 +226,7 @@ class StoppedGradients:
         return self._symbols[-1]
 
     def restore(self, expressions: list[Expression]) -> list[Expression]:
-        """Return the expressions with the values substituted for the symbols."""
+        """Return the expressions with the original values in place of the symbols."""
         return list(ca.substitute_inplace(self._symbols, self._values, expressions)[1])
 
 
@@ -327,7 +327,7 @@ def _scalars(vector: Expression) -> Triple:
 
 
 def _as_number(entry: Expression) -> Expression:
-    """Return a scalar, as a float if it is constant."""
+    """Return a scalar, as a float if it is a constant expression."""
     return float(entry) if entry.is_constant() else entry
 
 

@@ -257,7 +257,7 @@ class Prepared:
         return attempts
 
     def _elastic(self, first: Attempt) -> Elastic | None:
-        """Return the plan with the smallest violation; Ctrl-C raises with the last iterate of the first attempt."""
+        """Solve for the plan with the smallest violation; Ctrl-C raises with the last iterate of the first attempt."""
         horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
             return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon=horizon)
@@ -272,7 +272,7 @@ class Prepared:
         return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
     def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
-        """Return the plan near the guess, shifted by ``shift`` intervals; None if there is none."""
+        """Return the optimum near a guess that is a plan, shifted by ``shift`` intervals; None if there is none."""
         form = self.formulation
         if not isinstance(guess, Solution) or not self._is_own_plan(guess) or self.solver_name != "ipopt":
             return None
@@ -318,7 +318,7 @@ class Prepared:
         bounds: Bounds,
         solver: tuple[Any, Any] | None = None,
     ) -> Attempt:
-        """Run a solver, by default the own one, from a start, scaled by the sizes along it; see :func:`sizes_along`."""
+        """Run a solver, by default the main one, from a start, with scales from the sizes along it."""
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
         scales = self._scales(x0, names, bounds, p)
@@ -387,17 +387,17 @@ class Attempt:
 
     @property
     def plan(self) -> Solution | None:
-        """The plan, if the solver succeeded."""
+        """The plan, if the solver succeeded; else None."""
         return self.solution if self.outcome.success else None
 
     @property
     def is_final(self) -> bool:
-        """Whether no other start is tried: the solver succeeded, or the time is over."""
+        """Whether no other start needs to be tried: the solver succeeded, or the time is over."""
         return self.plan is not None or self.outcome.status is SolverStatus.TIME_LIMIT
 
     @property
     def is_broken(self) -> bool:
-        """Whether a function was not finite, or an integrator failed."""
+        """Whether a function value was not finite, or an integrator failed."""
         return self.outcome.status is SolverStatus.NOT_FINITE
 
     def __str__(self) -> str:

@@ -349,7 +349,7 @@ def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
 
 
 def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
-    """Return the quantities without a limit, joints of one kind together."""
+    """List the quantities that have no limit, joints of one kind together."""
     joints: dict[str, list[str]] = {}
     counts: dict[str, int] = {}
     for row in rows:
@@ -403,7 +403,7 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
 
 
 def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
-    """Return the check of a plan between the times at which its rates jump, where no acceleration is defined."""
+    """Check a plan segment by segment, because no acceleration is defined where its rates jump."""
     if isinstance(plan, ConsecutivePlans):
         return _worst([_check_segment(piece, sample.t, name) for piece in plan.pieces])
     if isinstance(plan, PathPlan):  # constant rates between waypoints
@@ -438,7 +438,7 @@ def _check_samples(
 
 
 def _worst(checks: Sequence[Check]) -> Check:
-    """Return the checks of several motions as one: all faults, and the worst row of each quantity."""
+    """Merge the checks of several motions: all faults, and the worst row of each quantity."""
     rows: dict[str, Row] = {}
     for row in (row for check in checks for row in check.rows):
         if row.name not in rows or _severity(row) > _severity(rows[row.name]):
@@ -452,6 +452,6 @@ def _worst(checks: Sequence[Check]) -> Check:
 
 
 def _severity(row: Row) -> tuple[bool, bool, float]:
-    """Return a key by which rows of one quantity are compared."""
+    """Return the sorting key that compares rows of one quantity by severity."""
     size = abs(row.limit) if row.limit else 1.0
     return row.verdict is RowVerdict.FAILED, row.verdict is RowVerdict.UNDECIDED, abs(row.value) / size

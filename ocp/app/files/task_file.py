@@ -125,7 +125,7 @@ def rotation_of(entries: TomlTable) -> Array:
 
 
 def _shape(table: TomlTable, shape: str, folder: Path) -> Shape:
-    """Return the shape of a table."""
+    """Read the shape of an [[obstacle]] table."""
 
     def place(name: str = "position") -> Any:
         return table.vector(name, 3, "three numbers, m", REQUIRED)
@@ -240,7 +240,7 @@ def _located_errors(entries: TomlTable, name: str | None) -> Iterator[None]:
 
 
 def _machine(entries: TomlTable, urdf: Path) -> Machine:
-    """Return the robot on its base."""
+    """Read the robot and its base."""
     tip = entries.text("tip", "the name of the link that carries the tip")
     if not urdf.is_file():
         raise entries.error("urdf", f"there is no file {urdf}; name the robot's URDF, from the task file's folder")
@@ -272,7 +272,7 @@ def _machine(entries: TomlTable, urdf: Path) -> Machine:
 
 
 def _task(entries: TomlTable, folder: Path) -> TipTask:
-    """Return the task of the tip."""
+    """Read the task of the tip."""
     path = _read_path(entries, folder)
     speed = _path_limit(entries, "speed", "m/s", REQUIRED)
     acceleration = _path_limit(entries, "acceleration", "m/s^2")
@@ -306,7 +306,7 @@ def _task(entries: TomlTable, folder: Path) -> TipTask:
 
 
 def _path_limit(entries: TomlTable, name: str, unit: str, default: Any = None) -> Any:
-    """Return a limit of the schedule along the path, of a size that machines have."""
+    """Read a limit of the schedule along the path; reject a size that no machine has."""
     return entries.number(name, f"a number above 0, {unit}, of 1e-6 to 1e6", default, least=0.999e-6, most=1e6)
 
 
@@ -333,7 +333,7 @@ def _read_path(entries: TomlTable, folder: Path) -> SmoothPath:
 
 
 def _limits(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """Return the joint limits as an option of the planner."""
+    """Read the joint limits and return them as an option of the planner."""
     limits: dict[str, Any] = {}
     for quantity, unit in LIMIT_UNITS.items():
         expected = f"a number above 0, {unit}, or {{ joint = number }}"
@@ -344,14 +344,14 @@ def _limits(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[st
 
 
 def _cost(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """Return the weights as an option of the planner."""
+    """Read the weights of the cost and return them as an option of the planner."""
     weights = _each(entries, "weights", names, 1.0, "numbers above 0 by joint: { elbow = 4 }")
     time = entries.number("time", "a number above 0, 1/s: cost of a second with a free pace", least=0.0)
     return {"cost": Cost(time=time or 0.0, weights=weights)}
 
 
 def _each(entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str) -> Any:
-    """Return one number for all joints or one for each, `other` for joints that are not named; None if missing."""
+    """Return one number for all joints, or one for each; unnamed joints get `other`. None if the entry is missing."""
     if name not in entries:
         return None
     if not isinstance(entries.raw(name), dict):
@@ -415,7 +415,7 @@ def _read_scene(
 
 
 def _outputs(entries: TomlTable | None, folder: Path) -> tuple[dict[str, Path], float]:
-    """Return the output files by kind, and the sampling period."""
+    """Read the output files, by kind, and the sampling period."""
     if entries is None:
         return {}, 0.01
     outputs = {}

@@ -39,7 +39,7 @@ Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilise
 
 @dataclass(frozen=True)
 class Layer:
-    """Configuration index that the remaining freedom improves, below the task and the zero moment point.
+    """Secondary objective: a configuration index that the remaining freedom improves, below task and zero moment point.
 
     Attributes:
         index: ``joint_limits``, p1 (23), to be decreased; ``manipulability`` of the rows of the tasks, p2 (27), to be
@@ -96,14 +96,14 @@ class _TaskHierarchy:
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add rows q'' = target with the least change of the accelerations."""
+        """Add a task, rows q'' = target, with the least change of the accelerations found so far."""
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
         self.projector = self.projector - ca.mtimes(inverse, projected)
 
     def add_free(self, direction: Any) -> None:
-        """Add a vector, projected to the remaining freedom."""
+        """Add an acceleration vector, projected onto the remaining null space."""
         self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
@@ -397,7 +397,7 @@ def _zmp_target(zmp: Callable[[Any], Any] | Any) -> Callable[[Any], Any]:
 
 
 class _Simulation:
-    """Integration of the state (q, q') over many fixed steps at a time."""
+    """Integration of the state (q, q') over fixed steps, many steps in one call."""
 
     def __init__(self, law: Any, n: int, step: float, integrator: str, tolerance: float) -> None:
         self.step, self._law, self._n = step, law, n

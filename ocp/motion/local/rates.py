@@ -38,7 +38,7 @@ MAX_INTEGRATOR_STEPS = 20000
 
 @dataclass(frozen=True)
 class LocalSolution:
-    """Motion by instantaneous resolution, at M sampled times.
+    """Motion from local redundancy resolution, at M sample times.
 
     Attributes:
         t: Times, the first 0. Shape (M,), s.
@@ -110,7 +110,7 @@ def resolve(
     samples: Any = 501,
     scene: CollisionScene | None = None,
 ) -> LocalSolution:
-    """Integrate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the motion of the base.
+    """Integrate the pseudo-inverse solution x2' = G# v, equation (26) of the free-floating paper, and the base motion.
 
     The motion of the machine at rest (its drift) and the feedback of pose tasks are part of v.
 
@@ -198,7 +198,7 @@ def _sample_times(samples: Any, horizon: float) -> Array:
 
 
 class _Model:
-    """Rates of the state (base, joints) and reported outputs as CasADi functions of (time, state)."""
+    """Differential equations of (base, joints) and the reported outputs, as CasADi functions of (time, state)."""
 
     def __init__(self, equations: TaskEquations, weights: Array, damping: float, symbols: Any) -> None:
         machine = equations.machine
@@ -238,7 +238,7 @@ def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: floa
 
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
-    """Return states and costs at all reachable times, and the reason if these are not all."""
+    """Return states and costs at all times that integration reaches, and the reason if it stops early."""
     try:
         result = model.integrator(times[0], times[1:], tolerance)(x0=first)
         states = np.vstack([first, np.array(result["xf"]).T])
@@ -323,7 +323,7 @@ class LocalMotion:
 
     @classmethod
     def stationary(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
-        """Return motions at rest.
+        """Return motions that stay at their configurations.
 
         Args:
             times: Shape (M,), s.
@@ -344,19 +344,19 @@ class LocalMotion:
 
     @classmethod
     def joined(cls, motions: Sequence[LocalMotion]) -> LocalMotion:
-        """Return the motions of several sets over the same times as one set."""
+        """Join several sets of motions over the same times into one."""
         names = ("base", "joints", "rates", "cost", "pose_error", "worst_time")
         return cls(motions[0].t, *(np.concatenate([getattr(motion, name) for motion in motions]) for name in names))
 
     def straight_to(self, joints: Array) -> LocalMotion:
-        """Return motions that lead from the same starts straight to joints (K, joint_size), without a task."""
+        """Return motions straight in joint space from given starts to joints (K, joint_size), without a task."""
         share = ((self.t - self.t[0]) / (self.t[-1] - self.t[0]))[:, None]
         displacement = (joints - self.joints[:, 0])[:, None]
         rates = np.repeat(displacement / (self.t[-1] - self.t[0]), len(self.t), axis=1)
         return replace(self, joints=self.joints[:, :1] + share * displacement, rates=rates)
 
     def take(self, rows: Any) -> LocalMotion:
-        """Return the motions at these indices."""
+        """Return the motions with the given indices."""
         fields = (self.base, self.joints, self.rates, self.cost, self.pose_error, self.worst_time)
         return LocalMotion(self.t, *(value[rows] for value in fields))
 
@@ -466,7 +466,7 @@ def _cone_function(equations: TaskEquations) -> Any:
 def _damped_rates(
     matrix: Array, velocities: Array, weights: Array, damping: float, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the least weighted rates (K, n) for velocities (K, m), joints fixed at limits that they would leave."""
+    """Return the least weighted rates (K, n) for task velocities (K, m); joints about to leave their limits stop."""
     finite: Any = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(velocities).all(axis=1)
     matrix, velocities = np.where(finite[:, None, None], matrix, 0.0), np.where(finite[:, None], velocities, 0.0)
     size = np.sqrt((matrix**2).sum(axis=(1, 2)) / max(matrix.shape[1], 1))

@@ -126,7 +126,7 @@ class GoalRequest:
 
 @dataclass(frozen=True, eq=False)
 class GoalTask:
-    """Checked request: bounds, start, goals with their turns, metric, and the proofs of clearance."""
+    """Checked request: bounds, start, goals in all turns, metric, and collision checks."""
 
     request: GoalRequest
     bounds: JointBounds
@@ -148,7 +148,7 @@ class GoalTask:
 
     @property
     def moves(self) -> bool:
-        """Whether the machine moves at the start or at the end."""
+        """Whether the machine has a velocity at the start or at the end."""
         return not all(isinstance(velocity, str) and velocity == "rest" for velocity in self.end_velocities)
 
     @property
@@ -158,7 +158,7 @@ class GoalTask:
 
     @property
     def is_fastest(self) -> bool:
-        """Whether the time alone is the cost, and free, and no power is limited."""
+        """Whether the motion is time-optimal: only a free time is the cost, and no power is limited."""
         is_free = self.request.horizon is None and self.request.cost.terms == ("time",)
         return is_free and not np.isfinite(self.bounds.power).any()
 
@@ -222,7 +222,7 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
 
 
 def _fastest(task: GoalTask, path: JointPath) -> Candidate:
-    """Return the audited locally fastest motion near a path, or one that stops at corners if none is found."""
+    """Return the locally fastest motion near a path, audited; if none is found, one that stops at corners."""
     settings = task.request.settings.fastest
     ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
     limits = MotionLimits(task.motions, task.bounds, task.torques, *ends)
@@ -244,7 +244,7 @@ def _fastest(task: GoalTask, path: JointPath) -> Candidate:
 
 
 def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return the audited motions within actuator limits: with stops at corners, and where time is left without."""
+    """Return audited motions within actuator limits: one that stops at corners and, if time is left, one that does not."""
     request, settings, bounds = task.request, task.request.settings, task.bounds
     candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
     for path in paths:
@@ -270,7 +270,7 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
 
 
 def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
-    """Return whether a candidate passed its audit and costs hardly more than any motion does."""
+    """Return whether a candidate passed its audit and its cost is within tolerance of the lower bound."""
     if not candidate.passed or candidate.solution is None:
         return False
     bound = cost_bound(task, candidate.solution.horizon)
@@ -316,7 +316,7 @@ class _PathProblem:
         return dynamics_problem(task.request.machine, (), horizon, **ends, limits=limits, cost=cost, setup=setup)
 
     def stopping(self) -> Candidate:
-        """Return the audited motion that stops at corners, slowed down to a fixed horizon."""
+        """Return the motion that stops at corners, slowed down to a fixed horizon, with its audit."""
         task, factor = self.task, self.horizon_guess / self.motion.duration
         if task.request.cost.energy or np.isfinite(task.bounds.power).any() or task.moves:
             words = "motions with stops are not offered where power counts, or the machine moves at an end"
@@ -329,7 +329,7 @@ class _PathProblem:
         return replace(self, motion=self.motion.slower(factor)).candidate("stops at the corners of a path")
 
     def candidate(self, method: str) -> Candidate:
-        """Return the audited motion; `method` says what it does."""
+        """Audit the motion and return it as a candidate; `method` describes how it was found."""
         problem = self.declare(self.task.request.clearance_constraints)
         return _audited(self.task, self.motion.solution(problem, method), self.path)
 

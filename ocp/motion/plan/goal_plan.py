@@ -40,7 +40,7 @@ __all__ = ["plan_to_goal"]
 
 @interruptible
 def plan_to_goal(request: GoalRequest) -> SolvedPlan:
-    """Return the lowest-cost motion found from the start to one of the goals, at rest at both ends if actuators count.
+    """Return the lowest-cost motion found from the start to one of the goals; with actuators, at rest at both ends.
 
     Raises:
         ProblemError: Sizes do not match; the start, or every goal, is outside the limits or collides: names the pair of
@@ -143,7 +143,7 @@ def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal
 
 
 def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
-    """Return paths of several classes, the shortest first.
+    """Search collision-free paths of several homotopy classes, the shortest first.
 
     Raises:
         SolveError: None was found.
@@ -176,7 +176,7 @@ def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
 
 
 def _best(task: GoalTask, candidates: list[Candidate]) -> SolvedPlan:
-    """Return the plan of the candidate of least cost, with a lower bound of the cost of all motions.
+    """Return the plan of the lowest-cost candidate, with a lower bound of the cost of all motions.
 
     Raises:
         SolveError: None passed its audit.

@@ -234,7 +234,7 @@ def with_joints(goal: Goal, joints: Array) -> Goal:
 
 
 def _phased(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
-    """Return the plan of a solution with phases."""
+    """Return the plan of a solution that has phases."""
     candidate = Candidate(start, solution.cost, None, Stage.AUDITED, solution)
     return PhasedPlan(machine, solution, parts_of_phases(solution), (candidate,))
 

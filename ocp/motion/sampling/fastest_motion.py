@@ -284,7 +284,9 @@ class _Search:
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
     def guess(self, path: Array) -> tuple[Array, float]:
-        """Return initial control points along a path, and a duration that respects the rate limits from rest to rest."""
+        """Return initial control points along a path, and a duration with which a motion from rest to rest keeps its
+        rate limits.
+        """
         p, ramp = self.degree, self.settings.ramp
         at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
         top = 1 / (1 - ramp)

@@ -73,7 +73,7 @@ class StepsMotion:
     balance: Array
 
     def held(self, foot: str) -> NDArray[np.bool_]:
-        """Return at which times a foot is held. Shape (M,), bool."""
+        """Return at which times a foot is on the ground. Shape (M,), bool."""
         by_phase = np.array([foot in phase.footholds for phase in self.steps.phases], dtype=bool)
         return np.asarray(by_phase[self.phase.astype(int)], dtype=bool)
 
@@ -87,11 +87,11 @@ class StepsMotion:
         return np.asarray(points)
 
     def _force(self, foot: str) -> Array:
-        """Return the force on a foot in the axes of its sole. Shape (M, 3), N."""
+        """Return the contact force on a foot in the axes of its sole. Shape (M, 3), N."""
         return np.asarray(np.einsum("kji,kj->ki", self.sole_rotation[foot], self.loads[foot][:, 3:]))
 
     def friction(self, foot: str) -> Array:
-        """Return the needed friction coefficient, tangential over normal force; nan in the air. Shape (M,)."""
+        """Return the required friction coefficient, tangential over normal force; nan in the air. Shape (M,)."""
         force = self._force(foot)
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
@@ -209,7 +209,7 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
 
 
 def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsMotion:
-    """Take steps with the least joint rates at every instant, by `resolve`.
+    """Take steps with the least joint rates at every time, by local resolution; see `resolve`.
 
     A lifted foot moves to its next foothold from rest to rest. Seen from above its path is straight; at the share s of
     the path it is raised by 64 s^3 (1 - s)^3 times the steps' clearance. A foot without a next foothold follows the
