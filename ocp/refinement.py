@@ -186,7 +186,7 @@ def _refine_mesh(
 def _shortfall(
     stopped: str, late: bool, idles: bool, beyond: list[_Row], audit: Audit, form: Formulation
 ) -> RefinementWarning | None:
-    """Return the warning for the most important remaining fault; None if the last plan passes its audit."""
+    """Return the warning about the worst remaining row; None if the last plan passes its audit."""
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
         hint = "the time limit is reached: raise time_limit" if late else "raise max_intervals"
@@ -229,7 +229,7 @@ def _first(
 def _next(
     problem: Problem, method: DirectMethod, arguments: dict[str, Any], settings: RefinementSettings
 ) -> tuple[Solution, Audit] | None:
-    """Return the plan on a finer mesh, and its audit; None if the time limit is reached first."""
+    """Solve on a finer mesh and audit the plan; return None if the time limit is reached first."""
     if time_left() <= 0:
         return None
     try:
@@ -257,7 +257,7 @@ class _Row(NamedTuple):
 
 
 class _Parts(NamedTuple):
-    """Contribution of each interval to a row (N,), in any unit; the row is their sum or their maximum."""
+    """Contributions of the intervals to an audit row (N,), in any unit; the row is their sum or their maximum."""
 
     kind: str
     values: np.ndarray
@@ -265,7 +265,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Return contributions scaled to a row's value; in a sum, the average scales to the value. Shape (N,)."""
+        """Scale the contributions so that they are comparable with the value of their row. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))
@@ -276,7 +276,7 @@ class _Parts(NamedTuple):
 def _rows(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit, tolerance: float, method: DirectMethod
 ) -> list[_Row]:
-    """Return the rows of the audit of a plan, with the intervals to which they are attributed."""
+    """Return the rows of the audit of a plan, each with the contributions of the intervals."""
     # over the whole horizon an unstable motion diverges; the sum is what feedback would have to correct
     deviation = min(audit.integration_error, float(audit.local_errors.sum()))
     requested = Finding(f"integration error, {tolerance:.0e} requested", deviation, tolerance)

@@ -54,7 +54,7 @@ ARM = ArmSettings()
 
 
 def sample_shares(first: int, count: int, dimension: int) -> Array:
-    """Return samples first, ..., first + count - 1 of a low-discrepancy sequence in the unit cube. (count, dimension)"""
+    """Return samples first, ..., first + count - 1 of a low-discrepancy sequence. Shape (count, dimension)."""
     return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
 
 

@@ -325,7 +325,7 @@ def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArra
 
 @lru_cache(maxsize=64)
 def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return all pairs of indices of groups with the given sizes. Shapes (P,)."""
+    """Return all pairs of the indices 0, ..., count - 1. Shapes (P,)."""
     return np.triu_indices(count, 1)
 
 

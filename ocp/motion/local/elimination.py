@@ -204,7 +204,7 @@ class Elimination(PoseSolver):
         return solutions, mixed, doubtful
 
     def prescribe(self, redundant: Array) -> Array:
-        """Return joint vectors with the redundant joints (M, k) at given positions and the others at 0. Shape (M, n)."""
+        """Return joints with the redundant ones (M, k) at given positions and the others at 0. Shape (M, n)."""
         joints = np.zeros((len(redundant), len(self.chain.axes)))
         joints[:, list(self.redundant)] = redundant
         return joints

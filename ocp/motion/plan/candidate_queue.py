@@ -119,7 +119,7 @@ class CandidateQueue:
 
     @property
     def exhausted(self) -> bool:
-        """Whether candidates have failed, none has passed, and the time limit for failures is over."""
+        """Whether candidates have failed without a collision, none has passed, and the time for failures is over."""
         seconds = time.thread_time() - self._began
         return seconds > self.settings.refusal_time and bool(self.candidates) and not (self.passed or self.collided)
 

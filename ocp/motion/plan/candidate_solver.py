@@ -98,7 +98,7 @@ class CandidateSolver(Solver):
         return [advanced, *self._free_start(advanced)]
 
     def with_own_cost(self) -> CandidateSolver:
-        """Return the solver that finally minimises the cost of the request instead of the joint rates."""
+        """Return the solver with a last stage that minimises the cost of the request instead of the joint rates."""
         solver = copy(self)
         solver.last = Stage.ACTUATED
         return solver
@@ -109,7 +109,7 @@ class CandidateSolver(Solver):
         return cost_of_motion(self.plan([candidate]), self.request.cost)
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
-        """Return whether the tasks along a local motion are nearly dependent, so that its candidate relaxes them."""
+        """Return whether the tasks are nearly dependent along a local motion; its candidate then relaxes them."""
         return self._can_relax and is_nearly_singular(self.motion.stretches, local)
 
     @property
@@ -124,7 +124,7 @@ class CandidateSolver(Solver):
         return self._can_relax and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
-        """Return the reason why no motion was found: where the last iterate, or else the seed, violates a constraint."""
+        """Return the reason why the solver found no motion: the violation of its last iterate, or else of the seed."""
         samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
         if not samples:
             return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
@@ -134,9 +134,7 @@ class CandidateSolver(Solver):
         return limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
 
     def _turned_over(self, solution: Solution) -> Reason | None:
-        """Return a rejection reason if a tool points the opposite way, a spurious solution of the task equations at
-        free starts.
-        """
+        """Return a rejection reason if a tool is upside down at a free start; the task equations hold there as well."""
         if self.request.start is not None:
             return None
         for sample in self._motion_samples(solution):
@@ -462,9 +460,7 @@ class CandidateSolver(Solver):
     # ---- results -----------------------------------------------------------------------------------------------------
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error for the case that no candidate passes; collisions are described for the lowest-cost
-        candidate.
-        """
+        """Return the error that no candidate passes; if bodies collide, it describes the lowest-cost candidate."""
         error = super().failure(candidates)
         reasons = ((candidate, candidate.reason) for candidate in candidates)
         colliding = [c for c, reason in reasons if reason is not None and reason.kind is Rejection.COLLISION]

@@ -174,7 +174,7 @@ def _plan(
 
 
 def _is_sequence(tasks: Any) -> bool:
-    """Return whether tasks and goals form a sequence that is not made of goals alone.
+    """Return whether tasks are a sequence of goals and tasks, or of groups of tasks; not goals or tasks alone.
 
     Raises:
         ProblemError: A part is neither a goal nor tasks.

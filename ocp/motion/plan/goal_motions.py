@@ -244,7 +244,7 @@ def _fastest(task: GoalTask, path: JointPath) -> Candidate:
 
 
 def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return audited motions within actuator limits: one that stops at corners and, if time is left, one that does not."""
+    """Return audited motions within actuator limits: with stops at corners and, if time is left, without."""
     request, settings, bounds = task.request, task.request.settings, task.bounds
     candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
     for path in paths:

@@ -63,7 +63,7 @@ __all__ = ["candidates_from", "checked_request", "clearance_for", "plan_from_con
 def plan_from_configurations(
     request: PlanRequest, configurations: Array, solver: CandidateSolver
 ) -> tuple[SolvedPlan, float | None]:
-    """Return the plan that start configurations lead to, and a lower bound of its cost or None.
+    """Return the plan that results from start configurations, and a lower bound of its cost or None.
 
     Args:
         request: The request.
@@ -105,7 +105,7 @@ def plan_from_configurations(
 
 
 def _finished(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
-    """Return the plan of least cost.
+    """Return the plan of the lowest-cost candidate.
 
     If the request has another cost than the squared rates, all motions that passed are solved again at that cost, in
     the order of the cost that they have without a change.
@@ -123,7 +123,7 @@ def _finished(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates of local motions: those that do their tasks first, then by rising cost.
+    """Return candidates of local motions: those that satisfy their tasks first, then by increasing cost.
 
     Args:
         motions: K local motions through each stretch.
@@ -149,7 +149,7 @@ def _repair(
     configurations: Array,
     seeds: list[Candidate],
 ) -> None:
-    """Try seeds again that collided; if none did, try other guesses, and diagnose conflicts."""
+    """Solve seeds in collision again; without collisions, try other guesses and diagnose conflicting constraints."""
     if queue.collided and not solver.no_clear_configuration:
         _try_alternatives(queue, solver, seeds)
     if queue.passed or queue.collided or queue.exhausted:
@@ -178,7 +178,7 @@ def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configuratio
 
 
 def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch) -> None:
-    """Run the classes of motions that may hold the optimum; if none passes, one motion of every class.
+    """Solve the classes of motions that may contain the optimum; if none passes, try one motion of every class.
 
     A free start and a coarse mesh may lead away from a nearly optimal motion. Motions of the search that promise a
     lower cost than the plan are therefore also solved with their start fixed, until the plan is close to its bound.
@@ -248,7 +248,7 @@ def _search_cells(
 
 
 def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Rerun candidates in collision: from their own local motions, then from fixed, collision-free starts.
+    """Solve candidates in collision again: from their own local motions, then from fixed, collision-free starts.
 
     Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
     motions belong to different homotopy classes; those without collision, or with the least, come first. A free start
@@ -301,7 +301,7 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
 
 
 def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
-    """Plan a request with held joints; `whole` is the request before joints were held.
+    """Plan a request with held joints; `whole` is the request before any joints were held.
 
     Raises:
         ProblemError, SolveError: As in `plan`.
@@ -324,7 +324,7 @@ def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
 def clearance_for(
     machine: Machine, limits: Limits | None, scene: Scene | Literal[False] | None
 ) -> ClearanceConstraints | None:
-    """Return the clearance constraints of a motion in a scene, or None if no pair of bodies has to be checked.
+    """Return the clearance constraints of a motion in a scene; None if no pair of bodies needs a check.
 
     Raises:
         ProblemError: A value of the scene is invalid, or does not fit the machine.
@@ -399,7 +399,7 @@ def checked_request(
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
-    """Return the cost of tip tasks, with its weights checked.
+    """Check the weights of the cost of tip tasks and return the cost.
 
     Args:
         free: Whether the horizon is free.

@@ -21,7 +21,7 @@ __all__ = ["Candidate", "Reason", "Rejection", "Seed", "Stage", "collision_reaso
 
 
 class Stage(IntEnum):
-    """Stage that a candidate has reached."""
+    """Stage of the solution process that a candidate has reached."""
 
     SEED = 0  # guess, mostly a local motion
     COARSE = 1  # solved on the coarse mesh
@@ -33,7 +33,7 @@ class Stage(IntEnum):
 
 
 class Rejection(Enum):
-    """Reasons for which a candidate is not the plan."""
+    """Kinds of reasons for rejecting a candidate."""
 
     COLLISION = "collides"
     COSTLIER = "costlier"
@@ -48,7 +48,7 @@ class Rejection(Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """Why a candidate is not the plan.
+    """Reason why a candidate was rejected.
 
     Attributes:
         kind: Kind of the reason.
@@ -69,7 +69,7 @@ class Reason:
         return self.kind.value + (self.detail and f": {self.detail}") + (self.remedy and f"; {self.remedy}")
 
     def record(self) -> dict[str, Any]:
-        """Return the record that a file holds."""
+        """Return the reason as data for a file."""
         return {**asdict(self), "kind": self.kind.name}
 
     @classmethod
@@ -167,12 +167,12 @@ class Candidate:
         return cls(np.array(start, dtype=float), float(cost), rejection, Stage(stage), motion)
 
     def record(self) -> list[Any]:
-        """Return the arguments of `of_record` but for the solution, as a file holds them."""
+        """Return the arguments of `of_record`, except the solution, as data for a file."""
         return [self.start.tolist(), self.cost, int(self.stage), self.reason and self.reason.record()]
 
     @property
     def passed(self) -> bool:
-        """Whether it has no reason for rejection."""
+        """Whether the candidate was not rejected."""
         return self.reason is None
 
     def rejected(self, reason: Reason) -> Candidate:
@@ -182,6 +182,6 @@ class Candidate:
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
 
     def finished(self) -> Candidate:
-        """Return the candidate as a plan lists it."""
+        """Return the candidate in the form in which a plan lists it, without intermediate data."""
         solution = self.solution if self.stage >= Stage.FINE else None
         return Candidate(self.start, self.cost, self.reason, self.stage, solution, audit=self.audit)

@@ -144,7 +144,7 @@ def fastest_motion_near(
 
 
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
-    """Return the fastest feasible motion of a sequence of linear programs, and the last trust region.
+    """Run the sequence of linear programs; return the fastest feasible motion and the last trust region.
 
     It is the last motion if none is feasible. The sequence ends when the duration decreases by less than `least_gain`.
 
@@ -180,7 +180,7 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Motion with its linearised constraints.
+    """Iterate of the search: a motion with its linearised constraints.
 
     Attributes:
         points: Control points. Shape (K, n).
@@ -198,7 +198,7 @@ class _State:
 
     @property
     def excess(self) -> float:
-        """Largest usage beyond what is allowed, 0 if the motion is feasible."""
+        """Largest violation of a limit, relative to it; 0 if the motion is feasible."""
         return max(0.0, float((self.usages - self.allowed).max(initial=0.0)))
 
     @property
@@ -206,7 +206,7 @@ class _State:
         return self.excess == 0
 
     def merit(self, penalty: float) -> float:
-        """Return the logarithm of the duration and a penalty of the excess."""
+        """Return the merit of the iterate: the logarithm of the duration plus a penalty of the excess."""
         return float(np.log(self.duration)) + penalty * self.excess
 
 
@@ -215,7 +215,7 @@ _Rows: TypeAlias = tuple[Any, Array, Array, float]
 
 
 class _Search:
-    """Linear programs for the motions along one spline basis."""
+    """Sequence of linear programs for motions in one spline basis."""
 
     def __init__(self, limits: MotionLimits, path: Array, settings: FastestMotionSettings) -> None:
         self.limits, self.settings, bounds = limits, settings, limits.bounds
@@ -243,7 +243,7 @@ class _Search:
         self._fix_ends()
 
     def _breaks(self, path: Array) -> Array:
-        """Return the bounds of the intervals, shares of the duration: short ones at both ends, equal ones between."""
+        """Return the knots as fractions of the duration: short intervals at both ends, equal ones between."""
         bounds, settings = self.limits.bounds, self.settings
         with np.errstate(divide="ignore", invalid="ignore"):
             build_up = np.where(np.isfinite(bounds.acceleration), bounds.acceleration / bounds.jerk, 0.0).max()
@@ -260,7 +260,7 @@ class _Search:
         return np.asarray(breaks / breaks[-1])
 
     def _values(self, places: Array, order: int) -> Any:
-        """Return the matrix from control points to values of a derivative at places. Shape (M, K)."""
+        """Return the matrix that maps control points to values of a derivative at given places. Shape (M, K)."""
         knots = self.knots[order : len(self.knots) - order]
         return BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
 
@@ -356,7 +356,7 @@ class _Search:
             yield sign * matrix, sign * by_duration.ravel(), sign * (values * scale).ravel(), (1 - share) / 2
 
     def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
-        """Return rows by all control points, from their weights in each row (R, K) and slopes by joints (R, n)."""
+        """Return constraint rows by control points, from weights (R, K) and derivatives by joints (R, n)."""
         weights = sp.coo_array(basis)
         row = np.repeat(weights.row, self.size)
         column = (weights.col[:, None] * self.size + np.arange(self.size)).ravel()
@@ -389,7 +389,7 @@ class _Search:
         return self.evaluate(moved.reshape(self.count, self.size), state.duration * (1 + change[count]))
 
     def add_places(self, state: _State) -> bool:
-        """Add the closest approaches between the samples that are not clear enough; return whether there were any."""
+        """Add constraints at collisions between the samples; return whether there were any."""
         dense = np.linspace(0.0, 1.0, self.settings.finer * (len(self.breaks) - 1) + 1)[1:-1]
         at, pair, distance, _ = self.limits.motions.near_pairs(self._values(dense, 0) @ state.points, 0.0)
         worst = {each: at[pair == each][distance[pair == each].argmin()] for each in np.unique(pair).tolist()}

@@ -50,7 +50,7 @@ class RandomTreeSettings:
 
 @dataclass(frozen=True, eq=False)
 class TreeSearch:
-    """Request for paths between a start and goals.
+    """Request for a path between a start and goals by random trees.
 
     Attributes:
         motions: Proofs of clearance.
@@ -67,7 +67,7 @@ class TreeSearch:
 
 
 class _Tree:
-    """Tree of configurations with the index of each one's parent."""
+    """Tree of configurations, each with the index of its parent."""
 
     def __init__(self, roots: Array) -> None:
         self.nodes, self.parents = roots.copy(), np.full(len(roots), -1)
@@ -94,7 +94,7 @@ class _Tree:
 def connect(
     search: TreeSearch, start: Array, goals: Array, *, random: np.random.Generator, most_samples: int
 ) -> Array | None:
-    """Return a path of straight motions, each proven clear, from the start to a goal; None if none was found.
+    """Return a path of straight motions, each proven collision-free, from the start to a goal; None if none is found.
 
     Args:
         search: Proofs of clearance, box and metric.
@@ -140,7 +140,7 @@ def _step_towards(starts: Array, targets: Array, step: float, scale: Array) -> A
 
 
 def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step: float) -> tuple[int, int] | None:
-    """Grow a tree from new nodes towards targets (K, n) of the other tree, step by step.
+    """Extend a tree from new nodes towards targets (K, n) of the other tree, step by step.
 
     Returns:
         Which of the targets is reached, and the tree's node there; None if none is.
@@ -250,7 +250,7 @@ def _path_of(joints: Array, goals: Array, scale: Array) -> JointPath:
 
 
 def _with_path(search: TreeSearch, paths: list[JointPath], path: JointPath) -> list[JointPath]:
-    """Return the paths with another one, the shortest first, and of each class the shortest only."""
+    """Add a path to paths sorted by length; only the shortest one of each homotopy class stays."""
     others = []
     for other in paths:
         if other.goal == path.goal and same_class(search.motions, other.joints, path.joints, search.scale):

@@ -53,7 +53,7 @@ class StraightMotionSettings:
 
 
 class StraightMotions:
-    """Proofs of clearance of straight motions of a machine on a fixed base among fixed obstacles.
+    """Collision proofs for straight joint motions of a machine on a fixed base among fixed obstacles.
 
     Attributes:
         scene: Collision scene; None if nothing can collide.
@@ -95,7 +95,7 @@ class StraightMotions:
         return at, pair, gap - self.scene.clearance, gradient
 
     def are_clear(self, starts: Array, ends: Array) -> NDArray[np.bool_]:
-        """Return which straight motions are proven clear. Shape (M,).
+        """Return which straight motions are proven collision-free. Shape (M,).
 
         Args:
             starts, ends: Configurations at both ends. Shape (M, n), rad or m.
@@ -123,7 +123,7 @@ class StraightMotions:
         clear: NDArray[np.bool_],
         intervals: tuple[Indices, Array, Array],
     ) -> None:
-        """Halve intervals until all pairs are decided; mark motions that are not clear.
+        """Halve intervals until all pairs are decided; mark motions that may collide.
 
         Args:
             lines: Starts and ends of the motions.
