@@ -131,7 +131,7 @@ def interruptible(function: Callable[P, T]) -> Callable[P, T]:
 
 @contextmanager
 def stop_requests_polled() -> Iterator[None]:
-    """Declare that the loop inside polls :func:`reason_to_stop` and ends by itself."""
+    """Declare that a loop inside checks :func:`reason_to_stop` regularly and ends by itself."""
     call = _CALL.get()
     if call is None:
         yield

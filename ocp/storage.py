@@ -157,7 +157,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def open_unlinked(path: str | os.PathLike[str]) -> io.BufferedReader:
-    """Open a regular file of at most ``MAX_FILE_BYTES`` that is not a link, in a folder that others may write.
+    """Open a regular file of at most ``MAX_FILE_BYTES``; reject a link in a folder that others can write to.
 
     Raises:
         OSError: It cannot be opened.

@@ -238,7 +238,7 @@ def _excess(
 
 
 def _peaks(values: np.ndarray) -> np.ndarray:
-    """Return the largest values of sampled curves (N, K, m); parabolas estimate maxima between samples. Shape (N, m)."""
+    """Return the largest values of sampled curves (N, K, m), by parabolas also between samples. Shape (N, m)."""
     left, middle, right = values[:, :-2], values[:, 1:-1], values[:, 2:]
     with np.errstate(invalid="ignore", divide="ignore"):
         rise = (right - left) ** 2 / (8 * (2 * middle - left - right))
@@ -325,9 +325,7 @@ def switches(problem: Problem, solution: Solution) -> np.ndarray:
 def _limited_values(
     form: Formulation, solution: Solution, at: np.ndarray, owner: np.ndarray, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the controls and the path constraints with controls that have limits, at M places (M, m), and the limits
-    (m,).
-    """
+    """Return the values (M, m) and limits (m,) of controls, and of path constraints with controls, at M places."""
     p = form.parameter_vector(solution.parameters)
     lower, upper = form.bound_values(p)
     x, u = solution.state_interpolant(at), solution.control_interpolant.within(owner, place)

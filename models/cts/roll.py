@@ -80,7 +80,7 @@ class ConstraintCheck(NamedTuple):
     slide_upper: Expression
 
     def all_but_slide(self) -> Expression:
-        """Return whether all constraints but the limits of joint 1 hold."""
+        """Return whether all constraints are satisfied, not counting the limits of joint 1 (the slide)."""
         return ca.logic_and(self.pitch_joints(), ca.logic_and(self.yaw, self.yaw_angles))
 
     def pitch_joints(self) -> Expression:
@@ -88,11 +88,11 @@ class ConstraintCheck(NamedTuple):
         return ca.logic_and(self.pitch, self.pitch_angles)
 
     def angles(self) -> Expression:
-        """Return whether joints 2 to 6 are within their limits."""
+        """Return whether the revolute joints 2 to 6 are within their limits."""
         return ca.logic_and(self.pitch_angles, self.yaw_angles)
 
     def slide(self) -> Expression:
-        """Return whether joint 1 is within limits."""
+        """Return whether joint 1 (the slide) is within its limits."""
         return ca.logic_and(self.slide_lower, self.slide_upper)
 
 

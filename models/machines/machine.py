@@ -262,7 +262,7 @@ def with_wheels(
 
 
 def find_wheels(robot: Robot) -> dict[str, float]:
-    """Return the inertia (kg m^2) about the axis of each joint whose angle is irrelevant, by name.
+    """Find the joints whose angle is irrelevant, such as reaction wheels; return their inertia (kg m^2) by name.
 
     Such a joint is unbounded and moves a single body, symmetric about the joint axis with its centre of mass on it,
     that carries neither the tip nor a collision shape.

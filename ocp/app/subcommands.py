@@ -1,4 +1,4 @@
-"""Run the subcommands of `selfmotion`: options in; exit status, text and contents of JSON out."""
+"""Run the subcommands of `selfmotion`: each turns options into an exit status, a text and JSON contents."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Second order: does the cost curve upwards along every feasible variation of a plan, and how much does it lose?
+"""Second-order conditions: is the second variation of the cost positive along every feasible variation of a plan?
 
 A stationary plan may be a maximum, a saddle point, or a minimum only up to a conjugate point. The second variation of
 the cost (:mod:`ocp.audit.accessory`) is swept backwards stage by stage. The cost must curve upwards along all

@@ -1,4 +1,4 @@
-"""First and second order optimality of a plan: its multipliers, the cost it loses, and the curvature of the cost.
+"""First and second order optimality of a plan: multipliers, cost above the optimum, and curvature of the cost.
 
 Where controls rest on their limits, the plan alone does not determine the costates. A plan that switches between limits
 where its mesh allows it fits a whole set of costates. A solver reports one of them, whose switching functions need not

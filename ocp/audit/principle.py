@@ -303,8 +303,7 @@ def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray
 
 
 def _step(gradient: np.ndarray, curved: np.ndarray, projector: np.ndarray, scale: float) -> np.ndarray:
-    """Return the minimiser d of gradient . d + d curved d / 2 over projected d at each point; |d| is about 1 without
-    curvature.
+    """Minimise a quadratic function of a control step d at each point, with |d| about 1 where it has no curvature.
 
     Shapes (k, nu), (k, nu, nu), (k, nu, nu). ``scale`` is the largest curvature.
     """

@@ -243,7 +243,7 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
-    """Return the scales of a program for variables of these sizes; rows and cost by their change from a start."""
+    """Return the scales of a program for given sizes of its variables; rows and cost scale with their changes."""
     program, size_of_variable = pattern.program, sizes.of_variables(pattern.transcription)
     # squares of smaller sizes underflow
     size_of_variable = np.where(size_of_variable > np.sqrt(np.finfo(float).tiny), size_of_variable, 1.0)

@@ -130,7 +130,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
 
 @lru_cache(maxsize=4096)
 def _partials(code: int, count: int, exponent: float | None) -> Any:
-    """Return the partial derivatives of an operation as an SX function; for a power with fixed exponent, in its base."""
+    """Return the partial derivatives of an operation as an SX function; a fixed exponent counts as a constant."""
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     if count == 1:
         return ca.Function("partials", [x], [ca.densify(ca.gradient(ca.SX.unary(code, x), x))])

@@ -55,7 +55,7 @@ class Rows:
         return tuple(dict.fromkeys(self.owners))
 
     def of(self, name: str) -> np.ndarray:
-        """Return the indices of the rows of a constraint."""
+        """Return the indices of the rows that belong to a constraint."""
         return np.array([i for i, owner in enumerate(self.owners) if owner == name])
 
     def select(self, mask: np.ndarray) -> Rows:
@@ -215,7 +215,7 @@ class Formulation:
         return self._signals_at(order, times.tobytes()) if self.signals else np.zeros((len(times), 0))
 
     def _evaluate_signals(self, order: int, times: bytes) -> np.ndarray:
-        """Return :meth:`signals_at` for times given as the bytes of an array, which can be hashed."""
+        """Return :meth:`signals_at` for times as bytes, which can be hashed for the cache."""
 
         def make() -> Sampler:
             t = ca.MX.sym("t")
@@ -370,7 +370,7 @@ class Formulation:
         return ca.Function("signals", [t], [ca.densify(ca.vertcat(*parts))])
 
     def _rows(self, kind: str, pool: dict[str, Constraint], end: float | None = None) -> Rows:
-        """Return the constraint rows of a kind; at an ``end`` of the horizon, 0 or 1, signals are replaced by numbers."""
+        """Return the constraint rows of a kind; at an ``end`` of the horizon, 0 or 1, signals become numbers."""
         symbols = self.problem.symbols
         expression = self.flat(ca.vertcat(symbols(0, 1), *[c.expression for c in pool.values()]))
         if self.signals and end is not None:

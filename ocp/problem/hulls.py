@@ -145,8 +145,7 @@ class HullPairs:
         return points
 
     def nearest(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return unit vectors from first to second body, gaps, and nearest points of the cores, in the reference
-        frames.
+        """Return unit vectors from first to second body, gaps, and nearest points, in the reference frames.
 
         Shapes (K, 3), (K,), m, and (K, 2, 3), m.
         """
@@ -469,7 +468,7 @@ def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]
 
 
 def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return bounds as an array of a given shape; a number is broadcast, and negative levers or turns raise an error."""
+    """Return bounds as an array of a given shape; raise ProblemError if levers or turns are negative."""
     array = table(f"{what}: {label}", value)
     array = np.broadcast_to(array, shape) if array.ndim == 0 else array.reshape(shape) if not shape[0] else array
     if array.shape != shape:

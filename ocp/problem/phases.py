@@ -322,7 +322,7 @@ class _PhaseInserter:
 
 
 def parts_of_phase(phase: str, pool: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a pool that belong to a phase, by their names in it."""
+    """Return the states, controls or other entries that belong to a phase, by their names in the phase."""
     prefix = f"{phase}."
     return {name.removeprefix(prefix): value for name, value in pool.items() if name.startswith(prefix)}
 

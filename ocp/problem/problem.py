@@ -457,7 +457,7 @@ class Problem:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
 
     def _inner(self) -> list[Any]:
-        """Symbols of states, controls, parameters, time and horizon, which constraints inside the horizon may use."""
+        """Symbols that constraints inside the horizon may use: states, controls, parameters, signals, time, horizon."""
         d = self.declared
         pools = (d.states, d.controls, d.parameters, d.signals)
         return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]

@@ -98,7 +98,9 @@ class FunctionWriter:
         return number
 
     def _leaf(self, record: dict[str, Any]) -> Any:
-        """Store a function that is not taken apart as a record, and return the function that the record describes."""
+        """Store a function as one record, without splitting it into operations, and return the function rebuilt from
+        the record.
+        """
         function = BUILDERS[record["kind"]](record, ())
         self._alive.append(function)
         self._append(function.__hash__(), record, function)

@@ -273,7 +273,7 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return the unit below a second in which times are plausible, or "", and the share of the velocity limits used.
+    """Return a time unit below 1 s in which times are plausible, or "", and the largest velocity over its limit.
 
     The share is that of the fastest joint if the times are in seconds. Plausible are samples at 10 kHz or less, and a
     fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.

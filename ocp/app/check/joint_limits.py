@@ -201,7 +201,7 @@ class _Side(NamedTuple):
 
     @property
     def worst_value(self) -> float:
-        """Largest value with its sign."""
+        """Largest value towards the limit, with its original sign."""
         return self.sign * float(self.values.max())
 
 

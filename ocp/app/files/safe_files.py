@@ -1,4 +1,4 @@
-"""Read text files of strangers safely, and check where outputs may be written.
+"""Read text files from untrusted sources safely, and check where outputs may be written.
 
 Text is read line by line, JSON and YAML as trees of bounded size and depth, and errors name the line. A tree consists
 of mappings, lists, texts and numbers. An alias of YAML counts with all the values that it stands for, so that a walk

@@ -274,7 +274,7 @@ def solve_with_clearance(clearance_constraints: Constraints, run: Callable[[Cons
 
 
 def is_clearance(name: Any) -> bool:
-    """Return whether a name, with or without that of a phase, is the name of a clearance."""
+    """Return whether a constraint name denotes a clearance, with or without the name of a phase."""
     return str(name).rpartition(".")[2].startswith(CLEARANCE)
 
 

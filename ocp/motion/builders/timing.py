@@ -86,7 +86,7 @@ class TimingProblem:
 
     @property
     def method(self) -> Collocation:
-        """Return collocation with one jerk per interval, without overshoot between the points."""
+        """Return collocation with one jerk per interval, so that no quantity overshoots between the points."""
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:

@@ -155,7 +155,7 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 
 def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Return demands at unit line speed over their limits, and the power p of each one's growth: v^p demand <= 1.
+    """Return the ratio of each demand to its limit at unit line speed v, and the power p by which v^p scales it.
 
     The rows are the centripetal acceleration, then velocity, acceleration and jerk of each joint. Shapes (C, M), (C,).
     """

@@ -131,7 +131,7 @@ class Axis(NamedTuple):
 
 
 class Opening(NamedTuple):
-    """Joint at which the kinematic loop is opened: the assignment of its six joints to x, y, z, a, b, c.
+    """Choice of the joint at which the kinematic loop is opened, and of the roles x, y, z, a, b, c of its joints.
 
     Attributes:
         first: Number of the joint x; the others follow in the order of the loop.
@@ -269,7 +269,7 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
 
 
 def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
-    """Open the loop at a joint: the joints before it move to its end, conjugated by the goal."""
+    """Open the loop at a joint: the joints before it move to the end of the loop, transformed by the goal pose."""
     back = goal.inverse
     joints = [axes[(first + i) % SIX] for i in range(SIX)]
     return _Loop([axis.moved(back) if i >= SIX - first else axis for i, axis in enumerate(joints)], goal, size)

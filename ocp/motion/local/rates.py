@@ -1,4 +1,4 @@
-"""Instantaneous redundancy resolution at velocity level: the least joint rates that do the task at each time.
+"""Instantaneous redundancy resolution at velocity level: the least joint rates that perform the task at each time.
 
 This is the classical method to which optimal plans are compared. `resolve` integrates one motion accurately.
 `track_tasks` tracks tasks from many start configurations at once, on one grid of times and within the joint limits, at

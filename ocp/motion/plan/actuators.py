@@ -1,4 +1,4 @@
-"""Motions along tasks within limits of torque, power, acceleration and jerk, or at a cost beside the squared rates.
+"""Motions along tasks within limits of torque, power, acceleration and jerk, or with other costs than squared rates.
 
 The guess is a motion without these limits, of least squared rates, whose problem has the rates as controls. The problem
 solved from it has accelerations as controls.

@@ -114,7 +114,7 @@ class CandidateQueue:
 
     @property
     def collided(self) -> bool:
-        """Whether a candidate was rejected for a collision."""
+        """Whether a candidate was rejected because of a collision."""
         return any(c.reason is not None and c.reason.kind is Rejection.COLLISION for c in self.candidates)
 
     @property

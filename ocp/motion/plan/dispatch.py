@@ -1,4 +1,4 @@
-"""One verb for every motion: a machine and what is asked of it in, the lowest-cost motion that passes its audit out."""
+"""The function `plan` for all kinds of motions, which selects the planner for the given tasks and goals."""
 
 from __future__ import annotations
 

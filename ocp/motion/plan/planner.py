@@ -1,4 +1,4 @@
-"""One call from a machine and its tasks to the lowest-cost motion that passes its audit.
+"""Planner of tip tasks: from start configurations to the lowest-cost motion that passes its audit.
 
 If the start is not given, inverse kinematics finds start configurations on every branch and spread over the
 self-motion. Resolved-rate control tracks the tasks from each of them. These local motions are the seeds of candidates,

@@ -341,7 +341,7 @@ class _WaypointPlanner:
         return SectionSearch(*arguments, **options, **sections, joint=joint)
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
-        """Return the error about where paths end, refined to the waypoints between searched ones."""
+        """Return the error about where all paths end, located among the waypoints between the searched ones."""
         error, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
         if error is None:
             return SolveError("no path goes through the waypoints", name="waypoints")

@@ -176,7 +176,7 @@ class Candidate:
         return self.reason is None
 
     def rejected(self, reason: Reason) -> Candidate:
-        """Return the candidate with a reason; separated bodies are named as the first reason."""
+        """Return the candidate, rejected for a reason; if bodies were separated, their collision is named first."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)

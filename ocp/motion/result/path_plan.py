@@ -223,7 +223,7 @@ class PathPlan(Plan):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> PathPlan:
-        """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
+        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
         try:
             numbers = {name: arrays[f"path.{name}"] for name in ARRAY_NAMES}
             head = unpack_record(read_head(path, arrays["path"]), numbers)

@@ -107,7 +107,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:  # type: ignore[override]
-        """Candidates of all plans."""
+        """Candidates of all consecutive plans."""
         return tuple(candidate for plan in self._plans for candidate in plan.candidates)
 
     @property
@@ -260,7 +260,7 @@ class SequencePlan(ConsecutivePlans):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SequencePlan:
-        """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
+        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
         try:
             head = read_head(path, arrays[cls.kind])
             phases = tuple(str(name) for name in head["phases"])
@@ -381,7 +381,7 @@ class SegmentedPlan(ConsecutivePlans):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SegmentedPlan:
-        """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
+        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
         try:
             numbers = {name: arrays[f"segments.{name}"] for name in ARRAY_NAMES}
             head = unpack_record(read_head(path, arrays["segments"]), numbers)

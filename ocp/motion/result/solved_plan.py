@@ -190,7 +190,7 @@ class SolvedPlan(Plan):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SolvedPlan:
-        """Return the plan of the arrays of a file, which are not trusted; raise as `load`."""
+        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
         solution = Solution.of_arrays(path, arrays)
         if "plan" not in arrays:
             words = f"{path} holds a solution and no plan; read it with Solution.load"

@@ -151,7 +151,7 @@ class CellSearch:
             max_cost, full = wanted, wanted >= max_cost / 2
 
     def _check_reach(self, error: DeadEnd) -> None:
-        """Raise Unreachable if a pose out of reach explains the dead end."""
+        """Raise Unreachable if the search ends because a pose is out of reach."""
         request, machine, bounds = self.request, self.request.machine, self.request.bounds
         if request.start is None or not isinstance(machine, FreeFloating):
             return  # the path of the centre of mass depends on the start

@@ -1,4 +1,4 @@
-"""Atlas of the self-motion manifold: charts that cover all configurations which do a task at some time samples.
+"""Atlas of the self-motion manifold: charts that cover all configurations that perform a task at some time samples.
 
 If a task leaves r of n joint directions free, the configurations that do it at one time form curves (r = 1), surfaces
 (r = 2) or isolated points (r = 0). A chart consists of a configuration, an orthonormal basis of the tangent space

@@ -1,4 +1,4 @@
-"""Diagnosis of a task that no motion does: where motions end, what obstructs them, and by how much to relax the task.
+"""Diagnosis of a task without a motion: where motions end, what obstructs them, and by how much to relax the task.
 
 From the first time sample on, configurations are propagated from chart to chart by all steps within the limits. Each
 chart keeps the configuration whose path has the largest clearance. The task ends at the last sample that is reached,

@@ -278,7 +278,7 @@ class SquaredRateBounds:
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        """Return values (P,) and slopes (P, r) at places (P, r)."""
+        """Return values (P,) and slopes (P, r) of the bounds at chart coordinates (P, r)."""
         places = _rows_last(places)
         start, after, end_place = self._minimize_after(places)
         products = _apply(self.level, places)

@@ -1,4 +1,4 @@
-"""Global search over all motions that do the tasks in their own time: choice of the time samples, and bounds."""
+"""Global search over all motions that perform the tasks at their times: choice of the time samples, and bounds."""
 
 from __future__ import annotations
 

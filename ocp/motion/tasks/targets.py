@@ -1,4 +1,4 @@
-"""Targets of tasks over time: their poses in the world next to a motion, and the nodes that a mesh needs for them."""
+"""Targets of tasks over time: their poses in the world along a motion, and the nodes that a mesh needs for them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Chaser and target of a capture: both as one machine, bounds that refuse impossible captures, and the first guess.
+"""Chaser and target of a capture: both as one machine, bounds that reject impossible captures, and the first guess.
 
 The twists match at the grasp, so that there is no impact. The momentum of the pair about its common centre of mass is
 
@@ -257,7 +257,7 @@ def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
 def _tip_path(
     chaser: FreeFloating, target: FreeFloating, times: Array, bases: Array, start: tuple[Array, Array], out: Array
 ) -> tuple[Array, Array]:
-    """Return positions (M, 3) and rotations (M, 3, 3) of the tip, from rest onto the grasped frame."""
+    """Return positions (M, 3) and rotations (M, 3, 3) of the tip along the approach, from rest to the grasp."""
     b = ca.SX.sym("b", target.base_size)
     pose = target.tip_pose(b, ca.DM(0, 1))
     pose_at = ca.Function("pose", [b], [pose.position, ca.vec(pose.rotation)])

@@ -1,4 +1,4 @@
-"""Least-cost motions of a machine that stands on the ground, does tasks with its tips, and must not tip over.
+"""Least-cost motions of a machine that stands on the ground, performs tasks with its tips, and must not tip over.
 
 This is the planned counterpart of local.accelerations (Yoo et al. 2004), for any Standing machine, planar or spatial,
 and any tasks: positions, orientations, free tool axes, several arms. Joint accelerations (or jerks) are the control.
