@@ -228,6 +228,8 @@ def test_a_singular_start_is_planned() -> None:
 @pytest.mark.parametrize(("changes", "message"), REFUSED)
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
     request = {"start" if name == "start_joints" else name: value for name, value in {**PAPER_TASK, **changes}.items()}
+    if "start_base" in request:
+        request["setup"] = VelocitySetup(start_base=request.pop("start_base"))
     with pytest.raises(ProblemError, match=message) as caught:
         minimum_velocity_problem(paper_example(), **request)
     assert (caught.value.name or "unnamed") in str(caught.value)
