@@ -258,7 +258,7 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
     finished_by_seed = {id(candidate.seed): candidate for candidate in queue.candidates}
     rerouted = []
     local = {id(seed): solver.local_collisions(seed.seed) for seed in seeds}
-    distances = {key: min((each.distance for each in found), default=np.inf) for key, found in local.items()}
+    distances = {key: min((each.distance for each in pairs), default=np.inf) for key, pairs in local.items()}
     for seed in seeds:
         finished = finished_by_seed[id(seed.seed)]
         colliding = solver.collisions(finished)
