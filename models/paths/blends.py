@@ -213,7 +213,9 @@ def corner_shape(angle: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Return interior angles, rad, and the optimal shape factor at each, over the chord of a blend of unit length."""
+    """Return interior angles, rad, and the optimal shape factor over the chord, for blends from distance 1 of the
+    corner.
+    """
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])

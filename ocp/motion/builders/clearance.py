@@ -159,7 +159,7 @@ class ClearanceConstraints:
             problem.path(f"{APART}{suffix}", distances, lower=least, unit="m")
 
     def find_collisions(self, base: Array, joints: Array, times: Array) -> list[Collision]:
-        """Return the pairs closer than the clearance at samples of a motion, see `local.collisions`."""
+        """Return the pairs closer than the clearance at samples of a motion; see `ocp.motion.local.collisions`."""
         return find_collisions(self.scene, base, joints, times)
 
 

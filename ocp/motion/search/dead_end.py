@@ -341,7 +341,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
 
 
 def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the last reached configurations (M, n), targets at the next sample (M, n), and which targets are valid.
+    """Return the last reached configurations (M, n), targets at the next sample (M, n), and which meet the task (M,).
 
     Targets are the projection of each configuration to the next sample, and the configurations there which keep all
     limits but are too far away.
