@@ -195,7 +195,7 @@ def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool)
     return rows
 
 
-def check_rule(machine: Standing, zmp: ZmpRule, horizon: float) -> None:
+def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
     """Raise ProblemError if a rule has the wrong type, leaves the support, or cannot be met in it."""
     if not isinstance(zmp, ZmpRule):
         words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
