@@ -5,7 +5,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
@@ -83,6 +83,8 @@ def test_the_rates_are_those_of_the_damped_pseudo_inverse(seed: int, damping: fl
     machine: Any = FixedBase(robot) if kind == "fixed" else FreeFloating(robot, kind)  # type: ignore[arg-type]
     base = None if kind == "fixed" else random_base(rng, machine.base)
     start, speed = rng.normal(size=machine.joint_size), float(rng.normal())
+    jacobian = numeric(machine.tip_jacobian(np.zeros(0) if base is None else base, start))
+    assume(np.abs(jacobian[3]).max() > 1e-6)  # some random arms do not move their tip along x
     local = resolve(
         machine,
         TipTask(rows=(3,), velocity=lambda t: speed * ca.cos(t)),
