@@ -81,6 +81,6 @@ def test_the_tool_axis_points_out_of_the_arm_and_the_reach_is_exact(name: str) -
 
 @pytest.mark.parametrize("name", ["five_axis", "", None, 6, ["six_axis"]])
 def test_another_name_is_refused_with_those_that_there_are(name: object) -> None:
-    with pytest.raises(ModelError, match=r"\['six_axis', 'seven_axis'\]") as caught:
+    with pytest.raises(ModelError, match="'six_axis' or 'seven_axis'") as caught:
         example_robot(name)  # type: ignore[arg-type]
     assert (caught.value.name, caught.value.value) == ("name", name)

@@ -598,7 +598,7 @@ def test_a_failed_round_raises_the_error_of_solving() -> None:
         ({"method": None}, "refine: .* expected, not None"),
         ({"method": Collocation}, "refine: .* expected"),
         ({"settings": {"solver": "snopt"}}, "solver must be"),
-        ({"parameters": {"p": 1.0}}, "unknown parameter"),
+        ({"parameters": {"p": 1.0}}, "parameter .p. does not exist"),
     ],
 )
 def test_bad_arguments_are_named(arguments: dict[str, Any], message: str) -> None:

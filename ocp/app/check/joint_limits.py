@@ -319,10 +319,9 @@ def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.
     twist = ca.mtimes(rows, machine.base_twist(base, q, v))
     rate = machine.base_rate(base, q, v)
     change = ca.jtimes(twist, ca.vertcat(base, q, v), ca.vertcat(rate, v, a))
-    motion_of_base = {"base_twist": twist, "base_acceleration": change}
-    frame, no_gravity = machine.world_from_base(base), (0.0, 0.0, 0.0)
+    frame = machine.world_from_base(base)
     torque = inverse_dynamics(
-        machine.robot, q, v, a, wrenches=(), gravity=no_gravity, world_from_base=frame, **motion_of_base
+        machine.robot, q, v, a, gravity=(0.0, 0.0, 0.0), world_from_base=frame, base_motion=(twist, change)
     )
     return ca.substitute(torque, base, ca.SX(ca.DM(machine.base_home())))
 

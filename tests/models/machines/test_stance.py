@@ -45,8 +45,7 @@ def test_a_robot_bears_the_same_whatever_link_it_is_rooted_at(seed: int, size: i
     at_old = Wrench(robot.root, held[3:], held[:3] - np.cross(place[1], held[3:]))
     moving: dict[str, Any] = {
         "world_from_base": frame,
-        "base_twist": np.concatenate([spin, velocity]),
-        "base_acceleration": np.concatenate([change, acceleration]),
+        "base_motion": (np.concatenate([spin, velocity]), np.concatenate([change, acceleration])),
     }
     scale = max(1.0, np.abs(held).max(), np.abs(torques).max())
     again = numeric(inverse_dynamics(turned, q[order], qd[order], qdd[order], wrenches=[at_old], **moving)).ravel()

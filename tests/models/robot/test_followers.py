@@ -195,7 +195,7 @@ def test_a_gripper_that_closes_weighs_both_fingers_on_its_one_drive() -> None:
         (lambda: gripper(Mimic("j0")), r"joints \['j0'\] mimic each other in a ring"),
         (lambda: gripper(Mimic("j1"), Mimic("j2"), Mimic("j0")), r"\['j0', 'j1', 'j2'\] mimic each other in a ring"),
         (lambda: gripper(None, Mimic("j0"), kinds="pf"), "joint 'j1' is fixed and cannot follow joint 'j0'"),
-        (lambda: Mimic("j0", np.inf), "mimic of joint 'j0': multiplier inf is not finite"),
+        (lambda: Mimic("j0", np.inf), "mimic of joint 'j0': multiplier must be a finite number, not inf"),
         (
             lambda: gripper(None, Mimic("j0", -1.0), lower=0.25, upper=0.5),
             r"joint 'j1' follows 'j0'.* only where that is in -0.5 .. -0.25, which its own limits 0.25 .. 0.5",

@@ -117,14 +117,15 @@ def test_a_joint_velocity_is_the_line_speed_that_it_leaves() -> None:
 
 
 @settings(max_examples=20)
-@given(seeds, st.integers(2, 5))
-def test_the_passes_equal_a_linear_program(seed: int, rows: int) -> None:
+@given(seeds, st.integers(2, 5), st.booleans())
+def test_the_passes_equal_a_linear_program(seed: int, rows: int, reverses: bool) -> None:
+    """Both passes are optimal unless a row has a point of zero inertia, p = 0 (Pham and Pham 2018): then, feasible."""
     rng = np.random.default_rng(seed)
     count = 40
     s = np.linspace(0, 1, count + 1)
     h = np.diff(s)
     phase, size = rng.uniform(0, 6.28, (2, rows)), rng.uniform(0.3, 2, rows)
-    p = size * np.cos(2 * np.pi * s[:-1, None] + phase[0])
+    p = size * (np.cos(2 * np.pi * s[:-1, None] + phase[0]) + (0.0 if reverses else 1.3))
     q = rng.uniform(0, 2) * np.sin(2 * np.pi * s[:-1, None] + phase[1])
     most = rng.uniform(0.5, 2, count + 1)
     x = reachability_passes(
@@ -138,8 +139,9 @@ def test_the_passes_equal_a_linear_program(seed: int, rows: int) -> None:
             matrix += [row, -row]
     result = linprog(-np.ones(count + 1), np.array(matrix), np.ones(len(matrix)), bounds=bounds)
     assert (np.array(matrix) @ x <= 1 + 1e-9).all()
-    assert x.sum() == pytest.approx(-result.fun, rel=2e-2)
     assert x.sum() <= -result.fun * (1 + 1e-9)
+    if not reverses:
+        assert x.sum() == pytest.approx(-result.fun, rel=1e-9)
 
 
 @settings(max_examples=50)
