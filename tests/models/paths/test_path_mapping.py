@@ -145,7 +145,7 @@ def test_the_mapping_of_a_quintic_reaches_the_distances_of_the_exact_inverse() -
 
 def test_a_degree_that_no_blend_has_is_a_named_error() -> None:
     for mapping in (predictor_corrector, gauss_newton):
-        with pytest.raises(ModelError, match="degree must be .* not 4"):
+        with pytest.raises(ModelError, match=r"degree must be .* not 4"):
             mapping(4)
 
 
