@@ -69,7 +69,7 @@ def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
     base, *motion = (ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 4))
     torques: Any = None
     if weights_torques(cost):
-        torques = joint_torques(checked_motors("cost", machine), base, *motion[:3])
+        torques = joint_torques(checked_motors("cost", machine), (base, *motion[:3]))
     running = running_cost(machine, cost, (base, *motion[:3]), jerks=motion[3], torques=torques)
     if cost.energy:
         running += cost.energy * ca.sum1(ca.fmax(torques * motion[1], 0.0))

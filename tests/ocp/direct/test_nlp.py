@@ -326,7 +326,7 @@ def stopping(kind):
     kind.eval, kind.stops = eval, True
 
 
-stopping(console.Progress)
+stopping(console.IterationMonitor)
 stopping(console.FatropMonitor)
 before = signal.getsignal(signal.SIGINT)
 for check in (False, True):
@@ -336,7 +336,7 @@ for check in (False, True):
     except KeyboardInterrupt as error:
         print(error.solution.success, error.solution.message, error.solution["x"].shape)
     print("restored", signal.getsignal(signal.SIGINT) is before)
-console.Progress.stops = console.FatropMonitor.stops = False
+console.IterationMonitor.stops = console.FatropMonitor.stops = False
 again = prepare(problem, Collocation(20), solver=SOLVER).solve()
 print("afterwards", again.success)
 try:

@@ -174,6 +174,8 @@ def triangles(machine: FixedBase, link: str) -> Any:
     model = coal.BVHModelOBBRSS()
     model.beginModel(0, 0)
     for shape in machine.robot.link(link).collisions:
+        if shape.kind != "mesh":
+            continue
         path = find_mesh(shape.file, shape.folder or None, [])
         assert path is not None
         vertices, faces = read_mesh(path)
@@ -197,7 +199,7 @@ def beside_triangles(machine: FixedBase) -> tuple[int, int]:
     rng = np.random.default_rng(3)
     low, high = np.maximum(machine.robot.lower, -np.pi), np.minimum(machine.robot.upper, np.pi)
     joints = rng.uniform(low, high, (1000, machine.joint_size))
-    pairs = list(around.covers)
+    pairs = [pair for pair in around.covers if all(" hull " in label for label in around.labels[pair])]
     report = distances_along(around, np.zeros(0), joints, np.zeros(len(joints)))[:, pairs]
     near = np.flatnonzero(((report > 0) & (report < 0.03)).any(axis=1))[:40]
     joints, report = joints[near], report[near]

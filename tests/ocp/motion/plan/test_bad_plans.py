@@ -119,8 +119,6 @@ TASKS_AND_TIMES = {
     | {
         "class": Cost,
         "of two": Cost(weights=[1.0, 2.0]),
-        "of a path": Cost(velocity=0, length=1),
-        "efforts": Cost(effort=1.0),
         "time of a fixed horizon": Cost(time=1.0),
         "of a standing machine": Weights(),
     },
@@ -263,10 +261,7 @@ CASES = [
         "ClearanceConstraints",
         ClearanceConstraints,
         {"scene": AROUND, "margins": {0: 0.01}},
-        {
-            "scene": INSTANCE,
-            "margins": MAPPING | {"unknown": {99: 0.01}, "negative": {0: -1.0}, "nan": {0: NAN}, "word": {"a": 0.1}},
-        },
+        {"scene": INSTANCE, "margins": MAPPING | {"unknown": {99: 0.01}, "nan": {0: NAN}, "word": {"a": 0.1}}},
     ),
     Case(
         "plan_problem",
@@ -321,7 +316,7 @@ CASES = [
             "within": but(POSITIVE, "None") | {"half a turn": np.pi, "200 degrees": np.radians(200.0)},
             "begin": NONNEGATIVE,
             "duration": POSITIVE,
-            "breaks": {"after the end": [99.0], "negative": [-1.0], "nan": [NAN], "word": "a", "matrix": [[0.1]]},
+            "breaks": {"after the end": [99.0], "negative": [-1.0], "nan": [NAN], "word": "a", "matrix": [[0.1, 0.2]]},
         },
     ),
     Case("along", path_tracks, {"path": LINE, "speed": 0.2}, {"path": INSTANCE, "speed": POSITIVE}),

@@ -159,7 +159,11 @@ def other_machine() -> Machine:
         ({"tasks": list(GOALS), "start": START, "cyclic": True}, "cyclic", "takes no cyclic"),
         ({"tasks": planar_steps(1, 0.8, 0.8), "start": START}, "machine", "first stance"),
         ({"tasks": Waypoints(np.zeros((2, 3)), np.ones((2, 4))), "start": START}, "start", "takes no start"),
-        ({"tasks": [GOALS[0], TipTask(rows=(3,), velocity=[0.1])], "start": START}, "goals", "Goal"),
+        (
+            {"tasks": [GOALS[0], TipTask(rows=(3,), velocity=[0.1])], "start": START},
+            "horizon",
+            "task 2: horizon is missing",
+        ),
     ],
 )
 def test_arguments_that_do_not_fit_are_named(arguments: dict[str, object], name: str | None, words: str) -> None:

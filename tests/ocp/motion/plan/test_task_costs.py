@@ -26,7 +26,7 @@ UNIFORM, SWINGING = line(lambda t: t), line(lambda t: 3 * t**2 - 2 * t**3)
 
 def torques_along(machine: FixedBase, joints: Array, rates: Array, accelerations: Array) -> Array:
     symbols = [ca.SX.sym("v", machine.joint_size) for _ in range(3)]
-    at = ca.Function("torques", symbols, [joint_torques(machine, ca.DM(0, 1), *symbols)])
+    at = ca.Function("torques", symbols, [joint_torques(machine, (ca.DM(0, 1), *symbols))])
     return np.array(at.map(len(joints))(joints.T, rates.T, accelerations.T)).T
 
 
