@@ -27,10 +27,10 @@ from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_co
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.builders.timing import minimum_time_problem
 from ocp.motion.builders.torques import JointFriction, joint_torques
-from ocp.motion.local.accelerations import Layer, Stabiliser, resolve_accelerations
+from ocp.motion.local.accelerations import AccelerationOptions, Layer, Stabiliser, resolve_accelerations
 from ocp.motion.local.ik_solver import IkConfigurations, IkSolver, Incompleteness, ToolFreedom, ik_configurations
-from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
-from ocp.motion.local.rates import resolve
+from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics
+from ocp.motion.local.rates import RateOptions, resolve
 from ocp.motion.plan import Candidate, DeadEnd, Plan, Reconfiguration, plan, plan_problem
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned
@@ -51,6 +51,7 @@ for _drawing in ("plot_solution", "html_of_solution", "plot_plan", "html_of_plan
     _register(_drawing, "ocp.app.view.plots")
 
 __all__ = [
+    "AccelerationOptions",
     "Anywhere",
     "Audit",
     "AuditError",
@@ -70,6 +71,7 @@ __all__ = [
     "Goal",
     "Grasp",
     "IkConfigurations",
+    "IkOptions",
     "IkSolver",
     "InFoot",
     "Incompleteness",
@@ -84,6 +86,7 @@ __all__ = [
     "Plan",
     "Problem",
     "ProblemError",
+    "RateOptions",
     "Reconfiguration",
     "RefinementSettings",
     "RefinementWarning",

@@ -20,7 +20,9 @@ MOST_OF_FRONT_DOORS = 12
 """Largest number of parameters of `plan`, of `schedule` and of the methods of `Problem`."""
 FRONT_DOORS = {"plan", "schedule"}
 ORDER = ("machine", "tasks", "horizon")
-"""First parameters of a function of motions that has any two of them."""
+"""First parameters of a function of motions that has any two of them, after the problem that it declares."""
+TASKS = {"task", "goal", "equations"}
+"""Names of one task, of a goal, and of the equations of tasks: they stand where tasks do."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +77,11 @@ def too_many(signature: Signature) -> str:
 
 
 def out_of_order(signature: Signature) -> str:
-    """Functions of motions take `machine, tasks, horizon` first; a single task counts as tasks."""
+    """Functions of motions take `machine, tasks, horizon` first; a task, goal or equations count as tasks."""
     if not signature.place.startswith("ocp/motion/"):
         return ""
-    names = ["tasks" if name == "task" else name for name in (*signature.positional, *signature.keywords)]
+    every = (*signature.positional, *signature.keywords)
+    names = ["tasks" if name in TASKS else name for name in (every[1:] if every[:1] == ("problem",) else every)]
     if "machine" not in names or not {"tasks", "horizon"} & set(names):
         return ""
     expected = [name for name in ORDER if name in names]
@@ -122,6 +125,11 @@ PLANTED = [
     (out_of_order, "def f(machine, horizon): ...", ""),
     (out_of_order, "def f(tasks, horizon): ...", ""),
     (out_of_order, "def f(machine, task, *, start): ...", ""),
+    (out_of_order, "def f(machine, goal, horizon, *, start): ...", ""),
+    (out_of_order, "def f(machine, equations, horizon, joints): ...", ""),
+    (out_of_order, "def f(problem, machine, horizon): ...", ""),
+    (out_of_order, "def f(problem, horizon, machine): ...", "takes horizon, machine first, expected machine, horizon"),
+    (out_of_order, "def f(machine, equations, joints, horizon): ...", "takes machine, tasks, joints first"),
     (out_of_order, "def f(tasks, machine): ...", "takes tasks, machine first, expected machine, tasks"),
     (out_of_order, "def f(machine, start, tasks): ...", "takes machine, start first, expected machine, tasks"),
     (ambiguous_start, "def f(start: Start): ...", ""),
@@ -131,8 +139,7 @@ PLANTED = [
 
 @pytest.mark.parametrize(("rule", "text", "message"), PLANTED, ids=[f"{p[0].__name__}: {p[1]}" for p in PLANTED])
 def test_a_planted_signature_is_judged(rule: object, text: str, message: str) -> None:
-    (signature,) = signatures_of(text, "ocp/motion/plan/example.py") if "class _A" not in text else [None]
     assert callable(rule)
-    words = rule(signature) if signature is not None else ""
+    words = "".join(rule(signature) for signature in signatures_of(text, "ocp/motion/plan/example.py"))
     assert message in words
     assert bool(message) == bool(words)

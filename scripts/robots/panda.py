@@ -50,7 +50,7 @@ def plan(coarse: bool = False) -> Example:
     """Laps by the pseudo-inverse and one lap of the cyclic plan; `coarse` for what a test can afford."""
     machine, task, laps = FixedBase(PANDA.read()), circling(), 3 if coarse else LAPS
     start = inverse_kinematics(machine, task, near=HOME, starts=0)[0].joints
-    local = resolve(machine, tasks=task, start_joints=start, horizon=laps * LAP, samples=laps * SAMPLES + 1)
+    local = resolve(machine, task, laps * LAP, start=start, samples=laps * SAMPLES + 1)
     problem = minimum_velocity_problem(machine, task, horizon=LAP, cyclic=True, setup=VelocitySetup(near=start))
     solution = solve(problem, Collocation(intervals=24 if coarse else 40, degree=4))
     drift = drifts(local.joints)

@@ -64,7 +64,7 @@ def plan(coarse: bool = False) -> Example:
     machine, task = FixedBase(UR5.read()), seam()
     best = planned(machine, task, search="global")
     first = inverse_kinematics(machine, task, scene=CollisionScene(machine))[0]
-    local = resolve(machine, tasks=task, start_joints=first.joints, horizon=DURATION, samples=FINE)
+    local = resolve(machine, task, DURATION, start=first.joints, samples=FINE)
     try:
         near = planned(machine, task, search="start")
     except SolveError:

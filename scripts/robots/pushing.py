@@ -18,7 +18,7 @@ import numpy as np
 import ocp
 from models import Footprint, Standing, Wrench, footprint, with_load
 from models.machines.standing import External
-from ocp import Collocation, Problem, Scene, TipTask, resolve_accelerations
+from ocp import AccelerationOptions, Collocation, Problem, Scene, TipTask, resolve_accelerations
 from ocp.motion.builders.standing.problem import StandingSetup, standing_problem
 from ocp.motion.tasks.limits import InFoot, Limits
 from scripts.robots import standing
@@ -98,7 +98,13 @@ def plan(coarse: bool = False) -> StandingExample:
     machine, ground = anymal()
     pressed = reaction(machine)
     local = resolve_accelerations(
-        machine, task(machine), START, SECONDS, external=pressed, step=5e-3, stop_at_lift_off=False
+        machine,
+        task(machine),
+        SECONDS,
+        start=START,
+        external=pressed,
+        step=5e-3,
+        options=AccelerationOptions(stop_at_lift_off=False),
     ).motion
     options: dict[str, Any] = {"limits": LIMITS, "scene": Scene(wrenches=pressed)}
     solution = ocp.plan(machine, task(machine), SECONDS, start=START, **options).solution

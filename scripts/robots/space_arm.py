@@ -34,7 +34,7 @@ def plan(coarse: bool = False) -> Example:
     goal = rotation @ np.array(ca.DM(rotation_from_rpy(*TURN))), position + np.array(SHIFT)
     line = pose_line((rotation, position), goal, DURATION)
     task = TipTask(position=line.position, orientation=line.orientation)
-    local = resolve(machine, tasks=task, start_joints=start, horizon=DURATION, samples=FINE)
+    local = resolve(machine, task, DURATION, start=start, samples=FINE)
     problem = minimum_velocity_problem(machine, task, DURATION, start=start)
     solution = solve(problem, Collocation(intervals=20 if coarse else 50, degree=4))
     facts = {

@@ -20,7 +20,16 @@ from models import CollisionScene, Footprint, Robot, Standing, Wrench, footprint
 from models.checks import Array
 from models.machines.standing import External, StandingMotion, standing_motion
 from models.paths import rest_to_rest
-from ocp import ClearanceConstraints, Collocation, Problem, Solution, TipTask, resolve_accelerations, solve
+from ocp import (
+    AccelerationOptions,
+    ClearanceConstraints,
+    Collocation,
+    Problem,
+    Solution,
+    TipTask,
+    resolve_accelerations,
+    solve,
+)
 from ocp.app.view.appearance import frames_along
 from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
 from ocp.motion.tasks.limits import InFoot, Limits
@@ -165,7 +174,13 @@ def plan() -> Results:
     machine, ground = tiago()
     pulled = rope(machine)
     local = resolve_accelerations(
-        machine, from_rest(circle(machine)), START, SECONDS, external=pulled, step=5e-3, stop_at_lift_off=False
+        machine,
+        from_rest(circle(machine)),
+        SECONDS,
+        start=START,
+        external=pulled,
+        step=5e-3,
+        options=AccelerationOptions(stop_at_lift_off=False),
     ).motion
     solution = solve(problem(machine, clearance_constraints=ClearanceConstraints(CollisionScene(machine))), METHOD)
     return Results(robot_file(), machine, ground, solution, sampled(machine, solution, pulled), local, pulled)

@@ -80,7 +80,7 @@ def plan(coarse: bool = False) -> Example:
     tried: list[tuple[LocalSolution, Solution | None, Solution | None]] = []
     rows: list[dict[str, Any]] = []
     for posture in starts(machine, task)[: 1 if coarse else BRANCHES]:
-        local = resolve(machine, tasks=task, start_joints=posture.joints, horizon=DURATION, samples=FINE)
+        local = resolve(machine, task, DURATION, start=posture.joints, samples=FINE)
         same, free = (_planned(machine, task, posture, method, free_start) for free_start in (False, True))
         tried.append((local, same, free))
         rows.append(

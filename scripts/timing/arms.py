@@ -17,7 +17,7 @@ import numpy as np
 
 from models import FixedBase, paths, smooth
 from models.checks import Array
-from ocp import TipTask, Unreachable, inverse_kinematics, resolve
+from ocp import RateOptions, TipTask, Unreachable, inverse_kinematics, resolve
 from ocp.motion.schedule import JointLimits, LineLimits, schedule
 from scripts import drawing
 from scripts.papers.run import text_table
@@ -92,8 +92,9 @@ def local_rows(repeats: int) -> list[dict[str, Any]]:
     for tolerance in TOLERANCES:
 
         def work(tolerance: float = tolerance) -> Any:
-            settings: Any = {"tolerance": tolerance, "samples": STEPS[0] + 1}
-            return resolve(machine, tasks=task, start_joints=start, horizon=LAP, **settings)
+            return resolve(
+                machine, task, LAP, start=start, samples=STEPS[0] + 1, options=RateOptions(tolerance=tolerance)
+            )
 
         motion = work()
         rows.append(_local_row("selfmotion", f"tolerance {tolerance:g}", least(work, repeats), motion.joints, motion.t))

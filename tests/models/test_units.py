@@ -40,7 +40,7 @@ def read(kind: str = "revolute", xyz: str = "0 0 1", rpy: str = "0 0 0", limit: 
 
 
 def moved(start: Any) -> Any:
-    return resolve(ARM, tasks=FORWARD, start_joints=start, horizon=0.1, samples=2)
+    return resolve(ARM, FORWARD, 0.1, start=start, samples=2)
 
 
 def planned(start: Any) -> Any:

@@ -144,7 +144,8 @@ interrupted("indirect with its own seed", lambda: Indirect(seed=Collocation(8000
 MACHINES = """
 arm, start = papers.paper_example(), [0.7, 0.6, 0.9]
 task = TipTask(rows=(3, 4), velocity=(-1.0, -1.0))
-interrupted("local", lambda: ocp.resolve(arm, task, start, 1.0, tolerance=1e-12, samples=30000), 0.1)
+accurate = ocp.RateOptions(tolerance=1e-12)
+interrupted("local", lambda: ocp.resolve(arm, task, 1.0, start=start, samples=30000, options=accurate), 0.1)
 pose = TipTask(position=[1.0, 1.0, 0.0], rows=(3, 4))
 base = arm.base_home()
 interrupted("inverse kinematics", lambda: inverse_kinematics(arm, pose, starts=300000))

@@ -18,7 +18,7 @@ from PIL import Image
 from models import FixedBase, FreeFloating, with_wheels
 from models.checks import Array
 from models.paths import rest_to_rest
-from ocp import Plan, Solution, SolveError, resolve_accelerations
+from ocp import AccelerationOptions, Plan, Solution, SolveError, resolve_accelerations
 from ocp.app.files import read_trajectory
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from scripts import gallery
@@ -164,9 +164,11 @@ def test_the_load_on_the_pushing_hand_is_the_reaction_of_its_force() -> None:
     (wrench,) = pushing.reaction(machine)(ca.DM(0.0), ca.DM.zeros(3))
     np.testing.assert_array_equal(np.array(ca.DM(wrench.force)).ravel() + pushing.PUSH, 0.0)
     # by hand: pushing to its right presses its left feet
-    task = (pushing.task(machine), pushing.START, pushing.SECONDS)
+    task, options = pushing.task(machine), AccelerationOptions(stop_at_lift_off=False)
     pressed, free = (
-        resolve_accelerations(machine, *task, external=external, step=1e-2, stop_at_lift_off=False).motion
+        resolve_accelerations(
+            machine, task, pushing.SECONDS, start=pushing.START, external=external, step=1e-2, options=options
+        ).motion
         for external in (pushing.reaction(machine), None)
     )
     aside = pressed.zero_moment_point[0, 1] - free.zero_moment_point[0, 1]

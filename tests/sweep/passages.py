@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 from models import FreeFloating
 from models.checks import Array
 from models.spatial import quaternion_from_rotation
-from ocp import Plan, ProblemError, SolveError, TipTask, plan, resolve
+from ocp import Plan, ProblemError, RateOptions, SolveError, TipTask, plan, resolve
 from tests.models.robot.trees import seven_joint_arm
 from tests.sweep.results import Row, Sweep, parser
 
@@ -114,7 +114,7 @@ def passage(seed: int, beyond: float = 0.0) -> Passage:
         task = TipTask(**by_name)
         if beyond:
             return Passage(machine, task, start, t, joints(t), np.inf)
-        local = resolve(machine, tasks=task, start_joints=start, horizon=SECONDS, samples=101, tolerance=1e-7)
+        local = resolve(machine, task, SECONDS, start=start, samples=101, options=RateOptions(tolerance=1e-7))
         if local.stopped is None and local.manipulability.min() > local.manipulability[0] / LOSS:
             continue
         cost = float(np.trapezoid((rates(t) ** 2).sum(axis=1) / 2, t))

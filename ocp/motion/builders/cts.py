@@ -247,7 +247,7 @@ def roll_problem(
         t,
         lower=rig.limit(6, False),
         upper=rig.limit(6, True),
-        start=start_roll,
+        first_roll=start_roll,
         rate_weight=settings.rate_weight,
         acceleration_weight=settings.acceleration_weight,
         rate_limit=settings.rate_limit,
@@ -315,7 +315,7 @@ def least_cost_roll(
     *,
     lower: float,
     upper: float,
-    start: float | None,
+    first_roll: float | None,
     rate_weight: float,
     acceleration_weight: float,
     rate_limit: float,
@@ -328,13 +328,13 @@ def least_cost_roll(
         cost: Function (indices of times, rolls), both of shape (n,), that returns finite costs of shape (n,).
         t: Equally spaced times. Shape (samples,), s.
         lower, upper: Limits of the roll, rad. If infinite, all rolls of a turn are searched, and the roll may wind.
-        start: Roll at t[0]; None leaves it free, in the turn nearest to 0.
+        first_roll: Roll at t[0]; None leaves it free, in the turn nearest to 0.
         rate_weight: Weight of the squared rate.
         acceleration_weight: Weight of the squared acceleration, which a grid of rolls does not resolve. It is replaced
             by a weight of the rate with which a change of roll in its optimal time costs the same.
         rate_limit: rad/s; the first grid may exceed it by one step.
     """
-    count, about = len(t), float(np.clip(0.0, lower, upper)) if start is None else start
+    count, about = len(t), float(np.clip(0.0, lower, upper)) if first_roll is None else first_roll
     step = FULL_TURN / SEARCH.rolls
     circle = not np.isfinite([lower, upper]).any()
     if circle:
@@ -347,7 +347,7 @@ def least_cost_roll(
     span = min(t[-1] - t[0], (36 * acceleration_weight / max(gain, 1e-12)) ** 0.25)  # least gain span + 12 v / span^3
     if span > 0:
         rate_weight += 12 * acceleration_weight / span**2
-    if start is not None:
+    if first_roll is not None:
         table[0, np.arange(len(rolls)) != int(np.abs(rolls - about).argmin())] = np.inf
     # a slow roll needs a coarse grid of times, else a grid step exceeds the rate limit
     ticks = int(np.clip((t[-1] - t[0]) * min(rate_limit, 1e6) / (SEARCH.steps_by_rate * step), 8, count))
@@ -364,8 +364,8 @@ def least_cost_roll(
         step /= SEARCH.tube_finer
         offsets = step * np.arange(-SEARCH.tube_side, SEARCH.tube_side + 1)
         tube = np.clip(roll[:, None] + offsets, lower, upper)
-        if start is not None:
-            tube[0] = start
+        if first_roll is not None:
+            tube[0] = first_roll
         stage = cost(np.repeat(np.arange(count), len(offsets)), tube.ravel()).reshape(count, -1)
         away_by_time = [b[None, :] - a[:, None] for a, b in pairwise(tube)]
         path = _lowest_cost_path(stage, away_by_time, np.diff(t), rate_weight, rate_limit, step)

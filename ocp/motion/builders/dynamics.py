@@ -186,13 +186,14 @@ class _Ends:
     def take(
         cls, machine: Motors, bounds: JointBounds, joints: tuple[Any, Any], velocities: tuple[Any, Any], base: Any
     ) -> _Ends:
-        names, n, hint = machine.robot.joint_names, machine.joint_size, "keep within them, or leave that end free: nan"
+        n, hint = machine.joint_size, "keep within them, or leave that end free: nan"
+        words: dict[str, Any] = {"names": machine.robot.joint_names, "hint": hint}
         first, last = (
-            clip_to_limits(name, names, _checked_end(name, value, n), bounds.lower, bounds.upper, hint)
+            clip_to_limits(_checked_end(name, value, n), bounds.lower, bounds.upper, label=name, **words)
             for name, value in zip(("start", "end"), joints, strict=True)
         )
         first_rates, last_rates = (
-            clip_to_limits(name, names, end_velocities(name, value, n), -bounds.velocity, bounds.velocity, hint)
+            clip_to_limits(end_velocities(name, value, n), -bounds.velocity, bounds.velocity, label=name, **words)
             for name, value in zip(("start_velocity", "end_velocity"), velocities, strict=True)
         )
         known = np.clip(np.where(np.isnan(first), np.nan_to_num(last), first), bounds.lower, bounds.upper)

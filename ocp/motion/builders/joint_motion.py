@@ -23,7 +23,7 @@ from ocp.curves import PiecewisePolynomial
 from ocp.errors import ProblemError, SolverStatus, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import ToolMotion, ToolMotionSetup, stretches_of, tool_motion_problem
-from ocp.motion.local.inverse_kinematics import inverse_kinematics
+from ocp.motion.local.inverse_kinematics import IkOptions, inverse_kinematics
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
@@ -72,7 +72,8 @@ def joint_motion_problem(
     for name, value in (("start", start), ("end", end)):
         joints, _ = checked_configuration(machine, value, None)
         hint = "keep within them"
-        ends.append(clip_to_limits(name, machine.robot.joint_names, joints, bounds.lower, bounds.upper, hint))
+        names = machine.robot.joint_names
+        ends.append(clip_to_limits(joints, bounds.lower, bounds.upper, label=name, names=names, hint=hint))
     scale = ca.DM(checked_weights(weights, n))
     problem = Problem("joint motion")
     problem.horizon(require.positive("horizon", horizon))
@@ -228,16 +229,18 @@ def minimum_velocity_problem(
         if not first:
             words = "start is missing; inverse_kinematics(machine, task) finds joints for a pose"
             raise ProblemError(words, name="start")
-        reference = inverse_kinematics(machine, first, base=setup.start_base, limits=limits.joints)[0].joints
+        ik_options = IkOptions(base=setup.start_base, limits=limits.joints)
+        reference = inverse_kinematics(machine, first, options=ik_options)[0].joints
     joints, base = checked_configuration(machine, reference, setup.start_base)
     weights = checked_weights(weights, machine.joint_size)
     stretches = stretches_of(machine, tasks, duration)
     for stretch in stretches:
         if stretch.equations is not None:
             begins = stretch is stretches[0] and start is not None
-            checked_tasks(stretch.equations, base, joints, duration, start=begins)
+            checked_tasks(stretch.equations, base, joints, duration, check_start=begins)
     bounds, names = limits.bounds(machine, ("velocity",)), machine.robot.joint_names
-    joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, "start inside them")
+    ends: dict[str, Any] = {"label": "start", "names": names, "hint": "start inside them"}
+    joints = clip_to_limits(joints, bounds.lower, bounds.upper, **ends)
     options = ToolMotionSetup(
         base=base, start=None if start is None else joints, reference=joints, cyclic=cyclic, weights=weights,
         bounds=bounds, clearance_constraints=setup.clearance_constraints,

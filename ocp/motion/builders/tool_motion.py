@@ -282,9 +282,9 @@ class _Motion:
         begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.setup.actuation.rests))
         cost = self.setup.actuation.cost or Cost(weights=self.setup.weights)
         own = replace(self.setup.actuation, cost=cost, rests=(begins, ends))
-        options: dict[str, Any] = {"horizon": self.horizon, "pace": pace, "suffix": stretch.suffix}
-        options |= {"actuation": own}
-        return declare_actuators(self.problem, self.machine, (place, joints), self.setup.bounds, **options)
+        options: dict[str, Any] = {"bounds": self.setup.bounds, "actuation": own, "pace": pace}
+        options |= {"suffix": stretch.suffix}
+        return declare_actuators(self.problem, self.machine, self.horizon, (place, joints), **options)
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
         """Declare velocities by which tasks may deviate; return them and their running cost, or 0, 0 if not relaxed."""

@@ -133,11 +133,11 @@ class Actuation:
 def declare_actuators(
     problem: Problem,
     machine: Machine,
-    place: tuple[Any, Any],
-    bounds: JointBounds,
-    *,
-    actuation: Actuation,
     horizon: float,
+    place: tuple[Any, Any],
+    *,
+    bounds: JointBounds,
+    actuation: Actuation,
     pace: Any,
     suffix: str = "",
 ) -> tuple[Any, Any, Any]:
@@ -148,10 +148,11 @@ def declare_actuators(
 
     Args:
         problem: Problem with a horizon.
+        machine: The machine.
+        horizon: Horizon of the problem, s.
         place: Base and joints as symbols.
         bounds: Limits of the joints and of the actuators.
         actuation: Cost, smoothness, and whether the joints are at rest where these states start and end.
-        horizon: Horizon of the problem, s.
         pace: Seconds of the motion in a second of the problem.
         suffix: Suffix of the declared names.
 
@@ -177,7 +178,7 @@ def declare_actuators(
     torques: Any = None
     if np.isfinite([bounds.torque, bounds.power]).any() or weights_torques(cost):
         torques = joint_torques(checked_motors("limits", machine), (base, joints, rates, second))
-        limit_torques(problem, robot, torques, bounds.torque, suffix)
+        limit_torques(problem, robot, torques, bounds.torque, suffix=suffix)
         if (rows := np.flatnonzero(np.isfinite(bounds.power)).tolist()) and not cost.energy:
             problem.path(f"power{suffix}", (torques * rates)[rows], upper=bounds.power[rows], unit="W")
     running = running_cost(machine, cost, (base, joints, rates, second), jerks=jerks, torques=torques)
@@ -227,7 +228,7 @@ def positive_power(problem: Problem, powers: Any, bounds: JointBounds, suffix: s
     return ca.sum1(power)
 
 
-def limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, suffix: str = "") -> None:
+def limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, *, suffix: str = "") -> None:
     """Declare the path constraint of the joints whose torque is limited."""
     if rows := np.flatnonzero(np.isfinite(largest)).tolist():
         bounds = {"lower": -largest[rows], "upper": largest[rows]}

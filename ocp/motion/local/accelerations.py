@@ -9,7 +9,7 @@ limits and rates, and stops with a reason if the foot lifts off or the motion di
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias, get_args
 
 import casadi as ca
@@ -23,15 +23,16 @@ from ocp.console import interruptible
 from ocp.curves import rk4_step
 from ocp.errors import ProblemError, require
 from ocp.motion.local.rates import least_rates
-from ocp.motion.tasks.checks import check_length, checked_configuration, checked_tasks
+from ocp.motion.tasks.checks import check_length, checked_tasks
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.goals import Start
 from ocp.motion.tasks.limits import checked_point, is_finite
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
 
 __all__ = [
-    "AccelerationSolution", "Law", "Layer", "Stabiliser", "Stop", "accelerations", "checked_law",
-    "resolve_accelerations",
+    "AccelerationOptions", "AccelerationSolution", "Law", "Layer", "Stabiliser", "Stop", "accelerations",
+    "checked_law", "resolve_accelerations",
 ]  # fmt: skip
 
 Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilised"]
@@ -88,6 +89,60 @@ class Stabiliser:
             require.nonnegative(f"stabiliser: {gain}", getattr(self, gain))
 
 
+@dataclass(frozen=True, eq=False)
+class AccelerationOptions:
+    """Options of a law and of its simulation.
+
+    Attributes:
+        zmp: Target (x, y) of the zero moment point for all laws but the first, m, in the directions in which motion
+            moves it, or a function of CasADi time that returns it; the machine's most stable point if None.
+        layers: Configuration indices that the remaining freedom improves, in this order after the law, (23)-(34).
+        stabiliser: Gains of the stabilised law.
+        null_damping: Damping of the joint velocities in the freedom that remains at the end, 1/s.
+        integrator: ``rk4`` with fixed steps or ``cvodes`` with error control.
+        tolerance: Absolute and relative tolerance of cvodes.
+        max_cvodes_steps: Largest number of steps of cvodes between two samples.
+        stop_at_lift_off: Whether a vertical ground force that is not positive ends the motion.
+        speed_limit: Joint speed, rad/s or m/s, above which the motion counts as diverged.
+        chunk: Steps between two checks of the motion.
+
+    Raises:
+        ProblemError: A value is invalid.
+    """
+
+    zmp: Callable[[Any], Any] | Any = None
+    layers: Sequence[Layer] = ()
+    stabiliser: Stabiliser = field(default_factory=Stabiliser)
+    null_damping: float = 0.0
+    integrator: Literal["rk4", "cvodes"] = "rk4"
+    tolerance: float = 1e-10
+    max_cvodes_steps: int = 5000
+    stop_at_lift_off: bool = True
+    speed_limit: float = 20.0
+    chunk: int = 50
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.layers, list | tuple) or not all(isinstance(layer, Layer) for layer in self.layers):
+            words = f"layers must be a list of Layer(...), not {self.layers!r}"
+            raise ProblemError(words, name="layers", value=self.layers)
+        require.instance("stabiliser", self.stabiliser, Stabiliser)
+        require.nonnegative("null_damping", self.null_damping)
+        require.choice("integrator", self.integrator, ("rk4", "cvodes"))
+        require.flag("stop_at_lift_off", self.stop_at_lift_off)
+        for name in ("tolerance", "speed_limit"):
+            require.positive(name, getattr(self, name))
+        for name in ("max_cvodes_steps", "chunk"):
+            require.count(name, getattr(self, name), least=1)
+
+    def zmp_target(self, machine: Standing) -> Callable[[Any], Any]:
+        """Return the target of the zero moment point of a machine as a checked function of time."""
+        zmp = machine.most_stable_point if self.zmp is None else self.zmp
+        if callable(zmp):
+            return lambda time: checked_point(zmp(time), "zmp")
+        point = checked_point(zmp, "zmp")
+        return lambda time: point
+
+
 class _TaskHierarchy:
     """Joint accelerations built task by task, each in the null space of the tasks before."""
 
@@ -107,18 +162,15 @@ class _TaskHierarchy:
         self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
-def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer], *, damping: float) -> None:
+def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
     """Raise ProblemError if a law is unknown or needs more joints than the machine has.
 
     Args:
         machine: The machine.
         size: Number of rows of all tasks.
-        law, layers, damping: As for `resolve_accelerations`.
+        law, layers: As for `resolve_accelerations`.
     """
     require.choice("law", law, get_args(Law))
-    require.nonnegative("null_damping", damping)
-    if not isinstance(layers, list | tuple) or not all(isinstance(layer, Layer) for layer in layers):
-        raise ProblemError(f"layers must be a list of Layer(...), not {layers!r}", name="layers", value=layers)
     axes = len(machine.moving_directions)
     tasks = {"the tip": size, "the zero moment point": 0 if law == "pseudo_inverse" else axes}
     tasks |= {"the centre of mass": axes if law == "stabilised" else 0}
@@ -134,15 +186,10 @@ def accelerations(
     machine: Standing,
     equations: TaskEquations,
     law: Law,
-    time: Any,
-    q: Any,
-    qd: Any,
+    state: tuple[Any, Any, Any],
     *,
-    zmp: Callable[[Any], Any],
     external: External | None = None,
-    layers: Sequence[Layer] = (),
-    stabiliser: Stabiliser | None = None,
-    null_damping: float = 0.0,
+    options: AccelerationOptions | None = None,
 ) -> Any:
     """Return the joint accelerations of a law. Shape (n, 1).
 
@@ -152,19 +199,16 @@ def accelerations(
         law: ``pseudo_inverse``: the tasks alone. ``augmented``: tasks and zero moment point together, (20).
             ``null_space``: the zero moment point in the null space of the tasks, (21)-(22). ``stabilised``: like
             augmented, with the centre of mass commanded in their null space.
-        time, q, qd: Symbols of one kind.
-        zmp: Target (x, y) of the zero moment point as a function of time, m, in the directions in which motion moves
-            it.
+        state: Time, joints and joint velocities, symbols of one kind.
         external: External wrenches as a function of time and tip position.
-        layers: Applied in this order after the law.
-        stabiliser: Gains of the stabilised law.
-        null_damping: Damping of the joint velocities in the freedom that remains at the end, 1/s.
+        options: Target of the zero moment point, layers, gains and damping; `AccelerationOptions()` if None.
     """
+    (time, q, qd), own = state, options or AccelerationOptions()
     directions, no_base = ca.DM(machine.moving_directions), ca.DM(0, 1)
     wrenches = wrenches_at(external, time, machine.tip_pose((), q).position)
     jacobian = equations.jacobian(no_base, q)
     task = -equations.acceleration(no_base, q, qd, ca.DM(machine.joint_size, 1), progress=(time,))
-    place = zmp(time)
+    place = own.zmp_target(machine)(time)
     zmp_rows = machine.zmp_rows(q, qd, place, wrenches)
     balance, needed = ca.mtimes(directions, zmp_rows.jacobian), ca.mtimes(directions, zmp_rows.needed(qd))
 
@@ -175,7 +219,7 @@ def accelerations(
         hierarchy.add_task(balance, needed)
     if law in ("augmented", "stabilised"):
         hierarchy.add_task(ca.vertcat(jacobian, balance), ca.vertcat(task, needed))
-    for layer in layers:
+    for layer in own.layers:
         limits = layer.index == "joint_limits"
         index = joint_limit_index(machine.robot, q) if limits else manipulability_of(jacobian)
         gradient = ca.jacobian(index, q)
@@ -184,11 +228,11 @@ def accelerations(
         else:
             hierarchy.add_task(gradient, layer.demand - ca.jtimes(ca.mtimes(gradient, qd), q, qd))
     if law == "stabilised":
-        gains = stabiliser or Stabiliser()
+        gains = own.stabiliser
         hierarchy.add_task(*_stabilising_task(machine, gains, q, qd, place, zmp_rows.right))
         hierarchy.add_free(-gains.damping * qd - gains.gradient * ca.gradient(joint_limit_index(machine.robot, q), q))
-    if null_damping:
-        hierarchy.add_free(-null_damping * qd)
+    if own.null_damping:
+        hierarchy.add_free(-own.null_damping * qd)
     return hierarchy.accelerations
 
 
@@ -211,22 +255,8 @@ def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, pla
     return ca.mtimes(directions, rows), ca.mtimes(directions, target)
 
 
-@dataclass(frozen=True)
-class StepSettings:
-    """Settings of the simulation.
-
-    Attributes:
-        chunk: Steps between two checks of the motion.
-        tip_tolerance: Largest pose error of a successful motion, m and rad.
-        cvodes_steps: Largest number of integrator steps between two samples.
-    """
-
-    chunk: int = 50
-    tip_tolerance: float = 1e-3
-    cvodes_steps: int = 5000
-
-
-STEPPING = StepSettings()
+TIP_TOLERANCE = 1e-3
+"""Largest pose error of a motion that succeeds, m and rad."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +305,7 @@ class AccelerationSolution:
             "lift_off": not motion.stays_on_ground,
             "leaves_foot": not motion.stays_in_foot,
             "joint_limits": not motion.stays_in_limits,
-            "leaves_path": not bool((self.tip_error <= STEPPING.tip_tolerance).all()),
+            "leaves_path": not bool((self.tip_error <= TIP_TOLERANCE).all()),
         }
         first = () if self.stopped is None else (self.stopped.reason,)
         return (*first, *(name for name, value in failed.items() if value and name not in first))
@@ -298,72 +328,45 @@ class AccelerationSolution:
 def resolve_accelerations(
     machine: Standing,
     tasks: TipTask | Sequence[TipTask],
-    start_joints: Any,
     horizon: float,
     *,
+    start: Any,
     law: Law = "pseudo_inverse",
-    start_velocities: Any = None,
-    zmp: Callable[[Any], Any] | Any = None,
     external: External | None = None,
-    layers: Sequence[Layer] = (),
-    stabiliser: Stabiliser | None = None,
-    null_damping: float = 0.0,
     step: float = 1e-3,
-    integrator: Literal["rk4", "cvodes"] = "rk4",
-    tolerance: float = 1e-10,
-    stop_at_lift_off: bool = True,
-    speed_limit: float = 20.0,
+    options: AccelerationOptions | None = None,
 ) -> AccelerationSolution:
     """Simulate a resolved-acceleration law from the start to the horizon, or until it fails.
 
     Args:
         machine: A Standing machine.
         tasks: A TipTask, or several that are done at once.
-        start_joints: Shape (n,), rad or m.
         horizon: Final time, s.
+        start: Joints at the start, shape (n,), rad or m, or a `Start` with the joints and their velocities.
         law: ``pseudo_inverse``, ``augmented`` (20), ``null_space`` (21)-(22) or ``stabilised``.
-        start_velocities: Shape (n,); at rest if None.
-        zmp: Target (x, y) of the zero moment point for all laws but the first, or a function of CasADi time that
-            returns it; the machine's most stable point if None.
         external: External wrenches as a function of time and tip position.
-        layers: Configuration indices that the remaining freedom improves, in sequence, (23)-(34).
-        stabiliser: Gains of the stabilised law.
-        null_damping: Damping of the joint velocities in the freedom that remains at the end, 1/s.
         step: Step of the integration and between samples, s.
-        integrator: ``rk4`` with fixed steps or ``cvodes`` with error control.
-        tolerance: Absolute and relative tolerance of cvodes.
-        stop_at_lift_off: Whether a vertical ground force that is not positive ends the motion.
-        speed_limit: Joint speed, rad/s or m/s, above which the motion counts as diverged.
+        options: Options of the law and of the simulation; `AccelerationOptions()` if None.
 
     Raises:
         ProblemError: An argument does not fit the machine, or the tasks cannot be done at the start.
     """
-    equations, duration = (
-        bind(require.instance("machine", machine, Standing), tasks),
-        require.positive("horizon", horizon),
-    )
-    require.flag("stop_at_lift_off", stop_at_lift_off)
-    joints, base = checked_configuration(machine, start_joints, None)
-    checked_law(machine, equations.size, law, layers, damping=null_damping)
-    for name, number in (("step", step), ("tolerance", tolerance), ("speed_limit", speed_limit)):
-        require.positive(name, number)
-    require.choice("integrator", integrator, ("rk4", "cvodes"))
+    equations = bind(require.instance("machine", machine, Standing), tasks)
+    duration, n = require.positive("horizon", horizon), machine.joint_size
+    own = AccelerationOptions() if options is None else require.instance("options", options, AccelerationOptions)
+    begin, joints, base = Start.of_known(start, machine)
+    checked_law(machine, equations.size, law, own.layers)
+    require.positive("step", step)
     checked_tasks(equations, base, joints, duration)
     check_length(equations, base, duration)
-    n = machine.joint_size
-    start = np.zeros(n) if start_velocities is None else start_velocities
-    velocities = require.array("start_velocities", start, (n,), meaning="one entry for each joint")
-    if not isinstance(stabiliser, Stabiliser | None):
-        words = f"stabiliser must be a Stabiliser(...), not {stabiliser!r}"
-        raise ProblemError(words, name="stabiliser", value=stabiliser)
-    zmp_target = _zmp_target(machine.most_stable_point if zmp is None else zmp)
+    at_rest = isinstance(begin.velocity, str) and begin.velocity == "rest"
+    rates = np.zeros(n) if at_rest else begin.velocity
+    velocities = require.array("start: velocity", rates, (n,), meaning="one entry for each joint")
+    own = replace(own, zmp=own.zmp_target(machine))
 
     def law_function(symbols: Any) -> Any:
-        time, q, qd = symbols.sym("time"), symbols.sym("q", n), symbols.sym("qd", n)
-        qdd = accelerations(
-            machine, equations, law, time, q, qd, zmp=zmp_target, external=external, layers=layers,
-            stabiliser=stabiliser, null_damping=null_damping,
-        )  # fmt: skip
+        time, q, qd = state = symbols.sym("time"), symbols.sym("q", n), symbols.sym("qd", n)
+        qdd = accelerations(machine, equations, law, state, external=external, options=own)
         gap = ca.norm_2(equations.error(ca.DM(0, 1), q, equations.targets(time)))
         return ca.Function("law", [time, q, qd], [ca.densify(qdd), gap], {"cse": True})
 
@@ -375,43 +378,36 @@ def resolve_accelerations(
         )
         raise ProblemError(words, name="law", value=law, time=0.0)
     steps = max(int(np.ceil(duration / step - 1e-9)), 1)
-    simulate = _Simulation(function, n, duration / steps, integrator, tolerance)
+    simulate = _Simulation(function, n, duration / steps, own)
     outputs = motion_function(machine, external, lambda q: equations.jacobian(ca.DM(0, 1), q))
-    recorder = _Recorder(outputs, function, stop_at_lift_off, speed_limit)
+    recorder = _Recorder(outputs, function, own.stop_at_lift_off, own.speed_limit)
     state, done = np.concatenate([joints, velocities]), 0
     stopped = recorder.add(np.zeros(1), state[None, :])
     while done < steps and stopped is None:
-        count = min(STEPPING.chunk, steps - done)
+        count = min(own.chunk, steps - done)
         times = np.asarray((done + np.arange(1, count + 1)) * simulate.step, dtype=float)
         stopped = recorder.add(times, simulate.advance(done * simulate.step, state, count))
         state, done = recorder.state, done + count
     return AccelerationSolution(law, *recorder.results(), stopped)
 
 
-def _zmp_target(zmp: Callable[[Any], Any] | Any) -> Callable[[Any], Any]:
-    """Return the target of the zero moment point as a checked function of time."""
-    if callable(zmp):
-        return lambda time: checked_point(zmp(time), "zmp")
-    point = checked_point(zmp, "zmp")
-    return lambda time: point
-
-
 class _Simulation:
     """Integration of the state (q, q') over fixed steps, many steps in one call."""
 
-    def __init__(self, law: Any, n: int, step: float, integrator: str, tolerance: float) -> None:
+    def __init__(self, law: Any, n: int, step: float, options: AccelerationOptions) -> None:
         self.step, self._law, self._n = step, law, n
         time, state = ca.MX.sym("time"), ca.MX.sym("state", 2 * n)
 
         def rate(at: Any, x: Any) -> Any:
             return ca.vertcat(x[n:], law(at, x[:n], x[n:])[0])
 
-        if integrator == "cvodes":
+        if options.integrator == "cvodes":
             fraction = ca.MX.sym("fraction")
             problem = {"t": fraction, "x": state, "p": time, "ode": step * rate(time + step * fraction, state)}
-            options = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": STEPPING.cvodes_steps}
-            options |= {"disable_internal_warnings": True, "show_eval_warnings": False}
-            solver = ca.integrator("motion", "cvodes", problem, 0.0, 1.0, options)
+            accuracy = {"abstol": options.tolerance, "reltol": options.tolerance}
+            accuracy |= {"max_num_steps": options.max_cvodes_steps}
+            quiet = {"disable_internal_warnings": True, "show_eval_warnings": False}
+            solver = ca.integrator("motion", "cvodes", problem, 0.0, 1.0, accuracy | quiet)
             after = solver(x0=state, p=time)["xf"]
         else:
             after = rk4_step(lambda place, x: rate(time + place * step, x), state, step)

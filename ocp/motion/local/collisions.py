@@ -69,8 +69,8 @@ def distances_along(
     base: Array,
     joints: Array,
     times: Array,
-    cutoff: float = np.inf,
     *,
+    cutoff: float = np.inf,
     pairs: Sequence[int] | None = None,
 ) -> Array:
     """Return the distances of all pairs at samples of a motion. Shape (M, n), m.

@@ -7,7 +7,7 @@ limit that a step would violate are fixed in that step. All starts share one map
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -22,9 +22,17 @@ from ocp.motion.local.collisions import Collision, checked_collision_scene, find
 from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.tip_task import ANGULAR, TipTask, pose_in_reference
+from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["IkSolution", "Unreachable", "describe_miss", "inverse_kinematics", "inverse_kinematics_at"]
+__all__ = [
+    "IK_OPTIONS",
+    "IkOptions",
+    "IkSolution",
+    "Unreachable",
+    "describe_miss",
+    "inverse_kinematics",
+    "inverse_kinematics_at",
+]
 
 LARGEST_SEED = 2**64
 
@@ -34,35 +42,61 @@ class IkSettings:
     """Settings of the Levenberg-Marquardt iterations and of the selection of their solutions.
 
     Attributes:
-        tolerance: Largest pose error of a solution, m and rad.
-        apart: Solutions closer to each other count as one, m and rad.
-        iterations: Largest number of iterations of each start.
         slide_spread: Range of the starts of prismatic joints without limits, m.
         first_damping: Damping of the first step.
         least_damping: Least damping.
         most_damping: Damping at which a start is abandoned.
         growth: Factor of the damping after a step that fails.
         shrinkage: Factor of the damping after a step that succeeds.
-        reach_tolerance: Pose error below which a pose does not count as out of reach, m or rad.
         slide_count: Number of solutions in collision that are moved along their self-motions if no solution is free.
-        simpson_steps: Steps of the integration of a velocity to a position.
     """
 
-    tolerance: float = 1e-10
-    apart: float = 1e-3
-    iterations: int = 100
     slide_spread: float = 1.0
     first_damping: float = 1e-2
     least_damping: float = 1e-12
     most_damping: float = 1e8
     growth: float = 4.0
     shrinkage: float = 0.25
-    reach_tolerance: float = 1e-4
     slide_count: int = 8
-    simpson_steps: int = 400
 
 
 IK_SETTINGS = IkSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class IkOptions:
+    """Options of inverse kinematics.
+
+    Attributes:
+        base: Base configuration, shape (base_size,); the machine's base_home() if None.
+        limits: Whether the position limits of the robot apply.
+        tolerance: Largest pose error of a solution, m and rad.
+        apart: Least distance between two solutions, in the largest joint difference, angles modulo full turns.
+        iterations: Largest number of iterations of each start.
+
+    Raises:
+        ProblemError: A value is invalid.
+    """
+
+    base: Any = None
+    limits: bool = True
+    tolerance: float = 1e-10
+    apart: float = 1e-3
+    iterations: int = 100
+
+    def __post_init__(self) -> None:
+        require.flag("limits", self.limits)
+        require.positive("tolerance", self.tolerance)
+        require.positive("apart", self.apart)
+        require.count("iterations", self.iterations, least=1)
+
+    def joint_range(self, machine: Machine) -> tuple[Array, Array]:
+        """Return the lower and upper limits of the joints, infinite where none apply. Shape (n,) each."""
+        unlimited = np.full(machine.joint_size, np.inf)
+        return (machine.robot.lower, machine.robot.upper) if self.limits else (-unlimited, unlimited)
+
+
+IK_OPTIONS = IkOptions()
 
 
 @dataclass(frozen=True)
@@ -116,15 +150,11 @@ def inverse_kinematics(
     task: TipTask | Sequence[TipTask],
     *,
     time: float = 0.0,
-    base: Any = None,
     starts: int = 64,
     near: Any = None,
     seed: int = 0,
-    limits: bool = True,
-    tolerance: float = IK_SETTINGS.tolerance,
-    apart: float = IK_SETTINGS.apart,
-    iterations: int = IK_SETTINGS.iterations,
     scene: CollisionScene | None = None,
+    options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
     """Return distinct joint vectors at which the machine satisfies its pose tasks, the best first.
 
@@ -135,21 +165,17 @@ def inverse_kinematics(
     because few samples keep the limits.
 
     Args:
-        machine: Any machine; a floating base stays at `base`.
+        machine: Any machine; a floating base does not move.
         task: A TipTask with a pose, or several that hold at once; velocity tasks are ignored.
         time: Time of the tasks, s.
-        base: Base configuration, shape (base_size,); the machine's base_home() if None.
         starts: Number of samples of the free parameters, and of random starts, uniform between the limits, -pi .. pi
             for unlimited joints. Of more solutions of a redundant arm, so many are kept that are far from each other.
             0: only the iterations from `near`.
         near: Further starts, before the random ones. Shape (joint_size,) or (k, joint_size).
         seed: Seed of the samples and of the random starts.
-        limits: Whether the position limits of the robot apply.
-        tolerance: Largest pose error of a solution, m and rad.
-        apart: Least distance between two solutions, in the largest joint difference, angles modulo full turns.
-        iterations: Largest number of iterations of each start.
         scene: Collision scene of the machine; solutions closer than the clearance are left out. If that leaves none,
             the ones with the largest distances are moved along their self-motions.
+        options: Base, limits and accuracy.
 
     Returns:
         The solutions, at least one, by decreasing quality.
@@ -166,27 +192,23 @@ def inverse_kinematics(
         words = "inverse kinematics need a pose: task=TipTask(position=..., orientation=... or direction=...)"
         raise ProblemError(words, name="task")
     equations = TaskEquations(machine, pose_tasks)
-    for name, number in (("starts", starts), ("iterations", iterations)):
-        require.count(name, number, least=int(name == "iterations"))
-    for name, value in (("tolerance", tolerance), ("apart", apart)):
-        require.positive(name, value)
+    require.instance("options", options, IkOptions)
+    require.count("starts", starts, least=0)
     require.count("seed", seed, 0, LARGEST_SEED)
-    require.flag("limits", limits)
     if scene is not None:
-        checked_collision_scene(scene, machine, limits)
+        checked_collision_scene(scene, machine, options.limits)
     if not np.isfinite(real(time)):
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     size = machine.joint_size
-    base_values = checked_configuration(machine, np.zeros(size), base)[1]
-    unbounded = np.full(size, np.inf)
-    lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
+    base_values = checked_configuration(machine, np.zeros(size), options.base)[1]
+    lower, upper = options.joint_range(machine)
     first = sample_starts(machine, lower, upper, int(starts), near=near, seed=seed)
     targets = np.array(equations.target_function()(float(time))).ravel()
     if not np.isfinite(targets).all():
         words = f"the task's targets are not finite at {time:g} s"
         raise ProblemError(words, name="task", value=targets, time=float(time))
 
-    search = _MultiStart(equations, base_values, targets, lower, upper, tolerance, apart, int(iterations))
+    search = _MultiStart(equations, base_values, targets, lower, upper, options)
     listed, random = search.list_branches(int(starts), int(seed))
     first = first[: len(first) - int(starts) + random]
     solutions = search.solve(np.vstack([first[: len(first) - random], listed, first[len(first) - random :]]), random)
@@ -217,19 +239,17 @@ def inverse_kinematics_at(
     *,
     starts: int,
     seed: int,
-    limits: bool,
     near: Array | None = None,
-    tolerance: float = IK_SETTINGS.tolerance,
+    options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
     """Return IK solutions on a fixed base for known targets from random starts alone; see `inverse_kinematics`.
 
     Raises:
         Unreachable: No start leads to the pose.
     """
-    machine, unbounded = equations.machine, np.full(equations.machine.joint_size, np.inf)
-    lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    first = sample_starts(machine, lower, upper, starts, near=near, seed=seed)
-    return _MultiStart(equations, np.zeros(0), targets, lower, upper, tolerance).solve(first, starts)
+    lower, upper = options.joint_range(equations.machine)
+    first = sample_starts(equations.machine, lower, upper, starts, near=near, seed=seed)
+    return _MultiStart(equations, np.zeros(0), targets, lower, upper, options).solve(first, starts)
 
 
 @dataclass(frozen=True)
@@ -241,9 +261,7 @@ class _MultiStart:
     targets: Array
     lower: Array
     upper: Array
-    tolerance: float = IK_SETTINGS.tolerance
-    apart: float = IK_SETTINGS.apart
-    iterations: int = IK_SETTINGS.iterations
+    options: IkOptions = IK_OPTIONS
 
     def solve(self, first: Array, random: int) -> list[IkSolution]:
         """Return the solutions from starts (K, n), the best first; unlimited angles of the last `random` ones are
@@ -257,7 +275,7 @@ class _MultiStart:
         wrap = self._revolute & ~np.isfinite(lower) & ~np.isfinite(upper)
         last = slice(len(first) - random, None)  # solutions from given starts stay near them
         q[last, wrap] = np.remainder(q[last, wrap] + np.pi, 2 * np.pi) - np.pi
-        if not (error <= self.tolerance).any():
+        if not (error <= self.options.tolerance).any():
             nearest = int(error.argmin())
             misses = self.equations.misses(self.base, q[nearest], self.targets)
             details: Any = {"lower": lower, "upper": upper, "misses": misses}
@@ -281,12 +299,12 @@ class _MultiStart:
         """Return joints (K, n) and largest pose errors (K,) after the iterations from these joints."""
         fixed = ca.DM(self.base), ca.DM(self.targets)
         function = self.equations.pose_residual_function
-        options: Any = {"tolerance": self.tolerance, "iterations": self.iterations, "fixed": fixed}
+        options: Any = {"tolerance": self.options.tolerance, "iterations": int(self.options.iterations), "fixed": fixed}
         return gauss_newton(function, joints, self.lower, self.upper, **options)
 
     def rank(self, joints: Array, errors: Array) -> list[IkSolution]:
-        """Sort candidates by quality and return the distinct solutions, the best first."""
-        solved, lower, upper = np.flatnonzero(errors <= self.tolerance), self.lower, self.upper
+        """Return the distinct solutions among candidates, the best first."""
+        solved, lower, upper = np.flatnonzero(errors <= self.options.tolerance), self.lower, self.upper
         if not solved.size:
             return []
         joints, size = joints[solved], self.equations.size
@@ -297,37 +315,14 @@ class _MultiStart:
         margin = np.min(share[:, np.isfinite(upper - lower) & (upper > lower)], axis=1, initial=1.0)
         quality = values.prod(axis=1) * np.maximum(margin, 0.0)
         solutions = [IkSolution(*each) for each in zip(joints, quality.tolist(), errors[solved].tolist(), strict=True)]
-        return distinct_solutions(sorted(solutions, key=lambda solution: -solution.quality), self._revolute, self.apart)
+        return distinct_solutions(
+            sorted(solutions, key=lambda solution: -solution.quality), self._revolute, self.options.apart
+        )
 
     @property
     def _revolute(self) -> NDArray[np.bool_]:
         """Which joints are revolute. Shape (n,)."""
         return np.array([joint.kind != "prismatic" for joint in self.equations.machine.robot.moving_joints])
-
-
-def equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, *, base: Any = ()) -> TipTask | None:
-    """Return a task as a pose task at a time; None if its pose depends on the path or has a start gap to close.
-
-    Args:
-        machine, task: The machine and its task.
-        start, base: Joints and base at the start.
-        time: Time since the begin of the task, s.
-    """
-    if task.is_pose:
-        return task if task.start_gap <= IK_SETTINGS.reach_tolerance else None
-    rows = [row for row in task.chosen if row not in ANGULAR]
-    if not rows or task.axes not in ("world", "reference") or (task.axes == "world") != (task.relative_to is None):
-        return None
-    equations = bind(machine, task)
-    times = np.linspace(0.0, time, IK_SETTINGS.simpson_steps + 1)
-    values = np.array(equations.target_function().map(len(times))(times[None, :]))
-    weights = np.ones(IK_SETTINGS.simpson_steps + 1)
-    weights[1:-1:2], weights[2:-1:2] = 4, 2
-    displacement = np.zeros(3)
-    velocities = values[[task.chosen.index(row) for row in rows]]
-    displacement[[row - 3 for row in rows]] = velocities @ weights * time / IK_SETTINGS.simpson_steps / 3
-    origin, _ = pose_in_reference(equations.bound[0], ca.DM(base), ca.DM(start))
-    return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(origin)).ravel() + displacement)
 
 
 def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, *, near: Any = None, seed: int) -> Array:
@@ -403,7 +398,7 @@ def gauss_newton(
 
 
 def distinct_solutions(
-    solutions: list[IkSolution], revolute: NDArray[np.bool_], apart: float = IK_SETTINGS.apart
+    solutions: list[IkSolution], revolute: NDArray[np.bool_], apart: float = IK_OPTIONS.apart
 ) -> list[IkSolution]:
     """Return the first of each group of solutions within `apart`, angles modulo full turns."""
     distinct: list[IkSolution] = []

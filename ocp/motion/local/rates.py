@@ -24,13 +24,14 @@ from ocp.console import interruptible
 from ocp.curves import integrator
 from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import checked_collision_scene, distances_along
-from ocp.motion.tasks.checks import checked_configuration, checked_tasks, checked_weights, dependent_rows, horizon_of
+from ocp.motion.tasks.checks import checked_tasks, checked_weights, dependent_rows, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.goals import Start
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
 from ocp.problem.values import Sampler, symbols_of
 
-__all__ = ["LocalMotion", "LocalSolution", "least_rates", "resolve", "track_tasks"]
+__all__ = ["LocalMotion", "LocalSolution", "RateOptions", "least_rates", "resolve", "track_tasks"]
 
 MAX_INTEGRATOR_STEPS = 20000
 """Between two samples; a smooth motion takes some tens."""
@@ -96,37 +97,53 @@ class LocalSolution:
         return {"base": base, "joints": joints, "joint_rates": rates}
 
 
-@interruptible
-def resolve(
-    machine: Machine,
-    tasks: TipTask | Sequence[TipTask],
-    start_joints: Any,
-    horizon: float | None = None,
-    *,
-    start_base: Any = None,
-    weights: Any = None,
-    damping: float = 0.0,
-    tolerance: float = 1e-10,
-    samples: Any = 501,
-    scene: CollisionScene | None = None,
-) -> LocalSolution:
-    """Integrate the pseudo-inverse solution x2' = G# v, equation (26) of the free-floating paper, and the base motion.
+@dataclass(frozen=True, eq=False)
+class RateOptions:
+    """Options of the least joint rates and of their integration.
 
-    The motion of the machine at rest (its drift) and the feedback of pose tasks are part of v.
-
-    Args:
-        machine: Any machine of `models`, on a fixed or a floating base.
-        tasks: Tasks of its tips; several are done at once.
-        start_joints: Shape (joint_size,).
-        horizon: Final time, s; that of the tasks if None.
-        start_base: Base configuration at the start, shape (base_size,); the machine's base_home() if None.
+    Attributes:
         weights: Positive weights of the squared joint rates that are minimised. Shape (joint_size,); all 1 if None.
         damping: 0 for the pseudo-inverse G# = G' (G G')^-1; otherwise G' (G G' + damping^2 1)^-1, which stays bounded
             where the Jacobian loses rank, at the price of a task error.
         tolerance: Absolute and relative tolerance of the integrator (cvodes, Adams).
+
+    Raises:
+        ProblemError: The damping is negative, or the tolerance is not positive.
+    """
+
+    weights: Any = None
+    damping: float = 0.0
+    tolerance: float = 1e-10
+
+    def __post_init__(self) -> None:
+        require.nonnegative("damping", self.damping)
+        require.positive("tolerance", self.tolerance)
+
+
+@interruptible
+def resolve(
+    machine: Machine,
+    tasks: TipTask | Sequence[TipTask],
+    horizon: float | None = None,
+    *,
+    start: Any,
+    samples: Any = 501,
+    scene: CollisionScene | None = None,
+    options: RateOptions | None = None,
+) -> LocalSolution:
+    """Integrate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the motion of the base.
+
+    The drift of the machine at rest and the feedback of pose tasks are part of v.
+
+    Args:
+        machine: Any machine of `models`, on a fixed or a floating base.
+        tasks: Tasks of its tips; several are done at once.
+        horizon: Final time, s; that of the tasks if None.
+        start: Joints at the start, shape (joint_size,), or a `Start` with the joints and the base.
         samples: Number of equidistant times to report, or the increasing times themselves from 0 to the horizon.
         scene: Collision scene of the machine; the distances of its bodies are reported at the samples and have no
             effect.
+        options: Weights, damping and tolerance; `RateOptions()` if None.
 
     Returns:
         The motion up to the horizon, or up to the last sample before it breaks down, with the reason in `stopped`.
@@ -135,22 +152,21 @@ def resolve(
         ProblemError: An argument does not fit the machine, or the task is singular at the start.
     """
     equations = bind(machine, tasks)
-    joints, base = checked_configuration(machine, start_joints, start_base)
+    own = RateOptions() if options is None else require.instance("options", options, RateOptions)
+    _, joints, base = Start.of_known(start, machine)
     duration = horizon_of([part.task for part in equations.bound], horizon)
-    rate_weights = checked_weights(weights, machine.joint_size)
+    rate_weights = checked_weights(own.weights, machine.joint_size)
     checked_tasks(equations, base, joints, duration)
-    require.nonnegative("damping", damping)
-    require.positive("tolerance", tolerance)
-    times = _sample_times(samples, duration)
-    if damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
+    times = _times(samples, duration)
+    if own.damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
         words = (
             f"{rows_dependent} is singular at the start joints {joints.tolist()}; "
-            "start elsewhere, fix fewer rows, or give a damping"
+            "start elsewhere, fix fewer rows, or give RateOptions(damping=...)"
         )
         raise ProblemError(words, name=rows_dependent, value=joints, time=0.0)
-    model = on_symbols(lambda symbols: _Model(equations, rate_weights, damping, symbols))
-    states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, tolerance)
-    solution = _report(machine, model, times[: len(states)], states, costs, tolerance, stopped)
+    model = on_symbols(lambda symbols: _Model(equations, rate_weights, own.damping, symbols))
+    states, costs, stopped = _integrate(model, np.concatenate([base, joints]), times, own.tolerance)
+    solution = _report(machine, model, times[: len(states)], states, costs, own.tolerance, stopped)
     if scene is None:
         return replace(solution, clearance=np.full(len(solution.t), np.nan))
     distances = distances_along(checked_collision_scene(scene, machine), solution.base, solution.joints, solution.t)
@@ -259,8 +275,8 @@ def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> t
         if not usable:
             manipulability = float(_manipulabilities(np.array(model.outputs(begin, states_so_far[-1])[1])[None])[0])
             reason = (
-                f"the integration fails between {begin:g} and {end:g} s, where the manipulability "
-                f"falls to {manipulability:.3g}: the task becomes singular; give a damping or another start"
+                f"the integration fails between {begin:g} and {end:g} s, where the manipulability falls to "
+                f"{manipulability:.3g}: the task becomes singular; give RateOptions(damping=...) or another start"
             )
             return np.array(states_so_far), np.array(costs_so_far), reason
         states_so_far.append(state)

@@ -21,7 +21,7 @@ from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED
 from ocp.motion.plan.actuators import limits_actuators
 from ocp.motion.plan.goal_sequence import plan_capture, plan_goal, plan_sequence, plan_steps
-from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
+from ocp.motion.plan.planner import PlanOptions, checked_request, clearance_for, plan_request
 from ocp.motion.plan.sequence import SequenceRequest, plan_consecutive, plan_in_segments
 from ocp.motion.plan.standing import plan_to_stand
 from ocp.motion.plan.waypoints import plan_path
@@ -167,9 +167,10 @@ def _plan(
             return plan_goal(machine, goals[0], horizon, constraints=constraints, **options)
         return plan_sequence(machine, goals, horizon, constraints=constraints, **options)
     options |= {"search": search, "cyclic": cyclic}
+    own_options = PlanOptions(**options)
     if isinstance(machine, Standing):
-        return plan_to_stand(machine, tasks, horizon, clearance_constraints=constraints, wrenches=wrenches, **options)
-    request = checked_request(machine, tasks, horizon, **options)
+        return plan_to_stand(machine, tasks, horizon, own_options, constraints=constraints, wrenches=wrenches)
+    request = checked_request(machine, tasks, horizon, own_options)
     return plan_request(replace(request, clearance_constraints=constraints))
 
 

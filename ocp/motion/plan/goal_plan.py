@@ -113,7 +113,8 @@ def _checked(request: GoalRequest) -> GoalTask:
 def _checked_end(machine: FixedBase, name: str, value: Any, bounds: JointBounds) -> Array:
     joints, _ = checked_configuration(machine, value, None)
     hint = "give joints within their limits"
-    return clip_to_limits(name, machine.robot.joint_names, joints, bounds.lower, bounds.upper, hint)
+    names = machine.robot.joint_names
+    return clip_to_limits(joints, bounds.lower, bounds.upper, label=name, names=names, hint=hint)
 
 
 def _collision(scene: Any, name: str, collision: Any) -> ProblemError:

@@ -27,7 +27,7 @@ from ocp.motion.builders.standing.plan import solve_steps
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.builders.torques import checked_motors
-from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics
+from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics
 from ocp.motion.plan.goal_motions import GoalRequest
 from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.result.candidate import Candidate, Stage
@@ -245,8 +245,8 @@ def nearest_configuration(machine: Machine, goal: Goal, near: Array, *, limits: 
     Raises:
         Unreachable, ProblemError: As `inverse_kinematics`.
     """
-    options: dict[str, Any] = {"near": near, "seed": seed, "limits": limits.joints}
-    solutions = inverse_kinematics(machine, goal.task, **options)
+    options = IkOptions(limits=limits.joints)
+    solutions = inverse_kinematics(machine, goal.task, near=near, seed=seed, options=options)
     distances = [float(np.linalg.norm(solution.joints - near)) for solution in solutions]
     return np.asarray(solutions[int(np.argmin(distances))].joints)
 
@@ -271,13 +271,14 @@ def goal_configurations(
             raise ProblemError("a goal needs joints or a pose", name="joints", value=None)
         values = require.array("goal", np.nan_to_num(floats(goal.joints)), (len(near),), meaning="one for each joint")
         joints = np.where(np.isnan(floats(goal.joints).ravel()), near, values)
-        return clip_to_limits("end", names, joints, bounds.lower, bounds.upper, "end inside them")[None]
-    scene = None if constraints is None else constraints.scene
+        words: dict[str, Any] = {"label": "end", "names": names, "hint": "end inside them"}
+        return clip_to_limits(joints, bounds.lower, bounds.upper, **words)[None]
+    scene, options = None if constraints is None else constraints.scene, IkOptions(limits=limits.joints)
     tasks = [goal.task, *(replace(goal.task, position=point) for point in _points_inside(goal.region, seed))]
     solutions, error = list[Array](), None
     for task in tasks:
         try:
-            members = inverse_kinematics(machine, task, near=near, seed=seed, limits=limits.joints, scene=scene)
+            members = inverse_kinematics(machine, task, near=near, seed=seed, scene=scene, options=options)
         except Unreachable as unreachable:
             error = error or unreachable
             continue

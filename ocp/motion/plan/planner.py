@@ -12,7 +12,7 @@ kind of seeds is used only if the kinds before it led to no plan, or to none tha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -57,7 +57,14 @@ from ocp.motion.tasks.goals import Cost, Scene, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["candidates_from", "checked_request", "clearance_for", "plan_from_configurations", "plan_request"]
+__all__ = [
+    "PlanOptions",
+    "candidates_from",
+    "checked_request",
+    "clearance_for",
+    "plan_from_configurations",
+    "plan_request",
+]
 
 
 def plan_from_configurations(
@@ -343,26 +350,32 @@ def clearance_for(
     return ClearanceConstraints(collision_scene) if len(collision_scene.pairs) else None
 
 
-def checked_request(
-    machine: Machine,
-    tasks: Any,
-    horizon: Any,
-    *,
-    start: Any = None,
-    cyclic: Any = False,
-    cost: Any = None,
-    limits: Any = None,
-    search: Any = "configurations",
-    seed: Any = 0,
-) -> PlanRequest:
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options of `plan` that tasks of tips take, as the user gave them.
+
+    Attributes:
+        start, cyclic, cost, limits, search, seed: As in `plan`.
+    """
+
+    start: Any = None
+    cyclic: Any = False
+    cost: Any = None
+    limits: Any = None
+    search: Any = "configurations"
+    seed: Any = 0
+
+
+def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOptions) -> PlanRequest:
     """Check the arguments of `plan`, except those of the collision scene.
 
     Raises:
         ProblemError: As in `plan`.
     """
+    limits, search = options.limits, options.search
     require.choice("search", search, get_args(SearchKind))
-    require.flag("cyclic", cyclic)
-    require.count("seed", seed, 0, LARGEST_SEED)
+    require.flag("cyclic", options.cyclic)
+    require.count("seed", options.seed, 0, LARGEST_SEED)
     all_tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, all_tasks)  # checks the tasks against the machine
     checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
@@ -372,26 +385,26 @@ def checked_request(
         if search == "global":
             words = "search='global' needs a fixed horizon; give it in s, or use search='configurations'"
             raise ProblemError(words, name="search", value="global")
-    own_cost = _checked_cost(machine, cost, free)
+    own_cost = _checked_cost(machine, options.cost, free)
     checked_limits.bounds(machine, ("velocity", "torque") if limits_actuators(checked_limits) else ("velocity",))
     if limits_actuators(checked_limits):
         checked_motors("plan: actuator limits", machine)
     duration = horizon_of(all_tasks, None if free else horizon)
-    joints, base = Start.of(start, machine)[1:]
+    joints, base = Start.of(options.start, machine)[1:]
     stretches = stretches_of(machine, all_tasks, duration)
     configuration = np.zeros(machine.joint_size) if joints is None else joints
     for stretch in stretches:
         if stretch.equations is not None:
             first = stretch is stretches[0] and joints is not None
-            checked_tasks(stretch.equations, base, configuration, duration, start=first)
+            checked_tasks(stretch.equations, base, configuration, duration, check_start=first)
     if joints is not None:
         bounds = checked_limits.bounds(machine)
         names, hint = machine.robot.joint_names, "start inside them"
-        joints = clip_to_limits("start", names, joints, bounds.lower, bounds.upper, hint)
+        joints = clip_to_limits(joints, bounds.lower, bounds.upper, label="start", names=names, hint=hint)
     squares = own_cost if own_cost.velocity else replace(own_cost, velocity=1.0)
     return PlanRequest(
         *(machine, all_tasks, duration, stretches, joints, base, squares.joint_weights(machine.joint_size)),
-        *(without_actuators(checked_limits), cyclic, int(seed), float(own_cost.time) if free else None),
+        *(without_actuators(checked_limits), options.cyclic, int(options.seed), float(own_cost.time) if free else None),
         search=search,
         cost=None if own_cost.velocity and set(own_cost.terms) <= {"velocity", "time"} else own_cost,
         actuator_limits=checked_limits if limits_actuators(checked_limits) else None,

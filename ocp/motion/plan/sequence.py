@@ -30,7 +30,7 @@ from ocp.motion.plan.actuators import limits_actuators, weights_actuators
 from ocp.motion.plan.goal_motions import GoalRequest
 from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.plan.goal_sequence import plan_goal, with_joints
-from ocp.motion.plan.planner import checked_request, clearance_for, plan_request
+from ocp.motion.plan.planner import PlanOptions, checked_request, clearance_for, plan_request
 from ocp.motion.result.segmented_plan import JUMP_TOLERANCE, Reconfiguration, SegmentedPlan, SequencePlan
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest, local_motions_from
@@ -187,7 +187,7 @@ class _Sequence:
         horizon = "free" if request.free else None
         if machine.base_size or (near is not None and _is_at_start(machine, tasks, near)):
             options["start"] = Start(near, self.state.base if machine.base_size else None)
-        checked = checked_request(machine, tasks, horizon, **options)
+        checked = checked_request(machine, tasks, horizon, PlanOptions(**options))
         rests = _rests(checked) if request.smooth else (False, False)
         checked = replace(checked, clearance_constraints=self._constraints(), rests=rests)
         if options["start"] is None and near is not None:
@@ -318,7 +318,7 @@ def plan_in_segments(
     """
     require.instance("machine", machine, FixedBase)
     options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "seed": seed}
-    request = checked_request(machine, tasks, horizon, search="global", **options)
+    request = checked_request(machine, tasks, horizon, PlanOptions(search="global", **options))
     constraints = clearance_for(machine, limits, scene)
     if constraints is not None and constraints.scene.has_moving_obstacles:
         words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"

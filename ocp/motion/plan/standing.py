@@ -15,8 +15,9 @@ from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.standing.plan import solve_standing
 from ocp.motion.builders.standing.problem import StandingSetup, Weights
-from ocp.motion.local.inverse_kinematics import inverse_kinematics
+from ocp.motion.local.inverse_kinematics import IkOptions, inverse_kinematics
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
+from ocp.motion.plan.planner import PlanOptions
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.search.configurations import PlannerSettings
@@ -32,14 +33,9 @@ def plan_to_stand(
     machine: Standing,
     tasks: TipTask | Sequence[TipTask],
     horizon: Any,
+    options: PlanOptions,
     *,
-    start: Any,
-    cyclic: bool,
-    cost: Weights | None,
-    limits: Limits | None,
-    search: str,
-    seed: int,
-    clearance_constraints: ClearanceConstraints | None,
+    constraints: ClearanceConstraints | None,
     wrenches: External | None,
 ) -> SolvedPlan:
     """Plan a motion that satisfies the tasks with the zero moment point inside the foot, at the cost of
@@ -51,10 +47,9 @@ def plan_to_stand(
 
     Args:
         machine: The standing machine.
-        tasks, horizon, start, limits, search, seed: As in `ocp.motion.plan.plan`.
-        cyclic: Must be False.
-        cost: Weights of the terms of the cost.
-        clearance_constraints: Clearance constraints, or None.
+        tasks, horizon: As in `ocp.motion.plan.plan`.
+        options: Start, limits, search and seed; `cost` weights the terms of the cost, and `cyclic` is False.
+        constraints: Clearance constraints, or None.
         wrenches: External wrenches as a function of time and tip position, or None.
 
     Raises:
@@ -62,10 +57,11 @@ def plan_to_stand(
             in `solve_standing`.
         SolveError: No start leads to a plan that passes its audit.
     """
-    require.flag("cyclic", cyclic)
-    if cyclic:
+    start, limits, cost = options.start, options.limits, options.cost
+    require.flag("cyclic", options.cyclic)
+    if options.cyclic:
         words = "a standing motion cannot be cyclic; declare standing_problem with StandingSetup(end=...)"
-        raise ProblemError(words, name="cyclic", value=cyclic)
+        raise ProblemError(words, name="cyclic", value=options.cyclic)
     if cost is not None:
         require.instance("cost", cost, Weights)
     all_tasks = [part.task for part in bind(machine, tasks).bound]
@@ -79,13 +75,14 @@ def plan_to_stand(
         start_velocity=_rest(equations, 0.0),
         end_velocity=_rest(equations, duration),
         external=wrenches,
-        clearance_constraints=clearance_constraints,
+        clearance_constraints=constraints,
         symbols=ca.SX if _takes_scalars(equations) else ca.MX,
     )
-    options: dict[str, Any] = {"weights": cost, "limits": limits, "setup": setup}
-    queue = CandidateQueue(_StandingSolver(machine, all_tasks, duration, options, start is not None), PlannerSettings())
-    seeds = [Candidate(joints) for joints in _start_configurations(machine, all_tasks, start, limits, seed)]
-    for batch in [[candidate] for candidate in seeds] if search == "start" else [seeds]:
+    arguments: dict[str, Any] = {"weights": cost, "limits": limits, "setup": setup}
+    solver = _StandingSolver(machine, all_tasks, duration, arguments, start is not None)
+    queue = CandidateQueue(solver, PlannerSettings())
+    seeds = [Candidate(joints) for joints in _start_configurations(machine, all_tasks, start, limits, options.seed)]
+    for batch in [[candidate] for candidate in seeds] if options.search == "start" else [seeds]:
         queue.run(batch)
         if queue.passed:
             break
@@ -152,5 +149,6 @@ def _start_configurations(
     if not poses:
         words = "start is missing: no task gives the tip's pose at the start; give plan(..., start=...)"
         raise ProblemError(words, name="start")
-    solutions = inverse_kinematics(machine, poses, seed=seed, limits=limits is None or limits.joints)
+    options = IkOptions(limits=limits is None or limits.joints)
+    solutions = inverse_kinematics(machine, poses, seed=seed, options=options)
     return [solution.joints for solution in solutions]

@@ -156,18 +156,23 @@ class Candidate:
         return f"<Candidate from {start}: cost {self.cost:.6g}, {self.reason or 'the plan'}>"
 
     @classmethod
-    def of_record(cls, start: Any, cost: Any, stage: Any, reason: Any, solution: Solution | None) -> Candidate:
+    def of_record(cls, record: Sequence[Any], solution: Solution | None) -> Candidate:
         """Return the candidate of a plan file; its motion is the given solution unless it was rejected.
+
+        Args:
+            record: As `record` returns it; it is not trusted.
+            solution: Motion of the plan.
 
         Raises:
             KeyError, TypeError, ValueError: The record is damaged.
         """
+        start, cost, stage, reason = record
         rejection = None if reason is None else Reason.of_record(reason)
         motion = solution if rejection is None else None
         return cls(np.array(start, dtype=float), float(cost), rejection, Stage(stage), motion)
 
     def record(self) -> list[Any]:
-        """Return the arguments of `of_record`, except the solution, as data for a file."""
+        """Return start, cost, stage and reason, as a file holds them."""
         return [self.start.tolist(), self.cost, int(self.stage), self.reason and self.reason.record()]
 
     @property

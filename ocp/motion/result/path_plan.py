@@ -236,10 +236,7 @@ class PathPlan(Plan):
             breaks = tuple(int(number) for number in head["reconfigurations"])
             if not all(0 <= number < count - 1 for number in breaks):
                 raise ValueError(f"it reconfigures at waypoints that it has not: {breaks}")
-            candidates = tuple(
-                Candidate.of_record(start, cost, stage, reason, None)
-                for start, cost, stage, reason in head["candidates"]
-            )
+            candidates = tuple(Candidate.of_record(record, None) for record in head["candidates"])
             return cls(
                 machine=machine,
                 joints=values.pop("joints"),

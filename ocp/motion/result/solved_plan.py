@@ -203,10 +203,7 @@ class SolvedPlan(Plan):
             if request.builder:
                 solution = solution.tied_to(request.problem())
             parts = tuple(Part(float(a), float(b), str(suffix)) for a, b, suffix in head["parts"])
-            candidates = tuple(
-                Candidate.of_record(start, cost, stage, reason, solution)
-                for start, cost, stage, reason in head["candidates"]
-            )
+            candidates = tuple(Candidate.of_record(record, solution) for record in head["candidates"])
             bound = None if head["bound"] is None else float(head["bound"])
             targets = tuple(Target(rows[:, 0], rows[:, 1:4], rows[:, 4:].reshape(-1, 3, 3)) for rows in head["targets"])
             held = request.held if request.builder else {str(name): float(value) for name, value in head["held"]}

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from models.checks import Array
 from ocp.errors import ProblemError
 from ocp.motion.local.ik_solver import IkBranches, ik_branches
-from ocp.motion.local.inverse_kinematics import Unreachable, inverse_kinematics_at
+from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics_at
 from ocp.motion.search.joint_space import TOLERANCE, JointSpace
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.problem.values import Sampler
@@ -214,7 +214,7 @@ class SelfMotionManifolds:
             listed = projected[good & self.space.within(projected)]
             if len(listed) and solutions.complete.all():
                 return listed
-        options: dict[str, Any] = {"limits": limits, "seed": seed, "starts": self.settings.starts}
+        options: dict[str, Any] = {"options": IkOptions(limits=limits), "seed": seed, "starts": self.settings.starts}
         try:
             random = inverse_kinematics_at(self.equations, self.targets[index], **options)
         except Unreachable:

@@ -17,7 +17,13 @@ from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch, stretches_of
 from ocp.motion.local.collisions import Collision, distances_along
-from ocp.motion.local.inverse_kinematics import Unreachable, describe_miss, inverse_kinematics, inverse_kinematics_at
+from ocp.motion.local.inverse_kinematics import (
+    IkOptions,
+    Unreachable,
+    describe_miss,
+    inverse_kinematics,
+    inverse_kinematics_at,
+)
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.search.joint_space import all_turns, turning_joints, whole_turns_between, whole_turns_into
 from ocp.motion.tasks.equations import TaskEquations, bind
@@ -165,9 +171,10 @@ class PlanRequest:
         )
 
     @property
-    def ik_options(self) -> dict[str, Any]:
-        """Options of inverse kinematics."""
-        return {"seed": self.seed, "limits": self.limits.joints, "starts": self.settings.ik_starts}
+    def ik_arguments(self) -> dict[str, Any]:
+        """Arguments of inverse kinematics at the start."""
+        own = IkOptions(base=self.base, limits=self.limits.joints)
+        return {"seed": self.seed, "starts": self.settings.ik_starts, "options": own}
 
     @cached_property
     def bounds(self) -> JointBounds:
@@ -191,7 +198,7 @@ def start_configurations(request: PlanRequest) -> Array:
         words = "start is missing: no task gives the tip's pose at the start; give plan(..., start=...)"
         raise ProblemError(words, name="start")
     try:
-        solutions = inverse_kinematics(request.machine, first, base=request.base, **request.ik_options)
+        solutions = inverse_kinematics(request.machine, first, **request.ik_arguments)
     except Unreachable as error:
         raise locate_error(request, error, 0.0) from error
     joints = np.array([solution.joints for solution in solutions])
@@ -209,7 +216,7 @@ def start_collisions(
     if request.clearance_constraints is None or pairs == []:
         return [None] * len(configurations)
     scene, times = request.clearance_constraints.scene, np.zeros(len(configurations))
-    distances = distances_along(scene, request.base, configurations, times, scene.clearance, pairs=pairs)
+    distances = distances_along(scene, request.base, configurations, times, cutoff=scene.clearance, pairs=pairs)
     closest = zip(distances, distances.argmin(axis=1).tolist(), strict=True)
     collisions = [Collision(pair, scene.labels[pair], float(row[pair]), 0.0) for row, pair in closest]
     return [collision if collision.distance < scene.clearance else None for collision in collisions]
@@ -235,9 +242,9 @@ def count_clear_configurations(request: PlanRequest, time: float) -> int | Unrea
     tasks = [task for task in request.tasks if task.is_pose and task.begin <= time <= task.end]
     if request.clearance_constraints is None or not tasks or request.machine.base_size:
         return None
-    options: dict[str, Any] = {"scene": request.clearance_constraints.scene, "limits": request.limits.joints}
+    scene, own = request.clearance_constraints.scene, IkOptions(limits=request.limits.joints)
     try:
-        return len(inverse_kinematics(request.machine, tasks, time=time, seed=request.seed, **options))
+        return len(inverse_kinematics(request.machine, tasks, time=time, seed=request.seed, scene=scene, options=own))
     except Unreachable as error:
         return error
 
@@ -327,9 +334,9 @@ def _joints_at_new_poses(
     if not any(request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)):
         return joints
     tasks = [request.tasks[i] for i in sorted({*before.tasks, *stretch.tasks})]
-    options: dict[str, Any] = {"time": stretch.begin, "base": base[0], "near": joints, **request.ik_options}
+    own = {"near": joints, "options": IkOptions(base=base[0], limits=request.limits.joints)}
     try:
-        solutions = inverse_kinematics(request.machine, tasks, **options)
+        solutions = inverse_kinematics(request.machine, tasks, time=stretch.begin, **{**request.ik_arguments, **own})
     except Unreachable as error:
         if request.machine.base_size:  # the base may bring the pose into reach
             return joints
@@ -350,15 +357,13 @@ def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
     """Raise Unreachable if a pose that all motions miss is out of reach; only for a fixed base."""
     if request.machine.base_size:
         return
-    options = request.ik_options
+    limits, starts, seed = request.limits.joints, request.settings.ik_starts, request.seed
     for stretch, motion in zip(request.stretches, motions, strict=True):
-        tasks = [request.tasks[i] for i in stretch.tasks]
+        tasks, interval = [request.tasks[i] for i in stretch.tasks], (stretch.begin, stretch.end)
         poses = [task for task in tasks if task.is_pose and task.start_gap <= REACH_TOLERANCE]
-        if not poses:
-            continue
-        for time in np.unique(motion.worst_time[motion.pose_error > REACH_TOLERANCE]).tolist():
-            interval = stretch.begin, stretch.end
-            if (error := end_of_reach(request.machine, poses, interval, time, **options)) is not None:
+        for time in np.unique(motion.worst_time[motion.pose_error > REACH_TOLERANCE]).tolist() if poses else ():
+            error = end_of_reach(request.machine, poses, interval, time, limits=limits, starts=starts, seed=seed)
+            if error is not None:
                 assert error.time is not None
                 raise locate_error(request, error, error.time)
 
@@ -408,7 +413,7 @@ class _Reach:
     def unreachable_at(self, time: float, limits: bool) -> Unreachable | None:
         """Update the solutions to a time; return the error if there are none, else None."""
         targets = np.array(self._targets(time)).ravel()
-        options = {**self.options, "limits": limits, "tolerance": REACH.tolerance}
+        options = {**self.options, "options": IkOptions(limits=limits, tolerance=REACH.tolerance)}
         for starts in (0, self.options["starts"]):
             if not starts and not len(self.solutions):
                 continue
@@ -487,9 +492,7 @@ def end_of_reach(
 def _joint_at_limit(machine: Machine, joints: Array) -> tuple[str, dict[str, Any]]:
     """Describe the joint nearest to its limit, if limits end the reach; return words and error fields."""
     moving = machine.robot.moving_joints
-    limits = [
-        min((joint.lower, joint.upper), key=lambda x: abs(x - q)) for joint, q in zip(moving, joints, strict=True)
-    ]
+    limits = [min(joint.lower, joint.upper, key=lambda x: abs(x - q)) for joint, q in zip(moving, joints, strict=True)]
     nearest = int(np.abs(joints - limits).argmin())
     joint, unit = moving[nearest], "m" if moving[nearest].kind == "prismatic" else "rad"
     fields = {"name": joint.name, "value": float(joints[nearest]), "limit": float(limits[nearest])}

@@ -270,7 +270,7 @@ class _Propagation:
             valid &= better
             checked = np.flatnonzero(valid)
             times = np.full(len(checked), search.times[k])
-            distances = distances_along(search.scene, np.zeros(0), joints[checked], times, required).min(axis=1)
+            distances = distances_along(search.scene, np.zeros(0), joints[checked], times, cutoff=required).min(axis=1)
             clearances[checked] = np.minimum(np.minimum(clearances[checked], distances), required)
         valid &= clearances > self.clearance[k][charts]
         rows = charts[valid]

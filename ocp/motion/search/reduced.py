@@ -13,6 +13,7 @@ that turns it about the centre of mass.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -23,21 +24,21 @@ from numpy.typing import NDArray
 from models import FreeFloating, Machine, center_of_mass
 from models.checks import Array
 from models.spatial import rotation, rotation_from_quaternion
-from ocp.motion.local.inverse_kinematics import (
-    Unreachable,
-    equivalent_pose,
-    gauss_newton,
-    sample_starts,
-    unreachable_error,
-)
+from ocp.motion.local.inverse_kinematics import Unreachable, gauss_newton, sample_starts, unreachable_error
 from ocp.motion.search.joint_space import TOLERANCE
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.limits import JointBounds
-from ocp.motion.tasks.tip_task import TipTask
+from ocp.motion.tasks.tip_task import ANGULAR, TipTask, pose_in_reference
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["LimitSide", "ReducedKinematics", "TaskKinematics", "check_floating_reach", "limit_rates"]
+
+
+START_GAP = 1e-4
+"""Largest gap at the start of a pose task, m or rad, with which the task still holds its pose."""
+SIMPSON_STEPS = 400
+"""Steps of the integration of a velocity to a position."""
 
 
 class LimitSide(IntEnum):
@@ -316,7 +317,7 @@ def check_floating_reach(
         poses = []
         for task in tasks:
             if task.begin <= time <= task.end and (task.is_pose or not task.begin):
-                pose = equivalent_pose(machine, task, start, time, base=base)
+                pose = _equivalent_pose(machine, task, start, time, base=base)
                 poses += [] if pose is None else [pose]
         if not poses:
             return None
@@ -352,6 +353,31 @@ def check_floating_reach(
                 time, error = middle, unreachable_then
         error.time = time
         raise error
+
+
+def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, *, base: Any = ()) -> TipTask | None:
+    """Return a task as a pose task at a time; None if its pose depends on the path or has a start gap to close.
+
+    Args:
+        machine, task: The machine and its task.
+        start, base: Joints and base at the start.
+        time: Time since the begin of the task, s.
+    """
+    if task.is_pose:
+        return task if task.start_gap <= START_GAP else None
+    rows = [row for row in task.chosen if row not in ANGULAR]
+    if not rows or task.axes not in ("world", "reference") or (task.axes == "world") != (task.relative_to is None):
+        return None
+    equations = bind(machine, task)
+    times = np.linspace(0.0, time, SIMPSON_STEPS + 1)
+    values = np.array(equations.target_function().map(len(times))(times[None, :]))
+    weights = np.ones(SIMPSON_STEPS + 1)
+    weights[1:-1:2], weights[2:-1:2] = 4, 2
+    displacement = np.zeros(3)
+    velocities = values[[task.chosen.index(row) for row in rows]]
+    displacement[[row - 3 for row in rows]] = velocities @ weights * time / SIMPSON_STEPS / 3
+    origin, _ = pose_in_reference(equations.bound[0], ca.DM(base), ca.DM(start))
+    return replace(task, velocity=None, rows=rows, position=np.array(ca.DM(origin)).ravel() + displacement)
 
 
 def _base_about_center_of_mass(machine: FreeFloating, base: Array, start: Array, z: Any, time: float) -> Any:

@@ -465,10 +465,10 @@ def _violation(
         return np.asarray(excess)
     required, middle, base = scene.clearance + margin, candidates[:, candidates.shape[1] // 2], np.zeros(0)
     span = np.abs(candidates - middle[:, None]).max(axis=1) @ scene.levers.joints.T
-    distances = distances_along(scene, base, middle, times, required + float(span.max(initial=0.0)))
+    distances = distances_along(scene, base, middle, times, cutoff=required + float(span.max(initial=0.0)))
     close = np.flatnonzero((distances - span < required).any(axis=1))  # at the other samples all candidates are clear
     count = candidates.shape[1]
     joints, repeated_times = candidates[close].reshape(-1, candidates.shape[2]), np.repeat(times[close], count)
-    distances = distances_along(scene, base, joints, repeated_times, required)
+    distances = distances_along(scene, base, joints, repeated_times, cutoff=required)
     excess[close] += np.maximum(required - distances, 0.0).max(axis=1, initial=0.0).reshape(len(close), count)
     return np.asarray(excess)

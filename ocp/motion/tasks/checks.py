@@ -75,12 +75,12 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
         ModelWarning: Angles that look like degrees.
     """
     if joints is None:
-        words = "start_joints are missing; inverse_kinematics(machine, task) finds some for a pose"
-        raise ProblemError(words, name="start_joints")
-    positions = require.array("start_joints", joints, (machine.joint_size,), meaning="one entry for each joint")
+        words = "start is missing; inverse_kinematics(machine, task) finds some for a pose"
+        raise ProblemError(words, name="start")
+    positions = require.array("start", joints, (machine.joint_size,), meaning="one entry for each joint")
     for joint, angle in zip(machine.robot.moving_joints, positions, strict=True):
         if joint.kind != "prismatic":
-            warn_of_degrees(f"start_joints: joint {joint.name!r} at", angle, joint.name)
+            warn_of_degrees(f"start: joint {joint.name!r} at", angle, joint.name)
     home = machine.base_home() if base is None else base
     base_values = require.array("start_base", home, (machine.base_size,), meaning="the machine's base configuration")
     if machine.base_size == 7 and abs(np.linalg.norm(base_values[3:]) - 1) > 1e-9:
@@ -89,11 +89,13 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
     return positions, base_values
 
 
-def clip_to_limits(what: str, names: Sequence[str], joints: Array, lower: Array, upper: Array, hint: str) -> Array:
+def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
     """Return joints at an end of a motion, nan where free, with rounding errors beyond the limits clipped. Shape (n,).
 
     Args:
-        what: Name of the joints in errors, for example "end_joints".
+        joints, lower, upper: Joints, or their velocities, and the limits. Shape (n,).
+        label: Name of the joints in errors, for example "end_joints".
+        names: Names of the joints.
         hint: End of the error message: what to do.
 
     Raises:
@@ -105,8 +107,8 @@ def clip_to_limits(what: str, names: Sequence[str], joints: Array, lower: Array,
         )
         if value < low - CHECKS.rounding * size or value > high + CHECKS.rounding * size:
             at, least, greatest = format_distinct(value, low, high)
-            verb = "ends" if what.startswith("end") else "starts"
-            words = f"{what}: {name!r} {verb} at {at}, outside its limits {least} .. {greatest}; {hint}"
+            verb = "ends" if label.startswith("end") else "starts"
+            words = f"{label}: {name!r} {verb} at {at}, outside its limits {least} .. {greatest}; {hint}"
             raise ProblemError(words, name=name, value=value, limit=(low, high))
     return np.clip(joints, lower, upper)
 
@@ -121,14 +123,16 @@ def checked_weights(weights: Any, size: int) -> Array:
     return array
 
 
-def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon: float, *, start: bool = True) -> None:
+def checked_tasks(
+    equations: TaskEquations, base: Array, joints: Array, horizon: float, *, check_start: bool = True
+) -> None:
     """Raise ProblemError if tasks prescribe motions that the machine cannot make, or a jump at the start.
 
     Args:
         equations: Equations of the tasks.
         base, joints: Start configuration.
         horizon: End of the tasks, s; 1 for tasks of a path parameter.
-        start: Whether the pose at the start is checked.
+        check_start: Whether the pose at the start is checked.
     """
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(joints))
     rows = _rows_by_name(equations)
@@ -157,7 +161,7 @@ def checked_tasks(equations: TaskEquations, base: Array, joints: Array, horizon:
         words = f"the task's targets are not finite at {first:g} s"
         raise ProblemError(words, name="task", value=values[:, ~finite][:, 0], time=first)
     _check_rotations(equations, values, times)
-    if start:
+    if check_start:
         for part in equations.bound:
             if not part.task.is_pose:
                 continue

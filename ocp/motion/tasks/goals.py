@@ -48,6 +48,19 @@ class Start:
         joints = None if start.joints is None else checked_configuration(machine, start.joints, start.base)[0]
         return start, joints, base
 
+    @classmethod
+    def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
+        """Return a start, its checked joints (n,) and its base (base_size,).
+
+        Args:
+            value: A start with joints, or joints.
+
+        Raises:
+            ProblemError: The joints are missing; or as `checked_configuration`.
+        """
+        start = value if isinstance(value, cls) else cls(value)
+        return start, *checked_configuration(machine, start.joints, start.base)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Goal:

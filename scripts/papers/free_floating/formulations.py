@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from models import Machine, paper_example
-from ocp import Problem, TipTask, minimum_velocity_problem, resolve
+from ocp import Problem, RateOptions, TipTask, minimum_velocity_problem, resolve
 from ocp.direct.guess import Samples
 from ocp.motion.local.rates import LocalSolution, least_rates
 from ocp.motion.tasks.equations import bind
@@ -75,7 +75,9 @@ def damped_motion(machine: Machine, horizon: float, damping: float) -> LocalSolu
     """The damped pseudo-inverse motion, its damping relative to the singular values at the start."""
     jacobian = np.array(ca.DM(bind(machine, TASK).jacobian(machine.base_home(), START_JOINTS)))
     size = float(np.linalg.norm(jacobian)) / np.sqrt(len(ROWS))
-    return resolve(machine, TASK, START_JOINTS, horizon, damping=damping * size, tolerance=1e-8)
+    return resolve(
+        machine, TASK, horizon, start=START_JOINTS, options=RateOptions(damping=damping * size, tolerance=1e-8)
+    )
 
 
 def _begin_from(problem: Problem, local: LocalSolution, controls: dict[str, Any]) -> None:

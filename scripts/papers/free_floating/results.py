@@ -10,7 +10,7 @@ import numpy as np
 
 from models import FreeFloating, paper_example
 from models.checks import Array
-from ocp import Audit, Collocation, MultipleShooting, Problem, Solution, resolve, solve
+from ocp import Audit, Collocation, MultipleShooting, Problem, RateOptions, Solution, resolve, solve
 from scripts.papers.free_floating import extremals, false_optima
 from scripts.papers.free_floating.extremals import Search
 from scripts.papers.free_floating.false_optima import Trial
@@ -101,7 +101,7 @@ class Results:
 
 def pseudo_inverse(machine: FreeFloating, times: Array) -> Motion:
     """Motion (26) with u = 0 at given times."""
-    local = resolve(machine, TASK, START_JOINTS, times[-1], tolerance=1e-12, samples=times)
+    local = resolve(machine, TASK, times[-1], start=START_JOINTS, samples=times, options=RateOptions(tolerance=1e-12))
     if local.stopped:
         raise RuntimeError(f"the pseudo-inverse motion ends early: {local.stopped}")
     return motion_of_local(machine, local, TIP_VELOCITY, ROWS)

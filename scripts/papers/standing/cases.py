@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, TypeAlias
 
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from models import STANDING_STARTS, Standing, standing_example
 from models.machines.standing import External, StandingMotion, tip_spring
-from ocp import TipTask, resolve_accelerations
+from ocp import AccelerationOptions, TipTask, resolve_accelerations
 from ocp.motion.builders.standing.problem import motion_cost
-from ocp.motion.local.accelerations import Layer, Stabiliser
+from ocp.motion.local.accelerations import Law, Layer, Stabiliser
 from scripts.papers.run import Row
 from scripts.papers.standing.printed import printed_law
 
@@ -75,13 +75,15 @@ class Case:
     """A local law on one of the tasks.
 
     Attributes:
-        table: 1 or 2. title: For the reader. settings: Of resolve_accelerations.
+        table: 1 or 2. title: For the reader. law: The law.
+        options: Options of resolve_accelerations.
         spring: Whether the spring pulls at the tip. printed: Whether (22) is taken with the sign that is printed.
     """
 
     table: int
     title: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    law: Law = "pseudo_inverse"
+    options: AccelerationOptions = field(default_factory=AccelerationOptions)
     spring: bool = False
     printed: bool = False
 
@@ -122,28 +124,28 @@ JOINT_LIMITS = Layer("joint_limits", JOINT_LIMIT_DEMAND)
 MANIPULABILITY = Layer("manipulability", MANIPULABILITY_DEMAND)
 
 
-def _augmented(*layers: Layer) -> dict[str, Any]:
-    return {"law": "augmented", "layers": layers}
+def _augmented(table: int, title: str, *layers: Layer, spring: bool = False) -> Case:
+    return Case(table, title, "augmented", AccelerationOptions(layers=layers), spring=spring)
 
 
 LOCAL: Mapping[str, Mapping[str, Case]] = {
     "table1": {
         "pseudo_inverse": Case(1, "pseudo-inverse"),
-        "damped": Case(1, "pseudo-inverse, damped null space", {"null_damping": DAMPING}),
-        "augmented": Case(1, "ZMP pinned, augmented (20)", _augmented()),
-        "null_space": Case(1, "ZMP pinned, null space (22)", {"law": "null_space"}),
+        "damped": Case(1, "pseudo-inverse, damped null space", options=AccelerationOptions(null_damping=DAMPING)),
+        "augmented": _augmented(1, "ZMP pinned, augmented (20)"),
+        "null_space": Case(1, "ZMP pinned, null space (22)", "null_space"),
         "as_printed": Case(1, "(22) with the sign of C as printed", printed=True),
-        "joint_limits": Case(1, "ZMP and joint limits", _augmented(JOINT_LIMITS)),
-        "manipulability": Case(1, "ZMP and manipulability", _augmented(MANIPULABILITY)),
-        "all_layers": Case(1, "ZMP, joint limits, manipulability", _augmented(JOINT_LIMITS, MANIPULABILITY)),
-        "stabilised": Case(1, "ZMP pinned, stabilised", {"law": "stabilised", "stabiliser": STABILISER}),
+        "joint_limits": _augmented(1, "ZMP and joint limits", JOINT_LIMITS),
+        "manipulability": _augmented(1, "ZMP and manipulability", MANIPULABILITY),
+        "all_layers": _augmented(1, "ZMP, joint limits, manipulability", JOINT_LIMITS, MANIPULABILITY),
+        "stabilised": Case(1, "ZMP pinned, stabilised", "stabilised", AccelerationOptions(stabiliser=STABILISER)),
     },
     "table2": {
         "pseudo_inverse": Case(2, "pseudo-inverse, no spring"),
         "pseudo_inverse_spring": Case(2, "pseudo-inverse, spring", spring=True),
-        "augmented_spring": Case(2, "ZMP pinned, augmented, spring", _augmented(), spring=True),
+        "augmented_spring": _augmented(2, "ZMP pinned, augmented, spring", spring=True),
         "stabilised_spring": Case(
-            2, "ZMP pinned, stabilised, spring", {"law": "stabilised", "stabiliser": STABILISER}, spring=True
+            2, "ZMP pinned, stabilised, spring", "stabilised", AccelerationOptions(stabiliser=STABILISER), spring=True
         ),
     },
 }
@@ -187,11 +189,13 @@ def run_case(case: Case) -> Local:
         return Local(case, motion, motion, motion_cost(motion), gap, *fails(motion), None)
     external = spring() if case.spring else None
 
-    def run(**settings: Any) -> Any:
-        return resolve_accelerations(machine(), task, start, HORIZON, external=external, **settings)
+    def run(options: AccelerationOptions) -> Any:
+        return resolve_accelerations(
+            machine(), task, HORIZON, start=start, law=case.law, external=external, options=options
+        )
 
-    completed = run(**case.settings)
-    beyond = run(**case.settings, stop_at_lift_off=False) if completed.stopped else completed
+    completed = run(case.options)
+    beyond = run(replace(case.options, stop_at_lift_off=False)) if completed.stopped else completed
     reason, time = fails(completed.motion)
     if completed.stopped is not None and (completed.stopped.time <= time or reason == "joint_limit"):
         reason, time = completed.stopped.reason, completed.stopped.time
@@ -240,7 +244,7 @@ def layer_rows() -> list[Row]:
     ]
     rows: list[Row] = []
     for layers in trials:
-        result = run_case(Case(1, "", _augmented(*layers)))
+        result = run_case(_augmented(1, "", *layers))
         rows.append(
             {
                 "layers": "; ".join(f"{one.index} {one.form} {one.demand:g}" for one in layers) or "none",
@@ -259,7 +263,7 @@ def stabiliser_rows() -> list[Row]:
     for pole in (3.0, 3.5, 4.0, 5.0):
         for gain in (0.0, 1.0, 2.0):
             chosen = Stabiliser((pole, pole, pole), gradient=gain)
-            result = run_case(Case(1, "", {"law": "stabilised", "stabiliser": chosen}))
+            result = run_case(Case(1, "", "stabilised", AccelerationOptions(stabiliser=chosen)))
             motion = result.motion
             rows.append(
                 {

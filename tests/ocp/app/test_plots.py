@@ -59,7 +59,7 @@ def motion() -> SolvedPlan:
 
 @cache
 def local() -> LocalSolution:
-    return resolve(arm(), tasks=TASK, start_joints=START, horizon=1.0)
+    return resolve(arm(), TASK, 1.0, start=START)
 
 
 @cache

@@ -211,7 +211,7 @@ def test_the_pseudo_inverse_is_no_optimum_of_the_whole_motion(size: float, motio
     start, path, costlier = MOTIONS[motion]
     machine = planar([size] * len(start))
     task = TipTask(rows=(3, 4), velocity=size * np.array(path))
-    local = resolve(machine, task, start, 2.0)
+    local = resolve(machine, task, 2.0, start=start)
     assert local.stopped is None
     for bound in (None, 99.0):
         problem = minimum_velocity_problem(machine, task, 2.0, start=start)

@@ -220,7 +220,7 @@ def test_center_of_mass_moves_with_the_linear_momentum(machine: FreeFloating) ->
 
 
 def test_motion_of_a_local_solution_keeps_its_arrays(machine: FreeFloating) -> None:
-    local = resolve(machine, TipTask(rows=ROWS, velocity=TIP_VELOCITY), START_JOINTS, 1.0, samples=11)
+    local = resolve(machine, TipTask(rows=ROWS, velocity=TIP_VELOCITY), 1.0, start=START_JOINTS, samples=11)
     assert isinstance(local, LocalSolution)
     motion = motion_of_local(machine, local, TIP_VELOCITY, ROWS)
     assert motion.joint_accelerations.shape == (11, 3)

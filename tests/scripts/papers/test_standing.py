@@ -134,7 +134,7 @@ def test_with_the_sign_as_printed_the_machine_does_not_fall_and_its_index_is_not
 def test_the_printed_law_with_the_right_sign_is_the_null_space_law() -> None:
     task, start, horizon = table_task(1), STANDING_STARTS[1], 0.8
     ours, gap = printed_law(machine(), task, start, horizon, sign=1.0)
-    other = resolve_accelerations(machine(), task, start, horizon, law="null_space").motion
+    other = resolve_accelerations(machine(), task, horizon, start=start, law="null_space").motion
     assert gap < 1e-9
     np.testing.assert_allclose(ours.t, other.t, atol=1e-12)
     np.testing.assert_allclose(ours.joints, other.joints, atol=1e-9)

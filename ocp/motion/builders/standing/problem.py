@@ -215,7 +215,7 @@ def standing_problem(
     begin, base = checked_configuration(machine, start, None)
     bounds = limits.bounds(machine, ("velocity", "torque"))
     begin = start_inside(machine, begin, bounds.lower, bounds.upper)
-    check_rule(machine, zmp, duration)
+    check_rule(machine, duration, zmp)
     last = 1.0 if along_parameter else duration
     checked_tasks(equations, base, begin, last)
     check_freedom(
@@ -233,7 +233,7 @@ def standing_problem(
         demand = task_demand(equations, begin, along_parameter) if tip_level == "acceleration" else None
         least_force = limits.least_force(machine)
         check_loads(machine, begin, acting, zmp=zmp, least_force=least_force, bounds=bounds, demand=demand)
-    guess = local_guess(machine, equations, begin, duration, by_parameter=along_parameter, external=external)
+    guess = local_guess(machine, equations, duration, begin, by_parameter=along_parameter, external=external)
 
     problem = Problem("standing plan", symbols=setup.symbols)
     final = declare_horizon(problem, horizon)

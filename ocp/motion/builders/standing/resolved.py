@@ -252,7 +252,7 @@ def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> t
         if name in stance.other_feet
     ]
     tasks += [_swing_task(stance, swing, t[-1], clearance) for swing in swings]
-    local = resolve(stance, tasks=tasks, start_joints=joints, horizon=t[-1], samples=t)
+    local = resolve(stance, tasks, t[-1], start=joints, samples=t)
     if local.stopped is not None:
         words = f"phase {steps.names[k]!r}: the pseudo-inverse breaks down at {local.t[-1]:.4g} s: {local.stopped}"
         raise SolveError(words, name=steps.names[k], time=float(local.t[-1]))

@@ -20,7 +20,7 @@ from models.paths import rest_to_rest
 from models.robot.dynamics import Wrench
 from ocp.direct.guess import Samples
 from ocp.errors import ProblemError
-from ocp.motion.local.accelerations import resolve_accelerations
+from ocp.motion.local.accelerations import AccelerationOptions, resolve_accelerations
 from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.motion.tasks.limits import Following, IndexAtLeast, JointBounds, Pinned, ZmpRule, foot_edges
@@ -62,7 +62,8 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
         if not low < high:
             message = f"joint {name!r} cannot move between its limits {low:g} .. {high:g}: lock it there"
             raise ProblemError(message, name=name, value=float(value), limit=(low, high))
-    return clip_to_limits("start", machine.robot.joint_names, joints, lower, upper, "start inside them")
+    names = machine.robot.joint_names
+    return clip_to_limits(joints, lower, upper, label="start", names=names, hint="start inside them")
 
 
 def check_freedom(
@@ -224,8 +225,8 @@ def _least_violations(
 def local_guess(
     machine: Standing,
     equations: TaskEquations,
-    joints: Array,
     horizon: float,
+    joints: Array,
     *,
     by_parameter: bool,
     external: External | None,
@@ -237,10 +238,12 @@ def local_guess(
     times, still = np.zeros(1), np.zeros((1, joints.size))
     parts = [joints[None, :], still, still]
     try:
+        options = AccelerationOptions(
+            null_damping=STARTS.damping, stop_at_lift_off=False, speed_limit=STARTS.largest_speed
+        )
         local = resolve_accelerations(
-            machine, tasks, joints, horizon, null_damping=STARTS.damping, external=external,
-            step=horizon / STARTS.steps, stop_at_lift_off=False, speed_limit=STARTS.largest_speed,
-        ).motion  # fmt: skip
+            machine, tasks, horizon, start=joints, external=external, step=horizon / STARTS.steps, options=options
+        ).motion
     except ProblemError:  # task and start were checked: the start is singular, and a plan may still leave it
         pass
     else:

@@ -23,6 +23,7 @@ from models import (
     reference_tunnel,
 )
 from ocp import (
+    AccelerationOptions,
     Collocation,
     Cone,
     Cost,
@@ -31,6 +32,7 @@ from ocp import (
     FreeTime,
     Goal,
     Grasp,
+    IkOptions,
     IndexAtLeast,
     Indirect,
     InFoot,
@@ -39,8 +41,10 @@ from ocp import (
     Limits,
     Pinned,
     Problem,
+    RateOptions,
     Stabiliser,
     StancePhase,
+    Start,
     Steps,
     StepWeights,
     TipTask,
@@ -147,12 +151,12 @@ TASK: Bad = INSTANCE | {
 }
 REQUEST_VALUES: dict[str, Bad] = {
     "machine": INSTANCE | {"a robot": CHAIN},
-    "start_joints": array(3) | NOTHING,
+    "start": array(3) | NOTHING,
     "horizon": HORIZON,
     "weights": RATES,
     "start_base": but(BASE, "empty"),
 }
-ARGUMENTS = {"machine": ARM, "tasks": FORWARD, "start_joints": START, "horizon": 1.0}
+ARGUMENTS = {"machine": ARM, "tasks": FORWARD, "start": START, "horizon": 1.0}
 
 
 def with_setup_of(kind: Any, argument: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -162,8 +166,16 @@ def with_setup_of(kind: Any, argument: str, options: dict[str, Any]) -> dict[str
     return {argument: kind(**own)} | rest
 
 
+def with_start(options: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments in which the base and the velocities at the start are part of the start."""
+    names = {"start_base": "base", "start_velocities": "velocity"}
+    own = {names[name]: value for name, value in options.items() if name in names}
+    rest = {name: value for name, value in options.items() if name not in names}
+    return {**rest, "start": Start(rest["start"], **own)} if own else rest
+
+
 BUILT = {"machine": ARM, "tasks": FORWARD, "start": START, "horizon": 1.0}
-STOOD = {"machine": STANDING, "tasks": STILL, "start_joints": UP, "horizon": 0.2}
+STOOD = {"machine": STANDING, "tasks": STILL, "start": UP, "horizon": 0.2}
 EACH: Bad = LIMIT | {"one of them zero": [1.0, 0.0, 1.0], "table of words": [["a"]]}
 
 TASKS = [
@@ -259,7 +271,7 @@ TASKS = [
 VELOCITIES = [
     Case(
         "inverse_kinematics",
-        inverse_kinematics,
+        lambda **options: inverse_kinematics(**with_setup_of(IkOptions, "options", options)),
         {"machine": ARM, "task": HELD, "starts": 4, "near": START},
         {
             "machine": REQUEST_VALUES["machine"],
@@ -277,7 +289,7 @@ VELOCITIES = [
     ),
     Case(
         "resolve",
-        resolve,
+        lambda **options: resolve(**with_start(with_setup_of(RateOptions, "options", options))),
         {**ARGUMENTS, "samples": 5},
         {
             **REQUEST_VALUES,
@@ -295,17 +307,15 @@ VELOCITIES = [
         {
             "machine": ARM,
             "tasks": TipTask(rows=(3, 4), velocity=[0.1, 0.0]),
-            "start_joints": START,
+            "start": START,
             "horizon": 1.0,
             "samples": 5,
         },
-        {"tasks": TASK, "start_joints": array(3), "horizon": HORIZON},
+        {"tasks": TASK, "start": array(3), "horizon": HORIZON},
     ),
     Case(
         "resolve a pose",
-        lambda position: resolve(
-            ARM, tasks=TipTask(position=position, rows=(3, 4)), start_joints=START, horizon=1.0, samples=3
-        ),
+        lambda position: resolve(ARM, TipTask(position=position, rows=(3, 4)), 1.0, start=START, samples=3),
         {"position": REACHED},
         {"position": PLACE | {"elsewhere": [9.0, 9.0]}},
     ),
@@ -314,7 +324,7 @@ VELOCITIES = [
         lambda **options: minimum_velocity_problem(**with_setup_of(VelocitySetup, "setup", options)),
         BUILT,
         {
-            **{"start" if name == "start_joints" else name: bad for name, bad in REQUEST_VALUES.items()},
+            **REQUEST_VALUES,
             "tasks": TASK,
             "cyclic": FLAG,
             "limits": but(INSTANCE, "None"),
@@ -328,12 +338,12 @@ VELOCITIES = [
 STANDINGS = [
     Case(
         "resolve_accelerations",
-        resolve_accelerations,
+        lambda **options: resolve_accelerations(**with_start(with_setup_of(AccelerationOptions, "options", options))),
         {**STOOD, "step": 0.05},
         {
             "machine": REQUEST_VALUES["machine"] | {"bolted": ARM},
             "tasks": TASK,
-            "start_joints": array(3) | NOTHING,
+            "start": array(3) | NOTHING,
             "horizon": HORIZON,
             "law": CHOICE,
             "start_velocities": array(3),

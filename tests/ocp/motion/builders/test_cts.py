@@ -105,7 +105,7 @@ def test_the_plan_avoids_an_obstacle_by_its_free_roll() -> None:
 
 
 def course(cost: Any, t: Any, **options: Any) -> Any:
-    known = {"lower": -np.inf, "upper": np.inf, "start": None, "rate_weight": 1e-4, "acceleration_weight": 0.0}
+    known = {"lower": -np.inf, "upper": np.inf, "first_roll": None, "rate_weight": 1e-4, "acceleration_weight": 0.0}
     return least_cost_roll(lambda k, roll: cost(t[k], roll), t, **{**known, "rate_limit": np.inf, **options})
 
 
@@ -123,11 +123,11 @@ def test_a_course_goes_through_the_gap_that_costs_least_and_starts_where_it_must
         gap = (np.abs(roll - 1.5) < 0.3) | (np.abs(roll + 2.5) < 0.3)
         return 0.1 * roll**2 + np.where((np.abs(at - 5) < 1) & ~gap, 1e3, 0.0)
 
-    rolls = course(cost, t, start=-0.4, rate_limit=2.0, rate_weight=0.01)
+    rolls = course(cost, t, first_roll=-0.4, rate_limit=2.0, rate_weight=0.01)
     assert rolls[0] == -0.4
     assert (np.abs(rolls[np.abs(t - 5) < 1] - 1.5) < 0.3).all()
     assert np.abs(np.diff(rolls)).max() <= 2.0 * (t[1] - t[0]) + 1e-9
-    held = course(cost, t, start=-0.4, rate_weight=0.01, lower=-3.0, upper=1.0)
+    held = course(cost, t, first_roll=-0.4, rate_weight=0.01, lower=-3.0, upper=1.0)
     assert (np.abs(held[np.abs(t - 5) < 1] + 2.5) < 0.3).all()
     assert course(cost, t, lower=100.0, upper=106.0).min() >= 100.0
 

@@ -45,7 +45,7 @@ def chain() -> FixedBase:
 
 def resolved(machine: Machine, *, start: Any, **request: Any) -> LocalSolution:
     """The local motion under arguments of `minimum_velocity_problem`."""
-    return resolve(machine, start_joints=start, **request)
+    return resolve(machine, start=start, **request)
 
 
 def audited(machine: Machine, method: Collocation, /, **request: Any) -> Solution:
@@ -100,7 +100,7 @@ def test_the_papers_optimum_passes_its_audit_and_beats_the_pseudo_inverse() -> N
     solution = solve(paper_problem(), LEGENDRE)
     audit = solution.audit()
     assert audit.passed, str(audit)
-    local = resolve(paper_example(), TipTask(rows=(3, 4), velocity=(-1.0, -1.0)), PAPER_START, 5.0)
+    local = resolve(paper_example(), TipTask(rows=(3, 4), velocity=(-1.0, -1.0)), 5.0, start=PAPER_START)
     assert solution.cost < 0.6 * local.cost[-1]
 
 
@@ -131,7 +131,7 @@ def test_an_arm_on_a_fixed_base_does_better_than_instantly() -> None:
     solution = audited(machine, Collocation(intervals=20, degree=3), tasks=task, start=CHAIN_START, horizon=3.0)
     assert list(solution.states) == ["joints"]
     assert_does_its_task(machine, solution, lambda t: [-0.3 * np.cos(t), 0.3 * np.sin(2 * t)], [3, 4])
-    assert solution.cost < resolve(machine, task, CHAIN_START, 3.0).cost[-1] - 1e-5
+    assert solution.cost < resolve(machine, task, 3.0, start=CHAIN_START).cost[-1] - 1e-5
     np.testing.assert_allclose(solution.costate("joints")[-1], 0, atol=1e-4)
 
 
@@ -183,7 +183,7 @@ def test_a_velocity_from_an_interpolant_is_met() -> None:
 def test_the_guess_is_the_local_motion_in_steps_of_first_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four times as many steps leave a quarter of the difference. It is looked at before the first singular passage."""
     machine, errors = paper_example(), []
-    local = resolve(machine, TASK, PAPER_START, 5.0)
+    local = resolve(machine, TASK, 5.0, start=PAPER_START)
     for steps in (64, 256, 1024):
         monkeypatch.setattr(joint_motion, "GUESS_STEPS", steps)
         states = minimum_velocity_problem(
@@ -225,13 +225,13 @@ def test_a_singular_start_is_planned() -> None:
     assert minimum_velocity_problem(machine, task, 0.2, start=np.zeros(3)).declared.path["task"].size == 2
 
 
-@pytest.mark.parametrize(("changes", "message"), REFUSED)
+WRONG_BASE = {"setup": VelocitySetup(start_base=(0.0,) * 7)}, "start_base has shape .7,., expected .3,."
+
+
+@pytest.mark.parametrize(("changes", "message"), [*REFUSED, WRONG_BASE])
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    request = {"start" if name == "start_joints" else name: value for name, value in {**PAPER_TASK, **changes}.items()}
-    if "start_base" in request:
-        request["setup"] = VelocitySetup(start_base=request.pop("start_base"))
     with pytest.raises(ProblemError, match=message) as caught:
-        minimum_velocity_problem(paper_example(), **request)
+        minimum_velocity_problem(paper_example(), **{**PAPER_TASK, **changes})
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 

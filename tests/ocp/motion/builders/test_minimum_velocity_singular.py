@@ -51,7 +51,7 @@ def floating(pose: bool) -> tuple[FreeFloating, dict[str, Any], Array]:
 
 def check(machine: Machine, request: dict[str, Any], speed: Array, intervals: int) -> tuple[Solution, LocalSolution]:
     """The plan passes its audit, stays on its line and has no jump, and one on a finer mesh costs the same."""
-    local = resolve(machine, request["tasks"], request["start"], request["horizon"], samples=401)
+    local = resolve(machine, request["tasks"], request["horizon"], start=request["start"], samples=401)
     assert local.stopped is not None or local.manipulability.min() < 0.03 * local.manipulability[0]
     problem = minimum_velocity_problem(machine, **request)
     plan = refine(problem, Collocation(intervals=intervals, degree=4))

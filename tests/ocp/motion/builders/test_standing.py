@@ -12,6 +12,7 @@ import pytest
 from models import STANDING_STARTS, Standing, Support, rectangle
 from models.machines.standing import center_of_pressure, standing_motion
 from ocp import (
+    AccelerationOptions,
     Collocation,
     MultipleShooting,
     Problem,
@@ -171,11 +172,14 @@ def test_the_reported_cost_is_that_of_the_sampled_motion_and_local_laws_cost_mor
     costs = {}
     laws: dict[str, dict[str, Any]] = {
         "plain": {},
-        "damped": {"null_damping": 2.0},
-        "stabilised": {"law": "stabilised", "stabiliser": Stabiliser((3.5, 3.5, 3.5), gradient=1.8)},
+        "damped": {"options": AccelerationOptions(null_damping=2.0)},
+        "stabilised": {
+            "law": "stabilised",
+            "options": AccelerationOptions(stabiliser=Stabiliser((3.5, 3.5, 3.5), gradient=1.8)),
+        },
     }
     for name, law in laws.items():
-        result = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], HORIZON, step=1e-2, **law)
+        result = resolve_accelerations(machine(), table_task(1), HORIZON, start=STANDING_STARTS[1], step=1e-2, **law)
         costs[name] = motion_cost(result.motion)
         assert costs[name] > solution.cost
     assert costs["plain"] == pytest.approx(2.49, rel=0.01)
@@ -273,7 +277,7 @@ def test_a_spatial_arm_stands_where_the_local_method_tips(
     standing: Standing, task: TipTask, start: Any, external: Any, index: float
 ) -> None:
     horizon = ARM_HORIZON if standing is arm() else 1.0
-    local = resolve_accelerations(standing, task, start, horizon, external=external, step=2e-3).motion
+    local = resolve_accelerations(standing, task, horizon, start=start, external=external, step=2e-3).motion
     assert not local.stands
     assert local.index.min() < index
     limits = Limits(friction=0.7, acceleration=100.0)
@@ -388,7 +392,7 @@ def test_the_fastest_lift_holds_its_limits_between_the_points() -> None:
 def test_the_plan_stands_in_a_contact_simulation_and_the_pseudo_inverse_falls() -> None:
     plan = sampled(machine(), held(table_plan(1, IN_RANGE)))
     assert_stands(machine(), plan)
-    local = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], HORIZON, step=5e-3).motion
+    local = resolve_accelerations(machine(), table_task(1), HORIZON, start=STANDING_STARTS[1], step=5e-3).motion
     assert assert_tips(machine(), local, 0.3) == pytest.approx(6.17, abs=0.05)
 
 
@@ -397,7 +401,7 @@ def test_another_machine_stands_by_plan_and_tips_by_pseudo_inverse_in_a_contact_
     start, zmp = planar_start(5), InFoot(0.02)
     plan = sampled(standing, held(standing_problem(standing, task, PLANAR_HORIZON, start=start, zmp=zmp), 60))
     assert_stands(standing, plan)
-    local = resolve_accelerations(standing, task, start, PLANAR_HORIZON, step=5e-3).motion
+    local = resolve_accelerations(standing, task, PLANAR_HORIZON, start=start, step=5e-3).motion
     assert not local.stands
     assert_tips(standing, local, 0.15)
 

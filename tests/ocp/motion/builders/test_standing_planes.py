@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from models import Standing, Support, rectangle
 from models.paths import rest_to_rest
-from ocp import Collocation, ProblemError, Solution, TipTask, resolve_accelerations, solve
+from ocp import AccelerationOptions, Collocation, ProblemError, Solution, TipTask, resolve_accelerations, solve
 from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
 from ocp.motion.local.accelerations import Law
 from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, Limits, Pinned, ZmpRule
@@ -87,7 +87,12 @@ def test_plans_and_laws_are_the_same_in_every_vertical_plane() -> None:
         machine, task = turned(degrees)
         point = resting_point(machine)
         costs.append([planned(machine, task, zmp).cost for zmp in (InFoot(0.01), Pinned(point))])
-        matches = [resolve_accelerations(machine, task, START, 0.2, law=law, zmp=point, step=0.01) for law in LAWS]
+        matches = [
+            resolve_accelerations(
+                machine, task, 0.2, start=START, law=law, step=0.01, options=AccelerationOptions(zmp=point)
+            )
+            for law in LAWS
+        ]
         assert all(one.succeeded for one in matches)
         pushes.append([one.motion.joint_accelerations for one in matches])
         for one in matches:

@@ -118,7 +118,7 @@ def test_an_arm_holds_its_hand_level_where_the_local_method_tips(kind: str) -> N
     turn, _ = pose(arm(), (), ARM_START)
     turning = {kind: turn if kind == "orientation" else turn[:, 2]}
     task = moved_task(arm(), ARM_START, ASIDE, SWING, **turning)
-    local = resolve_accelerations(arm(), task, ARM_START, SWING, step=5e-3, external=tool).motion
+    local = resolve_accelerations(arm(), task, SWING, start=ARM_START, step=5e-3, external=tool).motion
     assert not local.stands
     solution = solve_standing(
         arm(), task, SWING, start=ARM_START, limits=Limits(zmp=InFoot(0.005)), setup=StandingSetup(external=tool)
@@ -138,7 +138,7 @@ def test_an_arm_holds_its_hand_level_where_the_local_method_tips(kind: str) -> N
 def test_two_arms_stand_where_the_local_method_tips() -> None:
     ahead = (0.2, 0.0, 0.1)
     tasks = two_tasks(ahead, ahead)
-    local = resolve_accelerations(two(), tasks, TWO_START, TWO_HORIZON, step=5e-3)
+    local = resolve_accelerations(two(), tasks, TWO_HORIZON, start=TWO_START, step=5e-3)
     assert local.tip_error.max() < 1e-8
     assert not local.motion.stands
     solution = solve_standing(two(), tasks, TWO_HORIZON, start=TWO_START, limits=Limits(zmp=InFoot(0.005)))

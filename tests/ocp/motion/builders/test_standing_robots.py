@@ -18,7 +18,7 @@ import pytest
 
 from models import ModelWarning, Robot, Standing, Wrench, rectangle, simplify, standing_example, with_load
 from models.machines.standing import StandingMotion
-from ocp import Collocation, ProblemError, Solution, resolve_accelerations, solve
+from ocp import AccelerationOptions, Collocation, ProblemError, Solution, resolve_accelerations, solve
 from ocp.motion.builders.standing.problem import standing_problem
 from ocp.motion.tasks.equations import task_errors
 from ocp.motion.tasks.limits import Anywhere, Limits, Pinned
@@ -132,8 +132,9 @@ def test_tiago_stands_where_instantaneous_resolution_tips_it(tiago: gallery.Resu
 def test_pinning_the_zero_moment_point_where_it_starts_makes_tiago_lift_off(tiago: gallery.Results) -> None:
     place = tiago.local.zero_moment_point[0]
     task = gallery.from_rest(gallery.circle(tiago.machine))
-    settings: dict[str, Any] = {"law": "augmented", "zmp": place, "external": tiago.external, "step": 5e-3}
-    result = resolve_accelerations(tiago.machine, task, gallery.START, gallery.SECONDS, **settings)
+    settings: dict[str, Any] = {"law": "augmented", "external": tiago.external, "step": 5e-3}
+    settings["options"] = AccelerationOptions(zmp=place)
+    result = resolve_accelerations(tiago.machine, task, gallery.SECONDS, start=gallery.START, **settings)
     assert result.stopped is not None
     assert result.stopped.reason == "lift_off"
 
@@ -160,7 +161,7 @@ def test_anymal_stands_where_instantaneous_resolution_tips_it(anymal: Peered, an
     machine = anymal.machine
     settings: dict[str, Any] = {"external": pushing.reaction(machine), "step": 1e-2}
     task = pushing.task(machine)
-    local = resolve_accelerations(machine, task, pushing.START, pushing.SECONDS, **settings).motion
+    local = resolve_accelerations(machine, task, pushing.SECONDS, start=pushing.START, **settings).motion
     assert not local.stands
     audit = anymal_solution.audit()
     assert audit.passed, str(audit)

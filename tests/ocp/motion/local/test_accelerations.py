@@ -10,7 +10,7 @@ from hypothesis import given, settings
 
 from models import STANDING_STARTS, FixedBase, ModelError, Standing, momentum
 from models.robot.kinematics import jacobian_manipulability, joint_limit_index
-from ocp import ProblemError, TipTask, resolve, resolve_accelerations
+from ocp import AccelerationOptions, ProblemError, Start, TipTask, resolve, resolve_accelerations
 from ocp.motion.local.accelerations import AccelerationSolution, Law, Layer, Stabiliser, accelerations
 from ocp.motion.tasks.equations import bind, task_errors
 from ocp.motion.tasks.tracks import pose_line, track_expression
@@ -42,19 +42,15 @@ from tests.ocp.motion.tasks.space_tasks import pose, turned
 def table(number: int, **settings: Any) -> AccelerationSolution:
     external = spring() if number == 2 else None
     start = STANDING_STARTS[number]
-    return resolve_accelerations(machine(), table_task(number), start, HORIZON, external=external, **settings)
+    return resolve_accelerations(machine(), table_task(number), HORIZON, start=start, external=external, **settings)
 
 
 def law(standing: Standing, task: TipTask, **settings: Any) -> Any:
     """(time, q, q') -> q'' of a law, the zero moment point at the most stable point."""
     n = standing.joint_size
-    time, q, qd = ca.SX.sym("time"), ca.SX.sym("q", n), ca.SX.sym("qd", n)
-    place = ca.DM(standing.most_stable_point)
-    return ca.Function(
-        "law",
-        [time, q, qd],
-        [accelerations(standing, bind(standing, task), time=time, q=q, qd=qd, zmp=lambda _: place, **settings)],
-    )
+    state = ca.SX.sym("time"), ca.SX.sym("q", n), ca.SX.sym("qd", n)
+    result = accelerations(standing, bind(standing, task), state=state, **settings)
+    return ca.Function("law", list(state), [result])
 
 
 def near(rng: np.random.Generator, start: Array) -> tuple[float, Array, Array]:
@@ -88,7 +84,7 @@ def test_pinning_the_zero_moment_point_lifts_off_although_its_index_is_1(name: A
 
 
 def test_carried_on_past_the_lift_off_it_diverges() -> None:
-    result = table(1, law="augmented", stop_at_lift_off=False)
+    result = table(1, law="augmented", options=AccelerationOptions(stop_at_lift_off=False))
     assert result.stopped is not None
     assert result.stopped.reason == "divergence"
     assert result.stopped.time == pytest.approx(1.26, abs=5e-3)
@@ -98,7 +94,8 @@ def test_carried_on_past_the_lift_off_it_diverges() -> None:
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_the_augmented_and_the_null_space_form_are_equal(number: int) -> None:
-    both = [table(number, law=name, stop_at_lift_off=False, speed_limit=5.0) for name in ("augmented", "null_space")]
+    options = AccelerationOptions(stop_at_lift_off=False, speed_limit=5.0)
+    both = [table(number, law=name, options=options) for name in ("augmented", "null_space")]
     for what in ("joints", "joint_velocities", "joint_accelerations"):
         matches = [getattr(solution.motion, what) for solution in both]
         np.testing.assert_allclose(matches[0], matches[1], rtol=0, atol=1e-9)
@@ -164,7 +161,7 @@ def printed_sequence(time: float, q0: Array, qd0: Array, delta: tuple[float, flo
 
 def test_layers_in_sequence_follow_the_corrected_printed_form_and_their_tasks() -> None:
     layers = (Layer("joint_limits", -0.3), Layer("manipulability", 0.2))
-    result = law(machine(), table_task(1), law="augmented", layers=layers)
+    result = law(machine(), table_task(1), law="augmented", options=AccelerationOptions(layers=layers))
     q, qd, qdd = (ca.SX.sym(name, 5) for name in ("q", "qd", "qdd"))
     second = []
     for name in ("joint_limits", "manipulability"):
@@ -212,7 +209,8 @@ def test_layers_accelerate_their_indices_as_requested(name: str) -> None:
         start = np.array([2.0, -1.4, 1.2, -0.4, -0.3, 0.2])
     tip = tip_at(standing, start)[[row - 3 for row in rows]]
     layers = (Layer("joint_limits", -0.4), Layer("manipulability", 0.1))
-    result = law(standing, led(lambda t: [tip[0] + 0.1 * ca.sin(t), tip[1]], rows), law="augmented", layers=layers)
+    task = led(lambda t: [tip[0] + 0.1 * ca.sin(t), tip[1]], rows)
+    result = law(standing, task, law="augmented", options=AccelerationOptions(layers=layers))
     middle, width = (standing.robot.lower + standing.robot.upper) / 2, standing.robot.upper - standing.robot.lower
 
     def indices(q: Array) -> Array:
@@ -231,7 +229,8 @@ def test_layers_accelerate_their_indices_as_requested(name: str) -> None:
 @pytest.mark.parametrize(("name", "sign"), [("joint_limits", -1.0), ("manipulability", 1.0)])
 def test_a_gradient_layer_improves_its_index_without_disturbing_the_tasks(name: Any, sign: float) -> None:
     plain = law(machine(), table_task(1), law="augmented")
-    driven = law(machine(), table_task(1), law="augmented", layers=(Layer(name, sign, "gradient"),))
+    options = AccelerationOptions(layers=(Layer(name, sign, "gradient"),))
+    driven = law(machine(), table_task(1), law="augmented", options=options)
     q, rng = ca.SX.sym("q", 5), np.random.default_rng(4)
     slope = ca.Function("slope", [q], [index_and_slope(q, name)[1]])
     for _ in range(5):
@@ -245,7 +244,7 @@ def test_a_gradient_layer_improves_its_index_without_disturbing_the_tasks(name: 
 
 @pytest.mark.parametrize("layer", [Layer("joint_limits", -0.1), Layer("manipulability", 0.05)])
 def test_the_layers_do_not_stop_the_pinned_pendulum_from_falling(layer: Layer) -> None:
-    result = table(1, law="augmented", layers=(layer,))
+    result = table(1, law="augmented", options=AccelerationOptions(layers=(layer,)))
     assert result.stopped is not None
     assert result.stopped.time < 2.0
 
@@ -263,7 +262,8 @@ def test_the_stabilised_law_stands_on_table_1() -> None:
 
 def test_slower_poles_ask_less_of_the_joints() -> None:
     """The page's 5.9 rad/s^2 is that of poles of 3.5 1/s: the peak stands at the start, where k1 alone decides."""
-    motion = table(1, law="stabilised", stabiliser=Stabiliser((3.5, 3.5, 3.5), gradient=1.0)).motion
+    stabiliser = Stabiliser((3.5, 3.5, 3.5), gradient=1.0)
+    motion = table(1, law="stabilised", options=AccelerationOptions(stabiliser=stabiliser)).motion
     assert motion.stands
     assert motion.stays_in_limits
     assert np.abs(motion.joint_accelerations).max() == pytest.approx(5.9, rel=0.05)
@@ -281,7 +281,12 @@ def test_the_stabilised_law_fails_on_table_2() -> None:
 def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_beyond_its_limits() -> None:
     """The pinned pendulum carried on past its lift-off, but stopped before it diverges; and tighter joint limits."""
     flies = resolve_accelerations(
-        machine(), table_task(1), STANDING_STARTS[1], 1.2, law="augmented", stop_at_lift_off=False
+        machine(),
+        table_task(1),
+        1.2,
+        start=STANDING_STARTS[1],
+        law="augmented",
+        options=AccelerationOptions(stop_at_lift_off=False),
     )
     assert flies.stopped is None
     assert flies.motion.index.min() == pytest.approx(1.0, abs=1e-9)
@@ -294,7 +299,9 @@ def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_b
               enumerate(standing.robot.joints)]  # fmt: skip
     joints[3] = replace(joints[3], lower=STANDING_STARTS[1][3] - 0.01, upper=STANDING_STARTS[1][3] + 0.01)
     narrow = replace(standing, robot=replace(standing.robot, joints=tuple(joints)))
-    perturbed = resolve_accelerations(narrow, table_task(1), STANDING_STARTS[1], HORIZON, law="stabilised", step=5e-3)
+    perturbed = resolve_accelerations(
+        narrow, table_task(1), HORIZON, start=STANDING_STARTS[1], law="stabilised", step=5e-3
+    )
     assert perturbed.stopped is None
     assert perturbed.motion.index.min() == pytest.approx(1.0, abs=1e-9)
     assert perturbed.motion.stands
@@ -305,10 +312,8 @@ def test_an_index_of_1_is_no_success_where_the_ground_would_pull_or_a_joint_is_b
 def test_a_tip_that_is_lost_by_long_steps_is_no_success() -> None:
     """Held still by a path that swings faster than the steps see."""
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
-    result = resolve_accelerations(
-        machine(), led(lambda t: [y, z + 0.02 * ca.sin(40 * t) ** 2]), STANDING_STARTS[1], 0.5,
-        step=0.05, null_damping=2.0,
-    )  # fmt: skip
+    swinging, options = led(lambda t: [y, z + 0.02 * ca.sin(40 * t) ** 2]), AccelerationOptions(null_damping=2.0)
+    result = resolve_accelerations(machine(), swinging, 0.5, start=STANDING_STARTS[1], step=0.05, options=options)
     assert result.tip_error.max() > 1e-3
     assert "leaves_path" in result.failures
 
@@ -326,7 +331,7 @@ def test_random_machines_stop_for_a_named_reason_or_reach_the_horizon_with_sound
     def path(t: Any) -> list[Any]:
         return [y + 0.1 * ca.sin(t) ** 2, z]
 
-    result = resolve_accelerations(standing, led(path), start, 1.0, law=law, step=1e-2)
+    result = resolve_accelerations(standing, led(path), 1.0, start=start, law=law, step=1e-2)
     motion = result.motion
     assert np.isfinite(np.hstack([motion.joints, motion.joint_velocities, motion.joint_accelerations])).all()
     if result.stopped is None:
@@ -353,24 +358,26 @@ def test_the_pinned_pendulum_obeys_its_equation() -> None:
 
 
 def test_null_space_damping_keeps_the_pseudo_inverse_inside_the_foot() -> None:
-    assert table(1, null_damping=2.0).motion.stands
+    assert table(1, options=AccelerationOptions(null_damping=2.0)).motion.stands
 
 
 def test_a_moving_reference_is_followed() -> None:
-    result = table(1, law="augmented", zmp=lambda t: [0.0, 0.05 * ca.sin(3 * t)])
+    options = AccelerationOptions(zmp=lambda t: [0.0, 0.05 * ca.sin(3 * t)])
+    result = table(1, law="augmented", options=options)
     t = result.motion.t[:500]
     np.testing.assert_allclose(result.motion.zero_moment_point[:500, 1], 0.05 * np.sin(3 * t), atol=1e-9)
 
 
 def test_both_integrators_agree_and_rk4_is_of_fourth_order() -> None:
-    reference = table(1, integrator="cvodes", step=0.05, tolerance=1e-12).motion.joints[-1]
+    accurate = AccelerationOptions(integrator="cvodes", tolerance=1e-12)
+    reference = table(1, step=0.05, options=accurate).motion.joints[-1]
     errors = [np.abs(table(1, step=step).motion.joints[-1] - reference).max() for step in (0.2, 0.1)]
     assert errors[1] < 1e-5
     assert 3.3 < np.log2(errors[0] / errors[1]) < 4.7
 
 
 def test_a_spatial_arm_with_a_wrench_at_the_tool_is_resolved_and_tips() -> None:
-    result = resolve_accelerations(arm(), arm_task(), ARM_START, ARM_HORIZON, external=tool, step=2e-3)
+    result = resolve_accelerations(arm(), arm_task(), ARM_HORIZON, start=ARM_START, external=tool, step=2e-3)
     assert result.stopped is None
     assert result.tip_error.max() < 1e-9
     assert result.motion.index.min() < -0.3
@@ -384,7 +391,9 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
     def path(t: Any) -> list[Any]:
         return [y + (1.8 - y) * t**2, z * (1 - t**2)]
 
-    result = resolve_accelerations(machine(), led(path), STANDING_STARTS[1], 1.0, stop_at_lift_off=False)
+    result = resolve_accelerations(
+        machine(), led(path), 1.0, start=STANDING_STARTS[1], options=AccelerationOptions(stop_at_lift_off=False)
+    )
     assert result.stopped is not None
     assert result.stopped.reason in ("divergence", "breakdown")
     assert np.isfinite(result.motion.joint_accelerations).all()
@@ -394,27 +403,27 @@ def test_an_arm_that_runs_into_a_singularity_breaks_down_or_diverges() -> None:
     ("changes", "message"),
     [
         ({"law": "magic"}, "law must be .* not 'magic'"),
-        ({"integrator": "euler"}, "integrator must be .* not 'euler'"),
         ({"step": 0.0}, "step must be positive"),
-        ({"speed_limit": -1.0}, "speed_limit must be positive"),
-        ({"null_damping": -1.0}, "null_damping must be"),
         ({"step": "short"}, "step must be positive"),
-        ({"layers": ("limits",)}, "layers must be a list of Layer"),
-        ({"law": "stabilised", "stabiliser": 3}, "stabiliser must be"),
-        ({"zmp": lambda t: t, "law": "augmented"}, "zmp must be two numbers"),
+        ({"options": AccelerationOptions(zmp=lambda t: t), "law": "augmented"}, "zmp must be two numbers"),
         ({"tasks": TipTask(velocity=(0.0, 0.0), rows=(1, 4))}, r"no joint moves the tip in rows \[1\]"),
-        ({"start_velocities": (1.0,)}, "start_velocities has shape .1,., expected .5,."),
-        ({"zmp": (0.0,)}, "zmp must be two numbers"),
+        ({"start": Start(STANDING_STARTS[1], velocity=(1.0,))}, "start: velocity has shape .1,., expected .5,."),
+        ({"start": None}, "start is missing"),
+        ({"options": {"zmp": (0.0, 0.0)}}, "options must be"),
+        ({"options": AccelerationOptions(zmp=(0.0,))}, "zmp must be two numbers"),
         ({"tasks": led(lambda t: [0.0, 0.5])}, "'link5' is .* away from where its task begins"),
         ({"tasks": led(lambda t: [0.0])}, r"position has shape \(1, 1\), expected \(3, 1\) or \(2, 1\)"),
         (
-            {"law": "stabilised", "layers": (Layer("joint_limits", -1.0), Layer("manipulability", 1.0))},
+            {
+                "law": "stabilised",
+                "options": AccelerationOptions(layers=(Layer("joint_limits", -1.0), Layer("manipulability", 1.0))),
+            },
             "needs 6 joints .* there are 5",
         ),
     ],
 )
 def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], message: str) -> None:
-    arguments = {"tasks": table_task(1), "start_joints": STANDING_STARTS[1], "horizon": 1.0, **changes}
+    arguments = {"tasks": table_task(1), "start": STANDING_STARTS[1], "horizon": 1.0, **changes}
     with pytest.raises(ProblemError, match=message) as caught:
         resolve_accelerations(machine(), **arguments)
     assert (caught.value.name or "unnamed") in str(caught.value)
@@ -428,6 +437,12 @@ def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], mess
         (lambda: Layer("joint_limits", np.nan), "demand must be a number"),
         (lambda: Stabiliser((4.0, 4.0, -1.0)), "three positive numbers"),
         (lambda: Stabiliser("fast"), "three positive numbers"),  # type: ignore[arg-type]
+        (lambda: AccelerationOptions(integrator="euler"), "integrator must be .* not 'euler'"),  # type: ignore[arg-type]
+        (lambda: AccelerationOptions(speed_limit=-1.0), "speed_limit must be positive"),
+        (lambda: AccelerationOptions(null_damping=-1.0), "null_damping must be"),
+        (lambda: AccelerationOptions(chunk=0), "chunk must be"),
+        (lambda: AccelerationOptions(layers=("limits",)), "layers must be a list of Layer"),  # type: ignore[arg-type]
+        (lambda: AccelerationOptions(stabiliser=3), "stabiliser must be"),  # type: ignore[arg-type]
         (lambda: Stabiliser(damping=-1.0), "damping must be a finite number, zero or above"),
     ],
 )
@@ -447,14 +462,14 @@ def test_options_that_cannot_be_right_are_refused(make: Any, message: str) -> No
 )
 def test_functions_without_wrenches_are_refused(external: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], 1.0, external=external)
+        resolve_accelerations(machine(), table_task(1), 1.0, start=STANDING_STARTS[1], external=external)
 
 
 def test_a_force_that_is_no_number_breaks_the_motion_down() -> None:
     def push(time: Any, tip: Any) -> Any:
         return [machine().tip_wrench((0, 0, ca.sqrt(0.1 - time)))]
 
-    result = resolve_accelerations(machine(), table_task(1), STANDING_STARTS[1], 0.3, external=push, step=0.01)
+    result = resolve_accelerations(machine(), table_task(1), 0.3, start=STANDING_STARTS[1], external=push, step=0.01)
     assert result.stopped is not None
     assert result.stopped.reason == "breakdown"
     assert result.stopped.time == pytest.approx(0.11)
@@ -467,8 +482,8 @@ def test_a_pose_that_fixes_all_joints_determines_the_motion() -> None:
     goal = rotation @ turned((1, 2, 0.5), 0.4), position + np.array([0.02, 0.15, -0.1])
     line = pose_line((rotation, position), goal, 1.0)
     task = TipTask(position=line.position, orientation=line.orientation)
-    slow = resolve(FixedBase(six().robot), tasks=task, start_joints=SIX_START, horizon=1.0, samples=11)
-    fast = resolve_accelerations(six(), task, SIX_START, 1.0, step=0.01)
+    slow = resolve(FixedBase(six().robot), task, 1.0, start=SIX_START, samples=11)
+    fast = resolve_accelerations(six(), task, 1.0, start=SIX_START, step=0.01)
     assert fast.tip_error.max() < 1e-8
     np.testing.assert_allclose(fast.motion.joints[::10], slow.joints, atol=1e-7)
     np.testing.assert_allclose(fast.motion.joint_velocities[::10], slow.joint_rates, atol=1e-6)
@@ -478,7 +493,7 @@ def test_the_feedback_of_accelerations_closes_a_gap_critically_damped() -> None:
     """e'' + 2 g e' + g^2 e = 0 from rest: e = e0 (1 + g t) exp(-g t)."""
     _, y, z = tip_at(machine(), STANDING_STARTS[1])
     task = TipTask(position=(y + 0.003, z - 0.004), rows=ROWS, gain=3.0, start_gap=0.01)
-    result = resolve_accelerations(machine(), task, STANDING_STARTS[1], 1.0, step=0.01)
+    result = resolve_accelerations(machine(), task, 1.0, start=STANDING_STARTS[1], step=0.01)
     expected = 0.005 * (1 + 3 * result.motion.t) * np.exp(-3 * result.motion.t)
     np.testing.assert_allclose(result.tip_error, expected, atol=1e-9)
 
@@ -486,7 +501,7 @@ def test_the_feedback_of_accelerations_closes_a_gap_critically_damped() -> None:
 def test_two_tips_are_led_at_once() -> None:
     """A hand that is told nothing moves with the body; both stay on their paths where both are told."""
     tasks = two_tasks((0.1, 0.0, 0.1), (0.0, -0.1, 0.0))
-    one, both = (resolve_accelerations(two(), some, TWO_START, 0.5, step=0.01) for some in (tasks[0], tasks))
+    one, both = (resolve_accelerations(two(), some, 0.5, start=TWO_START, step=0.01) for some in (tasks[0], tasks))
     np.testing.assert_allclose(both.tip_error, 0, atol=1e-8)
     errors = task_errors(two(), tasks, one.motion.t, one.motion.joints)
     assert np.abs(errors[:, :3]).max() < 1e-8

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from models import FixedBase, lock_joints
 from models.checks import Array
-from ocp import ProblemError, TipTask, inverse_kinematics
+from ocp import IkOptions, ProblemError, TipTask, inverse_kinematics
 from ocp.motion.local.chain import Chain, Motion
 from ocp.motion.local.elimination import Elimination, elimination_of, solve_opening
 from ocp.motion.local.ik_solver import IkSolver, Incompleteness, ToolFreedom, ik_configurations
@@ -56,7 +56,7 @@ def dense_search(machine: FixedBase, position: Array, rotation: Array, starts: i
     """Configurations that damped Gauss-Newton iterations from many random starts find."""
     equations = bind(machine, TipTask(position=position, orientation=rotation))
     targets = np.concatenate([position, np.zeros(3), rotation.T.ravel(), np.zeros(3)])
-    solutions = inverse_kinematics_at(equations, targets, starts=starts, seed=0, limits=False)
+    solutions = inverse_kinematics_at(equations, targets, starts=starts, seed=0, options=IkOptions(limits=False))
     return np.array([solution.joints for solution in solutions])
 
 
@@ -295,7 +295,9 @@ def test_inverse_kinematics_lists_all_solutions_of_the_solver() -> None:
         expected = IkSolver(machine, limits=False)(positions, rotations)
         for k in range(4):
             task = TipTask(position=positions[k], orientation=rotations[k])
-            joints = np.array([each.joints for each in inverse_kinematics(machine, task, limits=False)])
+            joints = np.array(
+                [each.joints for each in inverse_kinematics(machine, task, options=IkOptions(limits=False))]
+            )
             apart = distances(expected.at(k), joints, revolute(machine))
             assert apart.shape[0] == apart.shape[1]
             assert apart.min(axis=1).max() < 1e-7

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Machine, Path, planar_chain, smooth
-from ocp import TipTask, inverse_kinematics, resolve
+from ocp import RateOptions, TipTask, inverse_kinematics, resolve
 from ocp.motion.local.rates import LocalMotion, track_tasks
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.trees import Array, numeric
@@ -70,7 +70,7 @@ def test_the_cost_is_the_one_of_the_least_rates_at_every_time() -> None:
     weights = np.array([9.0, 1, 1, 4, 1, 1, 0.5])
     result = followed(panda(), task(), start[None], steps=256, weights=weights)
     horizon = task().duration
-    local = resolve(panda(), tasks=task(), start_joints=start, horizon=horizon, weights=weights, samples=401)
+    local = resolve(panda(), task(), horizon, start=start, samples=401, options=RateOptions(weights=weights))
     assert local.stopped is None
     effort = 0.5 * np.trapezoid((np.asarray(local.joint_rates) ** 2) @ weights, local.t)
     assert result.cost[0] == pytest.approx(effort, rel=2e-3)
@@ -150,7 +150,7 @@ def test_a_floating_base_goes_where_its_momentum_says(momentum: Any) -> None:
     line = smooth(Path.through([place, place + np.array([0.05, -0.08, 0.06])]), deviation=0.01)
     request = TipTask.along(line, 0.05)
     result = followed(machine, request, PANDA_START[None], steps=256)
-    local = resolve(machine, tasks=request, start_joints=PANDA_START, horizon=request.duration, samples=257)
+    local = resolve(machine, request, request.duration, start=PANDA_START, samples=257)
     assert result.pose_error[0] < 1e-6
     np.testing.assert_allclose(result.base[0, -1], local.base[-1], atol=2e-4)
     np.testing.assert_allclose(result.joints[0, -1], local.joints[-1], atol=2e-4)

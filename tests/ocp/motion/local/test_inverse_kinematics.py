@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Link, Machine, Robot, planar_chain
-from ocp import ProblemError, TipTask, Unreachable, inverse_kinematics
+from ocp import IkOptions, ProblemError, TipTask, Unreachable, inverse_kinematics
 from ocp.motion.local.inverse_kinematics import inverse_kinematics_at
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.trees import seeds
@@ -72,7 +72,11 @@ def test_random_starts_make_up_for_samples_outside_narrow_limits() -> None:
 @pytest.mark.parametrize("limits", [True, False])
 def test_iterations_from_equations_and_targets_reach_the_poses(limits: bool) -> None:
     """Again and again with one set of functions."""
-    rng, options, robot = np.random.default_rng(3), dict[str, Any](starts=8, limits=limits), panda().robot
+    rng, options, robot = (
+        np.random.default_rng(3),
+        dict[str, Any](starts=8, options=IkOptions(limits=limits)),
+        panda().robot,
+    )
     equations = None
     for seed in range(3):
         rotation, position = pose(panda(), (), rng.uniform(robot.lower, robot.upper))
@@ -114,7 +118,9 @@ def test_reachable_poses_are_solved_within_the_limits(seed: int, free_roll: bool
 def test_the_base_may_float_and_two_arms_may_hold_one_thing() -> None:
     machine = floating_panda()
     rotation, position = pose(machine, BASE, PANDA_START)
-    best = inverse_kinematics(machine, TipTask(position=position, orientation=rotation), base=BASE)[0]
+    best = inverse_kinematics(machine, TipTask(position=position, orientation=rotation), options=IkOptions(base=BASE))[
+        0
+    ]
     np.testing.assert_allclose(pose(machine, BASE, best.joints)[1], position, atol=1e-9)
     both = two_pandas()
     tasks = [
@@ -155,7 +161,7 @@ def test_limits_refuse_forbidden_poses_and_name_the_joint() -> None:
     task = TipTask(position=(np.cos(1.0), np.sin(1.0), 0.0), rows=(3, 4))
     with pytest.raises(Unreachable, match=r"\['hinge'\] at their limits"):
         inverse_kinematics(machine, task)
-    assert inverse_kinematics(machine, task, limits=False)[0].joints[0] == pytest.approx(1.0)
+    assert inverse_kinematics(machine, task, options=IkOptions(limits=False))[0].joints[0] == pytest.approx(1.0)
 
 
 def test_an_orientation_half_a_turn_away_is_no_solution() -> None:
@@ -173,7 +179,7 @@ def test_an_orientation_half_a_turn_away_is_no_solution() -> None:
         (TipTask(rows=(3,), velocity=(0.0,)), {}, "need a pose"),
         (POINT, {"starts": -1}, "starts must be a whole number"),
         (POINT, {"starts": 0}, "no start"),
-        (POINT, {"tolerance": 0.0}, "tolerance must be positive"),
+        (POINT, {"options": {"tolerance": 1e-6}}, "options must be"),
         (POINT, {"near": (0.0, 0.0)}, r"near has shape \(1, 2\)"),
         (TipTask(position=(0.0, 0.0, np.nan)), {}, "position .* not finite"),
         (TipTask(position=(0.0, 0.0)), {}, r"position has shape \(2, 1\)"),
@@ -186,3 +192,17 @@ def test_requests_that_cannot_be_right_are_refused(task: Any, changes: dict[str,
     with pytest.raises(ProblemError, match=message) as caught:
         inverse_kinematics(ur5(), task, **changes)
     assert (caught.value.name or "unnamed") in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"apart": -1.0}, "apart must be positive"),
+        ({"iterations": 0}, "iterations must be a whole number"),
+        ({"limits": "no"}, "limits must be"),
+    ],
+)
+def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        IkOptions(**options)

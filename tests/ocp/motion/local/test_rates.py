@@ -5,12 +5,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from models import FixedBase, FreeFloating, Machine, paper_example, planar_chain
-from ocp import ProblemError, TipTask, resolve
+from ocp import ProblemError, RateOptions, Start, TipTask, resolve
 from ocp.motion.local.rates import LocalSolution, least_rates
 from tests.models.robot.trees import Array, numeric, random_base, random_robot, seeds, seven_joint_arm
 
@@ -31,7 +31,7 @@ def assert_identical_law(
 def test_the_papers_pseudo_inverse_peaks_are_reproduced() -> None:
     """Peaks refined on a grid of 0.1 ms; reference: an independent simulation by RK4, 1 ms."""
     dense = np.concatenate([[0.0], np.linspace(2.9, 3.2, 3001), [3.5]])
-    local = resolve(paper_example(), TipTask(rows=(3, 4), velocity=(-1.0, -1.0)), PAPER_START, 3.5, samples=dense)
+    local = resolve(paper_example(), TipTask(rows=(3, 4), velocity=(-1.0, -1.0)), 3.5, start=PAPER_START, samples=dense)
     assert local.stopped is None
     degrees = np.rad2deg(local.joint_rates)
     for joint, (peak, at) in enumerate([(153.73, 3.044), (66.97, 2.996), (-109.08, 3.043)]):
@@ -46,7 +46,7 @@ def test_the_papers_pseudo_inverse_peaks_are_reproduced() -> None:
 def test_the_tip_follows_its_velocity_and_the_momentum_stays_zero() -> None:
     machine = paper_example()
     local = resolve(
-        machine, TipTask(rows=(3, 4), velocity=lambda t: [-ca.cos(t), -1 + 0.2 * t]), PAPER_START, 2.0, samples=41
+        machine, TipTask(rows=(3, 4), velocity=lambda t: [-ca.cos(t), -1 + 0.2 * t]), 2.0, start=PAPER_START, samples=41
     )
     t = local.t
     moved = local.tip_in_world - local.tip_in_world[0]
@@ -62,7 +62,7 @@ def test_all_six_rows_of_a_spatial_machine_on_a_floating_base_are_followed() -> 
     start = np.array([0.3, 0.6, -0.2, 1.2, 0.4, 0.9, -0.3])
     velocity = np.array([0.05, -0.02, 0.04, 0.05, -0.05, 0.03])
     rows = list(range(6))
-    local = resolve(machine, TipTask(rows=rows, velocity=velocity), start, 1.0, samples=11)
+    local = resolve(machine, TipTask(rows=rows, velocity=velocity), 1.0, start=start, samples=11)
     assert local.stopped is None
     assert_identical_law(machine, local, rows, lambda _: velocity, 0.0)
     np.testing.assert_allclose(local.tip_in_world[-1] - local.tip_in_world[0], velocity[3:], atol=1e-8)
@@ -83,14 +83,15 @@ def test_the_rates_are_those_of_the_damped_pseudo_inverse(seed: int, damping: fl
     machine: Any = FixedBase(robot) if kind == "fixed" else FreeFloating(robot, kind)  # type: ignore[arg-type]
     base = None if kind == "fixed" else random_base(rng, machine.base)
     start, speed = rng.normal(size=machine.joint_size), float(rng.normal())
+    jacobian = numeric(machine.tip_jacobian(np.zeros(0) if base is None else base, start))
+    assume(np.abs(jacobian[3]).max() > 1e-6)  # some random arms do not move their tip along x
     local = resolve(
         machine,
         TipTask(rows=(3,), velocity=lambda t: speed * ca.cos(t)),
-        start,
         0.2,
-        start_base=base,
-        damping=damping,
+        start=Start(start, base=base),
         samples=4,
+        options=RateOptions(damping=damping),
     )
     assert_identical_law(machine, local, [3], lambda t: np.array([speed * np.cos(t)]), damping)
     np.testing.assert_allclose(local.joints[0], start)
@@ -108,14 +109,20 @@ def test_the_motion_agrees_with_another_integrator_and_improves_with_the_toleran
     reference = solve_ivp(rate, (0, 1.5), start, method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1]
     errors = []
     for tolerance in (1e-4, 1e-7, 1e-10):
-        local = resolve(machine, TipTask(rows=(3, 4), velocity=(-1, -1)), PAPER_START, 1.5, tolerance=tolerance)
+        local = resolve(
+            machine,
+            TipTask(rows=(3, 4), velocity=(-1, -1)),
+            1.5,
+            start=PAPER_START,
+            options=RateOptions(tolerance=tolerance),
+        )
         errors.append(np.abs(np.concatenate([local.base[-1], local.joints[-1]]) - reference).max())
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 1e-8
 
 
 def test_the_cost_is_half_the_squared_rates_integrated() -> None:
-    local = resolve(paper_example(), TipTask(rows=(3, 4), velocity=(-1, -1)), PAPER_START, 2.0, samples=2001)
+    local = resolve(paper_example(), TipTask(rows=(3, 4), velocity=(-1, -1)), 2.0, start=PAPER_START, samples=2001)
     running = (local.joint_rates**2).sum(axis=1) / 2
     steps = (running[1:] + running[:-1]) / 2 * np.diff(local.t)
     np.testing.assert_allclose(local.cost, np.concatenate([[0], np.cumsum(steps)]), atol=1e-6)
@@ -123,10 +130,12 @@ def test_the_cost_is_half_the_squared_rates_integrated() -> None:
 
 def test_interpolation_is_exact_at_the_samples_and_of_fourth_order_between() -> None:
     machine = paper_example()
-    fine = resolve(machine, TipTask(rows=(3, 4), velocity=(-1, -1)), PAPER_START, 2.0, samples=np.linspace(0, 2, 161))
+    fine = resolve(
+        machine, TipTask(rows=(3, 4), velocity=(-1, -1)), 2.0, start=PAPER_START, samples=np.linspace(0, 2, 161)
+    )
     errors = []
     for count in (11, 21):
-        coarse = resolve(machine, TipTask(rows=(3, 4), velocity=(-1, -1)), PAPER_START, 2.0, samples=count)
+        coarse = resolve(machine, TipTask(rows=(3, 4), velocity=(-1, -1)), 2.0, start=PAPER_START, samples=count)
         np.testing.assert_allclose(coarse.at(coarse.t[3])["joints"], coarse.joints[3], atol=1e-15)
         np.testing.assert_allclose(coarse.at(coarse.t[3])["joint_rates"], coarse.joint_rates[3], atol=1e-15)
         values = np.array([np.concatenate([coarse.at(t)["base"], coarse.at(t)["joints"]]) for t in fine.t])
@@ -140,7 +149,7 @@ def test_an_arm_that_runs_out_of_reach_stops_there_and_says_why() -> None:
     """Two links of 1 m from x = 1 m outwards at 1 m/s: stretched, and singular, after 1 s."""
     machine = FixedBase(planar_chain([1.0, 1.0], [1.0, 1.0]))
     start = np.deg2rad([60.0, -120.0])
-    local = resolve(machine, TipTask(rows=(3, 4), velocity=(1.0, 0.0)), start, 5.0)
+    local = resolve(machine, TipTask(rows=(3, 4), velocity=(1.0, 0.0)), 5.0, start=start)
     assert local.stopped is not None
     assert "singular" in local.stopped
     assert 0.97 <= local.t[-1] < 1.0
@@ -148,7 +157,9 @@ def test_an_arm_that_runs_out_of_reach_stops_there_and_says_why() -> None:
     for values in (local.joints, local.joint_rates, local.manipulability, local.cost):
         assert len(values) == len(local.t)
         assert np.isfinite(values).all()
-    damped = resolve(machine, TipTask(rows=(3, 4), velocity=(1.0, 0.0)), start, 5.0, damping=0.1)
+    damped = resolve(
+        machine, TipTask(rows=(3, 4), velocity=(1.0, 0.0)), 5.0, start=start, options=RateOptions(damping=0.1)
+    )
     assert damped.stopped is None
     assert damped.t[-1] == 5.0
     assert np.linalg.norm(damped.tip_in_world[-1]) <= 2.0
@@ -158,7 +169,7 @@ def test_a_velocity_from_an_interpolant_is_taken() -> None:
     knots = np.linspace(0, 2, 9)
     table = ca.interpolant("table", "bspline", [knots], np.sin(knots))
     local = resolve(
-        paper_example(), TipTask(rows=(3, 4), velocity=lambda t: ca.vertcat(table(t), -0.3)), PAPER_START, 2.0
+        paper_example(), TipTask(rows=(3, 4), velocity=lambda t: ca.vertcat(table(t), -0.3)), 2.0, start=PAPER_START
     )
     travelled = np.trapezoid(np.array(table(local.t)).ravel(), local.t)
     assert local.tip_in_world[-1, 0] - local.tip_in_world[0, 0] == pytest.approx(travelled, abs=1e-5)
@@ -180,8 +191,8 @@ def test_a_velocity_from_an_external_function_is_taken() -> None:
     local = resolve(
         paper_example(),
         TipTask(rows=(3, 4), velocity=lambda t: ca.vertcat(external(t), 0)),
-        PAPER_START,
         1.0,
+        start=PAPER_START,
         samples=5,
     )
     moved = local.tip_in_world - local.tip_in_world[0]
@@ -203,7 +214,7 @@ def velocity_task(velocity: Any, rows: tuple[int, ...] = (3, 4)) -> dict[str, An
     return {"tasks": TipTask(rows=rows, velocity=velocity)}
 
 
-PAPER_TASK: dict[str, Any] = {**velocity_task((-1.0, -1.0)), "start_joints": PAPER_START, "horizon": 1.0}
+PAPER_TASK: dict[str, Any] = {**velocity_task((-1.0, -1.0)), "start": PAPER_START, "horizon": 1.0}
 REFUSED: list[tuple[dict[str, Any], str]] = [
     (velocity_task((0.0,) * 4, (0, 1, 3, 4)), "fixes 4 rows .* only 3 joints"),
     (velocity_task((0.0, 0.0), (0, 3)), r"rows \[0, 3\]: no joint moves the tip in rows \[0\]"),
@@ -211,10 +222,9 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     (velocity_task((1.0, np.nan)), "velocity .* not finite"),
     (velocity_task(lambda t: [t, ca.SX.sym("stranger")]), r"depends on \['stranger'\]"),
     (velocity_task(lambda t: "fast"), "velocity gives 'fast'"),
-    ({"start_joints": (0.0, 1.0)}, "start_joints has shape .2,., expected .3,."),
-    ({"start_joints": (0.0, 1.0, np.inf)}, "start_joints .* not finite"),
-    ({"start_joints": "home"}, "start_joints 'home' is not numeric"),
-    ({"start_base": (0.0,) * 7}, "start_base has shape .7,., expected .3,."),
+    ({"start": (0.0, 1.0)}, "start has shape .2,., expected .3,."),
+    ({"start": (0.0, 1.0, np.inf)}, "start .* not finite"),
+    ({"start": "home"}, "start 'home' is not numeric"),
     ({"horizon": 0.0}, "horizon must be positive and finite"),
     ({"horizon": np.inf}, "horizon must be positive and finite"),
 ]
@@ -225,9 +235,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ("changes", "message"),
     [
         *REFUSED,
-        ({"start_joints": (0.0, 0.0, 0.0)}, r"rows \[3, 4\] is singular at the start"),
-        ({"damping": -1.0}, "damping must be a finite number"),
-        ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"start": (0.0, 0.0, 0.0)}, r"rows \[3, 4\] is singular at the start"),
+        ({"start": Start(PAPER_START, base=(0.0,) * 7)}, "start_base has shape .7,., expected .3,."),
+        ({"start": None}, "start is missing"),
+        ({"options": {"damping": 0.1}}, "options must be"),
         ({"samples": 1}, "at least 2 points"),
         ({"samples": (0.0, 0.5, 0.5, 1.0)}, "increasing"),
         ({"samples": (0.1, 1.0)}, "from 0 to the horizon"),
@@ -239,8 +250,17 @@ def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], mess
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"damping": -1.0}, "damping must be a finite number"), ({"tolerance": 0.0}, "tolerance must be positive")],
+)
+def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        RateOptions(**options)
+
+
 def test_a_quaternion_that_is_none_is_refused() -> None:
     machine = FreeFloating(random_robot(np.random.default_rng(3), 9), "spatial")
     base = np.array([0.0, 0, 0, 1, 1, 0, 0])
     with pytest.raises(ProblemError, match="not of unit length"):
-        resolve(machine, TipTask(rows=(3,), velocity=(1.0,)), np.zeros(machine.joint_size), 1.0, start_base=base)
+        resolve(machine, TipTask(rows=(3,), velocity=(1.0,)), 1.0, start=Start(np.zeros(machine.joint_size), base=base))

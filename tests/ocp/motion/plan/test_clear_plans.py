@@ -29,6 +29,7 @@ from models import (
 from ocp import (
     ClearanceConstraints,
     Collocation,
+    IkOptions,
     Limits,
     Plan,
     ProblemError,
@@ -46,7 +47,7 @@ from ocp import (
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan import planner
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.plan.planner import checked_request
+from ocp.motion.plan.planner import PlanOptions, checked_request
 from ocp.motion.result.candidate import Candidate, Rejection
 from tests.models.machines.armoured import armoured_arm
 from tests.ocp.motion.plan.motions import DOWN, curved_seam
@@ -194,7 +195,7 @@ def test_joints_without_a_task_start_clear_of_the_motion() -> None:
 def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
     """As many limits as the program has, each with the barrier that it begins with, cost what the motion costs."""
     around = CollisionScene(ARM, [POST])
-    required = checked_request(ARM, line(), None, start=START, search="start")
+    required = checked_request(ARM, line(), None, PlanOptions(start=START, search="start"))
     solver = CandidateSolver(replace(required, clearance_constraints=ClearanceConstraints(around)), START, START)
     pair = around.labels.index(("link6", "obstacle 0"))
     cost = 0.25
@@ -320,7 +321,7 @@ def test_pairs_clear_within_limits_are_checked_without_limits() -> None:
     with pytest.raises(ProblemError, match="limits=False"):
         minimum_velocity_problem(ARM, **required, setup=avoiding(around))
     with pytest.raises(ProblemError, match="limits=False"):
-        inverse_kinematics(ARM, TipTask(position=FIRST), limits=False, scene=around)
+        inverse_kinematics(ARM, TipTask(position=FIRST), scene=around, options=IkOptions(limits=False))
     free = CollisionScene(ARM, limits=False)
     assert minimum_velocity_problem(
         ARM, **required, setup=VelocitySetup(clearance_constraints=ClearanceConstraints(free))
@@ -382,13 +383,13 @@ def test_colliding_configurations_are_omitted_or_named() -> None:
 
 def test_a_local_motion_tells_how_near_it_comes() -> None:
     around = CollisionScene(ARM, [POST])
-    local = resolve(ARM, tasks=line(), start_joints=START, horizon=SECONDS, samples=101, scene=around)
+    local = resolve(ARM, line(), SECONDS, start=START, samples=101, scene=around)
     report = distances_along(around, np.zeros(0), local.joints, local.t)
     assert_allclose(local.clearance, report.min(axis=1))
     worst = int(local.clearance.argmin())
     assert local.clearance[worst] < 0
     assert local.nearest[worst] == ("link6", "obstacle 0")
-    assert np.isnan(resolve(ARM, tasks=line(), start_joints=START, horizon=SECONDS, samples=11).clearance).all()
+    assert np.isnan(resolve(ARM, line(), SECONDS, start=START, samples=11).clearance).all()
 
 
 @pytest.mark.long

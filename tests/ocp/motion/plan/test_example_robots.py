@@ -67,7 +67,7 @@ def seam(whole: Robot, seed: int = 0) -> TipTask:
             rows = paths[chosen][:, samples]
             flat = rows.reshape(-1, arm.dof)
             if len(flat):
-                distances = distances_along(scene, np.zeros(0), flat, np.zeros(len(flat)), CUTOFF)
+                distances = distances_along(scene, np.zeros(0), flat, np.zeros(len(flat)), cutoff=CUTOFF)
                 clear = np.all(distances > 0, axis=1).reshape(rows.shape[:2])
                 chosen = chosen[clear.all(axis=1)]
         for k in chosen.tolist():

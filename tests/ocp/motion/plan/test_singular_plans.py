@@ -11,7 +11,7 @@ import pytest
 
 from models import FixedBase, planar_chain
 from models.checks import Array
-from ocp import SolveError, TipTask, Unreachable, inverse_kinematics
+from ocp import IkOptions, SolveError, TipTask, Unreachable, inverse_kinematics
 from ocp.errors import ProblemError
 from ocp.motion.builders.tool_motion import ERRORS
 from ocp.motion.tasks.checks import CHECKS, clip_to_limits
@@ -96,7 +96,7 @@ def test_the_end_of_the_reach_is_the_one_of_a_dense_sweep_for_every_search(
         assert np.isfinite(outcome.angle)
         ends.append(outcome.time)
     assert np.ptp(ends) < 1e-4
-    options: dict[str, Any] = {"near": outcome.joints, "starts": 256, "tolerance": 1e-6}
+    options: dict[str, Any] = {"near": outcome.joints, "starts": 256, "options": IkOptions(tolerance=1e-6)}
     for time in outcome.time - np.geomspace(1e-3, 0.3, 5):
         assert inverse_kinematics(machine(arm), task, time=float(time), **options)
     for time in outcome.time + np.geomspace(1e-3, 0.1, 5):
@@ -154,8 +154,9 @@ def test_a_tool_that_turns_too_fast_names_joint_time_and_limit(angle: float, dur
 def test_values_beyond_a_limit_by_rounding_are_clipped_and_others_named(bound: tuple[float, float]) -> None:
     low, high = np.array([bound[0]]), np.array([bound[1]])
     size = bound[1] - bound[0] if np.isfinite(bound[0]) else 1.0
-    assert clip_to_limits("start", ["a"], high + 0.5 * CHECKS.rounding * size, low, high, "")[0] == bound[1]
+    words: dict[str, Any] = {"label": "start", "names": ["a"], "hint": ""}
+    assert clip_to_limits(high + 0.5 * CHECKS.rounding * size, low, high, **words)[0] == bound[1]
     with pytest.raises(ProblemError, match="'a' starts at") as caught:
-        clip_to_limits("start", ["a"], high + 3 * CHECKS.rounding * size, low, high, "")
+        clip_to_limits(high + 3 * CHECKS.rounding * size, low, high, **words)
     shown = str(caught.value).split("starts at ")[1].split(",")[0]
     assert shown != f"{bound[1]:.6g}"

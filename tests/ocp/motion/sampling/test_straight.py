@@ -55,7 +55,7 @@ def test_no_sample_of_a_proven_motion_of_an_arm_collides_and_motions_far_away_ar
     assert 3 < clear.sum() < 57
     for proven, start, stop in zip(clear, starts, stops, strict=True):
         joints = start + np.linspace(0.0, 1.0, 301)[:, None] * (stop - start)
-        least = distances_along(scene, np.zeros(0), joints, np.zeros(301), 0.02).min()
+        least = distances_along(scene, np.zeros(0), joints, np.zeros(301), cutoff=0.02).min()
         assert least >= -1e-6 if proven else least < 0.01
 
 

@@ -13,7 +13,7 @@ from models import FreeFloating, center_of_mass
 from models.examples import paper_example
 from ocp import Candidate, Plan, SolveError, TipTask, Unreachable, plan
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.plan.planner import checked_request
+from ocp.motion.plan.planner import PlanOptions, checked_request
 from ocp.motion.result.candidate import Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.cells import CellSearch
@@ -105,7 +105,7 @@ def test_every_motion_does_its_task_within_limits_and_conserves_momentum(report:
     path = np.array([-0.5, -0.5, 0.0])
     place = TipTask(position=lambda t: ca.DM(first) + t * ca.DM(path), rows=[3, 4], duration=4.0)
     task = TipTask(velocity=path[:2], rows=[3, 4], duration=4.0) if report == "velocity" else place
-    request = checked_request(machine, task, None, start=START, search="global")
+    request = checked_request(machine, task, None, PlanOptions(start=START, search="global"))
     b, q, u = (ca.SX.sym(name, 3) for name in "bqu")
     center = ca.Function("center", [b, q], [center_of_mass(machine.robot, q, machine.world_from_base(b))])
     rate = ca.Function("rate", [b, q, u], [machine.base_rate(b, q, u)])
@@ -154,7 +154,7 @@ def test_of_failing_motions_a_few_of_each_search_are_tried_and_the_others_report
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     machine, task, tried = paper_example(), example(4.0), list[float]()
-    request = checked_request(machine, task, None, start=START)
+    request = checked_request(machine, task, None, PlanOptions(start=START))
     sizes = [len(paths[0].cost) for paths in CellSearch(request, START[None]).local_motions()]
 
     def fails(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:

@@ -11,7 +11,7 @@ import pytest
 
 from models import FixedBase, Joint, Link, Robot
 from models.checks import Array
-from ocp import ProblemError, TipTask, inverse_kinematics
+from ocp import IkOptions, ProblemError, TipTask, inverse_kinematics
 from ocp.motion.search.charts import Charts, SelfMotionManifolds
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.tasks.equations import bind
@@ -74,7 +74,9 @@ def solution_sets(machine: FixedBase, task: TipTask, times: Array, starts: int, 
     rows = [
         (k, one.joints)
         for k, t in enumerate(times)
-        for one in inverse_kinematics(machine, task, time=float(t), starts=starts, seed=seed + k, apart=1e-2)
+        for one in inverse_kinematics(
+            machine, task, time=float(t), starts=starts, seed=seed + k, options=IkOptions(apart=1e-2)
+        )
     ]
     return np.array([k for k, _ in rows]), np.array([joints for _, joints in rows])
 

@@ -9,7 +9,7 @@ import pytest
 
 from models import FixedBase, Machine, Path, planar_chain, smooth
 from models.machines.machine import with_tip
-from ocp import ProblemError, TipTask, resolve
+from ocp import ProblemError, RateOptions, Start, TipTask, resolve
 from ocp.motion.tasks.equations import bind, task_errors
 from ocp.motion.tasks.tip_task import timed
 from ocp.motion.tasks.tracks import path_tracks, pose_line
@@ -40,8 +40,7 @@ def test_tasks_that_name_links_need_no_tip() -> None:
     end = (1.0, 0.0, 0.0)
     task = TipTask(rows=(3, 4), velocity=(0.1, 0.2), link="link3", point=end)
     report, result = (
-        resolve(machine, start_joints=[0.3, 0.5, -0.7], horizon=1.0, tasks=task)
-        for machine in (with_tip(fork, "link3", end), fork)
+        resolve(machine, task, 1.0, start=[0.3, 0.5, -0.7]) for machine in (with_tip(fork, "link3", end), fork)
     )
     np.testing.assert_array_equal(result.joints, report.joints)
     np.testing.assert_array_equal(result.tip_in_world, report.tip_in_world)
@@ -65,7 +64,7 @@ def test_rows_along_any_axes_are_followed_with_momentum_on_board(axes: Any) -> N
     """The twist of the tip, turned into those axes, is what was asked, at every sample; rows in any order."""
     machine, rows = floating_panda(MOMENTUM), [4, 0, 5, 3]
     task = TipTask(rows=rows, velocity=TWIST[rows], axes=axes)
-    local = resolve(machine, tasks=task, start_joints=PANDA_START, horizon=2.0, start_base=BASE, samples=9)
+    local = resolve(machine, task, 2.0, start=Start(PANDA_START, base=BASE), samples=9)
     assert local.stopped is None
     for base, joints, rates in zip(local.base, local.joints, local.joint_rates, strict=True):
         twist = numeric(machine.tip_twist(base, joints, rates)).ravel()
@@ -82,7 +81,7 @@ def test_a_pose_line_is_followed_and_the_drift_is_fed_back() -> None:
     machine = floating_panda(MOMENTUM)
     line = line_from(machine, BASE, PANDA_START, (0.1, -0.1, 0.05), (1, 2, 0.5), 0.4, 2.0)
     task = TipTask(position=line.position, orientation=line.orientation)
-    local = resolve(machine, tasks=task, start_joints=PANDA_START, horizon=2.0, start_base=BASE, samples=21)
+    local = resolve(machine, task, 2.0, start=Start(PANDA_START, base=BASE), samples=21)
     assert local.stopped is None
     assert np.abs(local.task_error).max() < 1e-8
     rotation, position = pose(machine, local.base[-1], local.joints[-1])
@@ -97,9 +96,9 @@ def test_the_feedback_closes_a_gap_at_its_rate() -> None:
         position=position + np.array([0.03, 0.0, 0.0]), orientation=rotation @ turned((0, 0, 1), 0.02), gain=3.0
     )
     with pytest.raises(ProblemError, match=r"'panda_hand' is 0\.03 .* start_gap = 1e-06"):
-        resolve(panda(), tasks=task, start_joints=PANDA_START, horizon=1.0)
+        resolve(panda(), task, 1.0, start=PANDA_START)
     task = replace(task, start_gap=0.1)
-    local = resolve(panda(), tasks=task, start_joints=PANDA_START, horizon=1.0, samples=11)
+    local = resolve(panda(), task, 1.0, start=PANDA_START, samples=11)
     expected = 0.01 * np.exp(-3 * local.t)
     np.testing.assert_allclose(np.linalg.norm(local.task_error[:, 3:], axis=1), 3 * expected, rtol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(local.task_error[:, :3], axis=1), 2 * expected, rtol=1e-3)
@@ -112,7 +111,7 @@ def test_a_free_roll_leaves_the_tool_axis_where_it_is_wanted() -> None:
         return ca.mtimes(ca.DM(rotation), ca.vertcat(ca.sin(0.2 * time), 0, ca.cos(0.2 * time)))
 
     task = TipTask(position=position, direction=tilting)
-    local = resolve(ur5(), tasks=task, start_joints=UR5_START, horizon=2.0, samples=11)
+    local = resolve(ur5(), task, 2.0, start=UR5_START, samples=11)
     assert task.size == 5
     assert np.abs(local.task_error).max() < 1e-8
     for time, joints, rates in zip(local.t, local.joints, local.joint_rates, strict=True):
@@ -132,7 +131,7 @@ def test_a_free_roll_leaves_the_tool_axis_where_it_is_wanted() -> None:
 def test_the_base_is_held_still_by_a_task_of_the_root_link() -> None:
     machine = floating_panda()
     task = [TipTask(rows=(3,), velocity=(0.02,)), TipTask(rows=(0, 1, 2), velocity=(0.0, 0.0, 0.0), link="satellite")]
-    local = resolve(machine, tasks=task, start_joints=PANDA_START, horizon=3.0, start_base=BASE, samples=13)
+    local = resolve(machine, task, 3.0, start=Start(PANDA_START, base=BASE), samples=13)
     assert local.stopped is None
     np.testing.assert_allclose(local.base[:, 3:], np.tile(BASE[3:], (13, 1)), atol=1e-9)
     np.testing.assert_allclose(local.tip_in_world[-1, 0] - local.tip_in_world[0, 0], 0.06, atol=1e-8)
@@ -152,7 +151,7 @@ def test_two_arms_move_one_thing_relative_to_each_other() -> None:
         TipTask(position=line.position, orientation=line.orientation, link="left_panda_hand"),
         TipTask(position=relative[0], orientation=relative[1], link="right_panda_hand", relative_to="left_panda_hand"),
     ]
-    local = resolve(machine, tasks=task, start_joints=start, horizon=3.0, samples=7)
+    local = resolve(machine, task, 3.0, start=start, samples=7)
     assert local.stopped is None
     assert local.task_error.shape == (7, 12)
     for base, joints in zip(local.base, local.joints, strict=True):
@@ -164,7 +163,7 @@ def test_two_arms_move_one_thing_relative_to_each_other() -> None:
 def test_a_velocity_relative_to_a_link_is_that_of_the_relative_position() -> None:
     machine = floating_panda(MOMENTUM)
     task = TipTask(rows=(3, 4, 5), velocity=(0.02, -0.03, 0.01), axes="reference", relative_to="satellite")
-    local = resolve(machine, tasks=task, start_joints=PANDA_START, horizon=2.0, start_base=BASE, samples=5)
+    local = resolve(machine, task, 2.0, start=Start(PANDA_START, base=BASE), samples=5)
     moved = []
     for base, joints in zip(local.base, local.joints, strict=True):
         frame = machine.world_from_base(base)
@@ -176,7 +175,7 @@ def test_a_velocity_relative_to_a_link_is_that_of_the_relative_position() -> Non
 def test_weights_make_a_joint_move_less() -> None:
     task = TipTask(rows=(3, 4, 5), velocity=(0.05, 0.0, 0.02))
     weights = np.array([1.0, 100.0, 1.0, 1.0, 1.0, 1.0, 1.0])
-    local = resolve(panda(), tasks=task, start_joints=PANDA_START, horizon=0.1, weights=weights, samples=2)
+    local = resolve(panda(), task, 0.1, start=PANDA_START, samples=2, options=RateOptions(weights=weights))
     jacobian = numeric(panda().tip_jacobian((), PANDA_START))[3:]
     root = np.sqrt(weights)
     expected = np.linalg.pinv(jacobian / root) @ [0.05, 0.0, 0.02] / root
@@ -188,7 +187,7 @@ def test_a_path_is_followed_at_constant_speed() -> None:
     corners = position + np.array([[0, 0, 0], [0.0, 0.1, 0], [0.04, 0.1, 0], [0.04, 0, 0]])
     path = smooth(Path.through(corners), deviation=0.004)
     task = TipTask(position=path_tracks(path, 0.1).position, direction=rotation[:, 2])
-    local = resolve(ur5(), tasks=task, start_joints=UR5_START, horizon=path.length / 0.1, samples=41)
+    local = resolve(ur5(), task, path.length / 0.1, start=UR5_START, samples=41)
     assert np.abs(local.task_error).max() < 1e-6
     motion = zip(local.joints, local.joint_rates, strict=True)
     speeds = np.linalg.norm([numeric(ur5().tip_twist((), q, rates)).ravel()[3:] for q, rates in motion], axis=1)
@@ -274,14 +273,14 @@ def test_tasks_that_are_none_are_refused(fields: dict[str, Any], message: str) -
 )
 def test_tasks_that_do_not_fit_the_machine_are_refused(task: Any, message: str) -> None:
     with pytest.raises(ProblemError, match=message) as caught:
-        resolve(ur5(), tasks=task, start_joints=UR5_START, horizon=1.0)
+        resolve(ur5(), task, 1.0, start=UR5_START)
     assert (caught.value.name or "unnamed") in str(caught.value)
 
 
 def test_an_opposite_tool_axis_is_no_start() -> None:
     rotation, position = pose(ur5(), (), UR5_START)
     with pytest.raises(ProblemError, match=r"'tool0' is .* away from where its task begins"):
-        resolve(ur5(), tasks=TipTask(position=position, direction=-rotation[:, 2]), start_joints=UR5_START, horizon=1.0)
+        resolve(ur5(), TipTask(position=position, direction=-rotation[:, 2]), 1.0, start=UR5_START)
 
 
 def test_a_planar_arm_takes_poses_in_its_plane() -> None:
@@ -291,7 +290,7 @@ def test_a_planar_arm_takes_poses_in_its_plane() -> None:
     goal = rotation @ turned((0, 0, 1), 0.5), position + np.array([-0.3, 0.2, 0.0])
     line = pose_line((rotation, position), goal, 2.0)
     task = TipTask(position=line.position, orientation=line.orientation, rows=(2, 3, 4))
-    local = resolve(machine, tasks=task, start_joints=start, horizon=2.0, samples=5)
+    local = resolve(machine, task, 2.0, start=start, samples=5)
     np.testing.assert_allclose(pose(machine, (), local.joints[-1])[1], position + np.array([-0.3, 0.2, 0.0]), atol=1e-8)
 
 
