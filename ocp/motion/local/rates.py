@@ -157,7 +157,7 @@ def resolve(
     duration = horizon_of([part.task for part in equations.bound], horizon)
     rate_weights = checked_weights(own.weights, machine.joint_size)
     checked_tasks(equations, base, joints, duration)
-    times = _times(samples, duration)
+    times = _sample_times(samples, duration)
     if own.damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
         words = (
             f"{rows_dependent} is singular at the start joints {joints.tolist()}; "
