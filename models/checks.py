@@ -130,7 +130,7 @@ class Checks:
         return self.error(words, name=str(name) or kind, value=name, limit=tuple(names))
 
     def number(self, label: str, value: Any, *, finite: bool = True, unit: str = "") -> float:
-        """Return a number as a float; infinity is one unless `finite`."""
+        """Return a number as a float; infinity is accepted unless `finite`."""
         number = real(value)
         if isnan(number) or (finite and isinf(number)):
             raise self.invalid(label, ("a finite number" if finite else "a number") + _in(unit), value)
@@ -192,7 +192,7 @@ class Checks:
         return value
 
     def each(self, label: str, values: Any, kind: type[_Kind]) -> tuple[_Kind, ...]:
-        """Return instances of a class, none or more, as a tuple."""
+        """Return a list as a tuple; raise an error unless all entries are instances of a class."""
         try:
             check_entries(values)
             items = tuple(values)
@@ -297,7 +297,7 @@ class Checks:
         return self.error(f"{label} {words}", name=argument_of(label), value=value, limit=limit)
 
     def _shaped(self, label: str, array: Array, shape: tuple[int | str, ...], least: int, meaning: str) -> Array:
-        """Return the array in a shape with free dimensions; raise the error if it does not fit."""
+        """Return the array after checking that it has a shape in which some dimensions are free."""
         if len(shape) == 1 and ((array.ndim == 0 and isinstance(shape[0], str)) or array.shape[1:] == (1,)):
             array = array.reshape(-1)
         fits = array.ndim == len(shape) and all(
@@ -320,7 +320,9 @@ def _in(unit: str) -> str:
 
 
 def _shown(array: Array, wrong: Any) -> str:
-    """Describe an invalid array: whole if it is a short vector, else by its first invalid entry or row."""
+    """Return the text by which an error message describes an invalid array: all of it if short, else its first invalid
+    part.
+    """
     if array.ndim < 2 and array.size <= MAX_LISTED:
         return f"{array.tolist()}"
     if array.ndim == 1:
@@ -352,7 +354,7 @@ def warn_of_millimetres(label: str, lengths: ArrayInput, name: str | None = None
 
 
 def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tuple[float, float], words: str) -> None:
-    """Warn of the first entry whose magnitude is in a range."""
+    """Warn of the first entry whose magnitude lies in a range."""
     low, high = range_
     for value in np.ravel(values).tolist():  # faster than array operations on few entries
         if low < abs(value) < high:

@@ -36,7 +36,7 @@ class ModelWarning(DetailedError, UserWarning):
 
 
 def _pickled(value: Any) -> Any:
-    """Return a value, or its `repr` if it cannot be pickled."""
+    """Return a value that can be pickled: the value itself, or its `repr`."""
     try:
         pickle.dumps(value)
     except Exception:  # pickling raises errors of many kinds

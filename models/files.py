@@ -1,4 +1,4 @@
-"""Files: safe reading of untrusted input, and a private disk cache of expensive results.
+"""Safe reading of untrusted files, and a private disk cache of expensive results.
 
 Only regular files of bounded size are read: opening a pipe would block, a device can be read without end, and opening
 other special files may have side effects.

@@ -363,7 +363,7 @@ def expand_tables(values: Any) -> Any:
 
 
 def _table(function: Any, inputs: list[Any]) -> list[Any]:
-    """Return the values of a table of one argument as polynomials. CasADi reveals its data only in generated C code."""
+    """Return a look-up table of one argument as polynomials; its data are read from C code that CasADi generates."""
     code = ca.CodeGenerator("table")
     code.add(function)
     text = code.dump()
@@ -393,7 +393,7 @@ def _table(function: Any, inputs: list[Any]) -> list[Any]:
 
 
 def _polynomials(breaks: Array, coefficients: Array, x: Any, *, beyond: bool) -> Any:
-    """Return a piecewise polynomial as a sum of the increments over its segments.
+    """Return a piecewise polynomial as an expression without branches: the sum of its increments over the segments.
 
     Outside all breakpoints the end segments continue if `beyond`, else the value is zero.
     """

@@ -75,7 +75,7 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Ask the call to end; if no loop polls, raise KeyboardInterrupt in it at its next Python step."""
+        """Stop the call: ask its loop if that polls, else raise KeyboardInterrupt at its next Python step."""
         self.stop = True
         began = time.monotonic()
         try:
@@ -131,7 +131,7 @@ def interruptible(function: Callable[P, T]) -> Callable[P, T]:
 
 @contextmanager
 def stop_requests_polled() -> Iterator[None]:
-    """Declare that the loop inside polls :func:`reason_to_stop` and ends by itself."""
+    """Declare that a loop inside checks :func:`reason_to_stop` regularly and ends by itself."""
     call = _CALL.get()
     if call is None:
         yield
@@ -244,7 +244,7 @@ _LISTENER: ContextVar[Callable[[str], Any] | None] = ContextVar("listener", defa
 
 
 def report(stage: str) -> None:
-    """Tell the listener of the current call, if there is one, what is being done."""
+    """Report the current stage of the work to the listener of the call, if there is one."""
     listener = _LISTENER.get()
     if listener is not None:
         listener(stage)
@@ -252,7 +252,7 @@ def report(stage: str) -> None:
 
 @contextmanager
 def shown_progress(title: str, progress: Any) -> Iterator[None]:
-    """Show the stages that are reported inside.
+    """Show the stages that are reported inside this block.
 
     Args:
         title: Name of the call.
@@ -377,7 +377,7 @@ class _Monitor(ca.Callback):  # type: ignore[misc]
         return 1
 
     def _store(self, iterate: Any) -> None:
-        """Store an iterate, and whether the solver is to stop."""
+        """Store an iterate, and decide whether the solver is to stop."""
         try:
             self.stopped = self.stopped or reason_to_stop()
         except KeyboardInterrupt:  # CasADi would turn it into another error

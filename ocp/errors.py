@@ -101,13 +101,13 @@ class SolverStatus(Enum):
 
     @property
     def message(self) -> str:
-        """Return the value with advice on what to try next; "" for a success."""
+        """The status with advice on what to try next; "" for a success."""
         if self.is_success:
             return ""
         return f"{self.value}: {ADVICE[self]}" if self in ADVICE else self.value
 
     def __str__(self) -> str:
-        """Return the value."""
+        """Return the text of the status."""
         return self.value
 
 
@@ -128,7 +128,7 @@ ADVICE = {
 
 @contextmanager
 def error_names(name: str) -> Iterator[None]:
-    """Set the name of every exception raised inside that has no name yet."""
+    """Name the exceptions raised inside that have no name yet."""
     try:
         yield
     except DetailedError as error:

@@ -160,7 +160,7 @@ def solve(
 
 
 def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
-    """Return the plan, or one of lower cost if a feasible variation lowers its cost.
+    """Return the plan, or a better one if a feasible variation lowers its cost.
 
     Raises:
         SolveError: There is such a variation, but the solver finds no plan along it: the cost may be unbounded below.
@@ -200,7 +200,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
 def _displaced_guess(
     form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
 ) -> dict[str, Any]:
-    """Return the plan displaced along the variation that lowers its cost, by a visible share of its size.
+    """Return the plan displaced by a visible amount along the variation that lowers its cost.
 
     If the variation is unknown, all controls are displaced by seeded random amounts.
     """
@@ -267,7 +267,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Comparison of several solutions of one problem.
+    """Comparison of the solutions of one problem by several methods, with the audit of each.
 
     Attributes:
         problem: Name of the problem.
@@ -427,7 +427,7 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
 def _sample(
     form: Formulation, solution: Solution, p: np.ndarray, fractions: np.ndarray, reported: np.ndarray
 ) -> tuple[list[np.ndarray], float, float]:
-    """Return states and controls at ``fractions``, costates and Hamiltonian at ``reported`` fractions, and two sizes.
+    """Sample a solution: states and controls at ``fractions``, costates and Hamiltonian at ``reported``, two sizes.
 
     The sizes are the largest sum of the absolute parts of the Hamiltonian, which itself vanishes for a free horizon,
     and the mean absolute running cost.

@@ -122,7 +122,7 @@ def refine(
     arguments = {"parameters": parameters, "options": options, "solver": settings.solver}
     with time_limited(time_limit):
         first = _first(problem, method, {**arguments, "guess": guess}, settings, time_limit)
-        return _refined(problem, method, first, tolerance, arguments, settings)[0]
+        return _refine_mesh(problem, method, first, tolerance, arguments, settings)[0]
 
 
 def refine_from(
@@ -134,10 +134,10 @@ def refine_from(
     :func:`ocp.methods.solve`.
     """
     arguments = {"options": options, "check": check}
-    return _refined(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings())
+    return _refine_mesh(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings())
 
 
-def _refined(
+def _refine_mesh(
     problem: Problem,
     method: DirectMethod,
     first: tuple[Solution, Audit],
@@ -145,7 +145,7 @@ def _refined(
     arguments: dict[str, Any],
     settings: RefinementSettings,
 ) -> tuple[Solution, Audit]:
-    """Return the last of the plans and its audit, with the RefinementWarning of `refine`."""
+    """Refine the mesh until a plan is accurate enough; return the last plan and its audit, or warn."""
     solution, audit = first
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
@@ -186,7 +186,7 @@ def _refined(
 def _shortfall(
     stopped: str, late: bool, idles: bool, beyond: list[_Row], audit: Audit, form: Formulation
 ) -> RefinementWarning | None:
-    """Return the warning for the most important remaining fault; None if the last plan passes its audit."""
+    """Return the warning about the worst remaining row; None if the last plan passes its audit."""
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
         hint = "the time limit is reached: raise time_limit" if late else "raise max_intervals"
@@ -212,7 +212,7 @@ def _first(
     settings: RefinementSettings,
     time_limit: float | None,
 ) -> tuple[Solution, Audit]:
-    """Return the plan on the first mesh, and its audit; raise SolveError at the time limit or if the solve fails."""
+    """Solve on the first mesh and audit the plan; raise SolveError at the time limit or if the solve fails."""
     solution = solve(problem, method, **arguments)
     try:
         return solution, judge(problem, solution, **settings.limits)
@@ -229,7 +229,7 @@ def _first(
 def _next(
     problem: Problem, method: DirectMethod, arguments: dict[str, Any], settings: RefinementSettings
 ) -> tuple[Solution, Audit] | None:
-    """Return the plan on a finer mesh, and its audit; None if the time limit is reached first."""
+    """Solve on a finer mesh and audit the plan; return None if the time limit is reached first."""
     if time_left() <= 0:
         return None
     try:
@@ -257,7 +257,7 @@ class _Row(NamedTuple):
 
 
 class _Parts(NamedTuple):
-    """Contribution of each interval to a row (N,), in any unit; the row is their sum or their maximum."""
+    """Contributions of the intervals to an audit row (N,), in any unit; the row is their sum or their maximum."""
 
     kind: str
     values: np.ndarray
@@ -265,7 +265,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Return contributions scaled to a row's value; in a sum, the average scales to the value. Shape (N,)."""
+        """Scale the contributions so that they are comparable with the value of their row. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))
@@ -276,7 +276,7 @@ class _Parts(NamedTuple):
 def _rows(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit, tolerance: float, method: DirectMethod
 ) -> list[_Row]:
-    """Return the rows of the audit of a plan, with the intervals to which they are attributed."""
+    """Return the rows of the audit of a plan, each with the contributions of the intervals."""
     # over the whole horizon an unstable motion diverges; the sum is what feedback would have to correct
     deviation = min(audit.integration_error, float(audit.local_errors.sum()))
     requested = Finding(f"integration error, {tolerance:.0e} requested", deviation, tolerance)

@@ -261,7 +261,7 @@ class Solution:
         return {name: (float(b), float(b + n)) for name, b, n in zip(declared, begins, lengths, strict=True)}
 
     def phase(self, name: str) -> Solution:
-        """Return a phase as a plan over its own time, from 0 to its duration, with the phase's own names.
+        """Return one phase as a solution over its own time, from 0 to its duration, with the phase's own names.
 
         Its cost is the phase's share. It has no problem, as only the whole can be audited.
 
@@ -331,7 +331,7 @@ class Solution:
         return replace(self, problem=problem, problem_lost="")
 
     def tied_to(self, problem: Problem) -> Solution:
-        """Return the solution with a problem from a file; raise ProblemError if damaged or of other variables."""
+        """Attach a problem from a file to the solution; raise ProblemError if it is damaged or has other variables."""
         try:
             check_variables_match(Formulation.of(problem), self)
         except ProblemError:
@@ -452,7 +452,7 @@ class Solution:
     # ---- with and without its problem ------------------------------------------------------------------------
 
     def _written_problem(self) -> tuple[dict[str, Any] | None, str]:
-        """Return the problem as numbers and text, and ""; or None, and the reason."""
+        """Return the problem as numbers and text, and ""; if that is impossible, None and the reason."""
         if self.problem is None:
             return None, self.problem_lost
         try:

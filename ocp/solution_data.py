@@ -130,26 +130,26 @@ def read_status(path: Any, word: Any) -> SolverStatus:
 
 
 def entry_named(kind: str, name: Any, pool: Mapping[str, T]) -> T:
-    """Return an entry of a pool; raise ProblemError, which lists similar names, if there is none."""
+    """Return the entry with a name; raise ProblemError, which lists similar names, if there is none."""
     if not isinstance(name, str) or name not in pool:
         raise require.unknown(kind, name, pool)
     return pool[name]
 
 
 def plain(value: Any) -> Any:
-    """Return a numpy number or array in the settings of a method as Python numbers, for JSON."""
+    """Convert numpy numbers and arrays in the settings of a method to Python numbers, for JSON."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"{value!r} cannot be saved")
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """Return the arrays (M, n) of a pool side by side; of an empty pool an array (``like``, 0)."""
+    """Stack arrays (M, n) side by side; without any, return an array (``like``, 0)."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 
 def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.ndarray]:
-    """Return columns of stacked values (M, n) by name, in the order and sizes of ``pool``."""
+    """Split stacked values (M, n) into columns by name, in the order and sizes of ``pool``."""
     values, offset = {}, 0
     for name, like in pool.items():
         values[name] = stacked[:, offset : offset + like.shape[1]]
@@ -176,7 +176,7 @@ def check_variables_match(form: VariableSlices, solution: Any) -> None:
 
 
 def match_order(form: VariableSlices, solution: Any) -> Any:
-    """Return the plan with states and controls in the order of a problem, since interpolants have no names."""
+    """Reorder states and controls of a plan as in a problem, because interpolants have no names."""
     orders = {"states": list(form.states), "costates": list(form.states), "controls": list(form.controls)}
     changes: dict[str, Any] = {}
     for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):

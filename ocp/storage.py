@@ -32,7 +32,7 @@ ZIP64_LOCATOR = b"PK\x06\x07"  # precedes it in a larger archive
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write one compressed ``.npz`` file, as :func:`write_whole` does.
+    """Write one compressed ``.npz`` file, atomically as :func:`write_whole` does.
 
     Raises:
         ProblemError: path is not the path of a file, or the arrays are larger than :func:`read_arrays` accepts.
@@ -47,7 +47,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text in UTF-8, as :func:`write_whole` does."""
+    """Write a text file in UTF-8, atomically as :func:`write_whole` does."""
     write_whole(path, lambda stream: stream.write(text.encode()))
 
 
@@ -157,7 +157,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def open_unlinked(path: str | os.PathLike[str]) -> io.BufferedReader:
-    """Open a regular file of at most ``MAX_FILE_BYTES`` that is not a link, in a folder that others may write.
+    """Open a regular file of at most ``MAX_FILE_BYTES``; reject a link in a folder that others can write to.
 
     Raises:
         OSError: It cannot be opened.
@@ -231,12 +231,12 @@ FORMULA = re.compile(r"^[=+\-@\t\r%]")
 
 
 def column_name(name: str) -> str:
-    """Return a joint's name for the header of a table, with special characters as %XX of their UTF-8 bytes."""
+    """Return a joint name for the header of a table, with special characters encoded as %XX of their UTF-8 bytes."""
     return ESCAPED.sub(_quoted, name)
 
 
 def cell(value: Any) -> Any:
-    """Return a value for a cell: the first character of a text that looks like a formula becomes %XX."""
+    """Return a value as the text of a CSV cell; text that looks like a formula starts with %XX instead."""
     return FORMULA.sub(_quoted, value) if isinstance(value, str) else value
 
 

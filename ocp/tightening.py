@@ -155,7 +155,7 @@ def largest_excess(problem: Problem, solution: Solution) -> float:
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """Return the largest excess, in words and as the details of an error; see :func:`_excess`."""
+    """Describe the largest excess over a bound as a sentence and as the attributes of an error; see :func:`_excess`."""
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
@@ -167,7 +167,7 @@ def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[st
 def _places(
     form: Formulation, transcription: Transcription, shared: bool
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Map variables ("x") and rows ("g") to states, controls or path rows (else -1) and to their intervals.
+    """Map variables ("x") and rows ("g") to the state, control or path row (else -1) and the interval they belong to.
 
     Args:
         shared: Whether a control at a node belongs to both intervals; otherwise it, and rows with it, may jump there.
@@ -202,7 +202,7 @@ def _slack(
     high: np.ndarray,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Return the smallest distance of each interval's points from their bounds, (2, N, m); inf without points."""
+    """Return the smallest distance from points to bounds in each interval, (2, N, m); inf without points."""
     slack = np.full(shape, np.inf)
     for kind, (entry, left, right) in places.items():
         bounded = entry >= 0
@@ -216,7 +216,7 @@ def _slack(
 def _excess(
     form: Formulation, solution: Solution, p: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest excess below and above the bounds (m,) in every interval, (2, N, m), and interval ends, s."""
+    """Return how far values lie below and above their bounds in each interval, (2, N, m), and the interval ends, s."""
     breaks = solution.control_interpolant.breaks
     n = len(breaks) - 1
     per_interval = (len(solution.state_interpolant.breaks) - 1) // n
@@ -238,7 +238,7 @@ def _excess(
 
 
 def _peaks(values: np.ndarray) -> np.ndarray:
-    """Return the largest values of sampled curves (N, K, m), by parabolas also between the samples. Shape (N, m)."""
+    """Return the largest values of sampled curves (N, K, m), by parabolas also between samples. Shape (N, m)."""
     left, middle, right = values[:, :-2], values[:, 1:-1], values[:, 2:]
     with np.errstate(invalid="ignore", divide="ignore"):
         rise = (right - left) ** 2 / (8 * (2 * middle - left - right))
@@ -325,9 +325,7 @@ def switches(problem: Problem, solution: Solution) -> np.ndarray:
 def _limited_values(
     form: Formulation, solution: Solution, at: np.ndarray, owner: np.ndarray, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the controls and the path constraints with controls that have limits, at M places (M, m), and the limits
-    (m,).
-    """
+    """Return the values (M, m) and limits (m,) of controls, and of path constraints with controls, at M places."""
     p = form.parameter_vector(solution.parameters)
     lower, upper = form.bound_values(p)
     x, u = solution.state_interpolant(at), solution.control_interpolant.within(owner, place)
@@ -371,13 +369,13 @@ def solve_at_switches(
 
 
 def _distinct(fractions: np.ndarray) -> np.ndarray:
-    """Return the switches inside the horizon, the first of those that count as one."""
+    """Return the switches inside the horizon; of several close ones only the first."""
     inside = fractions[(fractions > SWITCHING.same) & (fractions < 1 - SWITCHING.same)]
     return np.asarray(inside[np.diff(inside, prepend=-1.0) > SWITCHING.same])
 
 
 def _mesh(mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return a mesh with nodes at the switches, without the old nodes close to them."""
+    """Return a mesh with nodes at the switches and without the old nodes close to them."""
     inner, width = mesh[1:-1], np.diff(mesh)
     interval = np.clip(np.searchsorted(mesh, at, side="right") - 1, 0, len(width) - 1)
     close = (np.abs(inner[:, None] - at) < SWITCHING.too_near * width[interval]).any(axis=1)

@@ -95,7 +95,7 @@ class Evaluation(NamedTuple):
 
 
 class LevelBound(NamedTuple):
-    """An `ArcEndLevel` with a lower bound of the cost of rolls on it; `side` as in RoughRoll."""
+    """An `ArcEndLevel` with a lower bound of the cost of all rolls on it; `side` as in RoughRoll."""
 
     bound: Expression
     cosine: Expression
@@ -110,7 +110,7 @@ NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
 
 
 class RigSolution(NamedTuple):
-    """Joints, shape (6, 1), and index of a roll, nan unless the status is 0; codes in roll.ACTIVE and roll.STATUS."""
+    """Result for one target: joints (6, 1), cost, and the codes of active constraint and status."""
 
     joints: Expression
     cost: Expression
@@ -260,7 +260,7 @@ class Search:
     # ---- candidates ------------------------------------------------------------------------------------------
 
     def _cheap_ends(self) -> Any:
-        """Return the Function (target, previous, best) -> (best, evaluations), with the ends known to rounding."""
+        """Return the Function (target, previous, best) -> (best, evaluations), with the arc ends in closed form."""
         target, previous = _inputs(ca.SX)
         first = ca.SX.sym("best", INCUMBENT_SIZE)
         ends = closed_form_ends(self.rig, target, self.branch)
@@ -286,7 +286,7 @@ class Search:
         return ca.Function("rough_stationary", [x], [answer])
 
     def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the Function (target, previous, evaluations, best) -> best, by the levels of cos q2.
+        """Return the Function (target, previous, evaluations, best) -> best, which adds the ends by yaw joints.
 
         A level is searched if an evaluated roll better than the incumbent is on its infeasible side. All levels are
         searched if one violates a limit of joint 1 alone, since its arc may end before that limit is satisfied.
@@ -330,7 +330,7 @@ class Search:
         return ca.Function("levels", [x, before, evaluations, first], [best])
 
     def _slide_ends(self, chart: Any, upper: bool) -> Any:
-        """Return the Function (target, previous, best) -> best, with the ends by one limit of joint 1."""
+        """Return the Function (target, previous, best) -> best, which adds the arc ends by limits of joint 1."""
         target, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
         rough, reach = self._approximation(target), (0, 1 + self._slack()[1])
         datum = inside_limit(self.rig, 1, upper), limit_code(1, upper)
@@ -346,7 +346,7 @@ class Search:
         return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
-        """Return bounds of the changes of sin q4 and cos q2 within ROOTS.root_tolerance of a roll."""
+        """Return bounds on how far sin q4 and cos q2 can change if the roll changes by ROOTS.root_tolerance."""
         rig = self.rig
         sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4
@@ -370,7 +370,7 @@ class Search:
         return rough
 
     def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
-        """Return the Function (target, previous, rough, best) -> best: polishes and compares `count` points in turn.
+        """Return the Function (target, previous, rough, best) -> best, which polishes and compares `count` points.
 
         Points whose bound is not below the cost of the incumbent are skipped.
         """
@@ -390,7 +390,7 @@ class Search:
         return ca.Function("gates", [target, previous, rough, first], [column])
 
     def _stationary(self, target: Expression, rough: RoughRoll) -> Point:
-        """Return the stationary point of I1 near a point."""
+        """Return the stationary point of the index I1 near a point."""
         slope = self._index(target).derivative()
         bend = slope.derivative()
         return polish((rough.c, rough.s), lambda c, s: (slope.value(c, s), bend.value(c, s)))
@@ -398,7 +398,7 @@ class Search:
     def _compare(
         self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Incumbent
     ) -> tuple[Incumbent, list[Evaluation], Expression]:
-        """Return the incumbent after comparing more rolls, these rolls, and the least cost of any, feasible or not."""
+        """Compare further rolls with the incumbent; return the best one, their evaluations, and their least cost."""
         f = self._index(target)
         cost, c, s, code, below, above = best
         least, evaluations = ca.SX(ca.inf), []
@@ -429,7 +429,7 @@ class Search:
     # ---- answers ---------------------------------------------------------------------------------------------
 
     def _finish(self) -> Any:
-        """Return the Function (target, previous, best) -> answer for the incumbent."""
+        """Return the Function (target, previous, best) -> answer, with joints and status of the incumbent."""
         target, previous = _inputs(ca.SX)
         best = ca.SX.sym("best", INCUMBENT_SIZE)
         answer = self._solution(target, previous, _record(Incumbent, best), 0)

@@ -353,7 +353,7 @@ def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
 
 
 def _least_value(count: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of (angles, values) -> (angle of the least, the least, whether it is the first)."""
+    """Return inputs and outputs of (angles, values) -> (angle of the minimum, minimum, whether it is the first)."""
     angles, values = ca.SX.sym("angles", 1, count), ca.SX.sym("values", 1, count)
     best, least, is_first = angles[0], values[0], ca.SX(1)
     for k in range(1, count):

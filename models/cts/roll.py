@@ -80,19 +80,19 @@ class ConstraintCheck(NamedTuple):
     slide_upper: Expression
 
     def all_but_slide(self) -> Expression:
-        """Return whether all constraints but the limits of joint 1 hold."""
+        """Return whether all constraints are satisfied, not counting the limits of joint 1 (the slide)."""
         return ca.logic_and(self.pitch_joints(), ca.logic_and(self.yaw, self.yaw_angles))
 
     def pitch_joints(self) -> Expression:
-        """Return whether the pitch link reaches and joints 4, 5 and 6 are within limits."""
+        """Return whether the target is within reach of the pitch link and joints 4, 5 and 6 are within limits."""
         return ca.logic_and(self.pitch, self.pitch_angles)
 
     def angles(self) -> Expression:
-        """Return whether joints 2 to 5, and 6, are within limits."""
+        """Return whether the revolute joints 2 to 6 are within their limits."""
         return ca.logic_and(self.pitch_angles, self.yaw_angles)
 
     def slide(self) -> Expression:
-        """Return whether joint 1 is within limits."""
+        """Return whether joint 1 (the slide) is within its limits."""
         return ca.logic_and(self.slide_lower, self.slide_upper)
 
 
@@ -113,7 +113,7 @@ class ArcEndLevel(NamedTuple):
 
 
 def limit_code(joint: int, upper: bool) -> int:
-    """Return the code in ACTIVE of a limit of joint 1..6."""
+    """Return the number that stands for the lower or upper limit of joint 1..6 in ACTIVE."""
     return 3 + 2 * (joint - 1) + int(upper)
 
 
@@ -167,7 +167,7 @@ def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expressi
 
 
 def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return the ends of the feasible arcs by all constraints but the limits of joint 1, among meaningless points."""
+    """Return points that include all ends of the feasible arcs, except those by the limits of joint 1."""
     ends = closed_form_ends(rig, target, branch)
     chart = yaw_chart(rig, branch)
     for level in yaw_levels(rig, target, branch):
@@ -182,7 +182,7 @@ def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
 
 
 def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return the arc ends by joints 4, 5 and 6 and by the reach of the pitch link, accurate to rounding."""
+    """Return the arc ends that have a closed form: limits of joints 4, 5 and 6, and the reach of the pitch link."""
     axle, e_c, _ = corner_circle(rig, target)
     ends = []
     for sine, code in _pitch_sines(rig, target, branch):
@@ -198,12 +198,12 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
 
 
 def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel]:
-    """Return the values of cos q2 at which an arc may end: by joints 2 and 3 and by the reach of the yaw link."""
+    """Return the values of cos q2 at which an arc may end: limits of joints 2 and 3, and the reach of the yaw link."""
     levels = []
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
     def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Add the level of q2 with this sine and cosine, relevant only if joint 3 allows it."""
+        """Add a value of q2 at which an arc may end, valid only if joint 3 is within its limits there."""
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
@@ -227,7 +227,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
 
 
 def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
-    """Return four points near the rolls with a value of cos q2, in any branch, to be polished by `polish_to_value`.
+    """Return four approximate rolls, as (cos, sin), at which cos q2 has a value; `polish_to_value` makes them exact.
 
     They are roots of the squared equation. It is smooth near a stretched pitch link, where cos q2 is not; near yaw 0 it
     has nearly double roots, where cos q2 has simple ones.
@@ -249,7 +249,7 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
-    """Return the values of sin q4 at which an arc may end."""
+    """Return the values of sin q4 at which an arc of feasible rolls may end, each with the code of the active limit."""
     sines: list[tuple[Expression, int]] = []
     for sign in (-1, 1):
         if _allows(rig, 4, sign * np.pi / 2):
@@ -295,12 +295,12 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 
 def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Return the point polished until cos q2 (output 0 of the chart) or q1 (output 2) takes a value."""
+    """Return the point moved by Newton steps until cos q2 (output 0 of the chart) or q1 (output 2) has a value."""
     return polish(point, chart_residual(chart, target, output, value))
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the point polished until cos q2 takes a value, on its feasible side by a bound of the rounding errors.
+    """Return the point moved by Newton steps until cos q2 has a value, on the feasible side of it despite rounding.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     holds above the value, -1 if below.
@@ -312,7 +312,10 @@ def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expressi
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return output 0 or 2 of the chart minus a value, with its derivative by roll, for `polish`."""
+    """Return the function of the roll, as (cos, sin), that `polish` sets to zero: a chart output minus a value.
+
+    The output is 0 or 2; the function also returns its derivative by the roll.
+    """
 
     def function(c: Expression, s: Expression) -> Point:
         values = chart(target, c, s)
@@ -331,7 +334,7 @@ def _not_zero(x: Expression) -> Expression:
 
 
 def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
-    """Return the Function of the target -> arc ends by one limit of joint 1, among meaningless points.
+    """Return the Function of the target -> points that include all arc ends by one limit of joint 1.
 
     Output shape (2, 8): rows cosine and sine of the roll.
     """
@@ -345,7 +348,7 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
 
 
 def slide_points(rig: Rig, upper: bool) -> Any:
-    """Return the Function of the target -> points near the arc ends by one limit of joint 1. Output shape (2, 8)."""
+    """Return the Function of the target -> approximate arc ends by one limit of joint 1. Output shape (2, 8)."""
     limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
@@ -371,12 +374,12 @@ def slide_points(rig: Rig, upper: bool) -> Any:
 
 
 def checked_gain(rate_weight: float) -> float:
-    """Return w4 / (2 pi); raise a ModelError for a weight that is negative or not finite."""
+    """Return the weight of the roll rate over 2 pi; raise ModelError if it is negative or not finite."""
     return require.nonnegative("rig: rate_weight", rate_weight) / FULL_TURN
 
 
 def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:
-    """Return the roll of a point of the circle, in the turn nearest to the previous roll or in that of the limits."""
+    """Return the roll angle of a point of the circle, in the turn of the previous roll or in that of the limits."""
     angle = ca.atan2(s, c)
     if rig.limited(6):
         return nearest_turn(angle, rig.middle_and_half(6)[0])
@@ -432,7 +435,7 @@ def minimize_convex(
 
 
 def _inflections(f: Harmonics, gain: float, start: Expression, end: Expression) -> list[Expression]:
-    """Return the rolls with I1'' = -2 gain in the window, which separate convex and concave parts, and others."""
+    """Return the rolls with I1'' = -2 gain in the window, between which I2 is convex or concave."""
     bend = f.derivative().derivative()
     points = roots(bend._replace(a0=2 * gain))
     return [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in points]

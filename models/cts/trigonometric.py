@@ -226,7 +226,9 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """Return the root t = l / r in [-1, 1] of 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1)."""
+    """Solve the cubic of a pencil of conics: return t = l / r in [-1, 1] with 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) +
+    q^2 (t + 1) = 0.
+    """
     b2 = -a0 / r
     b1 = (p * p + q * q) / (4 * r * r) - 1
     b0 = a0 / r + (q * q - p * p) / (4 * r * r)
@@ -255,7 +257,7 @@ Series = list[tuple[Expression, Expression]]
 
 
 def multiply_series(f: Series, g: Series) -> Series:
-    """Return f g."""
+    """Return the product f g of two series."""
     total = [[0.0, 0.0] for _ in range(len(f) + len(g) - 1)]
     for i, (a, b) in enumerate(f):
         for k, (c, d) in enumerate(g):
@@ -268,7 +270,7 @@ def multiply_series(f: Series, g: Series) -> Series:
 
 
 def add_series(f: Series, g: Series, factor: float = 1) -> Series:
-    """Return f + factor g."""
+    """Return f + factor g for two series."""
     zero: Series = [(0.0, 0.0)]
     size = max(len(f), len(g))
     longer = [f + zero * (size - len(f)), g + zero * (size - len(g))]
@@ -344,7 +346,7 @@ def series_roots(degree: int) -> Any:
 
 
 def _steps(step: Any, count: int) -> Any:
-    """Return the Function (z, coefficients) -> (z after some steps, whether it still moves)."""
+    """Return the Function of `count` iterations of the root finding: (z, coefficients) -> (z, last step length)."""
     z, unit = ca.MX.sym("z", *step.size_in(0)), ca.MX.sym("scaled", *step.size_in(1))
     iterates, longest = z, None
     for _ in range(count):

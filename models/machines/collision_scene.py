@@ -168,7 +168,7 @@ class CollisionScene:
     def _place(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]], with_obstacles: Sequence[tuple[int, int]]
     ) -> None:
-        """Set the shapes of links, obstacles and hulls of meshes with their frames, and the checked pairs."""
+        """Place the shapes of links, obstacles and mesh hulls in their frames, and select the pairs to check."""
         close = self._close_meshes(own, checked)
         covered = {pair for pairs in close.values() for pair in pairs}
         links = [body.link for body in own]
@@ -315,7 +315,7 @@ class CollisionScene:
         )
 
     def _checked_request(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
-        """Return the indices of pairs, all if None, and a rounding, checked."""
+        """Check the pairs and the rounding that a caller requests; return the indices of the pairs and the rounding."""
         indices = np.arange(len(self.pairs))
         if isinstance(pairs, list | tuple) and not pairs:
             indices = indices[:0]
@@ -356,7 +356,7 @@ class CollisionScene:
         return [*(frames[link] for link in self._carriers), *self._moving(time)]
 
     def _moving(self, time: Expression) -> list[Frame]:
-        """Return the frames of the moving obstacles."""
+        """Return the frames of the moving obstacles at a time."""
         return [obstacle.frame(time) for obstacle in self.obstacles if isinstance(obstacle, MovingObstacle)]
 
     def _close_meshes(
@@ -381,7 +381,7 @@ class CollisionScene:
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
     def _levers_of(self, placed: PlacedShape, reference: int) -> Levers:
-        """Return the levers of one body in a reference frame: that of a link, or -1 for the world."""
+        """Return the levers of one body in a reference frame: the frame of a link, or the world (-1)."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
         joints, turns, base, base_turns = np.zeros(robot.dof), np.zeros(robot.dof), np.zeros(size), np.zeros(size)
         levers = Levers(base, base_turns, joints, turns)

@@ -236,7 +236,7 @@ class FreeFloating:
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Return the momentum of a motion, as by `momentum`, less the conserved one: zero if the motion is possible.
+        """Return the momentum of a motion minus the conserved momentum; zero for a motion that is possible.
 
         The motion is given by the rates of base configuration and joints.
         """
@@ -379,7 +379,7 @@ def _require_planar(robot: Robot) -> None:
 
 
 def _require_inertia(robot: Robot, rows: list[int]) -> None:
-    """Raise ModelError if the momentum in these rows does not determine the base motion.
+    """Raise ModelError if the robot lacks the inertia by which conserved momentum determines the base motion.
 
     Only the ratios of the inertias matter, not the units of mass and length.
     """

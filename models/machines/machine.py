@@ -138,13 +138,15 @@ class FixedBase:
 
     @cached_property
     def _pose_function(self) -> Any:
-        """Function of the joints -> pose of the tip. To inline a function is faster than to build its expressions."""
+        """Cached CasADi Function from joints to the pose of the tip; inlining it is faster than building its
+        expressions.
+        """
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_pose", [q], [*map(ca.densify, tip_pose(self.robot, q, self.world_from_base()))])
 
     @cached_property
     def _jacobian_function(self) -> Any:
-        """Function of the joints -> Jacobian of the tip."""
+        """Cached CasADi Function from joints to the Jacobian of the tip."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_jacobian", [q], [tip_jacobian(self.robot, q, self.world_from_base())])
 
@@ -260,7 +262,7 @@ def with_wheels(
 
 
 def find_wheels(robot: Robot) -> dict[str, float]:
-    """Return the inertia (kg m^2) about the axis of each joint whose angle is irrelevant, by name.
+    """Find the joints whose angle is irrelevant, such as reaction wheels; return their inertia (kg m^2) by name.
 
     Such a joint is unbounded and moves a single body, symmetric about the joint axis with its centre of mass on it,
     that carries neither the tip nor a collision shape.

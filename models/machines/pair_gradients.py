@@ -101,7 +101,7 @@ def distance_gradients(
 def _reduce_groups(
     value: Expression, gradient: Expression, positions: list[int], counts: list[int], softness: float
 ) -> tuple[Expression, Expression]:
-    """Return the soft minimum of each group of consecutive pairs, or the distance of a single pair, with gradients."""
+    """Return the distance of each pair with its gradient; bodies covered by several shapes get a soft minimum."""
     values, rows, order = [value], [gradient], []
     for begin, end in pairwise(accumulate(counts, initial=0)):
         members = positions[begin:end]

@@ -79,12 +79,12 @@ class Scara:
 
     @property
     def outer(self) -> float:
-        """Largest reach, m."""
+        """Largest distance of the tool from the shoulder axis, m."""
         return self.upper_arm + self.forearm
 
     @property
     def inner(self) -> float:
-        """Smallest reach, m."""
+        """Smallest distance of the tool from the shoulder axis, m."""
         return abs(self.upper_arm - self.forearm)
 
     @cached_property

@@ -282,7 +282,7 @@ class Stance(FixedBase):
         return rows_of_feet
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """Return the load of which only the `load_rows` are given. Shape (6, 1)."""
+        """Return the full load (6, 1) of a foot from its free rows `load_rows`; the other rows are zero."""
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
@@ -349,7 +349,7 @@ class Stance(FixedBase):
         return {name: np.array(points) for name, points in points_by_foot.items()}
 
     def friction_margin(self, name: str, load: Expression, friction: float) -> Expression:
-        """Return the squared friction limit less the squared friction load, N^2, negative if the sole slips or turns.
+        """Return the squared friction limit minus the squared friction load, N^2; negative if the sole slips or turns.
 
         (mu f_z)^2 - f_x^2 - f_y^2 - (m_z / c)^2 with the moment m_z about the normal through the middle of the sole and
         c two thirds of the radius of the largest circle in it: the ellipsoid of Howe and Cutkosky (1996). Shape (1, 1);

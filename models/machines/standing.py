@@ -161,7 +161,7 @@ class Standing(FixedBase):
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
-        """Return the rows of (18) for the zero moment point at `point`, by differentiation of its equation.
+        """Return the acceleration constraint (18) that fixes the zero moment point at `point`.
 
         Args:
             q, qd: Shape (n, 1) each.

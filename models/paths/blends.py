@@ -206,14 +206,16 @@ SEARCH = ShapeSearch()
 
 
 def corner_shape(angle: Array) -> Array:
-    """Return the best factors at corners between two lines with interior angles (rad). Shapes (V,) to (V,)."""
+    """Return the optimal shape factors of blends between two lines with interior angles (rad). Shapes (V,) to (V,)."""
     angles, shape_over_chord = _table()
     return np.asarray(2 * np.sin(angle / 2) * np.interp(angle, angles, shape_over_chord))
 
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Return interior angles, rad, and the best factor over the chord for a remaining distance of 1."""
+    """Return interior angles, rad, and the optimal shape factor over the chord, for blends from distance 1 of the
+    corner.
+    """
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])

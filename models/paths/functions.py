@@ -57,7 +57,7 @@ def turn_function(path: SmoothPath) -> Any:
 
 
 def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
-    """Return the column of the cell between two knots that contains a distance, by binary search.
+    """Return the table column of the cell that contains a distance, by binary search.
 
     The tables are interpolants, since CasADi copies a constant matrix whenever it evaluates a function.
     """
@@ -161,7 +161,7 @@ def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
 
 
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
-    """Return the paper's mapping: predictor (15), then `corrections` times the corrector (13).
+    """Return the paper's map of distance to parameter: predictor (15), `corrections` times corrector (13).
 
     It does not control its error: with the trapezoid rule (12) the sample drifts from its distance.
 
@@ -189,7 +189,7 @@ def _predictor_corrector(degree: int, corrections: int) -> Any:
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """Return the default mapping: the same predictor, then Newton steps on the arc length by Gauss-Legendre quadrature.
+    """Return the default map from distance to path parameter: the predictor (15), then Newton steps on the arc length.
 
     Arguments and result as for `predictor_corrector`, except `nodes`: the number of quadrature nodes over one control
     step, for each Newton step. The first steps need few nodes; the last one determines the drift.
@@ -269,7 +269,8 @@ def exponential(vector: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def orientation_function() -> Any:
-    """Return the casadi Function of the orientation on a piece and its rates, for any number of samples as columns.
+    """Return the casadi Function of tool orientation and its rates on one segment, for any number of samples as
+    columns.
 
     Inputs: reference (4); theta (3, 6) as 18 entries column by column, ascending powers of distance over length; length
     (m); distance over length. Outputs: unit quaternion (4); in world axes the angular rate per metre (3, rad/m), its

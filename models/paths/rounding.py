@@ -112,7 +112,7 @@ class _Corners(NamedTuple):
 def _remaining_distances(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """Return the corners, with the best shapes if these are free, and their remaining distances, (n - 1,), m.
+    """Return the corners, with optimised shapes if these are free, and their remaining distances, (n - 1,), m.
 
     Arguments as for `smooth`.
     """
@@ -135,7 +135,7 @@ def _remaining_distances(
 
 
 def _within_tolerance(corners: _Corners, tolerance: Array, overlap: Overlap) -> Array:
-    """Return the largest remaining distances within a tolerance. Shape (V,), m."""
+    """Return the largest remaining distances at which the blends keep a tolerance. Shape (V,), m."""
     path = corners.path
     # at most the segment length, so that every trial curve exists
     longest = np.minimum(path.lengths[:-1], path.lengths[1:])
@@ -257,7 +257,7 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
 
 
 def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
-    """Return the largest distance from each blend of the two stretches that it replaces. Shape (V,), m."""
+    """Return the largest distance from the replaced parts of the path to each blend. Shape (V,), m."""
     path, result = corners.path, np.empty(len(remaining))
     u, v = np.linspace(0, 1, 4 * SETTINGS.samples), np.linspace(0, 1, SETTINGS.samples)
     for first in range(0, len(remaining), SETTINGS.block):
@@ -284,7 +284,7 @@ def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
 
 
 def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remaining: Array) -> Array:
-    """Return the distance of points (V, S, 3) from the closer of the two stretches that each blend replaces."""
+    """Return the distances from points (V, S, 3) of each blend to the closer of the two path parts that it replaces."""
     return np.minimum(
         _distance_to_segment(path, vertices, points, path.lengths[vertices] - remaining, path.lengths[vertices]),
         _distance_to_segment(path, vertices + 1, points, np.zeros(len(vertices)), remaining),

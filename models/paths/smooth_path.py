@@ -203,7 +203,7 @@ class SmoothPath:
         return np.append(inside, self.length)
 
     def by_piece(self, of_segments: ArrayInput) -> Array:
-        """Return the speed of each piece from that of each segment (or one for all); blends take the lower neighbour.
+        """Return the speed on each piece from the speed of each segment; a blend takes the lower one of its neighbours.
 
         Shape (P,).
 
@@ -365,7 +365,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    """Return the sum of (-x)^k / (2 k + start)! and its two derivatives by x."""
+    """Return the power series with terms (-x)^k / (2 k + start)! and its first two derivatives."""
     value, first, second = (np.zeros_like(square) for _ in range(3))
     for k in reversed(range(SERIES_TERMS)):
         second = second * square + 2 * first

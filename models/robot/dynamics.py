@@ -167,7 +167,7 @@ def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
 
 
 def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Expression]:
-    """Return moment, force and point of a wrench."""
+    """Return moment, force and application point of a wrench."""
     moment, force, point = (stacked[3 * i : 3 * i + 3, column] for i in range(3))
     return moment, force, point
 
@@ -282,7 +282,7 @@ def _mass_sums(link: Link) -> tuple[Expression, Expression]:
 
 
 def _field(spin: Expression, turning: Expression) -> Expression:
-    """Return [alpha x] + [omega x]^2. Shape (3, 3)."""
+    """Return the acceleration field of a rotating body: [alpha x] + [omega x]^2. Shape (3, 3)."""
     squares = ca.mtimes(spin, spin.T)
     return skew(turning) + squares - ca.trace(squares) * ca.DM.eye(3)
 
@@ -301,7 +301,7 @@ class MassMoments(NamedTuple):
     second: Expression
 
     def plus(self, other: MassMoments) -> MassMoments:
-        """Return the moments of the union of two sets of bodies."""
+        """Return the mass moments of the union of two sets of bodies."""
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:

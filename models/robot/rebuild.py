@@ -61,7 +61,7 @@ def with_load(
     """
     carrier = _robot(robot).link(link)
     load = Link(f"load of {link}", mass, center_of_mass, np.zeros((3, 3)) if inertia is None else inertia)
-    loaded = _welded(carrier, [(load, np.eye(3), np.zeros(3))])
+    loaded = _merge_links(carrier, [(load, np.eye(3), np.zeros(3))])
     return replace(robot, links=tuple(loaded if each.name == link else each for each in robot.links))
 
 
@@ -229,7 +229,7 @@ def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     links = []
     for link in robot.links:
         if mass_carrier[link.name][0] == link.name:
-            links.append(_welded(link, [part for part in parts[link.name] if part[0] is not link]))
+            links.append(_merge_links(link, [part for part in parts[link.name] if part[0] is not link]))
         elif frame_carrier[link.name][0] == link.name:
             links.append(Link(link.name))
     if robot.tip is None:
@@ -239,8 +239,8 @@ def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
     return replace(robot, links=tuple(links), joints=tuple(joints), tip=tip, tip_translation=shift, tip_rotation=turn)
 
 
-def _welded(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
-    """Return a link merged with others, including shapes, given their poses (rotation, translation) in its frame."""
+def _merge_links(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
+    """Merge links, with their masses and shapes, into one, given their poses (rotation, translation) in its frame."""
     shapes = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.collisions)
     visuals = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.visuals)
     link = replace(link, collisions=(*link.collisions, *shapes), visuals=(*link.visuals, *visuals))

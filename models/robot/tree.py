@@ -302,7 +302,7 @@ def floating_joint(place: Joint) -> JointChain:
 
 
 def _chain(place: Joint, steps: Sequence[tuple[str, Kind, Array]]) -> JointChain:
-    """Return the chain of joints with one degree of freedom, given by suffix, kind and axis."""
+    """Return a chain of joints with one degree of freedom each, from the suffix, kind and axis of each joint."""
     links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
     ends = [place.parent, *(link.name for link in links), place.child]
     joints = []

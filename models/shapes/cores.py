@@ -43,7 +43,7 @@ class BoxCore(NamedTuple):
 
 
 def no_stop(value: Expression) -> Expression:
-    """Return the value unchanged, with its derivative."""
+    """Return the value unchanged; the counterpart of functions that stop its derivative."""
     return value
 
 
@@ -273,7 +273,7 @@ def _segment_box_square(
 
 
 def _without_derivative(s: Expression) -> Expression:
-    """Return a position along a segment, -1/2..1/2, rounded to multiples of 2^-53, which removes its derivative."""
+    """Return a position along a segment, -1/2..1/2, rounded to multiples of 2^-53 so that its derivative vanishes."""
     return ca.floor(s * 2.0**53) / 2.0**53
 
 

@@ -254,7 +254,7 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
 
 
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
-    """Return the sides of a plane across an axis whose two capsules and the others cover least.
+    """Return the two sides of a plane across an axis for which the covering capsules have the least volume in all.
 
     If no plane splits the part, the part itself is returned.
     """
@@ -388,7 +388,7 @@ def _enclosing_box(box: Box, points: Array) -> Box:
 
 
 def _overhang(shape: CoverShape, hull: Array) -> float:
-    """Return the largest distance of sampled surface points of a shape from the hull of some points."""
+    """Return how far a shape extends beyond the convex hull of some points, at sampled surface points."""
     around = _sphere_points(SETTINGS.samples)
     if isinstance(shape, Capsule):
         along = np.asarray(shape.end) - np.asarray(shape.start)

@@ -218,7 +218,7 @@ class StoppedGradients:
         self._values: list[Expression] = []
 
     def __call__(self, value: Expression) -> Expression:
-        """Return a symbol that stands for a value, which may contain other symbols."""
+        """Return a new symbol that replaces an expression, so that derivatives treat it as a constant."""
         if not isinstance(value, ca.MX) or value.is_constant():
             return value
         self._symbols.append(ca.MX.sym("stopped", value.shape))
@@ -226,7 +226,7 @@ class StoppedGradients:
         return self._symbols[-1]
 
     def restore(self, expressions: list[Expression]) -> list[Expression]:
-        """Return the expressions with the values substituted for the symbols."""
+        """Return the expressions with the original values in place of the symbols."""
         return list(ca.substitute_inplace(self._symbols, self._values, expressions)[1])
 
 
@@ -327,7 +327,7 @@ def _scalars(vector: Expression) -> Triple:
 
 
 def _as_number(entry: Expression) -> Expression:
-    """Return a scalar, as a float if it is constant."""
+    """Return a scalar, as a float if it is a constant expression."""
     return float(entry) if entry.is_constant() else entry
 
 

@@ -282,7 +282,7 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of the point of a simplex that is nearest to the origin, and that point.
+    """Return the point of a simplex that is nearest to the origin, and its barycentric weights.
 
     Shape (K, 4, 3) to (K, 4) and (K, 3). The vertices may coincide. Only faces that contain the last vertex are tried.
     """

@@ -55,7 +55,7 @@ class Triangles(NamedTuple):
 
 
 def without_colors(vertices: Array, faces: Faces) -> Triangles:
-    """Return triangles without colours."""
+    """Return the triangles of vertices and faces, all without a colour."""
     return Triangles(vertices, faces, np.full((len(faces), 4), np.nan))
 
 

@@ -248,7 +248,7 @@ class _Lever(NamedTuple):
     arm: float
 
     def moved(self, half: Array) -> Array:
-        """Return a bound of the change of distance when the entry changes by up to `half`, rad or m."""
+        """Return the largest change of the distance when the joint moves by at most `half`, rad or m."""
         turned = np.minimum(abs(self.ratio) * half, np.pi)
         return np.asarray(2 * self.arm * np.sin(turned / 2) if self.arm else abs(self.ratio) * half)
 
@@ -268,7 +268,7 @@ class _PairClassifier:
     _poses: dict[str, Poses] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why a pair need not be checked, or None, and whether it is checked although its covers always collide.
+        """Return why a pair need not be checked, or None; also whether its covers are known to collide.
 
         Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
         therefore classified by the convex hulls of meshes.
@@ -308,7 +308,7 @@ class _PairClassifier:
         return self._placed[key]
 
     def _pose(self, part: str) -> Poses:
-        """Return the poses of a rigid part in the root's at the first configurations."""
+        """Return the poses of a rigid part in the frame of the root at the first configurations."""
         if part not in self._poses:
             q = self.configurations[: SETTINGS.first_configurations]
             step = self.parts.step.get(part)
@@ -347,7 +347,7 @@ class _BodyPair:
         return None if colliding.any() or not self._proves_apart(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
-        """Return NEVER for hulls that are apart on a grid of two joints, refined where they are closest.
+        """Return NEVER if the hulls are apart at all points of a joint grid, refined where they are closest.
 
         Returns ALWAYS for hulls that overlap on the whole first grid, else None.
         """
@@ -380,7 +380,7 @@ class _BodyPair:
         return self.bounds_at(self._relative(q), above)
 
     def bounds_at(self, poses: Poses, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the same as `bounds` for poses of the second body's rigid part in the first body's."""
+        """Return distance bounds as `bounds` does, for given relative poses of the two rigid parts."""
         (turn, shift), first, second = poses, self.first, self.second
         bounds = np.linalg.norm(shift + turn @ second.centre - first.centre, axis=1) - first.radius - second.radius
         close: NDArray[np.bool_] = np.asarray(bounds <= above + MARGIN_M)
@@ -475,7 +475,7 @@ def _axis_rotations(axis: Array, angle: Array) -> Array:
 
 
 def _moved(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
-    """Return the poses of the part below a joint from those of the part above."""
+    """Return the poses of the part behind a joint from the poses of the part before it."""
     (turn, shift), (column, ratio, offset) = above, robot.couplings[step.joint.name]
     position = ratio * q[:, column] + offset
     shift = shift + turn @ step.translation

@@ -49,7 +49,7 @@ class _SweptCore:
 
 
 class _Posed(_SweptCore):
-    """A shape with a pose of its own."""
+    """Base class of shapes with a pose of their own."""
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
         """Return the shape in another frame, in which its own has this rotation (3, 3) and position (3,), m."""

@@ -104,13 +104,13 @@ def _run(options: argparse.Namespace) -> int:
     except BrokenPipeError:
         raise
     except (ModelError, ProblemError, AuditError, OSError) as error:
-        return _refused(options, error, 2)
+        return _report_error(options, error, 2)
     except SolveError as error:
-        return _refused(options, error, 1)
+        return _report_error(options, error, 1)
 
 
-def _refused(options: argparse.Namespace, error: Exception, status: int) -> int:
-    """Print an error, with --json also as JSON, and return the exit status."""
+def _report_error(options: argparse.Namespace, error: Exception, status: int) -> int:
+    """Print an error message, with --json also as JSON, and return the exit status."""
     message = str(error)
     if isinstance(error, OSError) and error.filename is not None:
         message = f"{PART.sub('', str(error.filename))}: {error.strerror}"
@@ -288,7 +288,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
 def _command(
     commands: Any, name: str, short: str, about: str, examples: str, run: CommandFunction
 ) -> argparse.ArgumentParser:
-    """Add a subcommand."""
+    """Add a subcommand to the command line."""
     subcommand: argparse.ArgumentParser = commands.add_parser(
         name, help=short, description=about, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -299,7 +299,7 @@ def _command(
 
 
 def _file(parser: Any, name: str, description: str, short: str = "", **more: Any) -> None:
-    """Add an argument that names a file."""
+    """Add an argument that names a file to a parser."""
     if name.startswith("-"):
         more.setdefault("metavar", "FILE")
     action = parser.add_argument(*([short] if short else []), name, type=Path, help=description, **more)
@@ -307,7 +307,7 @@ def _file(parser: Any, name: str, description: str, short: str = "", **more: Any
 
 
 def _force(parser: argparse.ArgumentParser) -> None:
-    """Add --force."""
+    """Add the option --force to a parser."""
     parser.add_argument("--force", action="store_true", help="also overwrite files that selfmotion did not write")
 
 
@@ -369,7 +369,7 @@ def check_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _limit(text: str) -> tuple[str, float]:
-    """Return the joint, or "", and the number of JOINT=NUMBER or NUMBER."""
+    """Parse JOINT=NUMBER or NUMBER: return the joint, or "", and the number."""
     name, _, value = text.rpartition("=")
     try:
         return name, float(value)
@@ -378,7 +378,7 @@ def _limit(text: str) -> tuple[str, float]:
 
 
 def _named_number(text: str) -> tuple[str, float]:
-    """Return the name and the number of NAME=VALUE."""
+    """Parse NAME=VALUE: return the name and the number."""
     name, value = _limit(text)
     if not name:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
@@ -386,7 +386,7 @@ def _named_number(text: str) -> tuple[str, float]:
 
 
 def _pair(text: str) -> tuple[str, str]:
-    """Return the two names of LINK,LINK."""
+    """Parse LINK,LINK: return the two names."""
     first, comma, second = text.partition(",")
     if not comma or not first.strip() or not second.strip():
         raise argparse.ArgumentTypeError(f"{text!r} is not two names, LINK,LINK")

@@ -1,4 +1,4 @@
-"""Run the subcommands of `selfmotion`: options in; exit status, text and contents of JSON out."""
+"""Run the subcommands of `selfmotion`: each turns options into an exit status, a text and JSON contents."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
 
 
 def machine_of(options: argparse.Namespace, robot: Robot, raw: RawTrajectory) -> tuple[Machine, list[str]]:
-    """Return the robot on the base of the options, and what was assumed about its feet."""
+    """Return the robot on the base that the options name, and a note on assumptions about its feet."""
     if options.floating:
         return FreeFloating(robot, "planar" if set(PLANAR_BASE) <= set(raw.names) else "spatial"), []
     translation, rotation = base_pose(options)
@@ -230,7 +230,7 @@ def run_completion(options: argparse.Namespace, progress: Progress) -> tuple[int
 
 
 def read_robot(options: argparse.Namespace) -> Robot:
-    """Return the robot of the options, with locked joints and load."""
+    """Read the robot that the options describe, with locked joints and load."""
     robot = Robot.from_urdf(options.robot, tip=options.tip)
     if options.lock:
         robot = lock_joints(robot, dict(options.lock))
@@ -252,7 +252,7 @@ FINDING_FIELDS = ("name", "value", "limit", "unit", "time", "passed", "verdict",
 def run_task(
     task: Task, output: Path | None, progress: Callable[[str], None], force: bool = False
 ) -> tuple[int, str, Any]:
-    """Plan, audit and write; return the exit status, a text, and the contents of JSON.
+    """Plan the motion of a task file, audit it and write the outputs; return exit status, text and JSON contents.
 
     Args:
         task: Contents of the task file.
@@ -303,7 +303,7 @@ def run_task(
 
 
 def _segments(result: Plan) -> dict[str, Any]:
-    """Return the segments of a plan, and the motions between them, if it has several."""
+    """Describe the segments of a plan and the motions between them, if it has several."""
     if not isinstance(result, SegmentedPlan):
         return {}
     names = ("time", "before", "after", "duration", "failure")

@@ -1,1 +1,1 @@
-"""The audit: does a plan do what it says, between its nodes too, and is it an extremal?"""
+"""The audit: checks of feasibility, also between the nodes of a plan, and of optimality."""

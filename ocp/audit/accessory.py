@@ -60,7 +60,7 @@ class AccessoryProblem:
         self._switches()
 
     def _units(self) -> None:
-        """Set the scales with which the sweep is well conditioned; they do not affect any verdict.
+        """Choose the scales that make the backward sweep well conditioned; they do not affect any verdict.
 
         Horizon and states have their sizes; states that hardly move take those of others of their unit. Controls are
         scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature take their
@@ -82,7 +82,7 @@ class AccessoryProblem:
         self.unit = np.concatenate([state, horizon, *([state] if self.with_start else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
-        """Return the entries of y = (x, T, u) in use, and the index of each in (z, u)."""
+        """Return the indices of the used entries of y = (x, T, u), and where each one is in (z, u)."""
         nx = self.nx
         keep = [*range(nx), *([nx] if self.free else [])]
         inputs = range(nx + 1, nx + 1 + self.nu)
@@ -125,7 +125,7 @@ class AccessoryProblem:
 
     @cached_property
     def residual_slope(self) -> np.ndarray:
-        """Remaining slope of T H along the controls that curve it, in scaled controls. Shape (M, nu)."""
+        """Slope of T H in the controls that no multiplier balances, in scaled controls. Shape (M, nu)."""
         along = self.along
         multipliers = self.adjoint.control_multipliers
         gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
@@ -140,22 +140,20 @@ class AccessoryProblem:
 
     @property
     def hamiltonian_scale(self) -> float:
-        """Curvature of the Hamiltonian over the sizes of states and controls, in units of cost."""
+        """Second-order change of the Hamiltonian over the sizes of states and controls, in units of cost."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
 
     @property
     def cost_scale(self) -> float:
-        """Curvature over the sizes by the running cost alone for the states: multipliers do not belong to a size of the
-        cost.
-        """
+        """Curvature over the sizes, for the states by the running cost alone, because multipliers have no cost size."""
         sizes, curvature = self.along.sizes, np.abs(self._curves[:, self.nx + 1 :])
         total = self.along.share @ (np.abs(self._cost_curves) @ sizes.state**2 + curvature @ sizes.control**2)
         return float(total) / 2
 
     @property
     def control_scale(self) -> float:
-        """Curvature of the cost over the full values of the controls, in units of cost."""
+        """Second-order change of the cost when every control changes by its own value, in units of cost."""
         return float(self.along.share @ np.sum(np.abs(self._curves[:, self.nx + 1 :]) * self.along.u**2, axis=1)) / 2
 
     def _constraints(self) -> None:
@@ -222,7 +220,7 @@ class AccessoryProblem:
 
 
 def obstacle(form: Formulation) -> str:
-    """Return why the second variation is unknown for the plans of a problem, or ""."""
+    """Return the reason why the second variation is unknown for all plans of a problem, or ""."""
     last = ca.vertcat(form.end.expression, form.terminal)
     if ca.depends_on(last, form.u0):
         return "the control at the start enters the conditions at the end"

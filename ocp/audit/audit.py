@@ -151,7 +151,7 @@ class Audit:
 
     @property
     def _word(self) -> str:
-        """The verdict in one word or two."""
+        """The verdict in one or two words."""
         return "passed" if self.passed else "not decided" if self.feasible and self.optimal is None else "FAILED"
 
     def __str__(self) -> str:
@@ -287,7 +287,7 @@ def audit(
 
 
 def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Finding:
-    """Compare horizon and last time of a plan with the declared horizon, to the tolerance of a solver."""
+    """Compare the horizon and the last time of a plan with the declared horizon, within the solver's tolerance."""
     low, high = (float(side[form.bounds.places["horizon"][0]]) for side in bounds)
     miss = max(low - solution.horizon, solution.horizon - high, abs(float(solution.t[-1]) - solution.horizon))
     declared = f"{low:.6g} s" if low == high else f"{low:.6g} to {high:.6g} s"
@@ -342,7 +342,7 @@ def clearance_finding(clearance: Clearance, limit: float) -> Finding:
 
 
 def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) -> Finding:
-    """Return the difference from the plan over the whole horizon; only reported if unstable dynamics explain it."""
+    """Return the deviation of the plan from its re-integration over the whole horizon, relative."""
     notes = [] if motion.breakdown_time is None else [f"the integration broke down at {motion.breakdown_time:.6g} s"]
     if is_unstable:
         notes.append(f"unstable dynamics amplify {motion.added[-1]:.2g}, the sum of the defects of the intervals")
@@ -360,7 +360,7 @@ def violation_finding(violation: Violation, constraints: float, tolerance: float
 
 
 def _worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None, note: str = "") -> Finding:
-    """Return the finding of the largest value; nan counts as the largest."""
+    """Return the finding with the largest value; nan counts as the largest."""
     if values.size == 0:
         return Finding(name, 0.0, limit, None, note)
     clean = np.where(np.isnan(values), np.inf, values)

@@ -153,7 +153,7 @@ class Clearance:
 
     @property
     def _assumptions(self) -> list[str]:
-        """Return a text on the pairs left out by assumption, in a list; empty if there are none."""
+        """Describe the pairs that are excluded by assumption, as a list of one text; empty if there are none."""
         first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_PRINTED]]
         more = [f"{len(self.assumed) - MAX_PRINTED} more"] if len(self.assumed) > MAX_PRINTED else []
         return [f"left out by assumption: {', '.join([*first, *more])}"] if first else []
@@ -285,7 +285,7 @@ class _Search:
         return Clearance(self.apart.name, tuple(closest), settled, checked, reason, self.apart.assumed)
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
-        """Return why intervals stay undecided, if a prescribed motion is the cause; else an empty text."""
+        """Return why intervals stay undecided if a prescribed motion is the cause; else an empty text."""
         begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         if self.track.prescribed is None:
             return ""
@@ -298,7 +298,7 @@ class _Search:
         return f"the prescribed motion between {names} {cause} at {begin[k]:.6g} s"
 
     def at(self, time: float) -> list[ClosestPair]:
-        """Return the distance of each pair at one time, s."""
+        """Return the distances of all pairs at one time, s."""
         self.best[:] = np.inf
         self._evaluate(np.full(len(self.apart), np.clip(time / self.track.horizon, 0.0, 1.0)))
         return self._closest(self.best)
@@ -335,7 +335,7 @@ class _Search:
         self._keep(pair, gap, when, points)
 
     def _sufficient_bounds(self) -> np.ndarray:
-        """Return the lower bound at which each pair counts as decided. Shape (n,), m.
+        """Return the lower bound of the distance that decides each pair. Shape (n,), m.
 
         The pair with the smallest margin is resolved to a relative accuracy. For the others it suffices that their
         margins are no smaller.
@@ -388,7 +388,7 @@ class _Search:
     def _moves(
         self, pair: np.ndarray, block: np.ndarray, level: int, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far the distances of pairs can fall within intervals of ``width`` s.
+        """Return by how much the distances of pairs can decrease within intervals of ``width`` s.
 
         Below the value at the middle, and below the chord between the ends. Shape (K,) each, m.
         """
@@ -403,7 +403,7 @@ class _Search:
         return moves * width / 2, (bends + 2 * turns * moves) * width**2 / 8
 
     def _keep(self, pair: np.ndarray, distance: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
-        """Store distances that are smaller than those found before."""
+        """Store distances that are smaller than all earlier ones."""
         order = np.lexsort((distance, pair))
         first = order[np.unique(pair[order], return_index=True)[1]]
         first = first[distance[first] < self.best[pair[first]]]

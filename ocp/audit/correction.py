@@ -100,7 +100,7 @@ def corrected_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion |
 
 
 class _Converged(NamedTuple):
-    """States at the grid and inside its cells, the running cost along them, and the ratio of successive corrections."""
+    """States of the re-integrated motion, its running cost, and the convergence rate of the corrections."""
 
     x: np.ndarray
     cost: float
@@ -108,7 +108,7 @@ class _Converged(NamedTuple):
 
 
 class _Newton:
-    """A plan at its fine grid and inside its cells, and the linear equation of its error."""
+    """Newton's method for the motion under the controls of a plan, on its fine grid."""
 
     def __init__(self, along: Linearisation, grid: FineGrid) -> None:
         self.along, form = along, along.form
@@ -158,7 +158,7 @@ class _Newton:
         return self._cumulative(panels, flow.shape) if (doubt <= allowed).all() else None
 
     def _cumulative(self, panels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the integral of values in ``_panels`` form from the start of each interval to every sample.
+        """Integrate values in ``_panels`` form from the start of each interval to every sample.
 
         ``shape`` is that of the values and of the result, (N, 2 cells + 1, m).
         """
@@ -170,7 +170,7 @@ class _Newton:
         return integral
 
     def converged(self, chained: bool, rate: float = 1.0) -> _Converged | None:
-        """Return the motion from the plan's first state, or from its own state at the start of every interval.
+        """Iterate to the motion that starts from the plan's first state, or anew in every interval.
 
         Args:
             chained: Whether the intervals are joined to one motion.
@@ -199,7 +199,7 @@ class _Newton:
         return float(np.einsum("k,j,kji,kji->", along.width, along.weight, slope, self.at_gauss @ change))
 
     def _own_error(self, integral: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return the error of states x that each interval adds, to first order. Shape (N, 2 cells + 1, nx)."""
+        """Return the integration error that each interval contributes to states x, to first order."""
         (n, q), nx = self.along.shape, self.along.form.nx
         defect = integral[..., :nx] - (x - x[:, :1])
         at_gauss = self.at_gauss @ defect
@@ -211,7 +211,7 @@ class _Newton:
         return np.asarray(defect + self._cumulative(_panels(fed), fed.shape))
 
     def _propagated(self, ends: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return the propagated errors of the interval ends (N, nx) of states x, jumps between intervals included."""
+        """Propagate the errors at the interval ends (N, nx) of states x, including jumps between intervals."""
         start = np.zeros(ends.shape)
         jumps = ends[:-1] + x[:-1, -1] - x[1:, 0]
         for k in range(len(jumps)):
@@ -221,7 +221,7 @@ class _Newton:
 
 
 def _panels(values: np.ndarray) -> np.ndarray:
-    """Return values (N, 2 cells + 1, m) of each five cells side by side. Shape (N cells / 5 m, 11)."""
+    """Arrange values (N, 2 cells + 1, m) as panels of five cells each. Shape (N cells / 5 m, 11)."""
     windows = np.lib.stride_tricks.sliding_window_view(values, LENGTH + 1, axis=1)
     return windows[:, ::LENGTH].reshape(-1, LENGTH + 1)
 

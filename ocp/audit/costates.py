@@ -26,7 +26,7 @@ __all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "end_limits", "interval_en
 
 
 class Ends(NamedTuple):
-    """The conditions at the ends of a plan.
+    """Residuals of the optimality conditions at start and end of a plan, with the multipliers there.
 
     Attributes:
         transversality: Residual of the costates at the ends that no multiplier explains, in units of cost.
@@ -136,7 +136,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
 
 
 def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray | None) -> np.ndarray:
-    """Return the part of all forces near a node that lies before it, by the hat function of the node, see `Adjoint`.
+    """Return which part of the forces near a node acts before it, weighted by the node's hat function; see `Adjoint`.
 
     Half of the ``atoms`` at the starts of the intervals, if these are not distributed yet.
     """
@@ -166,7 +166,7 @@ def interval_end_costates(along: Linearisation) -> tuple[np.ndarray, np.ndarray]
 
 
 class Backwards:
-    """The costate equation over every interval, backwards, with the multipliers of the controls as feedback."""
+    """Backward integration of the costate equation over every interval, with the control multipliers as feedback."""
 
     def __init__(self, along: Linearisation, multipliers: np.ndarray, across: np.ndarray) -> None:
         self.along = along
@@ -219,7 +219,7 @@ class Backwards:
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
     def chained(self, errors: np.ndarray) -> np.ndarray:
-        """Return the accumulated errors at the start of each interval, propagated backwards, from its own (N, nx)."""
+        """Accumulate the costate errors of the intervals (N, nx), propagated backwards, at the start of each."""
         (n, q), nx = self.along.shape, self.along.form.nx
         points = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
         weight = self.along.weight[:, None, None]
@@ -233,7 +233,7 @@ class Backwards:
 
 
 def _forces(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the state limits in interval k that fit its costates best: (q, m), atoms (2, m)."""
+    """Return the multipliers of the state limits in interval k that best explain its costates: (q, m), atoms (2, m)."""
     along = back.along
     q, nx, m = along.shape[1], along.form.nx, along.state_limits.lower.shape[1]
     points = slice(k * q, (k + 1) * q)
@@ -287,7 +287,7 @@ def _forces(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
 
 
 def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return the error of the costates that a plan reports inside its intervals, in units of cost. Shape (N,)."""
+    """Return the error of the reported costates inside the intervals, in units of cost. Shape (N,)."""
     (n, q), nx = along.shape, along.form.nx
     fractions = along.solution.t / along.solution.horizon
     k = np.clip(np.searchsorted(along.mesh, fractions, side="right") - 1, 0, n - 1)
@@ -310,7 +310,7 @@ def _ends(
     cost: float,
     lam1: np.ndarray,
 ) -> Ends:
-    """Return the conditions at the ends, with the multipliers of the right signs that fit them best."""
+    """Return the residuals of the end conditions for multipliers of the right signs that fit best."""
     form, solution, nx = along.form, along.solution, along.form.nx
     low, high = along.bounds
     places = form.bounds.places

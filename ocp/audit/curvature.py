@@ -1,4 +1,4 @@
-"""Second order: does the cost curve upwards along every feasible variation of a plan, and how much does it lose?
+"""Second-order conditions: is the second variation of the cost positive along every feasible variation of a plan?
 
 A stationary plan may be a maximum, a saddle point, or a minimum only up to a conjugate point. The second variation of
 the cost (:mod:`ocp.audit.accessory`) is swept backwards stage by stage. The cost must curve upwards along all
@@ -68,13 +68,13 @@ class Curvature:
 
     @property
     def upwards(self) -> bool | None:
-        """Whether the cost curves upwards along all feasible variations; None if inconclusive."""
+        """Whether the second variation is positive along all feasible variations; None if inconclusive."""
         if self.flat:
             return None
         return bool(self.least > FLAT_SHARE)
 
     def lost(self, slope: np.ndarray) -> float:
-        """Return the cost that start and horizon could save, to second order, for a slope (nz,) of the cost in them.
+        """Return how much a change of start and horizon could reduce the cost, to second order, given its slope (nz,).
 
         Where the cost does not curve, they change by their scales at most.
         """
@@ -134,7 +134,7 @@ class _Swept(NamedTuple):
 def _sweep(
     accessory: AccessoryProblem, stages: _Linearised, weak: bool, tolerances: RankTolerances = FULL_RANK
 ) -> _Swept:
-    """Sweep backwards over all stages: by linear solves if every stage curves upwards, else by eigenvectors.
+    """Sweep backwards over all stages: by linear solves if every stage is convex, else by eigenvectors.
 
     Args:
         weak: Whether active limits without multipliers are held too.
@@ -153,7 +153,7 @@ def _sweep(
 def _swept(
     accessory: AccessoryProblem, sweep: _Linearised, stages: list[_Stage], tolerances: RankTolerances, upwards: bool
 ) -> _Swept | None:
-    """Sweep backwards. With ``upwards`` return None if some stage does not curve upwards.
+    """Sweep backwards over all stages. With ``upwards``, return None as soon as a stage is not convex.
 
     Cost, step and curvature of a stage refer to (z, 1, controls), so that they include the slope of the cost.
     """
@@ -290,7 +290,7 @@ class _Linearised(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """A stage reduced to the f variations of its controls that its own constraints leave free.
+    """A stage of the sweep, reduced to the f control variations that its own constraints leave free.
 
     Attributes:
         lift: (z, 1, controls) as a function of (z, 1) and the free variations. Shape (nz + 1 + q nu, nz + 1 + f).
@@ -305,7 +305,7 @@ class _Stage(NamedTuple):
 
 
 def _reduced(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolerances: RankTolerances) -> list[_Stage]:
-    """Reduce each stage by its own constraints; stages with the same constraints are treated together."""
+    """Reduce each stage by its own constraints; stages with equal constraints are treated together."""
     n, q = accessory.along.shape
     nz, nu = accessory.nz, accessory.nu
     normals = accessory.normals.reshape(n, q, -1, nz + nu)
@@ -335,7 +335,7 @@ def _reduced(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolera
 def _eliminated(
     rows: np.ndarray, nz: int, tolerances: RankTolerances
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Eliminate constraint rows (K, r, nz + m) on nz states and m controls at K stages.
+    """Eliminate the controls that constraint rows (K, r, nz + m) determine, at K stages of nz states and m controls.
 
     Returns:
         For each group of L stages with equal ranks: their indices, (L,); states and controls from the states and the
@@ -365,7 +365,7 @@ def _eliminated(
 
 
 class _Gain(NamedTuple):
-    """Feedback of a stage: its controls from (z, 1) and the free variations, and minus the response of these."""
+    """Optimal feedback of a stage: controls as a linear function of (z, 1) and of the free variations."""
 
     lift: np.ndarray
     response: np.ndarray
@@ -384,7 +384,7 @@ def unit_rows(rows: np.ndarray, rank: float) -> np.ndarray:
 
 
 def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
-    """Return conditions at an end as rows of length 1: small entries of states that hardly move count."""
+    """Scale end conditions to rows of length 1, so that small entries of states that hardly move count."""
     return unit_rows(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 
@@ -438,7 +438,7 @@ def _variation(
 
 
 def _confirmed(least: float, at: float | None, variation: _Variation, scale: float) -> _Swept:
-    """Return a negative curvature only if the variation confirms it: its cost decreases and its constraints hold.
+    """Return a negative curvature only if a variation confirms it: it lowers the cost and keeps the constraints.
 
     End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no
     freedom.
@@ -449,8 +449,7 @@ def _confirmed(least: float, at: float | None, variation: _Variation, scale: flo
 
 
 def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
-    """Return why the curvature along the controls of a stage is inconclusive: the Hamiltonian does not curve along
-    them.
+    """Return why the curvature is inconclusive at a stage: the Hamiltonian is linear along a control direction.
 
     For a control that enters linearly the remaining curvature is of the order of the interval's width. A minimum on a
     singular arc is decided by the generalised Legendre-Clebsch condition, which is not checked here.
@@ -470,5 +469,5 @@ def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
 
 
 def _label(form: Formulation, direction: np.ndarray, nu: int) -> str:
-    """Return the label of the control with the largest share in a direction of a stage."""
+    """Return the name of the control with the largest component in a direction of a stage."""
     return form.control_labels[int(np.argmax(np.abs(direction).reshape(-1, nu).max(axis=0)))]

@@ -67,7 +67,7 @@ class Limits:
         return part
 
     def extend(self, count: int) -> None:
-        """Add equalities that the plan satisfies."""
+        """Append equalities that the plan satisfies."""
         m = len(self.below)
         self.equal = np.append(self.equal, np.ones(count, bool))
         zeros = np.zeros((m, count))
@@ -76,11 +76,11 @@ class Limits:
 
     @property
     def near(self) -> np.ndarray:
-        """Whether either side may be active. Shape (M, m), bool."""
+        """Whether the lower or the upper limit may be active. Shape (M, m), bool."""
         return np.asarray(self.lower | self.upper)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the product of multipliers (M, m) and the gaps to their limits: at least zero. Shape (M, m)."""
+        """Return the complementarity products: multipliers (M, m) times gaps to the limits, at least zero."""
         gap = np.where(multipliers > 0, self.above, self.below)
         return np.asarray(np.where(multipliers != 0, gap, 0.0) * np.abs(multipliers))
 
@@ -174,7 +174,7 @@ class Linearisation:
 
     @property
     def slope_size(self) -> float:
-        """Change of the running cost, to first order, over the sizes of states and controls, in units of cost."""
+        """First-order change of the running cost over the sizes of states and controls, in units of cost."""
         unit = np.concatenate([self.state_size, [0.0], self.sizes.control])
         return float(self.share @ (np.abs(self.cost_y) @ unit))
 
@@ -287,7 +287,7 @@ class Linearisation:
         self.node_limits_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
 
     def _arcs(self) -> None:
-        """Add state equalities as limits of the controls, through their first time derivative that contains a control.
+        """Add state equalities as limits of the controls, via their lowest time derivative that contains a control.
 
         A transcription that imposes such a row at points determines the costates up to multiples of the gradients of
         the row and of its derivatives (Hartl, Sethi, Vickson 1995, section 4). The slope of the Hamiltonian is then
@@ -304,7 +304,7 @@ class Linearisation:
 
 
 def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampler]]:
-    """Group path rows by the order of the first time derivative that contains a control.
+    """Group path rows by order: that of the lowest time derivative that contains a control.
 
     Returns:
         For each order the indices of its rows, and a sampler of the derivatives of these in the controls.
@@ -325,7 +325,7 @@ def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampl
 
 
 def over_fraction(form: Formulation) -> list[Any]:
-    """Return the symbol of the fraction of the horizon, and T L, T f and the path rows as expressions of it."""
+    """Return the symbol of the horizon fraction, with T L, T f and the path rows as expressions of it."""
     fraction = form.sym("s")
     parts = [form.T * form.running, form.T * form.f, form.path.expression]
     return [fraction, *ca.substitute(parts, [form.t], [fraction * form.T])]

@@ -1,4 +1,4 @@
-"""First and second order optimality of a plan: its multipliers, the cost it loses, and the curvature of the cost.
+"""First and second order optimality of a plan: multipliers, cost above the optimum, and curvature of the cost.
 
 Where controls rest on their limits, the plan alone does not determine the costates. A plan that switches between limits
 where its mesh allows it fits a whole set of costates. A solver reports one of them, whose switching functions need not
@@ -43,7 +43,7 @@ SOLVER = {
 
 
 class Fit(NamedTuple):
-    """The multipliers with the smallest loss.
+    """The multipliers of a plan that minimise its estimated loss.
 
     Attributes:
         lost: Loss of the plan in each interval without its ends, in units of cost. Shape (N,).
@@ -92,7 +92,7 @@ class _Program:
         return np.arange(first, first + right.size).reshape(right.shape)
 
     def add(self, rows: Any, columns: Any, values: Any) -> None:
-        """Add entries; the three arrays are broadcast to one shape."""
+        """Add matrix entries; the three arrays are broadcast to one shape."""
         rows, columns, values = np.broadcast_arrays(rows, columns, values)
         keep = values.ravel() != 0
         self._entries.append((rows.ravel()[keep], columns.ravel()[keep], values.ravel()[keep]))
@@ -136,7 +136,9 @@ class _Multipliers:
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
            share: Any = 1.0) -> _Multipliers:  # fmt: skip
-        """Add both sides of ``chosen`` limits (M, m), bool, with derivatives (M, m, n) in variables of sizes (n,).
+        """Add a multiplier for each side of the ``chosen`` limits (M, m), bool, whose derivatives are (M, m, n).
+
+        The variables have the sizes (n,).
 
         A multiplier per unit of s costs its gap times the ``share`` (M,) of its point.
         """
@@ -159,7 +161,7 @@ class _Multipliers:
 
 
 class _Dual:
-    """The dual program for the multipliers of a plan; costates times the sizes of their states, in units of cost."""
+    """The linear or quadratic program whose solution is the multipliers of a plan; everything in units of cost."""
 
     def __init__(self, along: Linearisation, curved: np.ndarray, cost: float) -> None:
         self.along, self.cost, self.program = along, cost, _Program()
@@ -197,7 +199,7 @@ class _Dual:
         self._ends()
 
     def _costate_equation(self) -> None:
-        """Add lambda' = -dH/dx over every interval, backwards from behind its last node to behind its first."""
+        """Add lambda' = -dH/dx over every interval, integrated backwards from node to node."""
         along, program, node = self.along, self.program, self.node
         controls, states = self.control_limits, self.state_limits
         (n, q), nx, size = along.shape, along.form.nx, along.state_size
@@ -219,7 +221,7 @@ class _Dual:
             program.add(rows_of_point[states.point], states.index[:, None], -force)
 
     def _stationarity(self, curved: np.ndarray) -> None:
-        """Add dH/du with its residual: the price is quadratic where the Hamiltonian curves, else linear in a step.
+        """Add dH/du = 0 with a residual, whose price is quadratic where the Hamiltonian is curved, else linear.
 
         The step is the size of the control along the plan or, if the control has limits, the range between them.
         """
@@ -240,7 +242,7 @@ class _Dual:
             self.residual.append(part)
 
     def _ends(self) -> None:
-        """Add the conditions at the ends; a residual is priced by the distance that controls could drive the states."""
+        """Add the end conditions; a residual is priced by how far the controls could move the states."""
         along, program, nx = self.along, self.program, self.along.form.nx
         form, (low, high), horizon = along.form, along.bounds, along.solution.horizon
         places, share = form.bounds.places, along.share
@@ -308,7 +310,7 @@ class _Dual:
 
 @dataclass(frozen=True)
 class Optimality:
-    """First and second order conditions along a plan.
+    """First and second order optimality conditions along a plan.
 
     Attributes:
         lost: Cost that the plan could save in each interval, to second order; that of the ends is in the first. Shape
@@ -350,7 +352,7 @@ def optimality(
     along: Linearisation | None = None,
     allowed: float = LIMIT_SHARE,
 ) -> Optimality:
-    """Compute the multipliers of a plan, the cost it loses, and the curvature of the cost.
+    """Compute the multipliers of a plan, the cost above the optimum, and the curvature of the cost.
 
     Args:
         form, p, bounds: The problem, its parameters, and its bounds at these.
@@ -411,7 +413,7 @@ def optimality(
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Return the loss of a plan with these multipliers without that of its start, in units of cost."""
+    """Return the loss of a plan with these multipliers, except the loss of its start, in units of cost."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
@@ -441,7 +443,7 @@ def _control_curvature(along: Linearisation) -> np.ndarray | None:
 
 
 def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
-    """Return the result for a plan along which the problem is not finite: it passes no check."""
+    """Return the result for a plan along which the problem is not finite: all its checks fail."""
     (n, _), m, form = along.shape, len(along.s), along.form
     infinite, t = np.full(n, np.inf), along.mesh * along.solution.horizon
     rows = np.zeros(len(form.end)), np.zeros(len(form.start))

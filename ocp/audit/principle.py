@@ -143,7 +143,7 @@ def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
 def balance(
     gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray, *, inverse: np.ndarray
 ) -> np.ndarray:
-    """Return the multipliers (M, m) that minimise |gradient (M, n) + directions (M, m, n)' multipliers| at each point.
+    """Return the multipliers (M, m) that minimise |gradient + directions' multipliers| at each of M points.
 
     Multipliers are at least zero for ``upper`` limits (M, m), at most zero for ``lower`` limits and free for both.
     ``inverse`` (M, n, m) is the pseudo-inverse of the directions of these limits.
@@ -159,7 +159,7 @@ def balance(
 
 
 def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return the largest entry of the remaining slope of T H, relative to its parts. Shape (M,)."""
+    """Return the largest remaining component of the slope of T H, relative to its terms. Shape (M,)."""
     form = along.form
     if not form.nu:
         return np.zeros(len(along.s))
@@ -172,7 +172,8 @@ def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.nda
 
 
 def nnls(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return the y (m,) that minimises |matrix y - target|^2 / 2 + price . y, at least zero unless ``free`` (m,), bool.
+    """Solve nonnegative least squares: minimise |matrix y - target|^2 / 2 + price . y; entries in ``free`` may be
+    negative.
 
     Active-set method (Lawson, Hanson 1974, chapter 23). Free entries have minimal norm.
     """
@@ -270,7 +271,7 @@ def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndar
 
 
 def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """Return the loss that the quadrature misses where the slope along a linear control changes its sign. Shape (N,).
+    """Return the cost that the quadrature misses where the slope of a linear control changes sign. Shape (N,).
 
     The integrand is max(slope, 0) and max(-slope, 0) times the distances to both limits. Args as in `control_loss`.
     """
@@ -302,8 +303,7 @@ def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray
 
 
 def _step(gradient: np.ndarray, curved: np.ndarray, projector: np.ndarray, scale: float) -> np.ndarray:
-    """Return the minimiser d of gradient . d + d curved d / 2 over projected d at each point; |d| is about 1 without
-    curvature.
+    """Minimise a quadratic function of a control step d at each point, with |d| about 1 where it has no curvature.
 
     Shapes (k, nu), (k, nu, nu), (k, nu, nu). ``scale`` is the largest curvature.
     """

@@ -133,7 +133,7 @@ class Steps(NamedTuple):
 
     @classmethod
     def even(cls, cells: int, each: int) -> Steps:
-        """Return one step for each cell, with ``each`` cells per interval."""
+        """Return the steps that divide each interval into cells, with ``each`` cells per interval."""
         cell = np.arange(cells)
         return cls(cell, (cell % each) / each, np.full(cells, 1.0 / each))
 
@@ -146,7 +146,7 @@ class Steps(NamedTuple):
 
 
 class Flow:
-    """Dynamics and running cost under the controls of a plan, to be integrated from given states."""
+    """Dynamics and running cost under the controls of a plan, integrated from given states."""
 
     def __init__(self, along: Linearisation) -> None:
         form, solution, sizes = along.form, along.solution, along.sizes
@@ -204,7 +204,9 @@ class Flow:
     def _run(
         self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Run steps in order, each from the end of the one before, or from its start where ``first`` is set."""
+        """Run steps in order; each starts from the end of the previous one, or from its own start where ``first`` is
+        set.
+        """
         count, size = len(first), starts.shape[1]
         padded = -(-count // SETTINGS.block) * SETTINGS.block
         data = np.zeros((padded, self._step.size1_in(1)))  # the last block is filled with steps of zero width

@@ -160,7 +160,7 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndar
 
 
 def spaced(grid: FineGrid) -> np.ndarray:
-    """Return the indices of evenly spaced samples of a grid, the first and last included."""
+    """Return the indices of evenly spaced samples of a grid, including the first and the last."""
     last = len(grid.t) - 1
     return np.linspace(0, last, min(N_SAMPLES, last + 1)).astype(int)
 
@@ -190,7 +190,7 @@ def _select(bounds: Bounds, index: np.ndarray) -> Bounds:
 def _sizes_of(
     values: np.ndarray, declared: Bounds, ends: list[np.ndarray], free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes (n,) of entries with values (M, n), and which entries move or have a fixed end other than zero.
+    """Return sizes (n,) of entries with values (M, n), and which entries move or have a nonzero fixed end.
 
     Entries that are ``free`` (n,) are constant along a plan: like a horizon they have the size of their value.
     """
@@ -211,7 +211,7 @@ def nearest_bound(declared: Bounds) -> np.ndarray:
 def _floored(
     size: np.ndarray, nonzero: np.ndarray, least: np.ndarray, still: Any = STANDSTILL
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sizes with a floor for entries that rest at zero, and which entries do not rest there."""
+    """Raise the sizes of entries that rest at zero to a floor; also return which entries do not rest there."""
     moves = nonzero | (size > np.maximum(ROUNDING_SHARE * size.max(initial=0.0), still))
     floor = SOLVER_SHARE * np.minimum(least, size[moves].max() if moves.any() else 1.0)
     return np.where(moves, size, np.maximum(size, floor)), moves
@@ -260,7 +260,7 @@ def _rows_of(
 
 
 def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes of states and controls among which none is small beside others of its unit.
+    """Return sizes of states and controls, raised where one is small beside others of the same unit.
 
     A held row is judged by the change that its variables could cause. At a singular configuration the joints that move
     may have no effect on it, and those with an effect stand still: their rounding errors are no measure of the row.
@@ -272,7 +272,7 @@ def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[n
 
 
 def _watched(form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray) -> np.ndarray:
-    """Return the sizes of watched rows: the longest path length among rows of one name, or the change with variables.
+    """Return the sizes of watched rows: the longest path among rows of one name, or their change with the variables.
 
     Args:
         by_variables: Change with the variables. Shape (rows,).
@@ -302,7 +302,7 @@ def _change_by_variables(
     p: np.ndarray,
     entries: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return how the rows of one kind depend on their variables at some samples.
+    """Return how strongly the rows of one kind depend on their variables, at some samples.
 
     Returns:
         Of each row, shape (rows,): the sum of its changes when single entries change by their sizes; whether an entry
@@ -328,7 +328,7 @@ def row_changes(
     p: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of one kind at K samples, and their changes when a single entry of states or controls changes.
+    """Return the constraint rows of one kind at K samples, and their changes with each single state or control.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.

@@ -1,1 +1,1 @@
-"""Direct methods: transcribe a problem to a nonlinear program, solve it, read the answer."""
+"""Direct methods: transcribe a problem to a nonlinear program, solve it, and read the solution."""

@@ -39,7 +39,7 @@ to a limit that is active without a multiplier, and of the residual of linear sy
 
 @dataclass(frozen=True)
 class Conditions:
-    """First and second derivatives of a program at a plan, in units of the solver.
+    """First and second derivatives of a nonlinear program at a solution, in the scaled variables of the solver.
 
     Attributes:
         hessian: Hessian of the Lagrangian, both triangles. Shape (n, n).
@@ -228,7 +228,7 @@ class Newton:
     def _root(
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, max_steps: int
     ) -> Outcome | None:
-        """Take at most ``max_steps`` Newton steps with a fixed active set; None if they do not converge."""
+        """Take at most ``max_steps`` Newton steps with a fixed active set; return None if they do not converge."""
         a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
         fixed, held = _held(sides, arguments)
         target = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
@@ -348,7 +348,7 @@ class _Matrix:
 
 
 def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which variables (n,) and rows (m,) are equalities or held at a limit."""
+    """Return which variables (n,) and rows (m,) act as equalities: real ones, and those held at a limit."""
     fixed, held = ((arguments[f"lb{kind}"] == arguments[f"ub{kind}"]) | (sides[kind] != 0) for kind in "xg")
     return fixed, held
 
@@ -359,7 +359,7 @@ def _same(sides: Sides, other_sides: Sides) -> bool:
 
 
 class Bordered:
-    """An order of variables in which a symmetric matrix is a band with a border of a few last variables.
+    """An order of variables in which a symmetric matrix is banded, with a border of a few last variables.
 
     Attributes:
         place: Position of each variable. Shape (n,).
@@ -382,7 +382,7 @@ class Bordered:
         self._size = size
 
     def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the index for :meth:`cholesky` of entries at these positions; ``first`` is not before ``second``."""
+        """Return the indices, for :meth:`cholesky`, of matrix entries at given positions; ``first`` >= ``second``."""
         band = second * self.width + first
         below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
         return np.asarray(np.where(first < self.inner, band, below))
@@ -439,7 +439,7 @@ class Cholesky:
     corner: np.ndarray
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Solve for a right side (n,), both in the order of :class:`Bordered`."""
+        """Solve for a right-hand side (n,), in the order of :class:`Bordered`."""
         n = self.below.shape[1]
         inner = scipy.linalg.cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
         if not len(self.below):

@@ -91,7 +91,7 @@ class Interpolants:
 
     @cached_property
     def mapped(self) -> Any:
-        """``values`` of all intervals side by side."""
+        """Function ``values``, mapped over all intervals."""
         return self.values.map("curves", "serial", self.variables.shape[1], [2, 3], [])
 
 
@@ -209,7 +209,7 @@ class Program:
 
     @cached_property
     def numbers(self) -> NumericDerivatives:
-        """Values and derivatives as arrays."""
+        """Functions of the program that return values and derivatives as arrays."""
         return NumericDerivatives(self)
 
     @cached_property
@@ -242,7 +242,7 @@ class NumericDerivatives:
         return self._cached
 
     def first(self, x: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, scipy.sparse.csc_array]:
-        """Return the gradient of the cost (n,) and the Jacobian of the rows (m, n)."""
+        """Return the first derivatives: gradient of the cost (n,) and Jacobian of the rows (m, n)."""
         _, slope, _, jacobian = self._evaluate(x, p)
         return slope, jacobian
 
@@ -256,7 +256,7 @@ class NumericDerivatives:
         return np.asarray(self._gradient(x, p)[1])
 
     def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> scipy.sparse.csc_array:
-        """Return the upper triangle of the Hessian of sigma f + lam . g. Shape (n, n)."""
+        """Return the second derivatives: upper triangle of the Hessian of sigma f + lam . g. Shape (n, n)."""
         upper: scipy.sparse.csc_array = self._hessian(x, p, np.array([sigma]), lam)[0]
         return upper
 
@@ -281,7 +281,7 @@ class ArrayFunction:
         ]
 
     def __call__(self, *arguments: np.ndarray) -> list[Any]:
-        """Evaluate the function: columns are returned as arrays (n,), other outputs as sparse matrices.
+        """Evaluate the function; columns are returned as arrays (n,), other outputs as sparse matrices.
 
         Raises:
             RuntimeError: The evaluation fails, for example in an integrator.
@@ -413,7 +413,7 @@ def derivatives(function: Any) -> Derivatives:
 
 
 def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return row and column in the upper triangle of the program, and factor, of each nonzero of a block Hessian."""
+    """Return row, column and factor in the program's upper triangle for each nonzero of a block Hessian."""
     first, second = places_of(pattern)
     where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")

@@ -215,7 +215,7 @@ def _compile(text: str) -> bytes:
 
 
 def _start_process(words: list[str], place: Path) -> subprocess.Popen[bytes]:
-    """Run a command in a folder, which also receives its output, until its input is closed."""
+    """Start a command in a folder with its output in a file there; the command ends when its input is closed."""
     with open(place / "words", "wb") as output:
         return subprocess.Popen(
             ["sh", "-c", WATCHED, "sh", *words],

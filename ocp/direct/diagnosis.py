@@ -49,7 +49,7 @@ SETTINGS = ElasticSettings()
 
 
 class Built(Protocol):
-    """The parts of a prepared problem that a diagnosis uses."""
+    """Parts of a prepared problem that a diagnosis uses."""
 
     problem: Problem
     formulation: Formulation
@@ -123,7 +123,7 @@ def diagnosis(
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
-    """Return lines on which states and controls are at their bounds, and for which share of the plan."""
+    """Describe which states and controls are at their bounds, and for which share of the plan, one a line."""
     form, transcription = built.formulation, built.transcription
     lines = []
     for role, labels in (("state", form.state_labels), ("control", form.control_labels)):
@@ -303,7 +303,7 @@ def elastic_plan(
 
 
 class _Soft:
-    """Rows and bounds that may be violated: all but the dynamics, the fixed ends and the smallest horizon.
+    """Rows and bounds that may be violated at a cost: all but the dynamics, the fixed ends and the smallest horizon.
 
     Rows are numbered before variables. Those with one label share a slack variable.
     """
@@ -355,7 +355,7 @@ class _Soft:
     def conflicts(
         self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float, units: np.ndarray
     ) -> list[Conflict]:
-        """Return the conflicts, the largest share first, in ``units`` of rows and variables."""
+        """Return the violated constraints; the largest violation, in ``units`` of its row or variable, comes first."""
         low, high = both_bounds(arguments)
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}

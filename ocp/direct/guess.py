@@ -207,7 +207,9 @@ def default_horizon(form: Formulation, bounds: Bounds) -> float:
 
 
 def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Trajectory:
-    """Return a straight line between fixed ends, else the middle of the bounds or their nearest point to zero."""
+    """Return the default guess: a straight line between fixed ends, else the middle of the bounds or the point nearest
+    zero.
+    """
 
     def middle(kind: str) -> tuple[np.ndarray, np.ndarray]:
         index = form.bounds.places[kind][place]
@@ -264,7 +266,7 @@ def alternative_starts(
 
 
 def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return a start with the states that follow from its initial state and its controls. Shape (size,).
+    """Return a start whose states follow from its initial state and its controls by integration. Shape (size,).
 
     Classical Runge-Kutta steps between the fractions of the states. From the first state that is not finite on, the
     states are constant.

@@ -237,7 +237,7 @@ def call_solver(solver: Any, progress: IterationMonitor | FatropMonitor, argumen
 def stopped(
     solver: Any, progress: IterationMonitor | FatropMonitor, arguments: dict[str, np.ndarray], began: float
 ) -> Outcome:
-    """Return the last iterate of a solver that was stopped or failed without a result; its multipliers are unknown."""
+    """Return the last iterate of a solver that was stopped or failed; its multipliers are unknown."""
     cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(progress.iterate, arguments["p"]))
     unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began
     status = progress.stopped or SolverStatus.STEP_FAILED
@@ -254,13 +254,13 @@ def log_line(words: str) -> None:
 
 
 def regularised(stats: dict[str, Any]) -> bool:
-    """Return whether ipopt modified the Hessian in its last step, or made no step; fatrop does not report this."""
+    """Return whether ipopt modified the Hessian in its last step or made no step; unknown for fatrop."""
     sizes = stats.get("iterations", {}).get("regularization_size", ())
     return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)
 
 
 def broken_down(solver: Any, arguments: dict[str, np.ndarray], error: RuntimeError) -> Outcome:
-    """Return the start as the outcome of a solver that an evaluation error ended, such as that of an integrator."""
+    """Return an unsuccessful outcome at the start, for a solver that an evaluation error ended."""
     rows = np.full(arguments["lbg"].shape, np.nan)
     status = SolverStatus.NOT_FINITE
     values = arguments["x0"], np.nan, rows, rows

@@ -219,7 +219,7 @@ class Prepared:
         elastic = None if attempts[-1].is_final else self._elastic(first)
         remaining = self._max_iterations - sum(attempt.outcome.iterations for attempt in attempts[1:])
         if elastic is not None and check and remaining > 0:
-            start = "elastic plan", elastic.plan, self._all_names
+            start = "elastic plan", elastic.plan, self._variable_names
             attempts.append(self._attempt(*start, arguments, bounds, self._short_solver))
             if attempts[-1].plan is not None:
                 return attempts[-1].plan
@@ -257,7 +257,7 @@ class Prepared:
         return attempts
 
     def _elastic(self, first: Attempt) -> Elastic | None:
-        """Return the plan with the smallest violation; Ctrl-C raises with the last iterate of the first attempt."""
+        """Solve for the plan with the smallest violation; Ctrl-C raises with the last iterate of the first attempt."""
         horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
             return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon=horizon)
@@ -272,7 +272,7 @@ class Prepared:
         return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
     def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
-        """Return the plan near the guess, shifted by ``shift`` intervals; None if there is none."""
+        """Return the optimum near a guess that is a plan, shifted by ``shift`` intervals; None if there is none."""
         form = self.formulation
         if not isinstance(guess, Solution) or not self._is_own_plan(guess) or self.solver_name != "ipopt":
             return None
@@ -282,7 +282,7 @@ class Prepared:
             p = form.parameter_vector(guess.parameters)
             limits_of_guess = self._known.relaxed(self.transcription.arguments(p, bounds_to_solve(form, p)))
             v, lam = guess.variables, guess.multipliers
-            scales = self._scales(v, self._all_names, bounds, arguments["p"])
+            scales = self._scales(v, self._variable_names, bounds, arguments["p"])
             cost, rows = self.program.numbers.values(v, p)
             start = Outcome(v, cost, rows, lam, guess.status, "", 0, 0.0)
             sides = active_sides(self.program, start, limits_of_guess, scales)
@@ -306,7 +306,7 @@ class Prepared:
 
     @cached_property
     def _short_solver(self) -> tuple[Any, Any]:
-        """The solver with fewer iterations, for alternative starts, and its progress."""
+        """The solver with fewer iterations, used for alternative starts, and its progress display."""
         return self._built_solver({**self._options, "max_iter": min(STARTS.iterations, self._max_iterations)})
 
     def _attempt(
@@ -318,7 +318,7 @@ class Prepared:
         bounds: Bounds,
         solver: tuple[Any, Any] | None = None,
     ) -> Attempt:
-        """Run a solver, by default the own one, from a start, scaled by the sizes along it; see :func:`sizes_along`."""
+        """Run a solver, by default the main one, from a start, with scales from the sizes along it."""
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
         scales = self._scales(x0, names, bounds, p)
@@ -353,8 +353,8 @@ class Prepared:
         return scales
 
     @property
-    def _all_names(self) -> set[str]:
-        """Names of all variables, as a plan has values for them, see :func:`sizes_along`."""
+    def _variable_names(self) -> set[str]:
+        """Names of all states and controls, and "horizon"."""
         return {*self.formulation.states, *self.formulation.controls, "horizon"}
 
     def _solution(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:
@@ -387,17 +387,17 @@ class Attempt:
 
     @property
     def plan(self) -> Solution | None:
-        """The plan, if the solver succeeded."""
+        """The plan, if the solver succeeded; else None."""
         return self.solution if self.outcome.success else None
 
     @property
     def is_final(self) -> bool:
-        """Whether no other start is tried: the solver succeeded, or the time is over."""
+        """Whether no other start needs to be tried: the solver succeeded, or the time is over."""
         return self.plan is not None or self.outcome.status is SolverStatus.TIME_LIMIT
 
     @property
     def is_broken(self) -> bool:
-        """Whether a function was not finite, or an integrator failed."""
+        """Whether a function value was not finite, or an integrator failed."""
         return self.outcome.status is SolverStatus.NOT_FINITE
 
     def __str__(self) -> str:

@@ -61,7 +61,7 @@ class ScalingSettings:
 
     @property
     def bad(self) -> float:
-        """Factor between sizes, or between a state and its change, at which a program is badly scaled."""
+        """Ratio between sizes, or between a state and its change, above which a program counts as badly scaled."""
         return self.usual**2
 
 
@@ -243,7 +243,7 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
-    """Return the scales of a program for variables of these sizes; rows and cost by their change from a start."""
+    """Return the scales of a program for given sizes of its variables; rows and cost scale with their changes."""
     program, size_of_variable = pattern.program, sizes.of_variables(pattern.transcription)
     # squares of smaller sizes underflow
     size_of_variable = np.where(size_of_variable > np.sqrt(np.finfo(float).tiny), size_of_variable, 1.0)
@@ -269,7 +269,7 @@ def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
 
 
 def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales: Scales, sizes: Sizes) -> str:
-    """Return a description of bad scaling in a program as it was solved, or ""."""
+    """Describe bad scaling of a program that was solved; "" if there is none."""
     form, transcription = pattern.form, pattern.transcription
     scaled_size = sizes.of_variables(transcription) / scales.variables
     deviation = np.abs(np.log(scaled_size))
@@ -299,7 +299,7 @@ def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
 
 
 def _powers(sizes: np.ndarray) -> np.ndarray:
-    """Return the nearest powers of two of sizes outside the usual range, and 1 for others."""
+    """Round sizes outside the usual range to powers of two; return 1 for the others."""
     unusual = (sizes < 1 / SCALING.usual) | (sizes > SCALING.usual)
     return np.where(unusual, np.exp2(np.round(np.log2(np.where(unusual, sizes, 1.0)))), 1.0)
 
@@ -313,7 +313,7 @@ def _evaluate(function: Callable[..., Any], point: np.ndarray, p: np.ndarray) ->
 
 
 class Predetermined:
-    """Variables of a program that are known in advance, and limits on them.
+    """Variables of a program whose values follow from the start alone, and limits on them.
 
     Variables that are joined to a fixed variable, as the end of the last interval is to a fixed end, are known too.
     """
@@ -336,7 +336,7 @@ class Predetermined:
         self.joins, self.joined = linear[pairs[:, 0]], column[pairs]
 
     def relaxed(self, arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the solver arguments without the limits that only involve known variables."""
+        """Return the solver arguments without the limits that involve only predetermined variables."""
         known = arguments["lbx"] == arguments["ubx"]
         equal = arguments["lbg"][self.joins] == arguments["ubg"][self.joins]
         known[self.joined[equal & known[self.joined].any(axis=1)]] = True
@@ -349,7 +349,7 @@ class Predetermined:
         return result
 
     def checked(self, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Outcome:
-        """Check an outcome against the removed limits; if one is violated, it is no success.
+        """Check an outcome against the limits that scaling removed; mark it infeasible if one is violated.
 
         Args:
             scales: Units in which violations are judged.

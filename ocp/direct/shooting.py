@@ -174,7 +174,7 @@ def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, boo
 
 
 def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> Any:
-    """Return (x, w, d, _, T, p) -> (states at ``places`` of the interval side by side, cost)."""
+    """Return the function (x, w, d, _, T, p) -> (states at ``places``, side by side, cost), integrated by CVODES."""
     sym = form.sym
     nw = n_controls_of(form, method)
     x, place, q = sym("x", form.nx), sym("place"), sym("q", nw + 3 + form.np)
@@ -190,7 +190,7 @@ def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> 
 
 
 def dense_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Return ([x; w], d, T, p) -> values at THIRDS of the cubic Hermite curve through each step of an interval."""
+    """Return ([x; w], d, T, p) -> states at THIRDS of each step, by cubic Hermite interpolation."""
     v, d = ca.MX.sym("v", form.nx + n_controls_of(form, method)), ca.MX.sym("d", 2)
     x, w = v[: form.nx], v[form.nx :]
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)

@@ -55,7 +55,7 @@ class Layout:
 
 
 def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool) -> Layout:
-    """Return the layout node 0, interval 0, node 1, ..., node N, horizon."""
+    """Return the order of variables node 0, interval 0, node 1, ..., node N, horizon."""
     stride = node_size + interval_size
     grid = np.arange(intervals * stride).reshape(intervals, stride).T
     node = np.column_stack([grid[:node_size], intervals * stride + np.arange(node_size)])
@@ -68,7 +68,7 @@ def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizo
 def _staged_layout(
     intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool
 ) -> Layout:
-    """Return the layout by stages: node k, copies of horizon and start, interval k, copy of its end."""
+    """Return the order by stages: node k, copies of horizon and start, interval k, copy of its end."""
     carried = node_size + free_horizon + node_size * keep_initial
     inputs = interval_size + node_size
     stride = carried + inputs
@@ -199,14 +199,14 @@ class TranscriptionBuilder:
         return first + np.arange(m * places).reshape(places, m).T
 
     def linear(self, rows: np.ndarray, columns: np.ndarray, values: np.ndarray | float) -> None:
-        """Add ``values * variable[columns]`` to ``rows``; the three are broadcast together."""
+        """Add linear terms ``values * variable[columns]`` to ``rows``; the three are broadcast together."""
         targets, variables, entries = np.broadcast_arrays(rows, columns, values)
         self._linear.append((targets.ravel(), variables.ravel(), entries.ravel().astype(float)))
 
     def path_rows(
         self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, *, at: np.ndarray
     ) -> None:
-        """Impose path rows at K points with fractions ``at``, states (nx, K) and controls (nu, K)."""
+        """Declare path constraints at K points with fractions ``at``, states (nx, K) and controls (nu, K)."""
         if len(rows) == 0 or len(at) == 0:
             return
         point_data = self.formulation.point_data(at)
@@ -216,7 +216,7 @@ class TranscriptionBuilder:
         self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
-        """Impose rows at every node; at the first node only those that fixed initial states do not determine.
+        """Declare constraints at every node; at the first one only those that fixed initial states leave open.
 
         ``controls`` (nu, N + 1) are the variables read there; they do not matter for rows without controls.
         """
@@ -231,7 +231,7 @@ class TranscriptionBuilder:
     def ends(
         self, basis: tuple[np.ndarray, np.ndarray], first: np.ndarray, last: np.ndarray, *, at_nodes: bool
     ) -> None:
-        """Impose start and end constraints and the terminal cost.
+        """Declare start and end constraints and the terminal cost.
 
         Args:
             basis: Weights (c,) of the control values of the first (last) interval that give the control at the start
@@ -257,7 +257,7 @@ class TranscriptionBuilder:
         initial: tuple[np.ndarray, np.ndarray] | None,
         place: int,
     ) -> None:
-        """Add the block at the start (place 0) or end (place 1) with v = [x, controls, T, x0, start controls]."""
+        """Add the function of start (place 0) or end (place 1) with v = [x, controls, T, x0, start controls]."""
         form, layout = self.formulation, self.layout
         sym, nx, nu = form.sym, form.nx, form.nu
         stage = self.intervals if place else 0

@@ -26,7 +26,7 @@ LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nod
 
 
 class BoundaryProblem:
-    """Segments of states and costates y = [x; lambda], and the conditions that make them one extremal.
+    """Boundary value problem of states and costates y = [x; lambda] in consecutive segments.
 
     Each segment is integrated from its own y with data q = [start time, duration, horizon, p, bang values, guess].
 
@@ -47,7 +47,7 @@ class BoundaryProblem:
         self._systems: dict[tuple[int, ...], tuple[Any, ...]] = {}
 
     def system(self, arcs: ControlArcs) -> tuple[Any, ...]:
-        """Return the residual and its Jacobian as functions of (unknowns, data), for these numbers of segments."""
+        """Return the residual and its Jacobian as functions of (unknowns, data), for given numbers of segments."""
         key = tuple(arcs.segments)
         if key not in self._systems:
             build = self._backward if self.backward else self._multiple
@@ -58,7 +58,7 @@ class BoundaryProblem:
         return self._systems[key]
 
     def _multiple(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Return forward multiple shooting, with y at the start of every segment and at the end as unknowns."""
+        """Return the system of multiple shooting: y at all segment starts and at the end are unknown."""
         form = self.form
         at, of = self.layout(arcs), self._data(arcs)
         z, data = ca.MX.sym("z", at["end"].stop), ca.MX.sym("data", of["guess"].stop)
@@ -82,7 +82,7 @@ class BoundaryProblem:
         return z, data, ca.vertcat(*residuals)
 
     def _backward(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Return backward shooting, with the end state as unknown and the given start as condition."""
+        """Return the system of backward shooting: the end state is unknown, the given start is the condition."""
         form = self.form
         of = self._data(arcs)
         total = sum(arcs.segments)
@@ -91,7 +91,7 @@ class BoundaryProblem:
         return z, data, y_start[: form.nx, :] - data[of["ends"]][form.nx : 2 * form.nx]
 
     def _chain(self, state: Any, data: Any, arcs: ControlArcs, total: int) -> tuple[list[Any], Any]:
-        """Return y at all nodes from the end to the start, integrated backwards from an end state."""
+        """Integrate y = [x; lambda] backwards from an end state; return its values at the nodes, the last one first."""
         form, of = self.form, self._data(arcs)
         horizon = data[of["horizon"]]
         gradient = ca.gradient(form.terminal, form.x)
@@ -106,7 +106,7 @@ class BoundaryProblem:
         return nodes, y
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
-        """Return the q of every segment side by side."""
+        """Return the integrator data q of all segments, side by side."""
         of, total = self._data(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
         begins, lengths = [], []
@@ -144,7 +144,7 @@ class BoundaryProblem:
         return side_by_side(sizes)
 
     def _data(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Return the slices of the vector of data: horizon if fixed, p, end values, bang values, guesses."""
+        """Return the slices of the data vector: horizon if fixed, p, end values, bang values, guesses."""
         sizes = self.ham.sizes
         total = sum(arcs.segments)
         parts = {"horizon": 1, "p": sizes[4], "ends": 4 * sizes[0], "bang": sizes[5] * total, "guess": sizes[6] * total}
@@ -193,7 +193,7 @@ class BoundaryProblem:
     def unpack(
         self, z: np.ndarray, arcs: ControlArcs, data: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Return y at the nodes (2 nx, S + 1), q of the segments, switch times, horizon."""
+        """Split the unknowns: y at the nodes (2 nx, S + 1), q of the segments, switch times, horizon."""
         form, total = self.form, sum(arcs.segments)
         horizon, switches = float(data[0]), np.zeros(0)
         if self.backward:
@@ -296,7 +296,7 @@ class NewtonResult:
 
     @property
     def success(self) -> bool:
-        """Return whether it converged, and no later check rejected it."""
+        """Return whether Newton's method converged, and no later check rejected its result."""
         return self.status.is_success
 
 

@@ -76,8 +76,8 @@ class Hamiltonian:
         return (form.nx, form.nx, 1, 1, form.np, len(self.linear), len(self.smooth) + len(form.path))
 
     def flow(self) -> Any:
-        """Return the function (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT) for the control that minimises
-        H.
+        """Return the function (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT), with the control that
+        minimises H.
         """
         form = self.form
         # H is stationary in u and mu, so both are constant in its derivatives
@@ -113,7 +113,7 @@ class Hamiltonian:
         return mu
 
     def _eliminate(self, name: str, outputs: list[Any]) -> Any:
-        """Return a function of outputs in which w is replaced by the minimiser of H."""
+        """Return a function of given outputs, with the minimiser of H inserted for w."""
         form = self.form
         sym = form.sym
         w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])
@@ -129,7 +129,10 @@ class Hamiltonian:
     # ---- the equations that make H stationary in the smooth controls, and their solution ----------------------
 
     def _solve(self) -> tuple[Any, str]:
-        """Return the function (x, lam, t, T, p, bang, guess) -> w, and the kind of its solution."""
+        """Return the function that computes the optimal controls and multipliers w, and how it does so.
+
+        Its arguments are (x, lam, t, T, p, bang, guess).
+        """
         form, n, m = self.form, len(self.smooth), len(self.form.path)
         sym = form.sym
         self._check_linear()
@@ -261,13 +264,13 @@ def used_columns(pattern: Any) -> list[bool]:
 
 
 def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bound table with all parameters one, to see which bounds are finite."""
+    """Return the bound table with all parameters set to one, to find which bounds are finite."""
     lower, upper = (np.asarray(v.full()).reshape(-1) for v in form.bounds.function(np.ones(form.np)))
     return lower, upper
 
 
 def numbers(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
-    """Return the value of an expression at a random point in 0.1..1."""
+    """Evaluate an expression at a random point, with entries between 0.1 and 1."""
     function = ca.Function("matrix", symbols, [ca.densify(matrix)])
     return np.asarray(function.call([ca.DM(rng.uniform(0.1, 1.0, s.numel())) for s in symbols])[0].full())
 

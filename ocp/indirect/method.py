@@ -258,7 +258,7 @@ class PreparedIndirect:
         return solution
 
     def _no_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
-        """Raise SolveError because the seed is unusable, or return it as an unsuccessful solution."""
+        """Handle an unusable seed: raise SolveError, or return an unsuccessful solution."""
         if check or seed is None:
             words = f"problem {self.problem.name!r}: the indirect method failed: {why}{error}"
             details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
@@ -365,9 +365,7 @@ class PreparedIndirect:
         )
 
     def _segments(self, y: np.ndarray, inputs: np.ndarray, bounds: Bounds) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return (initial y, q) of every reported segment: the shooting segments, split where a control meets its
-        bound.
-        """
+        """Return initial y and q of all reported segments: the shooting segments, split where controls reach bounds."""
         index = self.formulation.bounds.places["control"]
         low, high = bounds[0][index], bounds[1][index]
 
@@ -395,7 +393,7 @@ class PreparedIndirect:
 
 
 def bisect(marks: Callable[[float], np.ndarray], low: float, high: float, before: np.ndarray) -> float:
-    """Return the position in low..high at which the marks change from ``before``."""
+    """Return the position in low..high at which the marks change from ``before`` to another value, by bisection."""
     for _ in range(40):
         middle = 0.5 * (low + high)
         if np.array_equal(marks(middle), before):

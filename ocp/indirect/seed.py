@@ -23,7 +23,7 @@ __all__ = ["ControlArcs", "read_arcs", "read_unknowns"]
 
 @dataclass(frozen=True)
 class SeedSettings:
-    """Criteria of rejected seeds, tolerant because seeds may be coarse.
+    """Criteria by which a seed is rejected; they are tolerant because seeds may be coarse.
 
     Attributes:
         inside: Distance from both bounds, relative to their range, beyond which a control is inside them.
@@ -124,7 +124,7 @@ def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.n
 
 
 def signs(slope: np.ndarray) -> np.ndarray:
-    """Return signs of sampled switching functions (M, n); an insignificant sample takes the next significant sign.
+    """Return signs of sampled switching functions (M, n); a sample close to zero takes the sign that follows.
 
     After the last significant sample its sign continues. A switching function that vanishes at an end, for example at a
     free state, would have the sign of the seed's noise there.

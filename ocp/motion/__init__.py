@@ -1,1 +1,1 @@
-"""Motions of machines: tasks, inverse kinematics, problem builders, timing, search, and the front door `plan`."""
+"""Motions of machines: tasks, inverse kinematics, problem builders, timing, search, and the function `plan`."""

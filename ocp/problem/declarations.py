@@ -102,7 +102,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Constraint:
-    """A named vector constraint ``lower <= expression <= upper``; equal bounds make an equality.
+    """A named vector constraint ``lower <= expression <= upper``; equal bounds make it an equality.
 
     Attributes:
         name: Unique among the constraints of the problem.
@@ -145,7 +145,7 @@ class Constraint:
 
 @dataclass
 class Horizon:
-    """The final time, fixed if lower and upper are one expression."""
+    """The final time; it is fixed if lower and upper bound are the same expression."""
 
     symbol: Any
     lower: Any
@@ -302,13 +302,13 @@ def _require(condition: bool, what: str) -> None:
 
 
 def _require_columns(symbols: Any, size: int, what: str, *values: Any) -> None:
-    """Require that the values of a part are columns of ``size`` entries of these symbols."""
+    """Require that the values of a part are columns of ``size`` entries in the given symbols."""
     for value in values:
         _require(isinstance(value, symbols) and value.shape == (size, 1), what)
 
 
 def column_text(value: Any) -> str:
-    """Return the text of a column of numbers or expressions; a single number if all entries are equal."""
+    """Return a column of numbers or expressions as text; a single number if all entries are equal."""
     if isinstance(value, ca.MX):
         if ca.symvar(value):
             return shorten(str(value))
@@ -318,7 +318,7 @@ def column_text(value: Any) -> str:
 
 
 def shorten(expression: Any) -> str:
-    """Return an expression on one line of bounded length.
+    """Return an expression as text on one line of bounded length.
 
     SX prints shared subexpressions first, so a large expression is described by its symbols instead.
     """
@@ -436,7 +436,7 @@ class ExpressionReader:
 
 
 def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> int:
-    """Return the given size, or the common size of the labelled values; 1 if all are scalars."""
+    """Return the given size, or the common size of the labelled values; 1 if all of them are scalars."""
     if size is not None:
         return require.count(f"{what}: size", size)
     labelled = {f"{what}: {k}": v for k, v in values.items() if v is not None and not callable(v)}

@@ -92,7 +92,7 @@ class Enclosures:
 
 
 class _Jet(NamedTuple):
-    """The range and the slopes of one instruction, over M intervals."""
+    """Range and slopes of one instruction over M intervals."""
 
     value: Interval
     slope: Interval
@@ -111,7 +111,7 @@ ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_
 
 
 def _where(valid: Any, slope: Interval) -> Interval:
-    """Return the slopes in the valid intervals, and no bounds elsewhere."""
+    """Return the slopes in the valid intervals, and infinite bounds elsewhere."""
     return Interval(np.where(valid, slope.low, -np.inf), np.where(valid, slope.high, np.inf))
 
 
@@ -130,7 +130,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
 
 @lru_cache(maxsize=4096)
 def _partials(code: int, count: int, exponent: float | None) -> Any:
-    """Return the partial derivatives of an operation as an SX function; of a power with fixed exponent, in its base."""
+    """Return the partial derivatives of an operation as an SX function; a fixed exponent counts as a constant."""
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     if count == 1:
         return ca.Function("partials", [x], [ca.densify(ca.gradient(ca.SX.unary(code, x), x))])
@@ -141,7 +141,7 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
 
 
 def _number(x: Interval) -> float | None:
-    """Return the number if an interval is the same single number everywhere, else None."""
+    """Return the value of an interval that is the same single number everywhere, else None."""
     first = float(x.low[0])
     return first if bool((x.low == first).all() and (x.high == first).all()) else None
 
@@ -191,7 +191,7 @@ def _copysign(code: int, x: _Jet, y: _Jet) -> _Jet:
 
 
 def _angle(code: int, y: _Jet, x: _Jet) -> _Jet:
-    """Apply the rule of atan2, smooth except on the half-line where it jumps by a turn."""
+    """Apply the rule of atan2, which is smooth except on the half-line where it jumps by a full turn."""
     smooth = _smooth(code, y, x)
     continuous = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
     return _Jet(smooth.value, _where(continuous, smooth.slope))
@@ -219,7 +219,7 @@ FRAME_ENTRIES = 12
 
 
 class PrescribedMotion:
-    """The bodies of separated pairs whose frames depend on time alone.
+    """Bodies of separated pairs that move as a function of time alone, such as moving obstacles.
 
     Args:
         separation: The pairs. placements: Their frames, possibly in other symbols. time: The symbol of time.
@@ -236,7 +236,7 @@ class PrescribedMotion:
         what = f"separation {separation.name!r}"
         parts = [placements[k : k + FRAME_ENTRIES] for k in range(0, placements.numel(), FRAME_ENTRIES)]
         frames = [k for k, part in enumerate(parts) if ca.depends_on(part, time)]
-        rows = [_of_time(f"{what}: frame {k}", parts[k], time, parameters, values) for k in frames]
+        rows = [_as_function_of_time(f"{what}: frame {k}", parts[k], time, parameters, values) for k in frames]
         self._enclosures = Enclosures(ca.vertcat(*rows), time, what) if rows else None
         hulls = list(separation.hulls.values())
         covered = CoveredPairs(separation.pairs, separation.covers)
@@ -293,8 +293,8 @@ class PrescribedMotion:
         return displacements, deviations
 
 
-def _of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]) -> Any:
-    """Return a frame with the values of its parameters inserted."""
+def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]) -> Any:
+    """Return a frame as an expression of time with numbers as parameters; raise if it depends on states."""
     known = {identity(symbol) for symbol in ca.symvar(ca.vertcat(time, *parameters))}
     others = [symbol for symbol in ca.symvar(frame) if identity(symbol) not in known]
     if others and ca.depends_on(frame, ca.vertcat(*map(ca.vec, others))):
@@ -305,7 +305,7 @@ def _of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values
 
 
 def _coordinates(core: np.ndarray) -> np.ndarray:
-    """Return the map from a frame to the world coordinates of the corners of a box about points. Shape (3 C, 12)."""
+    """Return the linear map from a frame to the world coordinates of box corners about points. Shape (3 C, 12)."""
     ends = np.stack([core.min(axis=0), core.max(axis=0)])
     corners = np.unique(np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3), axis=0)
     with_one = np.column_stack([corners, np.ones(len(corners))])

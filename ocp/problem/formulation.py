@@ -55,7 +55,7 @@ class Rows:
         return tuple(dict.fromkeys(self.owners))
 
     def of(self, name: str) -> np.ndarray:
-        """Return the indices of the rows of a constraint."""
+        """Return the indices of the rows that belong to a constraint."""
         return np.array([i for i, owner in enumerate(self.owners) if owner == name])
 
     def select(self, mask: np.ndarray) -> Rows:
@@ -81,7 +81,7 @@ class BoundTable:
     places: dict[str, np.ndarray]
 
     def pullback(self, p: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-        """Return multipliers (2, n) of lower and upper bounds times the bounds' derivatives in p. Shape (np,)."""
+        """Multiply multipliers (2, n) of the bounds by the derivatives of the bounds in p. Shape (np,)."""
         return np.asarray(self._pullback(p, multipliers.T).full()).reshape(-1)
 
     @cached_property
@@ -191,7 +191,7 @@ class Formulation:
         return cached
 
     def cached(self, name: Any, make: Callable[[], Any]) -> Any:
-        """Return the cached value of a name, made on the first call."""
+        """Return the cached value of a name; compute it on the first call."""
         if name not in self._cache:
             self._cache[name] = make()
         return self._cache[name]
@@ -215,7 +215,7 @@ class Formulation:
         return self._signals_at(order, times.tobytes()) if self.signals else np.zeros((len(times), 0))
 
     def _evaluate_signals(self, order: int, times: bytes) -> np.ndarray:
-        """Return :meth:`signals_at` for times given as the bytes of an array, which can be hashed."""
+        """Return :meth:`signals_at` for times as bytes, which can be hashed for the cache."""
 
         def make() -> Sampler:
             t = ca.MX.sym("t")
@@ -229,7 +229,7 @@ class Formulation:
 
     @property
     def duration(self) -> float:
-        """The horizon if there are signals, s; else 1, as the horizon may be unknown."""
+        """The horizon, s, if there are signals; else 1, because the horizon may be unknown."""
         return float(self.horizon_value) if self.signals else 1.0
 
     def sampled(
@@ -254,7 +254,7 @@ class Formulation:
         return list(function(x, u, times, horizon, p, self.signals_at(times), *values))
 
     def sampler(self, outputs: list[Any], *more: Any) -> Sampler:
-        """Return the function (x, u, t, T, p, w, *more) -> outputs for evaluation at many samples."""
+        """Return the function (x, u, t, T, p, w, *more) -> outputs, which evaluates them at many samples."""
         symbols = self.problem.symbols
         inputs = [self.x, self.u, self.t, self.T, self.p, self.w, *more]
         return Sampler(inputs, [symbols(output) for output in outputs])
@@ -337,7 +337,7 @@ class Formulation:
     # ---- flattening ------------------------------------------------------------------------------------------
 
     def flat(self, expression: Any) -> Any:
-        """Return an expression of the declared symbols as one of the stacked symbols."""
+        """Return an expression of the declared symbols in terms of the stacked symbols."""
         d = self._declared
         old: list[Any] = [self.problem.time]
         new: list[Any] = [self.t]
@@ -370,7 +370,7 @@ class Formulation:
         return ca.Function("signals", [t], [ca.densify(ca.vertcat(*parts))])
 
     def _rows(self, kind: str, pool: dict[str, Constraint], end: float | None = None) -> Rows:
-        """Return the rows of a kind; at an ``end`` of the horizon, 0 or 1, the signals become numbers."""
+        """Return the constraint rows of a kind; at an ``end`` of the horizon, 0 or 1, signals become numbers."""
         symbols = self.problem.symbols
         expression = self.flat(ca.vertcat(symbols(0, 1), *[c.expression for c in pool.values()]))
         if self.signals and end is not None:
@@ -432,7 +432,7 @@ class Formulation:
 
 
 def entries_of(declared: Declarations) -> list[Any]:
-    """Return all declared parts as one list."""
+    """Return all declared states, controls, parameters, constraints and other parts as one list."""
     pools = [getattr(declared, kind.name) for kind in fields(declared)]
     return [entry for pool in pools for entry in (pool.values() if isinstance(pool, dict) else [pool])]
 

@@ -134,7 +134,7 @@ class HullPairs:
             self._axes = np.where(lengths[:, :, None] > 0, edges / np.maximum(lengths, 1e-300)[:, :, None], np.eye(3))
 
     def points(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> list[np.ndarray]:
-        """Return points of both bodies in the frame of observation. Shapes (K, m, 3), (K, l, 3)."""
+        """Return the points of both bodies of each pair in the pair's reference frame. Shapes (K, m, 3), (K, l, 3)."""
         rotations, positions = frames
         turn, origin = rotations[at, self._observer[row]], positions[at, self._observer[row]]
         points = []
@@ -145,7 +145,7 @@ class HullPairs:
         return points
 
     def nearest(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return unit vectors from the first body to the second, gaps, and nearest points of the cores, as observed.
+        """Return unit vectors from first to second body, gaps, and nearest points, in the reference frames.
 
         Shapes (K, 3), (K,), m, and (K, 2, 3), m.
         """
@@ -176,7 +176,7 @@ class HullPairs:
 
 
 class CoveredPairs:
-    """Pairs of bodies, and the pairs that cover some of them.
+    """Pairs of bodies, some of them with pairs of smaller shapes that cover their bodies.
 
     Covering pairs contain the two bodies between them, so the smallest of their distances is a lower bound of the
     distance of the pair. The distance of the hulls is another one; the larger bound counts. Unlike a hull, covers of
@@ -195,8 +195,9 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows of pairs (K,), the pairs first, and to which of the K each belongs: places, rows. Shape (R,)
-        each.
+        """Return which of the K pairs each row belongs to, and the indices of the rows. Shape (R,) each.
+
+        The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow.
         """
         counts = self._counts[pair]
         place = np.repeat(np.arange(len(pair)), counts)
@@ -231,7 +232,7 @@ class SeparatingDirections(NamedTuple):
     along: np.ndarray
 
     def of(self, selected: np.ndarray) -> SeparatingDirections:
-        """Return the directions of the selected pairs. ``selected`` has shape (K,), bool."""
+        """Return the directions of a subset of the pairs. ``selected`` has shape (K,), bool."""
         keep = selected[self.place]
         return SeparatingDirections((np.cumsum(selected) - 1)[self.place[keep]], self.row[keep], self.along[keep])
 
@@ -252,7 +253,7 @@ class BodyPairs:
         self._normals = np.array([_normal(*pair) for pair in bodies]).reshape(-1, 3)
 
     def balls(self, frames: Frames, at: np.ndarray, pair: np.ndarray) -> np.ndarray:
-        """Return the gaps between the balls that contain the bodies of pairs at samples. Shape (K,) each, m."""
+        """Return the gaps between the bounding balls of the bodies of pairs at samples. Shape (K,) each, m."""
         bodies = self._first[pair], self._second[pair]
         first, second = (self._in_world(frames, at, self._middles[k], self._frames[k]) for k in bodies)
         return self._ball_distance(second - first, pair)
@@ -272,7 +273,7 @@ class BodyPairs:
         return distances
 
     def all_balls(self, frames: Frames) -> np.ndarray:
-        """Return the gaps between the balls that contain the bodies of all pairs at all samples. Shape (M, n), m."""
+        """Return the gaps between the bounding balls of all pairs of bodies at all samples. Shape (M, n), m."""
         middles = self._in_world(frames, np.arange(len(frames.positions))[:, None], self._middles, self._frames)
         square, along_normal = np.zeros((2, len(middles), len(self._first)))
         for axis in range(3):  # one coordinate after the other: arrays of three columns are slow
@@ -307,7 +308,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the gaps of pairs along given directions, the smaller of both ends of a time interval. Shape (K,), m.
+        """Return the gaps of pairs along given directions, the smaller one of both ends of an interval. Shape (K,), m.
 
         The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
         """
@@ -319,7 +320,7 @@ class BodyPairs:
 
     @staticmethod
     def _in_world(frames: Frames, at: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        """Return points that move with frames, at samples, in world."""
+        """Transform points from moving frames to the world, at samples."""
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _ball_distance(self, offset: np.ndarray, pair: np.ndarray) -> np.ndarray:
@@ -328,7 +329,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Yield each group, which of the rows belong to it, and their indices in the group."""
+        """Yield each group of pairs, which of the rows belong to it, and their indices in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -336,7 +337,7 @@ class BodyPairs:
 
 
 def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
-    """Group pairs of hulls with their frame of observation, (n, 3), -1 for the world, by their kinds."""
+    """Group pairs of hulls with their reference frame, (n, 3), -1 for the world, by their kinds."""
     kinds: dict[tuple[int, int], list[int]] = {}
     for i, (first, second, _) in enumerate(pairs):
         kinds.setdefault((hulls[first].kind, hulls[second].kind), []).append(i)
@@ -344,7 +345,7 @@ def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
 
 
 def _padded(core: np.ndarray, count: int) -> np.ndarray:
-    """Return points, the last repeated until there are `count`."""
+    """Repeat the last point until there are `count` points."""
     return np.concatenate([core, np.repeat(core[-1:], count - len(core), axis=0)])
 
 
@@ -446,7 +447,7 @@ class Separation:
         return tuple((names[first], names[second]) for first, second, _ in self.pairs)
 
     def of(self, pairs: Sequence[int]) -> Separation:
-        """Return the separation of some of the pairs."""
+        """Return a separation constraint for some of the pairs only."""
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
         covers = {row: self.covers[pair] for row, pair in enumerate(keep) if pair in self.covers}
@@ -467,7 +468,7 @@ def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]
 
 
 def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array of a shape, or a number broadcast to it; levers and turns must not be negative."""
+    """Return bounds as an array of a given shape; raise ProblemError if levers or turns are negative."""
     array = table(f"{what}: {label}", value)
     array = np.broadcast_to(array, shape) if array.ndim == 0 else array.reshape(shape) if not shape[0] else array
     if array.shape != shape:

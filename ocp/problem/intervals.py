@@ -75,7 +75,7 @@ def check_instructions(what: str, function: Any) -> None:
 
 
 def _out(low: Any, high: Any) -> Interval:
-    """Return bounds widened by possible rounding; nan becomes unbounded."""
+    """Widen bounds by possible rounding errors; nan becomes unbounded."""
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     # the functions of a C library are accurate to four units in the last place
     share, smallest = 4 * np.finfo(float).eps, 1e-300
@@ -84,12 +84,12 @@ def _out(low: Any, high: Any) -> Interval:
 
 
 def constant(value: float, like: Array) -> Interval:
-    """Return the range of a number over as many intervals as an array has entries."""
+    """Return a number as an interval for as many intervals as an array has entries."""
     return Interval(np.full(like.shape, value), np.full(like.shape, value))
 
 
 def _range_of(corners: list[Array]) -> Interval:
-    """Return the range of the values at the corners."""
+    """Return the smallest and largest value at the corners as an interval."""
     stacked = np.array(corners)
     return _out(stacked.min(axis=0), stacked.max(axis=0))
 
@@ -115,7 +115,7 @@ def _opposite(first: Interval, second: Interval) -> bool:
 
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
-    """Return the range of one value if the test holds and of the other if not."""
+    """Return the range of a conditional: of one value if the test holds, of the other if it fails."""
     holds, fails = decided(test)
     low = np.where(holds, yes.low, np.where(fails, no.low, np.minimum(yes.low, no.low)))
     high = np.where(holds, yes.high, np.where(fails, no.high, np.maximum(yes.high, no.high)))
@@ -184,7 +184,7 @@ def _absolute(x: Interval) -> Interval:
 
 
 def _rising(function: Callable[[Any], Any], low: float = -np.inf, high: float = np.inf) -> Callable[..., Interval]:
-    """Return the rule of an increasing function on the domain from low to high."""
+    """Return the interval rule of an increasing function with the domain from low to high."""
 
     def rule(x: Interval) -> Interval:
         inside = _clamped(x, low, high)
@@ -196,7 +196,7 @@ def _rising(function: Callable[[Any], Any], low: float = -np.inf, high: float = 
 
 
 def _falling(function: Callable[[Any], Any], low: float, high: float) -> Callable[..., Interval]:
-    """Return the rule of a decreasing function on the domain from low to high."""
+    """Return the interval rule of a decreasing function with the domain from low to high."""
     rising = _rising(lambda x: -function(x), low, high)
 
     return lambda x: _negative(rising(x))
@@ -213,8 +213,8 @@ def _contains_multiple(x: Interval, first: float, step: float) -> Any:
     return np.floor((x.high + slack - first) / step) >= np.ceil((x.low - slack - first) / step)
 
 
-def _wave(function: Callable[[Any], Any], crest: float) -> Callable[..., Interval]:
-    """Return the rule of a sinusoid of amplitude 1 with a crest at an angle."""
+def _sinusoid_rule(function: Callable[[Any], Any], crest: float) -> Callable[..., Interval]:
+    """Return the interval rule of sine or cosine, whose maximum is at the angle `crest`."""
 
     def rule(x: Interval) -> Interval:
         ends = function(x.low), function(x.high)
@@ -254,7 +254,7 @@ def _copysign(x: Interval, y: Interval) -> Interval:
 
 
 def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tuple[Any, Any]:
-    """Return the rounded quotient x / y, and where it is constant over the interval."""
+    """Return the rounded quotient x / y, and for which intervals it is constant."""
     quotient = _divide(x, y)
     multiple = rounded(quotient.low)
     known = np.isfinite(multiple) & (multiple == rounded(quotient.high))
@@ -283,7 +283,7 @@ def _remainder(x: Interval, y: Interval) -> Interval:
 
 
 def _below(x: Interval, y: Interval, *, strict: bool) -> Interval:
-    """Apply the test x < y or x <= y: 1 if true, 0 if false."""
+    """Apply the test x < y or x <= y to intervals: 1 if true, 0 if false."""
     always = x.high < y.low if strict else x.high <= y.low
     never = x.low >= y.high if strict else x.low > y.high
     return Interval(np.where(always, 1.0, 0.0), np.where(never, 0.0, 1.0))
@@ -311,7 +311,7 @@ def _or(x: Interval, y: Interval) -> Interval:
 
 
 def _step(function: Callable[[Any], Any]) -> Callable[..., Interval]:
-    """Return the rule of an increasing step function with integer values, which rounding does not affect."""
+    """Return the interval rule of an increasing step function with integer values, which rounding does not affect."""
     return lambda x: Interval(function(x.low), function(x.high))
 
 
@@ -332,8 +332,8 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "EXPM1": _rising(np.expm1),
     "LOG": _rising(np.log, low=0.0),
     "LOG1P": _rising(np.log1p, low=-1.0),
-    "SIN": _wave(np.sin, tau / 4),
-    "COS": _wave(np.cos, 0.0),
+    "SIN": _sinusoid_rule(np.sin, tau / 4),
+    "COS": _sinusoid_rule(np.cos, 0.0),
     "TAN": _tangent,
     "ASIN": _rising(np.arcsin, -1.0, 1.0),
     "ACOS": _falling(np.arccos, -1.0, 1.0),

@@ -67,7 +67,7 @@ class Phase:
 
 
 class Phases(Problem):
-    """Consecutive problems as one problem.
+    """Several consecutive problems, joined to one problem.
 
     ``phases["carry"]`` has the symbols of a phase. :meth:`join` connects phases; ``end`` and ``start`` declare further
     conditions on their ends and starts. The horizon of the whole is 1, the fraction of every phase;
@@ -113,7 +113,7 @@ class Phases(Problem):
         return Phase(name, times.begin, times.duration, self)
 
     def of(self, phase: str) -> dict[str, Variable]:
-        """Return states and controls of a phase, by their names in it."""
+        """Return states and controls of a phase by their names in that phase."""
         return parts_of_phase(self[phase].name, {**self.declared.states, **self.declared.controls})
 
     def join(self, before: str, after: str, states: Mapping[str, Any] | None = None) -> None:
@@ -183,7 +183,7 @@ class Phases(Problem):
 
 
 class _PhaseInserter:
-    """Declares the parts of a phase in the symbols of the whole problem."""
+    """Declares the parts of a phase in the whole problem, in the symbols of the latter."""
 
     def __init__(self, whole: Phases, name: str, problem: Problem) -> None:
         self.whole, self.name, self.problem = whole, name, problem
@@ -231,7 +231,7 @@ class _PhaseInserter:
         self.new.append(new)
 
     def _substituted(self, expression: Any) -> Any:
-        """Return an expression of the phase in the symbols of the whole."""
+        """Return an expression of the phase in the symbols of the whole problem."""
         used = {identity(symbol) for symbol in ca.symvar(expression)}
         pairs = [
             (old, self.whole.symbols(new))
@@ -244,7 +244,7 @@ class _PhaseInserter:
         return self.whole.symbols(ca.densify(placed))
 
     def _column(self, values: Any) -> Any:
-        """Substitute entry by entry, so that numbers remain numbers."""
+        """Substitute entry by entry, so that entries that are numbers remain numbers."""
         entries = ca.vertsplit(values)
         numbers = [not ca.symvar(entry) for entry in entries]
         placed = [
@@ -262,7 +262,7 @@ class _PhaseInserter:
         self._replace(parameter.symbol, symbol)
 
     def _duration(self) -> tuple[Any, float | None]:
-        """Return the duration, and its number, None if it has none."""
+        """Return the duration as an expression and as a number; None instead of the number if it is free."""
         horizon = self.problem.declared.horizon
         assert horizon is not None
         if horizon.fixed:
@@ -322,7 +322,7 @@ class _PhaseInserter:
 
 
 def parts_of_phase(phase: str, pool: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a pool that belong to a phase, by their names in it."""
+    """Return the states, controls or other entries that belong to a phase, by their names in the phase."""
     prefix = f"{phase}."
     return {name.removeprefix(prefix): value for name, value in pool.items() if name.startswith(prefix)}
 
@@ -334,5 +334,5 @@ def _by_name(what: str, value: Any) -> Mapping[str, Any]:
 
 
 def _stretched(function: Callable[[Any], Any], length: float) -> Callable[[Any], Any]:
-    """Return a function of the time of a phase as one of its fraction."""
+    """Convert a function of the time of a phase to a function of the phase's time fraction."""
     return lambda fraction: function(fraction * length)

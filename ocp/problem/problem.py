@@ -43,7 +43,7 @@ Declared = TypeVar("Declared", bound="Problem")
 
 
 def _about_its_name(method: Declare) -> Declare:
-    """Let the errors of a declaration carry the name that is declared."""
+    """Add the name of a declaration to the errors that it raises."""
 
     @wraps(method)
     def declare(self: Any, name: Any, *args: Any, **values: Any) -> Any:
@@ -61,7 +61,7 @@ def checked_problem(problem: Any) -> Problem:
 
 
 def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]], Callable[Arguments, Declared]]:
-    """Return a decorator of builders: their problems store the builder's name and arguments, to be declared again."""
+    """Decorate a problem builder: its problems store its name and arguments, so that they can be declared again."""
 
     def decorate(declare: Callable[Arguments, Declared]) -> Callable[Arguments, Declared]:
         parameters = signature(declare)
@@ -450,14 +450,14 @@ class Problem:
 
     @property
     def _reader(self) -> ExpressionReader:
-        """The reader of values in this problem's symbols; ends and bounds may use the parameters declared so far."""
+        """Reader of values as expressions of this problem; bounds may use the parameters declared so far."""
         return ExpressionReader(self.symbols, tuple(v.symbol for v in self.declared.parameters.values()))
 
     def _horizon_symbol(self) -> list[Any]:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
 
     def _inner(self) -> list[Any]:
-        """Return the symbols that are allowed inside the horizon."""
+        """Symbols that constraints inside the horizon may use: states, controls, parameters, signals, time, horizon."""
         d = self.declared
         pools = (d.states, d.controls, d.parameters, d.signals)
         return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]

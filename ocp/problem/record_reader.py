@@ -97,7 +97,7 @@ class FunctionReader:
             self._work.append(work)
 
     def _rebuild(self, record: Mapping[str, Any], name: str) -> tuple[Any, int]:
-        """Return a function of a list of operations, and how many operations an evaluation takes.
+        """Rebuild a function from a list of operations; also return how many operations an evaluation takes.
 
         It has SX symbols, or MX symbols if it calls other functions: only these differentiate all calls as CasADi does.
         """
@@ -174,7 +174,7 @@ def _entries(function: Any) -> int:
 
 
 def _call(callee: Any, entries: list[Any]) -> list[Any]:
-    """Return the entries of all results of a call, given the entries of all its arguments."""
+    """Return the entries of all results of a function call, given the entries of all its arguments."""
     if len(entries) != _entries(callee):
         raise ProblemError(f"a call has {len(entries)} arguments, not {_entries(callee)}", name="arguments")
     arguments, begin = [], 0
@@ -231,7 +231,7 @@ def _read_pattern(shape: Any) -> Any:
 
 
 def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return the function that finds the cell of a table for a number."""
+    """Return CasADi's function `low`: the index of the table interval that contains a number."""
     table, modes = _floats(record["table"], finite=True), ("linear", "exact", "binary")
     count, mode = _whole(record["count"], "count", 0, MAX_ENTRIES), _whole(record["mode"], "mode", 0, 2)
     if len(table) < 2 or (np.diff(table) < 0).any():
@@ -241,7 +241,7 @@ def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return the function that takes entries of a table at computed positions; nan outside."""
+    """Return the function that reads entries of a table at computed positions; nan outside the table."""
     table, x = _floats(record["table"]), ca.MX.sym("x", _whole(record["count"], "count", 0, MAX_ENTRIES))
     if not len(table):
         raise ProblemError("a table is empty", name="table")

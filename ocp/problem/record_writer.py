@@ -76,7 +76,7 @@ class FunctionWriter:
         return self._register(key, len(self.records) - 1)
 
     def _forwarded_to(self, record: dict[str, Any]) -> int | None:
-        """Return the number of the function to which a function merely forwards its arguments; None otherwise.
+        """Return the number of the function to which a function only forwards its arguments; else None.
 
         Without this check, each save of a loaded problem would wrap its tables in one more function.
         """
@@ -98,19 +98,21 @@ class FunctionWriter:
         return number
 
     def _leaf(self, record: dict[str, Any]) -> Any:
-        """Return the function of a record, and store the record."""
+        """Store a function as one record, without splitting it into operations, and return the function rebuilt from
+        the record.
+        """
         function = BUILDERS[record["kind"]](record, ())
         self._alive.append(function)
         self._append(function.__hash__(), record, function)
         return function
 
     def _call_leaf(self, record: dict[str, Any], entries: Sequence[Any], pattern: Any) -> Any:
-        """Return the result of the function of a record, called on one column."""
+        """Call the function of a record on one column and return the result."""
         argument = ca.vertcat(*entries) if entries else ca.SX(0, 1)
         return from_entries(pattern, self._leaf(record).call([argument], False, True)[0].nonzeros())
 
     def _as_scalars(self, function: Any) -> Any:
-        """Return the function in SX symbols, with calls for parts that are not scalar arithmetic."""
+        """Convert a function to SX symbols; parts that are not scalar arithmetic become calls."""
         kind = function.class_name()
         if kind == "SXFunction":
             return function
@@ -143,7 +145,7 @@ class FunctionWriter:
         return [from_entries(function.sparsity_out(k), entries) for k, entries in enumerate(outputs)]
 
     def _apply(self, function: Any, node: Any, code: int, arguments: Sequence[Any]) -> list[Any]:
-        """Return the results of one operation on matrices."""
+        """Apply one operation to matrices and return the results."""
         if code == ca.OP_CONST:
             return [ca.SX(node.to_DM())]
         if code == ca.OP_CALL:
@@ -177,7 +179,7 @@ class FunctionWriter:
         return list(step.expand().call(list(arguments)))
 
     def _gather(self, node: Any, arguments: Sequence[Any]) -> Any:
-        """Return entries of a table at computed positions."""
+        """Return the entries of a table at computed positions."""
         where, chosen = node.info(), [argument.nonzeros() for argument in arguments[1:]]
         sides = {
             side: [ca.SX(k) for k in range(*(where[side][key] for key in ("start", "stop", "step")))]
@@ -280,7 +282,7 @@ def _numbers(matrix: Any) -> np.ndarray:
 
 
 def _fields(function: Any, kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values that CasADi's debugging output states by name: `int`, `float` or lists of them.
+    """Parse values that CasADi's debugging output states by name: `int`, `float` or lists of them.
 
     The text comes from a function of this process, never from a file.
     """

@@ -20,7 +20,7 @@ def is_symbolic(value: Any) -> bool:
 
 
 def stacked(what: str, value: Any) -> Any:
-    """Return an expression as one column; a list or tuple of expressions and numbers is stacked."""
+    """Return an expression as one column; the entries of a list or tuple are stacked."""
     try:
         return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))
     except NOT_NUMBERS as error:
@@ -34,7 +34,7 @@ def symbols_of(*functions: Any) -> Any:
 
 
 def identity(symbol: Any) -> int:
-    """Return a number that is equal for equal scalar SX or equal MX symbols only."""
+    """Return a number that identifies a symbol: equal only for equal scalar SX or equal MX symbols."""
     return int(symbol.element_hash() if isinstance(symbol, ca.SX) else symbol.__hash__())
 
 
@@ -69,7 +69,7 @@ def check_finite(what: str, value: np.ndarray) -> None:
 
 
 def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise ProblemError if a lower bound exceeds its upper bound, or if no finite number meets both."""
+    """Raise ProblemError if a lower bound exceeds its upper bound, or if no finite number lies between them."""
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         details: dict[str, Any] = {"value": float(low), "limit": float(high)}
         if low > high:

@@ -51,7 +51,7 @@ DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 class WorkerFailure(OSError):
-    """A task ended for a reason that is not its own: a disk is full."""
+    """A worker failed for a reason that is not the task's, such as a full disk."""
 
 
 # ---- one task ----------------------------------------------------------------------------------------------------
@@ -103,7 +103,7 @@ def attempt(function: Function, task: str, with_guess: bool, guess: Payload | No
 
 
 def failed(status: str, error: str, message: str) -> Payload:
-    """Return the payload of a task without a result."""
+    """Return the payload of a task that ended without a result."""
     empty: dict[str, Any] = {"value": None, "files": [], "cost": None, "verdict": None, "seconds": 0.0}
     empty["inputs"] = {"kept": {}}
     return Payload({"status": status, "error": error, "message": message, **empty})
@@ -171,7 +171,7 @@ WORKER_NAME = "Dask Worker"
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """Settings of the use of Dask.
+    """Settings of the Dask workers.
 
     Attributes:
         deaths: Number of ended workers after which a task is given up.
@@ -332,7 +332,7 @@ class Engine:
         return not self._running
 
     def room(self) -> int:
-        """Return how many chunks of jobs may be sent now: one for each idle thread of the workers.
+        """Return the number of chunks of jobs that may be sent now: one for each idle thread of the workers.
 
         No more are sent, because a worker that ends loses all its jobs, running or not.
         """
@@ -346,7 +346,7 @@ class Engine:
         return max(0, self._threads - len(self._running))
 
     def share(self, ready: int) -> int:
-        """Return how many of the ready jobs to send together, so that each thread gets several chunks."""
+        """Return how many of the waiting jobs to send together, so that each thread gets several chunks."""
         return max(1, min(self._chunk_size, ready // (4 * max(1, self._threads))))
 
     def submit(self, jobs: list[Job]) -> None:
@@ -377,7 +377,7 @@ class Engine:
         return [outcome for future, jobs in finished for outcome in self._outcomes(future, jobs)]
 
     def _outcomes(self, future: Any, jobs: list[Job]) -> list[Outcome]:
-        """Return the outcomes of a chunk."""
+        """Wait for a chunk of jobs and return their outcomes; jobs of a lost worker have none."""
         try:
             payloads = [Payload(*each) for each in future.result(timeout=self.settings.patience)]
         except WorkerFailure:

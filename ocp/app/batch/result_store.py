@@ -206,7 +206,7 @@ def digest_of(path: str) -> str | None:
 
 
 def file_of(value: Plan | Solution) -> bytes:
-    """Return the bytes of the file that `save` writes."""
+    """Return the bytes of the file that the `save` method of a value writes."""
     with tempfile.TemporaryDirectory() as folder:
         value.save(Path(folder) / "result.npz")
         return (Path(folder) / "result.npz").read_bytes()
@@ -315,7 +315,7 @@ class ResultStore:
         return store
 
     def _begin(self) -> None:
-        """Write the head of the store."""
+        """Write the head of the store, which names the function."""
         text = json.dumps({"format": FORMAT, "function": self.function, "version": self.version}, indent=1).encode()
         write_whole(self.folder / HEAD, lambda stream: stream.write(text))
 
@@ -403,11 +403,11 @@ class ResultStore:
         return Payload(record, tuple(files))
 
     def value(self, record: dict[str, Any]) -> Any:
-        """Return the value of a record."""
+        """Return the function value that a record stores."""
         return unpack_result(self.payload(record))
 
     def recorded(self) -> Iterator[str]:
-        """Yield the keys of all records in order."""
+        """Yield the keys of all stored records in order."""
         shards: list[str] = []
         with suppress(FileNotFoundError):
             shards = sorted(os.listdir(self.folder / "results"))
@@ -422,13 +422,13 @@ class ResultStore:
 
 
 def loaded(path: Path) -> Any:
-    """Return the data of a JSON file; raise ValueError if a number is not finite."""
+    """Read a JSON file; raise ValueError if a number is not finite."""
     with open_unlinked(path) as stream:
         return json.loads(stream.read(), parse_float=finite, parse_constant=finite)
 
 
 def finite(text: str) -> float:
-    """Return a finite number."""
+    """Return a number; raise ValueError unless it is finite."""
     if not isfinite(value := float(text)):
         raise ValueError(f"{text} is not a finite number")
     return value

@@ -181,7 +181,7 @@ class _PendingTasks:
                     bar.set_postfix(failed=self.failures, refresh=False)
 
     def _suspect(self, key: str, deaths: int, max_deaths: int) -> None:
-        """Isolate a task that was running when a worker ended, or give it up after too many ended workers."""
+        """Isolate a task that was running when a worker died; give it up after too many dead workers."""
         self.deaths[key] += deaths
         if key == self.isolated and self.deaths[key] >= max_deaths:
             self._end(key, failed("killed", "", f"it ended {self.deaths[key]} workers"))
@@ -189,7 +189,7 @@ class _PendingTasks:
             self.suspects.append(key)
 
     def _submit(self, engine: Engine) -> None:
-        """Send as many tasks as the workers have room for; while there are suspects, one suspect alone."""
+        """Send as many tasks as the workers can take; a suspect task runs alone."""
         if self.suspects or self.isolated:
             if not engine.is_idle or not engine.room():
                 return
@@ -204,7 +204,7 @@ class _PendingTasks:
             engine.submit([Job(key, self.texts[key], self._guess(key)) for key in keys])
 
     def _guess(self, key: str) -> Payload | None:
-        """Return the payload of the nearest neighbour with a result."""
+        """Return the result of the nearest neighbour, which serves as the guess of a task."""
         parent = self._neighbour(key)
         record = None if parent is None else self.store.read(parent)
         return None if record is None else self.store.payload(record)

@@ -79,7 +79,8 @@ class Result:
         return self._store.value(record)
 
     def row(self) -> dict[str, Any]:
-        """Return a row of a table: ``COLUMNS``, and ``task.NAME`` and ``result.NAME`` of numbers and texts.
+        """Return the result as a row of a table: ``COLUMNS``, then numbers and texts as ``task.NAME`` and
+        ``result.NAME``.
 
         Longer entries of a task are given as JSON.
         """
@@ -230,19 +231,19 @@ def read_batch(folder: str | os.PathLike[str]) -> Batch:
 
 
 def entry(task: Any, name: str) -> Any:
-    """Return an entry of a task."""
+    """Return a named entry of a task; raise ProblemError if it is missing."""
     if not isinstance(task, dict) or name not in task:
         raise require.unknown("entry of a task", name, task if isinstance(task, dict) else ())
     return task[name]
 
 
 def scalar(value: Any) -> Any:
-    """Return a value that fits into a cell."""
+    """Return a value in a form that fits into a table cell."""
     return value if value is None or isinstance(value, str | int | float) else json.dumps(value, ensure_ascii=False)
 
 
 def uniform(values: list[Any]) -> list[Any]:
-    """Return values of one type: booleans, numbers, or all as texts."""
+    """Convert the values of a column to one type: booleans, numbers, or texts."""
     present = [value for value in values if value is not None]
     if all(isinstance(value, bool) for value in present):
         return values

@@ -116,7 +116,7 @@ def _distance_text(distance: float) -> str:
 
 
 def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault]) -> list[Fault]:
-    """Return the faults with the time of the first sample that violates the clearance."""
+    """Return the faults, each with the time of the first sample that violates the clearance."""
     if not faults:
         return []
     worst_times = np.array([fault.time for fault in faults])
@@ -133,7 +133,7 @@ def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault])
 
 
 def _sampled(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
-    """Return rows and faults of the distances at the samples and midway between them."""
+    """Check the distances at the samples and midway between them; return rows and faults."""
     middles = (motion.t[1:] + motion.t[:-1]) / 2
     times = np.concatenate([motion.t, middles])
     joints = motion.position.at(times)
@@ -222,14 +222,14 @@ def path_rows(
 
 
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
-    """Return the row of a value and its limit, which may be infinite."""
+    """Return a row of the table for a value and its limit, which may be infinite."""
     bounded = bool(np.isfinite(limit))
     verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.INFO
     return Row(name, value, limit if bounded else None, unit, time, verdict)
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:
-    """Return the z axis of the tool at parameters (K,) of the path: waypoint numbers with fractions. Shape (K, 3)."""
+    """Return the z axis of the tool at path parameters (K,): waypoint numbers with fractions. Shape (K, 3)."""
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -239,7 +239,7 @@ def _axes(path: Waypoints, parameter: Array) -> Array:
 
 
 def _between(t: Array, values: Array, times: Array) -> Array:
-    """Return samples interpolated linearly, with normalised quaternions. Shape (K, n)."""
+    """Interpolate samples linearly, quaternions with normalisation. Shape (K, n)."""
     interpolated = np.column_stack([np.interp(times, t, column) for column in values.T])
     if values.shape[1] == 7:
         interpolated[:, 3:] /= np.linalg.norm(interpolated[:, 3:], axis=1)[:, None]
@@ -247,7 +247,7 @@ def _between(t: Array, values: Array, times: Array) -> Array:
 
 
 def _distances(points: Array, corners: Array) -> tuple[Array, Array]:
-    """Return the distances of points (K, 3) from the polyline through corners (M, 3), and where it is closest.
+    """Return the distances of points (K, 3) from the polyline through corners (M, 3), and where it is nearest.
 
     The latter are numbers of the preceding corners plus fractions. Shape (K,) each.
     """

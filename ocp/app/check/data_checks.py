@@ -104,7 +104,7 @@ class Fault:
 
 @dataclass(frozen=True, eq=False)
 class CleanedTrajectory:
-    """Usable part of a trajectory.
+    """Samples of a trajectory that can be checked, after invalid ones are removed.
 
     Attributes:
         joints: Indices of its joints in the robot's joint vector. Shape (k,).
@@ -185,7 +185,7 @@ def clean_trajectory(
 def _columns(
     raw: RawTrajectory, robot: Robot, base: Sequence[str], faults: list[Fault], notes: list[str]
 ) -> tuple[list[int], Indices]:
-    """Return the columns of the joints in the file, and their indices in the joint vector."""
+    """Match the columns of a file with joints; return the columns and the indices of their joints."""
     names = robot.joint_names
     joints = [k for k, name in enumerate(names) if name in raw.names]
     missing = [name for name in names if name not in raw.names]
@@ -251,14 +251,14 @@ def _finite(raw: RawTrajectory, used: list[int], joints: Indices, faults: list[F
 
 
 def _count(invalid: Any, raw: RawTrajectory, k: int) -> str:
-    """Return how many values are invalid and where the first one is."""
+    """Describe how many values are invalid and where the first one is."""
     count = int(invalid.sum())
     text = f"{count} values are not numbers, the first" if count > 1 else "a value is not a number,"
     return f"{text} at {raw.t[k]:.6g} s (line {raw.lines[k]})"
 
 
 def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> Indices:
-    """Return the indices of samples with increasing times."""
+    """Return the indices of the samples that remain when times must increase."""
     t = raw.t[finite_rows]
     steps = np.diff(t)
     descriptions = (steps < 0, "goes back from {:.6g} s to {:.6g} s"), (steps == 0, "{:.6g} s is repeated")
@@ -273,7 +273,7 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return the unit below a second in which times are plausible, or "", and the share of the velocity limits used.
+    """Return a time unit below 1 s in which times are plausible, or "", and the largest velocity over its limit.
 
     The share is that of the fastest joint if the times are in seconds. Plausible are samples at 10 kHz or less, and a
     fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
@@ -360,7 +360,7 @@ def _worst_in_degrees(
 def _unwrapped(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], limits: tuple[Array, ...], notes: list[str]
 ) -> tuple[Array, list[Fault]]:
-    """Return the positions without jumps by whole turns, and a fault for each joint with limits that had some.
+    """Remove jumps by whole turns from the positions; return them, with a fault for each limited joint that had some.
 
     For a joint with limits, a jump is nearly a whole turn in a step that the joint is too slow for, or that no arm
     makes. It is removed if the limits allow, if necessary after a shift by whole turns.
@@ -431,7 +431,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
 def _jumps(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], velocity: Array, faults: list[Fault]
 ) -> None:
-    """Add a fault for each joint with steps far longer than those around them, which no arm makes."""
+    """Add a fault for each joint that jumps: a step far longer than those around it."""
     h = np.diff(t)
     steps = np.diff(q, axis=0)
     speeds = steps / h[:, None]

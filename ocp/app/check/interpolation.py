@@ -67,7 +67,7 @@ class PiecewisePolynomial:
 
     @property
     def greatest(self) -> Array:
-        """Bounds of the absolute values in every interval. Shape (N, n)."""
+        """Upper bounds of the absolute values in every interval. Shape (N, n)."""
         return np.asarray(np.abs(self.coefficients).max(axis=1))
 
 
@@ -144,7 +144,7 @@ class Motion:
         return "linear" if self.v is None else "cubic" if self.a is None else "quintic"
 
     def by(self, rule: Rule) -> Motion:
-        """Return the same samples with another interpolation rule.
+        """Return the same samples with another rule of interpolation.
 
         Raises:
             ProblemError: The rule needs velocities or accelerations that the samples do not have.
@@ -217,7 +217,7 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return the value that every motion through the samples needs in each interval, as `MotionQuantity.needed`.
+        """Return the least magnitude that every motion through the samples reaches in each interval.
 
         Acceleration: a motion between given positions and velocities needs the least if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
@@ -253,7 +253,7 @@ class Motion:
         return peak(1.0), peak(-1.0)
 
     def _differences(self, values: Array, digits: Array, order: int) -> MotionQuantity | None:
-        """Return order! times the divided differences, each between the times of its samples."""
+        """Estimate the time derivative of an order by divided differences, each over as many samples as it needs."""
         if len(self.t) <= order:
             return None
         table, blur = values, np.broadcast_to(digits, values.shape)

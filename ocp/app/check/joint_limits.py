@@ -53,7 +53,7 @@ ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^
 
 
 class RowVerdict(StrEnum):
-    """Verdict on a row."""
+    """Verdict on one row of the table of a check."""
 
     OK = "ok"
     FAILED = "FAILED"
@@ -93,7 +93,7 @@ class Row:
 
 
 def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> Limits:
-    """Return limits that are given by joint; those of other joints are the robot's own.
+    """Combine limits given by joint name with the limits of the robot for all other joints.
 
     Args:
         robot: The robot.
@@ -178,7 +178,7 @@ class _Side(NamedTuple):
 
     @classmethod
     def of(cls, quantity: MotionQuantity, column: int, sign: float, limit: float, tolerance: float) -> _Side:
-        """Return the maxima of one joint towards one limit; `room` is the tolerance."""
+        """Return the maxima of one joint towards one of its limits, with the tolerance `room`."""
         coefficients, t = sign * quantity.pieces.coefficients[:, :, column], quantity.pieces.t
         needed = np.broadcast_to(quantity.needed[0 if sign > 0 else 1], quantity.blur.shape)[:, column]
         ends, enclosed = np.maximum(coefficients[:, 0], coefficients[:, -1]), coefficients.max(axis=1)
@@ -201,7 +201,7 @@ class _Side(NamedTuple):
 
     @property
     def worst_value(self) -> float:
-        """Largest value with its sign."""
+        """Largest value towards the limit, with its original sign."""
         return self.sign * float(self.values.max())
 
 
@@ -243,7 +243,7 @@ def _check_limits(
 def effort_rows(
     cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Check the torques in the file, at its samples."""
+    """Check the torques that the file contains, at its samples."""
     rows: list[Row] = []
     faults: list[Fault] = []
     if cleaned.efforts is None:

@@ -149,7 +149,7 @@ FAULT_ORDER = {
 
 @dataclass(frozen=True)
 class Interpretation:
-    """How a controller and the reader of a trajectory file interpret its numbers.
+    """Conventions of a trajectory file: interpolation, time unit, wrapped angles and order of the columns.
 
     Attributes:
         rule: Interpolation of the controller, "linear", "cubic" or "quintic". None: the highest that the data allow; a
@@ -349,7 +349,7 @@ def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
 
 
 def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
-    """Return the quantities without a limit, joints of one kind together."""
+    """List the quantities that have no limit, joints of one kind together."""
     joints: dict[str, list[str]] = {}
     counts: dict[str, int] = {}
     for row in rows:
@@ -403,9 +403,9 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
 
 
 def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
-    """Return the check of a plan between the times at which its rates jump, where no acceleration is defined."""
+    """Check a plan segment by segment, because no acceleration is defined where its rates jump."""
     if isinstance(plan, ConsecutivePlans):
-        return _worst([_check_piece(piece, sample.t, name) for piece in plan.pieces])
+        return _worst([_check_segment(piece, sample.t, name) for piece in plan.pieces])
     if isinstance(plan, PathPlan):  # constant rates between waypoints
         joints = tuple(replace(joint, effort=np.inf) for joint in plan.machine.robot.joints)
         times = np.union1d(sample.t, plan.t)
@@ -415,8 +415,8 @@ def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
     return _check_samples(plan.machine, plan.machine.robot, values, name)
 
 
-def _check_piece(piece: Piece, times: Array, name: str) -> Check:
-    """Return the check of one motion of consecutive ones at those of the times that it covers, and at its ends."""
+def _check_segment(piece: Piece, times: Array, name: str) -> Check:
+    """Return the check of one segment of a motion at its ends and at the given times that lie inside it."""
     plan, local = piece.plan, times - piece.begin
     inside = local[(local > 0) & (local < plan.horizon)]
     sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))
@@ -438,7 +438,7 @@ def _check_samples(
 
 
 def _worst(checks: Sequence[Check]) -> Check:
-    """Return the checks of several motions as one: all faults, and the worst row of each quantity."""
+    """Merge the checks of several motions: all faults, and the worst row of each quantity."""
     rows: dict[str, Row] = {}
     for row in (row for check in checks for row in check.rows):
         if row.name not in rows or _severity(row) > _severity(rows[row.name]):
@@ -452,6 +452,6 @@ def _worst(checks: Sequence[Check]) -> Check:
 
 
 def _severity(row: Row) -> tuple[bool, bool, float]:
-    """Return a key by which rows of one quantity are compared."""
+    """Return the sorting key that compares rows of one quantity by severity."""
     size = abs(row.limit) if row.limit else 1.0
     return row.verdict is RowVerdict.FAILED, row.verdict is RowVerdict.UNDECIDED, abs(row.value) / size

@@ -166,7 +166,7 @@ class _Reader:
         raise line_error(self.file, self.block.number, self.block.text, why, limit=limit)
 
     def _note(self, text: str) -> None:
-        """Note something about the current line."""
+        """Add a note about the current line."""
         lines = self.note_lines.setdefault(text, [])
         if not lines or lines[-1] != self.block.number:
             lines.append(self.block.number)
@@ -314,7 +314,7 @@ class _Reader:
                 self.offset[i] = self.position[i] - words.pop(axis) * UNITS[self.unit]
 
     def _target(self, words: dict[str, float]) -> Array:
-        """Return the programmed target in the frame of the program's start. Shape (3,), m."""
+        """Return the programmed target point in the frame of the program's start. Shape (3,), m."""
         target, unit = self.position.copy(), UNITS[self.unit]
         for i, axis in enumerate(AXES):
             if axis in words:
@@ -398,7 +398,7 @@ class _Reader:
         self._add(arcs, target)
 
     def _add(self, segments: Sequence[Segment], reached: Array) -> None:
-        """Append segments at the current feed."""
+        """Append path segments with the current feed."""
         if not self.feed:
             self._refuse("no feed is set; write F, or read with feed= in m/s")
         feed = self.feed * sum(segment.length for segment in segments) if self.inverse_time else self.feed
@@ -410,7 +410,7 @@ class _Reader:
             self._end_path()
 
     def _stop(self, words: dict[str, float]) -> bool:
-        """Execute the M words, reject words left over, and return whether the program ends."""
+        """Execute the M words, reject unused words, and return whether the program ends."""
         is_end = False
         for code in (code for letter, code in self.block.codes if letter == "M"):
             kind, name = M_WORDS.get(code, ""), f"M{code // 10}"

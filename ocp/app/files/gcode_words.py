@@ -135,7 +135,7 @@ def arcs_about_center(
 
 
 def _moved(center: Array, first: Array, last: Array) -> Array:
-    """Return the point nearest to `center` with equal distance from both other points. Shape (2,) each."""
+    """Return the point equidistant from two points that is nearest to `center`. Shape (2,) each."""
     chord = last - first
     square = float(chord @ chord)
     return center if square == 0 else np.asarray(center - ((center - (first + last) / 2) @ chord) / square * chord)
@@ -144,7 +144,7 @@ def _moved(center: Array, first: Array, last: Array) -> Array:
 def _turned(
     start: Array, end: Array, center: Array, clockwise: bool, sweep: float, plane: tuple[int, int, int]
 ) -> Arc | Helix:
-    """Return the arc, or for more than a turn or a rise the helix, that begins at `start` and turns by `sweep`."""
+    """Return the arc, or the helix if it rises or exceeds a full turn, that begins at `start` and turns by `sweep`."""
     axis, middle = np.zeros(3), start.copy()
     axis[plane[2]] = -1.0 if clockwise else 1.0
     middle[list(plane[:2])] = center
@@ -302,7 +302,7 @@ def _without_comments(file: FileName, number: int, text: str) -> str:
 
 
 def _tenths(file: FileName, number: int, text: str, letter: str, value: str) -> int:
-    """Return a code in tenths."""
+    """Return a G or M code times ten, since codes such as G38.2 have one decimal."""
     exact = float(value) * 10 if len(value) < 9 else -1.0
     if exact < 0 or abs(exact - round(exact)) > 1e-6:
         raise line_error(file, number, text, f"{letter}{value} is not a code; codes have at most one decimal")

@@ -51,7 +51,7 @@ class Note(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """A path that is traversed at its feeds without a stop.
+    """A path traversed at the programmed feed without a stop, such as a cut of a mill.
 
     Attributes:
         path: Path of n segments.
@@ -152,7 +152,7 @@ class Program:
 
     @property
     def rapids(self) -> tuple[Rapid, ...]:
-        """The rapids of the program."""
+        """Rapid moves (G0) of the program."""
         return tuple(each for each in self.sections if isinstance(each, Rapid))
 
     @property
@@ -238,20 +238,20 @@ def checked_reversal(owner: str, value: Any) -> Reversal:
 
 
 def _counted(number: int, noun: str) -> str:
-    """Return a count with its noun."""
+    """Return a count with its noun, in the plural if necessary."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _moved(points: Array, position: ArrayInput, orientation: ArrayInput) -> Array:
     # lines from the origin along the axes check the pose and give its rotation
-    """Return points (k, 3) moved to a pose."""
+    """Transform points (k, 3) by a pose."""
     frame = [Path.through([(0, 0, 0), axis]).placed(position, orientation).segments[0] for axis in np.eye(3)]
     origin = np.asarray(frame[0].start)
     return np.asarray(origin + points @ np.array([np.asarray(line.end) - origin for line in frame]))
 
 
 def smoothed(path: Path, deviation: ArrayInput, options: dict[str, Any]) -> SmoothPath:
-    """Return a path rounded within a deviation, with options of models.smooth; raise its errors as ProblemError."""
+    """Round a path within a deviation, with the options of models.smooth; raise its errors as ProblemError."""
     known = {"kind", "shape", "overlap"}
     if unknown := [name for name in options if name not in known]:
         message = f"smooth: unknown option {unknown[0]!r}; known: {', '.join(sorted(known))}"
@@ -347,7 +347,7 @@ class TimedProgram:
         )
 
     def _rest(self, which: int) -> Array:
-        """Return the position of a pause: the end of the previous move."""
+        """Return the position during a pause: the end of the previous move."""
         for each in reversed(self.program.sections[:which]):
             if isinstance(each, Rapid):
                 return each.end

@@ -1,4 +1,4 @@
-"""Read text files of strangers safely, and check where outputs may be written.
+"""Read text files from untrusted sources safely, and check where outputs may be written.
 
 Text is read line by line, JSON and YAML as trees of bounded size and depth, and errors name the line. A tree consists
 of mappings, lists, texts and numbers. An alias of YAML counts with all the values that it stands for, so that a walk
@@ -88,7 +88,7 @@ def read_lines(
 
 
 def line_error(file: Any, number: int, text: str, why: str, *, limit: Any = None) -> ProblemError:
-    """Return the error of a line, counted from 1, with its text, what is wrong and what to do."""
+    """Return the error of a numbered line: its text, what is wrong and what to do."""
     quoted = text.strip()
     quoted = quoted if len(quoted) <= QUOTED_CHARACTERS else quoted[:QUOTED_CHARACTERS] + " ..."
     return ProblemError(f"{file}, line {number}, {quoted!r}: {why}", name=f"line {number}", value=quoted, limit=limit)
@@ -109,7 +109,7 @@ def split_cells(line: str, delimiter: str) -> list[str]:
 
 
 def is_number(cell: str) -> bool:
-    """Return whether `float` reads a cell."""
+    """Return whether the text of a cell is a number."""
     try:
         float(cell)
     except ValueError:
@@ -221,7 +221,7 @@ def _first_document(events: Any) -> Any:
 
 
 def _scalar(event: Any) -> Any:
-    """Return the value of a scalar."""
+    """Return the value of a YAML scalar."""
     text = str(_checked_tag(event).value)
     if not event.implicit[0]:  # quoted, or with a tag
         return text
@@ -231,7 +231,7 @@ def _scalar(event: Any) -> Any:
 
 
 def _checked_tag(event: Any) -> Any:
-    """Return an event, or raise ValueError if its tag is unknown."""
+    """Return an event of a YAML parser; raise ValueError if its tag is unknown."""
     if event.tag not in TAGS:
         raise ValueError(f"the tag {event.tag!r} is not supported")
     return event
@@ -244,7 +244,7 @@ def _check_count(count: int) -> None:
 
 
 def checked_depth(tree: Any) -> Any:
-    """Return a tree; raise ValueError if it is nested more than INPUT_LIMITS.nesting deep."""
+    """Return a tree of values; raise ValueError if it is nested more than INPUT_LIMITS.nesting deep."""
     level = [tree]
     for _ in range(INPUT_LIMITS.nesting + 1):
         level = [child for node in level for child in children_of(node)]
@@ -308,7 +308,7 @@ def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None 
 
 
 def _is_own(kind: str, path: Path) -> bool:
-    """Return whether selfmotion wrote the file."""
+    """Return whether an existing file was written by selfmotion, and may be overwritten."""
     try:
         if kind == "plan":
             return "head" in read_arrays(path)

@@ -125,7 +125,7 @@ def rotation_of(entries: TomlTable) -> Array:
 
 
 def _shape(table: TomlTable, shape: str, folder: Path) -> Shape:
-    """Return the shape of a table."""
+    """Read the shape of an [[obstacle]] table."""
 
     def place(name: str = "position") -> Any:
         return table.vector(name, 3, "three numbers, m", REQUIRED)
@@ -212,8 +212,8 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
     for name, read in (
         ("limits", _limits),
         ("cost", _cost),
-        ("search", _search),
-        ("scene", partial(_scene, obstacles)),
+        ("search", _read_search),
+        ("scene", partial(_read_scene, obstacles)),
     ):
         if (table := root.table(name, f"a table [{name}]")) is not None:
             options |= read(table, names, folder)
@@ -229,8 +229,8 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
 
 
 @contextmanager
-def _about(entries: TomlTable, name: str | None) -> Iterator[None]:
-    """Raise errors from inside the block as errors of an entry."""
+def _located_errors(entries: TomlTable, name: str | None) -> Iterator[None]:
+    """Add the file and the entry of a task file to errors raised inside the block."""
     try:
         yield
     except (ModelError, ProblemError) as error:
@@ -240,27 +240,27 @@ def _about(entries: TomlTable, name: str | None) -> Iterator[None]:
 
 
 def _machine(entries: TomlTable, urdf: Path) -> Machine:
-    """Return the robot on its base."""
+    """Read the robot and its base."""
     tip = entries.text("tip", "the name of the link that carries the tip")
     if not urdf.is_file():
         raise entries.error("urdf", f"there is no file {urdf}; name the robot's URDF, from the task file's folder")
-    with _about(entries, "urdf"):
+    with _located_errors(entries, "urdf"):
         robot = Robot.from_urdf(urdf)
     if tip is not None:
-        with _about(entries, "tip"):
+        with _located_errors(entries, "tip"):
             robot = Robot.from_urdf(urdf, tip=tip)
     locked_positions = entries.numbers_by_name("lock", "a table of joints and positions: lock = { finger = 0.02 }")
     if locked_positions:
-        with _about(entries, "lock"):
+        with _located_errors(entries, "lock"):
             robot = lock_joints(robot, locked_positions)
     load = entries.number("load", "a number above 0, kg", least=0.0)
     if load is not None:
-        with _about(entries, "load"):
+        with _located_errors(entries, "load"):
             robot = with_load(robot, robot.tip_link, load, robot.tip_translation)
     base = entries.choice("base", ("fixed", "standing", "floating"), "fixed")
     position, rotation = entries.vector("position", 3, "three numbers, m", (0.0, 0.0, 0.0)), rotation_of(entries)
     foot = entries.vector("foot", 4, "four numbers, m: least and greatest x, least and greatest y")
-    with _about(entries, "base"):
+    with _located_errors(entries, "base"):
         if base == "floating":
             return FreeFloating(robot)
         if base == "fixed":
@@ -272,8 +272,8 @@ def _machine(entries: TomlTable, urdf: Path) -> Machine:
 
 
 def _task(entries: TomlTable, folder: Path) -> TipTask:
-    """Return the task of the tip."""
-    path = _path(entries, folder)
+    """Read the task of the tip."""
+    path = _read_path(entries, folder)
     speed = _path_limit(entries, "speed", "m/s", REQUIRED)
     acceleration = _path_limit(entries, "acceleration", "m/s^2")
     jerk, centripetal = (
@@ -282,7 +282,7 @@ def _task(entries: TomlTable, folder: Path) -> TipTask:
     )
     timing: Any = speed
     if acceleration is not None:
-        with _about(entries, "acceleration"):
+        with _located_errors(entries, "acceleration"):
             timing = schedule(path, LineLimits(speed, acceleration, jerk, centripetal))
     elif "jerk" in entries or "centripetal" in entries:
         raise entries.missing("acceleration", "a schedule needs it: acceleration = 1.0, in m/s^2")
@@ -300,18 +300,18 @@ def _task(entries: TomlTable, folder: Path) -> TipTask:
     for name, value in (("within", within), ("link", link), ("tolerance", tolerance)):
         if value is not None:
             options[name] = value
-    with _about(entries, "speed"):
+    with _located_errors(entries, "speed"):
         task = TipTask.along(path, timing, roll="given" if tool == "given" else "free", **options)
         return replace(task, rows=(3, 4, 5), direction=None, orientation=None) if tool == "free" else task
 
 
 def _path_limit(entries: TomlTable, name: str, unit: str, default: Any = None) -> Any:
-    """Return a limit of the schedule along the path, of a size that machines have."""
+    """Read a limit of the schedule along the path; reject a size that no machine has."""
     return entries.number(name, f"a number above 0, {unit}, of 1e-6 to 1e6", default, least=0.999e-6, most=1e6)
 
 
-def _path(entries: TomlTable, folder: Path) -> SmoothPath:
-    """Return the rounded path."""
+def _read_path(entries: TomlTable, folder: Path) -> SmoothPath:
+    """Read the path of a task file and return it with rounded corners."""
     deviation = entries.number("rounding", "a number above 0, m: largest deviation of rounded corners", 1e-3, least=0.0)
     name = entries.text("file", "the name of a file of waypoints")
     points = entries.raw("points")
@@ -320,7 +320,7 @@ def _path(entries: TomlTable, folder: Path) -> SmoothPath:
     if name is not None:
         if not (folder / name).is_file():
             raise entries.error("file", f"there is no file {folder / name}; name it from the task file's folder")
-        with _about(entries, "file"):
+        with _located_errors(entries, "file"):
             return read_waypoints(folder / name).smooth(deviation)
     try:
         corners = floats(points)
@@ -328,30 +328,30 @@ def _path(entries: TomlTable, folder: Path) -> SmoothPath:
         corners = np.zeros(0)
     if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 2 or not np.isfinite(corners).all():
         raise entries.error("points", "points must be two or more triples of numbers, m: [[x, y, z], [x, y, z]]")
-    with _about(entries, "points"):
+    with _located_errors(entries, "points"):
         return smooth(ToolPath.through(corners), deviation=deviation)
 
 
 def _limits(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """Return the joint limits as an option of the planner."""
+    """Read the joint limits and return them as an option of the planner."""
     limits: dict[str, Any] = {}
     for quantity, unit in LIMIT_UNITS.items():
         expected = f"a number above 0, {unit}, or {{ joint = number }}"
-        with _about(entries, quantity):
+        with _located_errors(entries, quantity):
             limits[quantity] = _each(entries, quantity, names, np.inf, expected)
             Limits(**{quantity: limits[quantity]})
     return {"limits": Limits(**limits, joints=entries.flag("positions", True))}
 
 
 def _cost(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """Return the weights as an option of the planner."""
+    """Read the weights of the cost and return them as an option of the planner."""
     weights = _each(entries, "weights", names, 1.0, "numbers above 0 by joint: { elbow = 4 }")
     time = entries.number("time", "a number above 0, 1/s: cost of a second with a free pace", least=0.0)
     return {"cost": Cost(time=time or 0.0, weights=weights)}
 
 
 def _each(entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str) -> Any:
-    """Return one number for all joints or one for each, `other` for joints that are not named; None if missing."""
+    """Return one number for all joints, or one for each; unnamed joints get `other`. None if the entry is missing."""
     if name not in entries:
         return None
     if not isinstance(entries.raw(name), dict):
@@ -370,8 +370,8 @@ def _check_joints(entries: TomlTable, name: str, by_joint: dict[str, float], nam
             raise table.error(joint, f"the robot has no independent joint {joint!r}; it has {', '.join(names)}")
 
 
-def _search(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """Return the options of the planner for its search."""
+def _read_search(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
+    """Read the search settings of a task file and return them as options of the planner."""
     kind = entries.choice("kind", ("configurations", "start", "global", "segments"), "configurations")
     cyclic, pace = entries.flag("cyclic"), entries.choice("pace", ("given", "free"), "given")
     options: dict[str, Any] = {"seed": entries.count("seed", "a whole number, 0 or more", 0)}
@@ -391,8 +391,10 @@ def _search(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[st
     return options
 
 
-def _scene(obstacles: tuple[Shape, ...], entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """Return the scene as an option of the planner."""
+def _read_scene(
+    obstacles: tuple[Shape, ...], entries: TomlTable, names: tuple[str, ...], folder: Path
+) -> dict[str, Any]:
+    """Read the collision scene of a task file and return it as an option of the planner."""
     checked = entries.flag("look", True)
     clearance = entries.number("clearance", "a distance of 0 or more, m", 0.0, least=-1e-300)
     srdf = entries.text("srdf", "the name of an SRDF file")
@@ -413,7 +415,7 @@ def _scene(obstacles: tuple[Shape, ...], entries: TomlTable, names: tuple[str, .
 
 
 def _outputs(entries: TomlTable | None, folder: Path) -> tuple[dict[str, Path], float]:
-    """Return the output files by kind, and the sampling period."""
+    """Read the output files, by kind, and the sampling period."""
     if entries is None:
         return {}, 0.01
     outputs = {}
@@ -422,7 +424,7 @@ def _outputs(entries: TomlTable | None, folder: Path) -> tuple[dict[str, Path], 
             outputs[kind] = folder / name
             if not outputs[kind].parent.is_dir():
                 raise entries.error(kind, f"there is no folder {outputs[kind].parent}; create it, or name another")
-            with _about(entries, kind):
+            with _located_errors(entries, kind):
                 checked_output(kind, outputs[kind], folder, force=True)
     period = entries.number("period", "a number above 0, s", 0.01, least=0.0)
     entries.done()

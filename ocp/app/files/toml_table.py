@@ -145,7 +145,7 @@ class TomlTable:
         return [(one, other) for one, other in self._read(name, [], expected, fits)]
 
     def raw(self, name: str, default: Any = None) -> Any:
-        """Return an entry of any type."""
+        """Return an entry of any type, unchecked."""
         return self._read(name, default, "", lambda value: True)
 
     def table(self, name: str, expected: str = "a table", default: Any = None) -> TomlTable | None:
@@ -154,11 +154,11 @@ class TomlTable:
         return None if values is None else self._inner(values, name)
 
     def _inner(self, values: Any, *place: Any) -> TomlTable:
-        """Return the table of these values at a place within this one."""
+        """Return a nested table with its place in the file, so that its errors name the line."""
         return TomlTable(self.file, values, place=(*self.place, *place), texts=self._texts, lines=self._lines)
 
     def tables(self, name: str) -> list[TomlTable]:
-        """Return the tables under [[name]]."""
+        """Return the tables of the array [[name]]."""
         tables = self._read(
             name,
             [],
@@ -168,7 +168,7 @@ class TomlTable:
         return [self._inner(values, name, k) for k, values in enumerate(tables)]
 
     def only(self, *names: str) -> None:
-        """Reject entries with other names than these, before any is read.
+        """Reject all entries with other names than the given ones, before any is read.
 
         Raises:
             ProblemError: An entry is unknown; names its line and the known entries.
@@ -219,7 +219,7 @@ def read_toml(file: FileName) -> TomlTable:
 
 
 def _places(texts: Sequence[str]) -> dict[Place, int]:
-    """Return the line number of every table and entry."""
+    """Return the line number of every table and entry of a file."""
     lines: dict[Place, int] = {}
     counts: dict[Place, int] = {}
     table: Place = ()

@@ -189,7 +189,7 @@ def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str
 def _meanings(
     file: FileName, head: list[str], joints: frozenset[str]
 ) -> tuple[tuple[int, float] | None, dict[tuple[str, str], tuple[int, float]], list[str]]:
-    """Return column and unit of the time, those of each joint's values by name and kind, and notes."""
+    """Identify the columns of a table: time with its unit, the values of each joint by kind, and notes."""
     if joint_names := table_joints(head):  # our own table: the names of its joints are not interpreted
         columns = [(name, kind) for kind in KINDS[:3] for name in joint_names]
         return (0, 1.0), {key: (column, 1.0) for column, key in enumerate(columns, 1)}, []
@@ -226,7 +226,7 @@ def _meanings(
 
 
 def _kind(name: str) -> tuple[str, str]:
-    """Return the joint and the kind of value in a column's name."""
+    """Return the joint and the kind of value that the name of a column denotes."""
     for sign in "./:_ ":
         prefix, _, last = name.rpartition(sign)
         if prefix and last.lower() in WORDS:
@@ -241,7 +241,7 @@ def _kind(name: str) -> tuple[str, str]:
 
 
 def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
-    """Return the outermost mapping that has joint names and points; each value is visited once."""
+    """Search a tree for the outermost mapping with joint names and points; each value is visited once."""
     level, visited = [tree], set[int]()
     for _ in range(depth + 1):
         next_level: list[Any] = []
@@ -257,7 +257,7 @@ def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
 
 
 def _from_points(file: FileName, tree: Any) -> RawTrajectory:
-    """Return the trajectory in a tree of names and values."""
+    """Return the trajectory of a tree with joint names and trajectory points."""
     message = _trajectory_in(tree)
     if message is None:
         words = f"{file} contains no joint trajectory; joint_names and points are expected"
@@ -297,7 +297,7 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
 
 
 def _rows(file: FileName, word: str, points: list[Any], width: int) -> Array:
-    """Return the values of all points. Shape (M, width)."""
+    """Return one kind of values of all trajectory points. Shape (M, width)."""
     rows = np.full((len(points), width), np.nan)
     for number, point in enumerate(points, 1):
         if not isinstance(point, list) or len(point) != width:
@@ -332,7 +332,7 @@ def _seconds(file: FileName, number: int, point: Mapping[str, Any]) -> float:
 
 
 def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) -> RawTrajectory:
-    """Return the trajectory of joint states, one per message, or of the first joint trajectory."""
+    """Return the trajectory of messages: joint states, one per message, or the first joint trajectory."""
     notes = []
     first = messages[0][1]
     if "points" in first:

@@ -153,7 +153,7 @@ class Waypoints:
         return smoothed(self.path(reversal=reversal), require.positive("tolerance", tolerance), options)
 
     def _check_still(self, last: int, i: int) -> None:
-        """Raise ProblemError if the tool turns while its position stays."""
+        """Raise ProblemError if the tool turns on the spot, without a change of position."""
         if self.orientations is None:
             return
         turn = np.pi
@@ -316,7 +316,7 @@ def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[lis
 
 
 def _table(file: FileName, rows: list[tuple[int, str, list[str]]], used: Sequence[bool]) -> Array:
-    """Return the numbers of the used columns, zero in the others. Shape (M, columns)."""
+    """Return the numbers of the used columns; unused columns are zero. Shape (M, columns)."""
     if not rows:
         raise ProblemError(f"{file}: the file has a header but no waypoint", name="file", value=str(file))
     width = len(used)
@@ -361,19 +361,19 @@ def _axes(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequenc
 
 
 def _from_vectors(vectors: Array) -> Array:
-    """Return the quaternions of rotation vectors."""
+    """Convert rotation vectors to quaternions."""
     angle = np.linalg.norm(vectors, axis=1)[:, None]
     return np.concatenate([np.cos(angle / 2), np.sinc(angle / 2 / np.pi) / 2 * vectors], axis=1)
 
 
 def _aligned(quaternions: Array) -> Array:
-    """Choose the sign of each quaternion so that it is the nearer one to its predecessor."""
+    """Choose the sign of each quaternion so that it is the one nearer to its predecessor."""
     signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(quaternions * np.cumprod(np.concatenate([[1.0], signs]))[:, None])
 
 
 def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
-    """Return orientations with the tool axis as z axis, by parallel transport from row to row."""
+    """Return orientations with a given tool axis as z axis, by parallel transport from row to row."""
     previous = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
     steps = np.column_stack([1 + (previous * axes).sum(axis=1), np.cross(previous, axes)])
     opposite = steps[:, 0] < 1e-7  # 1 + cosine; half of the digits of double precision

@@ -278,7 +278,7 @@ class Animation:
 
 
 def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
-    """Return a sampled plan with its audit; `settings` are those of the audit."""
+    """Sample a plan for display, with its audit; `settings` are those of the audit."""
     times = _times(plan.horizon)
     sample = plan.sampled(times)
     base = plan.at(times)["base"] if plan.machine.base_size else np.zeros((len(times), 0))
@@ -308,7 +308,7 @@ def animate_solution(
     base: str = "base",
     **settings: Any,
 ) -> Animation:
-    """Return the sampled solution of a problem.
+    """Sample the solution of a problem for display.
 
     Args:
         solution: The solution.
@@ -352,7 +352,7 @@ def animate_solution(
 
 
 def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Animation:
-    """Return a sampled joint trajectory, interpolated as controllers do.
+    """Sample a joint trajectory for display, interpolated as controllers do.
 
     Raises:
         ProblemError: The trajectory lacks joints of the machine, or has no valid sample.
@@ -389,7 +389,7 @@ def _between(times: Array, t: Array, values: Array) -> Array:
 def _animation(
     name: str, machine: Machine, samples: MotionSamples, own_curves: Sequence[Curve], **details: Any
 ) -> Animation:
-    """Return a motion with the curves that every motion has."""
+    """Return an animation with the curves that every motion has."""
     t, relative = samples.t, PAGE_SETTINGS.same_cost
     effort = cumulative_integral(t, (samples.rates**2).sum(axis=1) / 2)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
@@ -417,7 +417,7 @@ def _times(horizon: float) -> Array:
 
 
 def _torque_like(solution: Solution, joints: str) -> bool:
-    """Return whether the joints are smooth enough for torques: another state has their size."""
+    """Return whether the joints are differentiable enough for inverse dynamics."""
     return len(solution.state_interpolant.nodes) > 2 and any(
         name != joints and values.shape[1] == solution.states[joints].shape[1]
         for name, values in solution.states.items()
@@ -425,7 +425,7 @@ def _torque_like(solution: Solution, joints: str) -> bool:
 
 
 def _audited(solutions: Sequence[Solution], judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
-    """Return sentence, result and rows of the audit, or only a sentence if the problem is missing."""
+    """Return the sentence, result and rows of the audit, or only a sentence if the solution has no problem."""
     lost = next((solution.problem_lost for solution in solutions if solution.problem is None), None)
     if lost is not None:
         return {"verdict": f"There is no audit, because the file has no problem: {lost}."}
@@ -455,7 +455,7 @@ def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[
 
 
 def _margins(rows: Sequence[Curve]) -> list[Curve]:
-    """Return the smallest margin of each constraint to its limits, and the largest error of its equations."""
+    """Return the smallest margin of each inequality to its limits, and the largest error of each equation."""
     curves = []
     for name in dict.fromkeys(one.group for one in rows):
         group = [one for one in rows if one.group == name]

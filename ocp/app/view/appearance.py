@@ -192,7 +192,7 @@ def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
 
 
 def _turned(profile: Array) -> Triangles:
-    """Return the surface of revolution about z of a profile of (radius, z), shape (k, 2), from axis to axis."""
+    """Return the surface of revolution about z of a profile of points (radius, z), shape (k, 2)."""
     sides = SURFACE_STYLE.sides
     angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -220,7 +220,7 @@ def rod(start: Array, end: Array, radius: float) -> Triangles:
 
 
 def _rods(robot: Robot, shown: set[str]) -> list[tuple[str, Triangles]]:
-    """Return rods for the moving links without surfaces, from joint to joint and to the tip."""
+    """Return rods from joint to joint and to the tip, for links that have no surface of their own."""
     ends = [(joint.parent, np.asarray(joint.translation, dtype=float)) for joint in robot.joints]
     if robot.tip is not None:
         ends.append((robot.tip, np.asarray(robot.tip_translation, dtype=float)))
@@ -237,7 +237,7 @@ def _rods(robot: Robot, shown: set[str]) -> list[tuple[str, Triangles]]:
 
 
 def _few(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
-    """Return the surfaces with at most `most` faces in all."""
+    """Reduce the surfaces to at most `most` faces in all."""
     size = SURFACE_STYLE.min_cell
     coarse = surfaces
     while sum(len(mesh.faces) for _, mesh in coarse) > most and size < 1.0:
@@ -260,7 +260,7 @@ def _coarser(mesh: Triangles, size: float) -> Triangles:
 
 
 def _parts(surfaces: list[tuple[str, Triangles]]) -> list[Part]:
-    """Return surfaces grouped by link and colour."""
+    """Group surfaces by link and colour."""
     parts = []
     for link in dict.fromkeys(name for name, _ in surfaces):
         mesh = join_meshes([triangles for name, triangles in surfaces if name == link])
@@ -389,7 +389,7 @@ class Obstacle(NamedTuple):
     positions: Array | None = None
 
     def solid(self, points: Array) -> Solid:
-        """Return the surface in the body's own frame; for a half-space a square near points (k, 3)."""
+        """Return the surface of the body in its own frame; a half-space is drawn as a square near points (k, 3)."""
         if self.normal is None:
             offsets = np.zeros((1, 3))
             if self.radius > 0:
@@ -465,7 +465,7 @@ def obstacles_of_plan(plan: Plan, times: Array) -> list[Obstacle]:
 
 
 def _moves(problem: Problem, separation: Separation, frame: int) -> bool:
-    """Return whether a frame moves by time alone."""
+    """Return whether a frame moves as a function of time alone."""
     if frame < 0:
         return False
     rows = separation.placements[12 * frame : 12 * frame + 12]

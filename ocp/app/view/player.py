@@ -47,7 +47,7 @@ class Buffers:
         self.size = 0
 
     def put(self, values: Any, kind: str) -> dict[str, Any]:
-        """Store an array as numbers of a kind, "f4", "u2", "i1" or "u4", and return its reference."""
+        """Store an array as numbers of one kind, "f4", "u2", "i1" or "u4", and return a reference to it."""
         array = np.ascontiguousarray(values, dtype=f"<{kind}" if kind != "i1" else kind)
         data = array.tobytes()
         reference = {"at": self.size, "kind": kind, "shape": list(array.shape)}
@@ -58,7 +58,7 @@ class Buffers:
 
 
 class Page(NamedTuple):
-    """A page.
+    """A web page that plays a motion.
 
     Attributes:
         text: HTML.
@@ -103,7 +103,7 @@ def build_page(
     head += b" " * (-len(head) % 4)
     data_bytes = len(head).to_bytes(4, "little") + head + b"".join(buffers.parts)
     data = base64.b64encode(gzip.compress(data_bytes, 9, mtime=0)).decode()
-    text = _filled(name, shown[0], data)
+    text = _fill_template(name, shown[0], data)
     size, most = len(text.encode()), PAGE_SETTINGS.most_bytes
     if size > most:
         words = f"the page has {size / 1e6:.3g} MB, at most {most / 1e6:g} are allowed; show fewer motions"
@@ -111,8 +111,8 @@ def build_page(
     return Page(text, missing)
 
 
-def _filled(title: str, first: Animation, data: str) -> str:
-    """Return the text of the page."""
+def _fill_template(title: str, first: Animation, data: str) -> str:
+    """Return the HTML text of the page: the template with title, style, scripts and data inserted."""
     source = files("ocp.app.view").joinpath("page")
     text = source.joinpath("page.html").read_text(encoding="utf-8")
     script = "\n".join(source.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
@@ -122,7 +122,7 @@ def _filled(title: str, first: Animation, data: str) -> str:
 
 
 def _alike(a: Robot, b: Robot) -> bool:
-    """Return whether two robots look the same."""
+    """Return whether two robots look the same, so that one set of surfaces serves both."""
     if a is b:
         return True
     names = [[part.name for part in robot.links] for robot in (a, b)]
@@ -148,12 +148,12 @@ def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
 
 
 def _movers(robot: Robot) -> list[str]:
-    """Return the root and the links that move."""
+    """Return the root and the links that move, whose frames the page animates."""
     return [robot.root, *(joint.child for joint in robot.joints if joint.moves)]
 
 
 def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, Any]:
-    """Return the surfaces in the frames of the moving links."""
+    """Return the surfaces of a robot, expressed in the frames of its moving links."""
     carriers, movers = _carriers(robot), _movers(robot)
     parts = []
     for part in appearance.parts:
@@ -198,7 +198,7 @@ def _poses(frames: Frames, names: Sequence[str]) -> Array:
 
 
 def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
-    """Return the description of a motion."""
+    """Return the description of one motion for the page."""
     rows = np.unique(np.linspace(0, len(motion.t) - 1, min(len(motion.t), PAGE_SETTINGS.poses)).round().astype(int))
     frames = frames_along(motion.machine, motion.joints[rows], motion.base[rows])
     tip = motion.machine.robot.tip is not None
@@ -269,13 +269,13 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
 
 
 def _solid(vertices: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[str, Any]:
-    """Return the surface of a solid."""
+    """Return the description of a solid obstacle for the page."""
     part = part_of("", vertices, faces, (0.0, 0.0, 0.0, 1.0))
     return _surface(part.vertices, part.normals, part.faces, buffers)
 
 
 def _plain(value: float | None) -> float | None:
-    """Return a finite number, otherwise None."""
+    """Return a number for JSON: None if it is not finite."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 

@@ -212,7 +212,7 @@ def _motion_of(plan: Plan) -> Motion:
 
 
 def _compared(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
-    """Return a motion to compare with a plan, and its cost if it is known."""
+    """Return a motion that is compared with a plan, and its cost if it is known."""
     cost: float | None = None
     if isinstance(other, Plan):
         joints, motion, cost = other.names, _motion_of(other), other.cost
@@ -312,7 +312,7 @@ def _widths(solution: Solution) -> dict[str, int]:
 
 
 def _local_widths(name: str, other: Any) -> dict[str, int]:
-    """Return the numbers of entries of a result of `resolve`, by the names of `minimum_velocity_problem`."""
+    """Return the sizes of the states and controls of a result of `resolve`, named as in `minimum_velocity_problem`."""
     if not isinstance(other, LocalSolution):
         words = (
             f"plot: {name!r} is a {type(other).__name__}; a solution can be compared with a solution or a result of "
@@ -323,13 +323,13 @@ def _local_widths(name: str, other: Any) -> dict[str, int]:
 
 
 def _local(other: LocalSolution) -> dict[str, Array]:
-    """Return base, joints and rates of a result of `resolve`, by the names of `minimum_velocity_problem`."""
+    """Return the result of `resolve` as states and controls named as in `minimum_velocity_problem`."""
     samples = {"base": other.base, "joints": other.joints, "rates": other.joint_rates}
     return {name: values for name, values in samples.items() if values.shape[1]}
 
 
 def _along(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times, s, and values of states and controls by name; the times include both sides of every node.
+    """Return times, s, and values of states and controls by name; a node has a value from either side.
 
     States and controls of a phase are given over the interval of that phase.
     """
@@ -359,7 +359,7 @@ def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
 
 
 def _named(against: Any) -> dict[str, Any]:
-    """Return the motions to compare with, by name."""
+    """Return the motions to compare a plan with, by name."""
     if against is None:
         return {}
     if isinstance(against, Mapping):

@@ -119,7 +119,7 @@ class Camera(NamedTuple):
         return cls(eye @ axes, axes, size)
 
     def seen(self, points: Any) -> tuple[Array, Array]:
-        """Return the pixels of points (..., 3), from the upper left corner of the picture, (..., 2), and depths, m."""
+        """Project points (..., 3): return their pixels from the upper left corner, (..., 2), and their depths, m."""
         x, y, z = np.moveaxis((np.asarray(points, dtype=float) - self.eye) @ self.axes.T, -1, 0)
         depth = np.maximum(-z, 1e-9)
         width, height = self.size
@@ -264,7 +264,7 @@ class _Mesh:
 
 
 def _projected(camera: Camera, mesh: _Mesh) -> tuple[Array, Array]:
-    """Return the picture positions of all triangles' corners, (f, 3, 2), and their inverse depths, (f, 3)."""
+    """Project the corners of all triangles: return picture positions (f, 3, 2) and inverse depths (f, 3)."""
     positions, depths = camera.seen(mesh.corners)
     return positions[mesh.faces], (1.0 / depths)[mesh.faces]
 
@@ -314,13 +314,13 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
 
 
 def _counted(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Return the numbers 0, 1, ..., each repeated by its count, and the number of the repetition."""
+    """Return the numbers 0, 1, ..., each repeated by its count, and the index of each repetition."""
     which = np.repeat(np.arange(len(counts)), counts)
     return which, np.arange(len(which)) - (np.cumsum(counts) - counts)[which]
 
 
 def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Yield ranges whose counts sum to at most `batch_size`, or little more."""
+    """Yield ranges of consecutive items whose counts sum to about `batch_size`."""
     ends = np.cumsum(counts)
     begin = 0
     while begin < len(counts):
@@ -342,7 +342,7 @@ class _Sun:
 
     @classmethod
     def on(cls, mesh: _Mesh, camera: Camera) -> _Sun:
-        """Return the sun for a scene and a camera."""
+        """Return the light of a scene with its shadow map, from a direction relative to the camera."""
         back = camera.axes[2]
         azimuth, elevation = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
         to_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
@@ -356,7 +356,7 @@ class _Sun:
         return cls(to_sun, axes, low, step, places, height)
 
     def lit(self, points: Array) -> Array:
-        """Return the share of sunlight that reaches points (k, 3), 0 to 1."""
+        """Return the share of direct light that reaches points (k, 3), from 0 (shadow) to 1."""
         x, y, z = self.axes @ points.T
         column, row = (
             np.floor((coordinate - corner) / self.step).astype(np.int64)
@@ -372,7 +372,7 @@ class _Sun:
 
 
 def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None) -> None:
-    """Draw the floor with its shadows into an empty picture."""
+    """Draw the floor with the shadows on it into an empty picture."""
     below = np.flatnonzero(camera.rays(np.arange(len(picture)))[:, 2] * (floor.height - camera.eye[2]) > 0)
     ray = camera.rays(below)
     place = camera.eye + ray * ((floor.height - camera.eye[2]) / ray[:, 2])[:, None]
@@ -387,7 +387,7 @@ def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun |
 
 
 def _shaded(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun: _Sun | None) -> Array:
-    """Return the colours of triangles (k,) of a mesh where rays (k, 3) from the eye meet them. Shape (k, 3)."""
+    """Return the colours of triangles (k,) at the points where rays (k, 3) from the eye meet them. Shape (k, 3)."""
     a, b, c = (mesh.corners[mesh.faces[:, k]] for k in range(3))
     one, two, to = b - a, c - a, camera.eye - a
     # barycentric coordinates of the second and third corners (Moeller, Trumbore 1997)

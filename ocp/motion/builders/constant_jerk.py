@@ -108,7 +108,8 @@ def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) 
 
 
 def least_durations(distances: Array, bounds: JointBounds) -> Array:
-    """Return the least times from rest to rest of joints by themselves, within velocity, acceleration and jerk limits.
+    """Return the least duration of each joint alone, from rest to rest within its velocity, acceleration and jerk
+    limits.
 
     Args:
         distances: Absolute distances, rad or m. Shape (..., n).
@@ -146,7 +147,7 @@ class ConstantJerkMotion:
         return ConstantJerkMotion(self.durations * factor, self.joints, *derivatives)
 
     def sampled(self, places: Array) -> tuple[Array, Array, Array]:
-        """Return joints, rates and accelerations at places (M,), shares of each phase. Shape (K, M, n) each."""
+        """Return joints, rates and accelerations at fractions (M,) of each phase. Shape (K, M, n) each."""
         t = (self.durations[:, None] * places)[:, :, None]
         joints, rates, accelerations, jerks = (
             each[:, None] for each in (self.joints, self.rates, self.accelerations, self.jerks)
@@ -158,7 +159,7 @@ class ConstantJerkMotion:
         )
 
     def solution(self, problem: Problem, method: str) -> Solution:
-        """Return the motion as a solution of a `dynamics_problem` without power, without multipliers.
+        """Return the motion as a solution of `dynamics_problem` (without power), with no multipliers.
 
         Args:
             problem: The problem.
@@ -240,7 +241,7 @@ class TorqueLimits:
         return self._samplers[linearised]
 
     def slowed(self, motion: ConstantJerkMotion) -> ConstantJerkMotion:
-        """Return the motion slowed down by the least factor, at least 1, that keeps the limits at samples.
+        """Return the motion slowed down just enough to keep the torque limits at samples.
 
         Raises:
             SolveError: A joint cannot hold the machine at rest somewhere on the path.
@@ -302,7 +303,7 @@ def _columns(motion: ConstantJerkMotion) -> Sequence[Array]:
 
 
 def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
-    """Return limits of velocity, acceleration and jerk, finite as far as a motion over these distances needs it."""
+    """Return velocity, acceleration and jerk limits; infinite ones are replaced where a profile needs finite ones."""
     velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
     jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
     velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
@@ -312,12 +313,12 @@ def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Arr
 
 
 def _profiles(distances: Array, bounds: JointBounds) -> _Ramps:
-    """Return the profiles of joints by themselves over absolute distances (..., n)."""
+    """Return the rest-to-rest profile of each joint alone over absolute distances (..., n)."""
     return _ramps(distances, *_effective(distances, bounds))
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the profiles of the shares of straight motions by changes (K, n). Shape (K,) each."""
+    """Return the profiles of the path fraction of straight motions by changes (K, n). Shape (K,) each."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [
@@ -327,7 +328,7 @@ def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
 
 
 def _straight(start: Array, change: Array, bounds: JointBounds) -> ConstantJerkMotion:
-    """Return the fastest straight motion by a change (n,); one that stays where it is lasts for a moment."""
+    """Return the fastest straight motion by a change (n,); one without a change lasts for a moment."""
     profile = _straight_profile(change[None], bounds)
     duration = float(profile.duration[0])
     if duration == 0:

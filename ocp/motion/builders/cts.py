@@ -184,7 +184,7 @@ def roll_problem(
     settings: RollSettings | None = None,
     obstacles: RollObstacles | None = None,
 ) -> Problem:
-    """Declare the roll over a trajectory of targets with the least integral of I1 + w rate^2 + v acceleration^2.
+    """Declare the roll along a trajectory of targets with the least integral of I1 + w rate^2 + v acceleration^2.
 
     The states are "roll" (rad) and "rate" (rad/s), the control is "acceleration" (rad/s^2). The path constraints
     "reach" (sin q4 and cos q2), "limits" and "clearance" keep the rig within its reach and joint limits and away from
@@ -264,7 +264,7 @@ def roll_problem(
     target = _column(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Return an expression at the target of each time."""
+        """Evaluate an expression at the target of each time."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
@@ -305,7 +305,7 @@ def _curve(targets: Targets, symbols: Any) -> Any:
 
 
 def _violation(value: Any, lower: Any, upper: Any) -> Any:
-    """Return the total violation of bounds."""
+    """Return the sum of all violations of bounds."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
 
 
@@ -320,7 +320,7 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll over time with the least integral of cost + rate_weight rate^2, to the step of a grid.
+    """Return the roll over time that minimises the integral of cost + rate_weight rate^2, on a grid of rolls.
 
     Shape (samples,), rad.
 
@@ -374,7 +374,9 @@ def least_cost_roll(
 
 
 def _lowest_cost_path(stage: Array, away: Any, spans: Array, rate_weight: float, rate_limit: float, step: float) -> Any:
-    """Return the roll index of each time on the path of least cost, with a penalty beyond the rate limit."""
+    """Return the roll index at each time on the lowest-cost path through the grid, with a penalty beyond the rate
+    limit.
+    """
     weights = np.convolve(np.append(spans, 0), [0.5, 0.5])[: len(stage)]
     weights[[0, -1]] = np.maximum(weights[[0, -1]], spans[[0, -1]] / 2)
     penalty = 1e3 * (np.ptp(stage[np.isfinite(stage)]) + rate_weight + 1e-9)

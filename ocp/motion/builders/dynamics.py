@@ -94,7 +94,7 @@ def dynamics_problem(
     cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
 ) -> Problem:
-    """Declare a motion within actuator limits of least effort, energy or time.
+    """Declare a motion within actuator limits that minimises effort, energy or time.
 
     The states are "joints", "velocities", "accelerations" if the jerk is the control, and "base" of a floating machine.
     The controls are "accelerations" or "jerks", and "power" (W, the positive actuator power) if energy is weighted or
@@ -204,11 +204,11 @@ class _Ends:
 
     @property
     def end(self) -> Array:
-        """Return the end of the joints' guess. Shape (n,)."""
+        """Return the joints at the end of the guess; those without an end value stay at the start. Shape (n,)."""
         return np.where(np.isnan(self.last), self.start, self.last)
 
     def quintic(self, duration: float, order: int) -> Any:
-        """Return the quintic rest-to-rest motion of the joints, or a derivative, as a function of time."""
+        """Return the quintic motion of the joints from rest to rest, or a derivative, as a function of time."""
         shape = QUINTIC.deriv(order) if order else QUINTIC
         begin = self.start if order == 0 else np.zeros(len(self.start))
         return lambda t: begin + (self.end - self.start) * shape(t / duration) / duration**order
@@ -276,7 +276,7 @@ def _declare_actuators(
 
 
 def _checked_end(name: str, value: Any, n: int) -> Array:
-    """Return joints or their velocities at an end, nan where free. Shape (n,).
+    """Return joints or joint velocities at an end, nan where free. Shape (n,).
 
     Raises:
         ProblemError: The value has another size, or is infinite.

@@ -150,7 +150,7 @@ def phase_names(goals: Sequence[Goal]) -> tuple[str, ...]:
 
 
 def machines_of(machine: Motors, goals: Sequence[Goal]) -> tuple[Motors, ...]:
-    """Return the machine of each phase.
+    """Return the machine of each phase of motions to goals.
 
     Raises:
         ProblemError: The machine changes its joints or its kind of base, or while it moves or has momentum.
@@ -176,12 +176,12 @@ def machines_of(machine: Motors, goals: Sequence[Goal]) -> tuple[Motors, ...]:
 
 
 def _rests(goal: Goal) -> bool:
-    """Return whether the machine rests at a goal."""
+    """Return whether the machine is at rest at a goal."""
     return isinstance(goal.velocity, str) and goal.velocity == "rest"
 
 
 def _join(phases: Phases, before: str, after: str, goal: Goal) -> None:
-    """Make the states continuous from one phase to the next, except those fixed at both ends anyway."""
+    """Make the states continuous between two phases, except those that are fixed at both ends."""
     fixed: dict[str, Any] = {}
     if goal.joints is not None and not np.isnan(np.asarray(goal.joints, dtype=float)).any():
         fixed["joints"] = None
@@ -314,7 +314,7 @@ def solve_dynamics(
 
 
 def _check_end_velocity(setup: DynamicsSetup) -> None:
-    """Raise ProblemError if the setup has the velocity at the end, which goals give themselves."""
+    """Raise ProblemError if the setup prescribes an end velocity, because every goal has its own."""
     if setup.end_velocity != "rest":
         words = "end_velocity: every goal has its own; set Goal(velocity=...)"
         raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
@@ -437,7 +437,7 @@ def _first_within_limits(
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Yield plans on a mesh that satisfy their limits, or the errors; the caller stops when one is good enough."""
+    """Yield plans on a mesh that satisfy their limits, or errors; the caller stops when a plan is good enough."""
     warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)
@@ -453,7 +453,9 @@ def _attempts(
 def _tightened(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
-    """Return a plan that satisfies its limits between the nodes at hardly any extra cost, or the error."""
+    """Tighten the limits so that a plan satisfies them between the nodes; return it if it costs hardly more, or the
+    error.
+    """
     if largest_excess(problem, plan) <= HOLDING.excess:
         return plan
     own, largest = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.cost_increase * abs(plan.cost)
@@ -468,7 +470,7 @@ def _tightened(
 
 
 def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocation:
-    """Return the next mesh: refined where tightening cost the last plan too much, if only that failed; else halved."""
+    """Return the next mesh: refined where tightening was too costly, if only that failed; otherwise halved."""
     if plan.bound_tightening is None or failure.solution is not plan or failure.name != "cost":
         return mesh.halved()
     nodes, amounts = plan.control_interpolant.breaks, plan.bound_tightening.max(axis=(0, 2))

@@ -61,7 +61,7 @@ SPLINE = SplineSettings()
 
 
 class _Along(NamedTuple):
-    """Joints and their first three derivatives by the distance. Shape (M, n) each."""
+    """Joints along a path and their first three derivatives with respect to distance. Shape (M, n) each."""
 
     position: Array
     first: Array
@@ -70,7 +70,7 @@ class _Along(NamedTuple):
 
 
 class _Torques(NamedTuple):
-    """Coefficients of the torques inertia a + drag v^2 + rest. Shape (M, n) each."""
+    """Joint torques along a path as inertia a + drag v^2 + rest, with speed v and acceleration a. Shape (M, n) each."""
 
     inertia: Array
     drag: Array
@@ -116,7 +116,7 @@ class PlannedJoints:
         return _Along(*self.curves(self._checked(distance)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Return the coefficients of the torques at distances from the start. Shape (M,), m.
+        """Return the torque coefficients at distances from the start. Shape (M,), m.
 
         Raises:
             ProblemError: The base of the machine moves, or distances are invalid, see `at`.
@@ -235,7 +235,7 @@ def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple
 
 
 class _PiecewisePolynomial:
-    """Spline as one polynomial per interval, about its middle.
+    """A spline as one polynomial per interval, about the middle of the interval.
 
     Args:
         breaks: Ends of the intervals. Shape (K + 1,), m.
@@ -311,7 +311,7 @@ class _BatchedFunction:
         return [part.T for part in np.split(results, np.cumsum(self.sizes)[:-1])]
 
     def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Return rows of numbers, and the instructions on them."""
+        """Return the table whose rows hold all intermediate values, and the instructions on these rows."""
         table = np.zeros((self.rows + len(self.constants), SPLINE.batch))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)
@@ -319,7 +319,7 @@ class _BatchedFunction:
 
 
 def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
-    """Return the spline through samples."""
+    """Return the interpolating spline through samples as one polynomial per interval."""
     # in units of the length, which keeps the derivatives of the fit in range
     unit = float(s[-1])
     fit = ca.interpolant("fit", "bspline", [(s / unit).tolist()], joints.ravel().tolist(), {"degree": [DEGREE]})
@@ -332,7 +332,7 @@ def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
 
 
 def _forces(machine: Machine) -> _BatchedFunction | None:
-    """Return the function (q, q', q'') -> (inertia, drag, rest); None if the base is not fixed."""
+    """Return the function (q, q', q'') -> (inertia, drag, rest) of the torques; None if the base is not fixed."""
     if not isinstance(machine, FixedBase):
         return None
     q, first, second = (ca.SX.sym(name, machine.joint_size) for name in ("q", "first", "second"))

@@ -86,7 +86,7 @@ class TimingProblem:
 
     @property
     def method(self) -> Collocation:
-        """Return collocation with one jerk per interval, without overshoot between the points."""
+        """Return collocation with one jerk per interval, so that no quantity overshoots between the points."""
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:
@@ -251,7 +251,7 @@ def _declared(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the problem over a span of theta, in units; `along` gives the reference speed and path_columns."""
+    """Declare the problem over a span of theta, in scaled units; `along` gives reference speed and path columns."""
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
     speeds = np.asarray(path.by_piece(limits.speed))
@@ -292,7 +292,7 @@ def _declared(
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Return the limited quantities over their limits, by name; `values` are the reference speed and path_columns."""
+    """Return limited quantities over their limits, by name; `values` are reference speed and path columns."""
     demands: dict[str, Any] = {}
     if np.isfinite(limits.centripetal):
         demands["centripetal acceleration"] = v**2 * values[2] / limits.centripetal
@@ -313,7 +313,7 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 
 
 def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
-    """Return the parts into which each interval is split; the error falls with the square of the interval."""
+    """Return into how many parts to split each interval; the error falls with the square of the interval."""
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
     distance_error, speed_error = distance / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
@@ -325,7 +325,7 @@ def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
-    """Return the distances before and after a span of the reference's time, m."""
+    """Return the distances before and after a span of the reference motion, m."""
     # the jerk is constant there; the cube is accurate near the end, a difference of distances is not
     left = reference.duration - span[1]
     return float(reference.jerk[0] * span[0] ** 3 / 6), float(reference.jerk[-1] * left**3 / 6)

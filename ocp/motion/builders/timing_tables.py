@@ -155,7 +155,7 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 
 def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Return the demands over their limits at unit line speed, and the powers p of the speed: v^p demand <= 1.
+    """Return the ratio of each demand to its limit at unit line speed v, and the power p by which v^p scales it.
 
     The rows are the centripetal acceleration, then velocity, acceleration and jerk of each joint. Shapes (C, M), (C,).
     """
@@ -184,7 +184,7 @@ def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> 
 
 
 def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
-    """Return the largest demand inside each interval of a profile, from either side of a jump. Shape (K,)."""
+    """Return the largest demand in each interval of a profile, including both sides of jumps. Shape (K,)."""
     inside = (np.arange(TABLES.points) + 0.5) / TABLES.points
     inside[0], inside[-1] = 1e-9, 1 - 1e-9
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
@@ -222,7 +222,7 @@ def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | Non
 
 
 def distinct(values: Array, tolerance: float) -> Array:
-    """Return sorted values without those closer than a tolerance to the one before; the last one stays."""
+    """Return sorted values without those within a tolerance of the one before; the last one stays."""
     ordered = np.sort(values)
     ordered = ordered[np.concatenate([[True], np.diff(ordered) > tolerance])]
     ordered[-1] = values.max()

@@ -109,7 +109,7 @@ class ToolMotion:
     breaks: Array
 
     def guess(self, motions: Sequence[LocalMotion], number: int) -> dict[str, Any]:
-        """Return a guess for a solve from motion `number` of the local motions in each stretch."""
+        """Return a guess of the problem from the local motion with index `number`."""
         guess: dict[str, Any] = {}
         for stretch, part in zip(self.stretches, motions, strict=True):
             t = (part.t - stretch.begin) * (self.horizon / stretch.duration)
@@ -122,7 +122,7 @@ class ToolMotion:
 
 
 def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> tuple[Stretch, ...]:
-    """Return the stretches of a horizon (s), with the feedback of their tasks limited to what a mesh can follow.
+    """Divide the horizon into stretches with the same tasks; limit the pose feedback to what a mesh can follow.
 
     Raises:
         ProblemError: A task begins or ends outside the horizon.
@@ -199,7 +199,7 @@ class ToolMotionSetup:
 
     @property
     def free(self) -> bool:
-        """Whether the start is free, with the tips where their tasks begin."""
+        """Whether the start configuration is free, except that the tips are at the start poses of their tasks."""
         return self.start is None or bool(np.isnan(self.start).any())
 
 
@@ -246,7 +246,7 @@ def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: T
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """A problem under declaration and the data that all stretches of its motion share."""
+    """A problem that is being declared, with the data that all its stretches share."""
 
     problem: Problem
     machine: Machine
@@ -259,7 +259,7 @@ class _Motion:
         return self.stretches[-1].end
 
     def pace(self, stretch: Stretch) -> float:
-        """Return the seconds of a stretch in a second of the problem."""
+        """Return the ratio of time in a stretch to time in the problem."""
         return stretch.duration / self.horizon
 
     def states(self, stretch: Stretch) -> tuple[Any, Any]:
@@ -277,7 +277,7 @@ class _Motion:
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
 
     def velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
-        """Declare velocities as states; return them, the accelerations and the cost in a second of motion."""
+        """Declare velocities as states; return velocities, accelerations and the running cost."""
         assert self.setup.actuation is not None
         begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.setup.actuation.rests))
         cost = self.setup.actuation.cost or Cost(weights=self.setup.weights)
@@ -287,7 +287,7 @@ class _Motion:
         return declare_actuators(self.problem, self.machine, self.horizon, (place, joints), **options)
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare and return the velocities by which tasks may deviate, and their running cost; 0, 0 if not relaxed."""
+        """Declare velocities by which tasks may deviate; return them and their running cost, or 0, 0 if not relaxed."""
         assert stretch.equations is not None
         if not self.setup.relaxed or not stretch.equations.size:
             return 0, 0
@@ -347,7 +347,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
 
 
 def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
-    """Declare the problem of `tool_motion_problem` with the time as a state over the tasks' own time s.
+    """Declare the problem of `tool_motion_problem` with free time: a state over the task time s.
 
     With q' = dq/ds and z = dt/ds the cost is the integral of (time_cost + q. W q. / 2) dt = (time_cost z + q' W q'/(2
     z)) ds, which is convex in q' and z. The tasks, J q' = v(s), and the rate limits, |q'| <= v z, are linear in them.
@@ -395,7 +395,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
 
 def _closure(motion: _Motion) -> Any:
-    """Declare and return the constant velocity by which a closed task may deviate, so that the joints close exactly.
+    """Declare and return the constant velocity by which a closed task may deviate so that the joint path closes.
 
     If the joints return, a closed task returns by itself. Both conditions would contradict each other by the error of
     the discretisation; so the task may deviate by a velocity of that size.
@@ -426,7 +426,7 @@ def _declare_tasks(
     required: NDArray[np.bool_] | None = None,
     derivatives: Sequence[tuple[Any, Any]] | None = None,
 ) -> None:
-    """Constrain a stretch to its tasks, with base, joints and rates as symbols.
+    """Declare the task constraints of a stretch in the symbols of base, joints and rates.
 
     `closure` is the deviation of a closed task. If `free`, the tasks that begin here must be at their start poses,
     except in rows that are not `required`, (size,), to which the stretch before leads. With `derivatives`, of states by
@@ -480,7 +480,7 @@ def _declare_tasks(
 
 
 def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
-    """Return the derivatives of a stretch's task rows by base and joints, in a random configuration.
+    """Return the derivatives of a stretch's task rows with respect to base and joints, at a random configuration.
 
     A rank found there holds everywhere but on a set of measure zero. Shape (size, base_size + joint_size).
     """

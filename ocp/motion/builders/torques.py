@@ -106,7 +106,7 @@ def joint_torques(
 
 
 def checked_motors(name: str, machine: Any) -> Motors:
-    """Return the machine; raise ProblemError unless its joint torques alone move it."""
+    """Return the machine; raise ProblemError unless joint torques alone determine its motion."""
     if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
         words = f"{name}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; use "
         words += "standing_problem for a standing machine"
@@ -141,7 +141,7 @@ def declare_actuators(
     pace: Any,
     suffix: str = "",
 ) -> tuple[Any, Any, Any]:
-    """Declare velocities as states and accelerations within the limits; return them, and the cost of a second.
+    """Declare velocities and accelerations within the limits; return both and the running cost (per second).
 
     The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
     "power" where these are limited or weighted.
@@ -193,7 +193,7 @@ def weights_torques(cost: Cost) -> bool:
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
-    """Return the cost of a second of a motion, without those of the time and of the positive power.
+    """Return the running cost of a motion (per second), without its time and positive power.
 
     Args:
         machine: The machine.

@@ -40,7 +40,7 @@ Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilise
 
 @dataclass(frozen=True)
 class Layer:
-    """Configuration index that the remaining freedom improves, below the task and the zero moment point.
+    """Secondary objective: a configuration index that the remaining freedom improves, below task and zero moment point.
 
     Attributes:
         index: ``joint_limits``, p1 (23), to be decreased; ``manipulability`` of the rows of the tasks, p2 (27), to be
@@ -151,14 +151,14 @@ class _TaskHierarchy:
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add rows q'' = target with the least change of the accelerations."""
+        """Add a task, rows q'' = target, with the least change of the accelerations found so far."""
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
         self.projector = self.projector - ca.mtimes(inverse, projected)
 
     def add_free(self, direction: Any) -> None:
-        """Add a vector, projected to the remaining freedom."""
+        """Add an acceleration vector, projected onto the remaining null space."""
         self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
@@ -336,7 +336,7 @@ def resolve_accelerations(
     step: float = 1e-3,
     options: AccelerationOptions | None = None,
 ) -> AccelerationSolution:
-    """Simulate a law from the start to the horizon, or until it fails.
+    """Simulate a resolved-acceleration law from the start to the horizon, or until it fails.
 
     Args:
         machine: A Standing machine.
@@ -392,7 +392,7 @@ def resolve_accelerations(
 
 
 class _Simulation:
-    """Integration of the state (q, q') over many fixed steps at a time."""
+    """Integration of the state (q, q') over fixed steps, many steps in one call."""
 
     def __init__(self, law: Any, n: int, step: float, options: AccelerationOptions) -> None:
         self.step, self._law, self._n = step, law, n

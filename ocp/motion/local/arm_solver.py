@@ -29,7 +29,7 @@ STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """Settings of the choice of the joints that are solved for.
+    """Settings of the choice of redundant joints.
 
     Attributes:
         max_samples: Largest number of sampled parameters.
@@ -54,7 +54,7 @@ ARM = ArmSettings()
 
 
 def sample_shares(first: int, count: int, dimension: int) -> Array:
-    """Return samples first, ..., first + count - 1 of a sequence that fills the unit cube evenly. (count, dimension)"""
+    """Return samples first, ..., first + count - 1 of a low-discrepancy sequence. Shape (count, dimension)."""
     return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
 
 
@@ -77,7 +77,7 @@ class ArmSolver:
     upper: Array
 
     def redundant_positions(self, solver: PoseSolver, shares: Array) -> Array:
-        """Return positions of the redundant joints of a solver at shares (M, k) of their ranges."""
+        """Return positions of the redundant joints at fractions (M, k) of their ranges."""
         joints = list(solver.redundant)
         if not joints:
             return shares[:, :0]
@@ -114,7 +114,7 @@ class ArmSolver:
         return self._within_limits(solutions._replace(joints=solutions.joints[:, :n]), turns), doubtful
 
     def _within_limits(self, solutions: Solutions, turns: bool) -> Solutions:
-        """Return the solutions within the limits, with joints shifted by whole turns that keep them."""
+        """Return the solutions within the limits, in all full turns of the joints that keep them."""
         windows, order = self._windows, list(self.chain.order)
         start, shiftable = windows.low if turns else windows.middle, windows.shiftable
         joints = solutions.joints.copy()
@@ -132,7 +132,7 @@ class ArmSolver:
 
     @cached_property
     def _windows(self) -> _Windows:
-        """Windows of a whole turn within the limits."""
+        """Full-turn windows of the joint ranges, into which solutions are shifted."""
         below, above, revolute = np.isfinite(self.lower), np.isfinite(self.upper), self.chain.revolute
         both, lower, upper = below & above & revolute, self.lower - ARM.excess, self.upper + ARM.excess
         low = np.where(below, lower, upper - TURN)
@@ -152,7 +152,7 @@ def _whole_turns(counts: tuple[int, ...]) -> Array:
 
 
 class _Windows(NamedTuple):
-    """Windows of a whole turn within the limits of revolute joints.
+    """Full-turn windows of the position limits of revolute joints.
 
     Attributes:
         lower, upper: Limits, beyond which lies only rounding. Shape (n,).
@@ -208,7 +208,7 @@ def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = No
 
 
 def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
-    """Return how well conditioned the problem is that each choice of redundant joints leaves.
+    """Return how well conditioned the remaining problem is for each choice of redundant joints.
 
     This is the geometric mean, at random configurations, of the least singular value of the Jacobian of the others.
     """

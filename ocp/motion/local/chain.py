@@ -69,19 +69,19 @@ class Motion(NamedTuple):
     shift: Array
 
     def take(self, chosen: NDArray[np.intp]) -> Motion:
-        """Return the motions at these indices."""
+        """Return the motions with the given indices."""
         return Motion(self.turn[chosen], self.shift[chosen])
 
     def after(self, first: Motion) -> Motion:
-        """Return the composition with a motion that is applied first."""
+        """Return the composition of these motions with motions that are applied first."""
         return Motion(self.turn @ first.turn, self.at(first.shift))
 
     def rotate(self, vectors: Array) -> Array:
-        """Return the images of directions (M, 3)."""
+        """Rotate directions (M, 3) by the motions."""
         return np.asarray((self.turn @ vectors[:, :, None])[:, :, 0])
 
     def at(self, points: Array) -> Array:
-        """Return the images of points (M, 3)."""
+        """Transform points (M, 3) by the motions."""
         return self.rotate(points) + self.shift
 
     @property
@@ -100,15 +100,15 @@ class SymbolicAxis(NamedTuple):
 
     @classmethod
     def of(cls, direction: Array, point: Array, revolute: bool) -> SymbolicAxis:
-        """Return a constant axis."""
+        """Return a symbolic axis with numeric direction and point."""
         return cls(expression(direction), expression(point), revolute)
 
     def moved(self, motion: Frame) -> SymbolicAxis:
-        """Return the axis moved by a motion."""
+        """Return the axis transformed by a rigid motion."""
         return self._replace(direction=ca.mtimes(motion.rotation, self.direction), point=motion.point(self.point))
 
     def frame(self, position: Any) -> Frame:
-        """Return the motion of the joint by a position."""
+        """Return the rigid motion of the joint for a position."""
         if not self.revolute:
             return Frame(ca.DM.eye(3), self.direction * position)
         turn = rotation(self.direction, position)
@@ -151,7 +151,7 @@ class Solutions(NamedTuple):
 
     @classmethod
     def none(cls, size: int) -> Solutions:
-        """Return no solution of an arm with `size` joints."""
+        """Return an empty set of solutions for an arm with `size` joints."""
         return cls(np.zeros(0, dtype=np.intp), np.zeros((0, size)), np.zeros(0, dtype=bool))
 
 
@@ -325,7 +325,7 @@ def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArra
 
 @lru_cache(maxsize=64)
 def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return all pairs of so many things. Shapes (P,)."""
+    """Return all pairs of the indices 0, ..., count - 1. Shapes (P,)."""
     return np.triu_indices(count, 1)
 
 

@@ -39,7 +39,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class NearbySettings:
-    """Settings of the poses near doubtful ones.
+    """Settings of the search at poses near those whose solutions may be incomplete.
 
     Attributes:
         pairs: Number of pairs of poses.
@@ -57,7 +57,7 @@ NEARBY = NearbySettings()
 
 @dataclass(frozen=True, eq=False)
 class PoseSolver(ABC):
-    """Inverse kinematics of a chain in which all joints but a few are redundant.
+    """Inverse kinematics of a chain for given positions of its redundant joints.
 
     Attributes:
         chain: The chain.
@@ -69,7 +69,7 @@ class PoseSolver(ABC):
 
     @cached_property
     def free(self) -> list[int]:
-        """Numbers of the other joints, in the order of the chain."""
+        """Indices of the joints that are solved for, in the order of the chain."""
         return [j for j in self.chain.order if j not in self.redundant]
 
     @abstractmethod
@@ -109,7 +109,7 @@ class PoseSolver(ABC):
         return solutions, doubtful
 
     def _nearby(self, tips: Motion) -> Iterator[Motion]:
-        """Iterate over poses near others, on opposite sides of them."""
+        """Yield poses near given ones, on opposite sides of them."""
         rng = np.random.default_rng(NEARBY.seed)
         for _ in range(NEARBY.pairs):
             turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
@@ -183,7 +183,7 @@ class ClosedForm(PoseSolver):
         return self.chain.refine(pose, joints, self.free, tips), np.zeros_like(families), families
 
     def _loop(self) -> _SymbolicLoop:
-        """Return the loop of the free joints as expressions, with the joints behind the triple at the front."""
+        """Return the closure equation of the free joints; joints behind the three special axes move to its front."""
         chain = self.chain
         symbols, fixed = ca.SX.sym("pose", len(self.redundant) + 12), Frame(ca.DM.eye(3), ca.DM(3, 1))
         points, axes = chain.points.copy(), list[SymbolicAxis]()
@@ -202,12 +202,12 @@ class ClosedForm(PoseSolver):
         return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
 
     def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
-        """Return solutions as one column, each in the order of the free joints."""
+        """Return the solutions as one column, each in the order of the free joints."""
         return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
 
     @cached_property
     def _planar_function(self) -> Sampler:
-        """Function of a pose -> two solutions of a SCARA, excess."""
+        """Function of a pose -> two solutions of a SCARA, and by how much the pose is out of reach."""
         symbols, axes, order, goal = self._loop()
         triple = [axes[order.index(j)] for j in self.triple]
         slide = next(axis for axis in axes if not axis.revolute)
@@ -218,7 +218,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function of a pose -> pairs of angles of x and z, residuals, and determination; see `_pair_solver`."""
+        """Function of a pose -> pairs of angles of x and z, residuals, and how well these are determined."""
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
         offsets = (x.point - y.point) / size, (z.point - y.point) / size
@@ -243,7 +243,9 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function of a pose and angles of x and z -> two solutions, their excess, and the lever arm of y."""
+        """Function of a pose and angles of x and z -> two solutions, their excess over the reach, and the lever arm of
+        y.
+        """
         symbols, (x, y, z, *triple), order, goal = self._loop()
         angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"
         before, after = z.frame(angles[1]), compose(inverse(x.frame(angles[0])), goal)
@@ -259,7 +261,7 @@ class ClosedForm(PoseSolver):
 
 
 class _SymbolicLoop(NamedTuple):
-    """A loop of joint motions that multiply to a goal, as expressions.
+    """The closure equation of an arm as expressions: the product of its joint motions equals a goal pose.
 
     Attributes:
         symbols: Positions of the redundant joints, rows of the rotation of the tip, its position. Shape (k + 12,).
@@ -314,7 +316,7 @@ def _six_joint_forms(chain: Chain, lockable: tuple[int, ...]) -> tuple[ClosedFor
 
 
 def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
-    """Return how three consecutive axes lie: "parallel", "meeting", or "" for neither."""
+    """Classify three consecutive axes: "parallel", "meeting" in a point, or "" for neither."""
     axes, points = chain.axes, chain.points
     if not chain.revolute[list(triple)].all():
         return ""
@@ -328,7 +330,7 @@ def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
 
 
 def _meeting_point(chain: Chain, triple: tuple[int, ...]) -> tuple[Array, float]:
-    """Return the point nearest to three axes, and its largest distance from one of them."""
+    """Return the point nearest to three axes, and its largest distance from them."""
     axes, points = chain.axes[list(triple)], chain.points[list(triple)]
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     projected = np.einsum("kij,kj->ki", projectors, points)
@@ -338,7 +340,8 @@ def _meeting_point(chain: Chain, triple: tuple[int, ...]) -> tuple[Array, float]
 
 @cache
 def _pair_solver() -> Any:
-    """Return the CasADi function of two equations -> pairs of angles that solve them, residuals, and determination.
+    """Return the CasADi function that solves two equations in two angles, with residuals and how well angles are
+    determined.
 
     The equations are a [cos, sin](first) + b [cos, sin](second) = c. The singular value decomposition b = L diag(s) R,
     in closed form, separates them: with a' = L' a and c' = L' c the remainders w = c' - a' [cos, sin](first) satisfy
@@ -383,13 +386,14 @@ def _pair_solver() -> Any:
 
 
 def _rotation(angle: Any) -> Any:
-    """Return the rotation of the plane by an angle."""
+    """Return the 2 x 2 rotation matrix of an angle."""
     cosine, sine = ca.cos(angle), ca.sin(angle)
     return ca.vertcat(ca.horzcat(cosine, -sine), ca.horzcat(sine, cosine))
 
 
 def _close_roots(f: Harmonics) -> Any:
-    """Return eight angles that include the roots of a trigonometric polynomial, close ones each. Shape (8, 1).
+    """Return eight angles that include all roots of a trigonometric polynomial, double roots as close pairs. Shape (8,
+    1).
 
     Of two roots close to each other the general method may find only one. The parabola of the same value, slope and
     curvature there has both.
@@ -408,7 +412,10 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Return the angles with cosine cos + sine sin = value, or the nearest, as their middle and half their distance."""
+    """Solve cosine cos(q) + sine sin(q) = value: the two roots are the first result plus and minus the second.
+
+    Without a root, return the angle that comes nearest to the value.
+    """
     share = value / ca.fmax(ca.hypot(cosine, sine), TINY)
     return ca.atan2(sine, cosine), ca.acos(ca.fmin(ca.fmax(share, -1.0), 1.0))
 

@@ -33,7 +33,7 @@ __all__ = [
 
 
 class Collision(NamedTuple):
-    """A pair of bodies closer than the clearance.
+    """A pair of bodies whose distance is below the clearance.
 
     Attributes:
         pair: Index in `CollisionScene.pairs`.
@@ -113,7 +113,7 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
 
 
 def _cover_distance(scene: CollisionScene, pair: int, base: Array, joints: Array, time: float) -> float:
-    """Return the least distance of the bodies that cover the two bodies of a pair, m."""
+    """Return the smallest distance between the shapes that cover the two bodies of a pair, m."""
     frames = frames_of(prepared_pairs(scene)[0](base[None], joints[None], np.full((1, 1), time))[0])
     rows = np.array([(*covers, scene.pairs[pair, 2]) for covers in scene.cover_pairs[pair]])
     return float(BodyPairs([*scene_hulls(scene).values()], rows, {}).distances(frames).min())
@@ -178,7 +178,7 @@ def slide_apart(
     lower: Array,
     upper: Array,
 ) -> Array:
-    """Move configurations in collision along their self-motions, as far as needed or possible.
+    """Move configurations out of collision along their self-motion manifolds, as far as necessary or possible.
 
     Args:
         scene: Collision scene of the machine.

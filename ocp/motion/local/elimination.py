@@ -41,7 +41,7 @@ COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPL
 
 
 def _half_angle_products() -> Array:
-    """Return the products of 1, cos h, sin h and cos h/2, sin h/2 in cos h/2, sin h/2, cos 3h/2, sin 3h/2. (3, 2, 4)"""
+    """Return the products of (1, cos h, sin h) and (cos h/2, sin h/2) as combinations of half-angle terms. (3, 2, 4)"""
     products = np.zeros((3, 2, 4))
     products[0] = np.eye(2, 4)
     products[1] = [[0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]]
@@ -113,15 +113,15 @@ class Axis(NamedTuple):
     revolute: bool = True
 
     def take(self, chosen: NDArray[np.intp]) -> Axis:
-        """Return the axes at these indices."""
+        """Return the axes with the given indices."""
         return self if len(self.point) == 1 else Axis(self.direction[chosen], self.point[chosen], self.revolute)
 
     def moved(self, motion: Motion) -> Axis:
-        """Return the axes moved by a motion."""
+        """Return the axes transformed by a rigid motion."""
         return Axis(motion.rotate(self.direction), motion.at(self.point), self.revolute)
 
     def by(self, position: Array) -> Motion:
-        """Return the motions of the joints by these positions (M,)."""
+        """Return the rigid motions of the joints for given positions (M,)."""
         if not self.revolute:
             return Motion(np.broadcast_to(np.eye(3), (len(position), 3, 3)), self.direction * position[:, None])
         skew = (self.direction @ SKEW).reshape(-1, 3, 3)
@@ -131,7 +131,7 @@ class Axis(NamedTuple):
 
 
 class Opening(NamedTuple):
-    """A choice of the joints x, y, z, a, b, c of the loop.
+    """Choice of the joint at which the kinematic loop is opened, and of the roles x, y, z, a, b, c of its joints.
 
     Attributes:
         first: Number of the joint x; the others follow in the order of the loop.
@@ -145,7 +145,7 @@ class Opening(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """A loop of six joints opened somewhere: x, y, z, a, b, c multiply to the goal; poses M."""
+    """Closure equations of six joints, opened at a joint: the product of x, y, z, a, b, c is the goal, at M poses."""
 
     joints: list[Axis]
     goal: Motion
@@ -153,7 +153,7 @@ class _Loop(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Candidates of one opening.
+    """Candidate solutions from one opening of the loop.
 
     Attributes:
         pose: Pose of each candidate. Shape (K,).
@@ -204,7 +204,7 @@ class Elimination(PoseSolver):
         return solutions, mixed, doubtful
 
     def prescribe(self, redundant: Array) -> Array:
-        """Return joints with the redundant ones (M, k) at these positions and the others at 0. Shape (M, n)."""
+        """Return joints with the redundant ones (M, k) at given positions and the others at 0. Shape (M, n)."""
         joints = np.zeros((len(redundant), len(self.chain.axes)))
         joints[:, list(self.redundant)] = redundant
         return joints
@@ -216,7 +216,7 @@ class Elimination(PoseSolver):
         return self.chain.refine(pose, joints, self.free, goal)
 
     def loop(self, prescribed: Array, goal: Motion) -> tuple[list[Axis], Motion]:
-        """Return the axes of the free joints, and the motion that they must make with the others as prescribed."""
+        """Return the axes of the free joints, and the motion that they must produce for given redundant joints."""
         chain, fixed, axes = self.chain, Motion(np.eye(3)[None], np.zeros((1, 3))), list[Axis]()
         for j in chain.order:
             axis = Axis(chain.axes[[j]], chain.points[[j]], bool(chain.revolute[j])).moved(fixed)
@@ -269,14 +269,14 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
 
 
 def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
-    """Return the loop opened at a joint: those before it move behind the others, conjugated by the goal."""
+    """Open the loop at a joint: the joints before it move to the end of the loop, transformed by the goal pose."""
     back = goal.inverse
     joints = [axes[(first + i) % SIX] for i in range(SIX)]
     return _Loop([axis.moved(back) if i >= SIX - first else axis for i, axis in enumerate(joints)], goal, size)
 
 
 def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
-    """Return left singular vectors and ranks of the products of x and y, and the coefficients of those of z, a, b.
+    """Eliminate x and y: return left singular vectors and ranks of their products, and the coefficients of z, a, b.
 
     Shapes (M, 15, 15), (M,), (M, 15, 3, 3, 3), the last (1, ...) if it is the same for all poses.
     """
@@ -291,12 +291,12 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
 
 
 def _reversed(axis: Axis) -> Axis:
-    """Return an axis of the opposite direction, whose joint moves backwards."""
+    """Return the axis with opposite direction, about which the joint moves backwards."""
     return axis._replace(direction=-axis.direction)
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return the coordinates of a line element moved by joints, as coefficients of the products of their angles.
+    """Return line coordinates transformed by joints, as coefficients of products of cosines and sines.
 
     Args:
         axes: Axes of the joints, the one that moves the line element first in front.
@@ -382,7 +382,7 @@ def _inverses(matrices: Array) -> Array:
 
 
 def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening) -> _Candidates:
-    """Return candidates from the real eigenvalues of an opening, double ones included."""
+    """Return candidates from the real eigenvalues of one opening, including double ones."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)
     matrices = _matrices(singular_vectors[:, :, opening.rank :], remaining, opening.roles)
@@ -396,7 +396,7 @@ def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening)
         distance[np.abs(rotation + 1) < ELIMINATION.real] = np.inf  # a prismatic joint at infinity
     pose, column = np.nonzero(distance < ELIMINATION.real)
     upper, vector = np.abs(values[pose, column]) > 1, vectors[pose, :, column]
-    half, other, residual = _angles_of(np.where(upper[:, None], vector[:, 12:], vector[:, :12]).reshape(-1, 4, 3))
+    half, other, residual = _factor_angles(np.where(upper[:, None], vector[:, 12:], vector[:, :12]).reshape(-1, 4, 3))
     away, simple = distance[pose, column], residual < ELIMINATION.simple
     least = np.bincount(pose[simple & (away < ELIMINATION.surely_real)], minlength=len(distance))
     mixed = np.bincount(pose[~simple & (away < ELIMINATION.probably_real)], minlength=len(distance))
@@ -404,12 +404,12 @@ def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening)
     angles[:, opening.roles] = np.column_stack([np.angle(rotation[pose, column]), half, other])
     middle = np.where(revolute[2:5], angles, size * np.tan(angles / 2))
     free = np.empty((len(pose), SIX))
-    free[:, [(opening.first + i) % SIX for i in range(SIX)]] = _complete(loop, pose, middle)
+    free[:, [(opening.first + i) % SIX for i in range(SIX)]] = _all_positions(loop, pose, middle)
     return _Candidates(pose, free, least, mixed > 0, (condition < ELIMINATION.regular) | (ranks < opening.rank))
 
 
-def _angles_of(vectors: Array) -> tuple[Array, Array, Array]:
-    """Return both angles of products (K, 4, 3) of (cos h/2, sin h/2, cos 3h/2, sin 3h/2) and (1, cos h, sin h).
+def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
+    """Return the angles g and h of products (K, 4, 3) of (cos g/2, sin g/2, cos 3g/2, sin 3g/2) and (1, cos h, sin h).
 
     The third result is the largest deviation from such products, of which the largest is 1.
     """
@@ -431,8 +431,8 @@ def _angles_of(vectors: Array) -> tuple[Array, Array, Array]:
     return angle, other_angle, np.abs(residual).max(axis=(1, 2), initial=0.0)
 
 
-def _complete(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
-    """Return the positions (K, 6) of all joints of a loop for those of z, a and b (K, 3).
+def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
+    """Return the positions (K, 6) of all joints of a loop from those of its middle joints z, a and b (K, 3).
 
     The motions of x and y are found from e_x^-1 (G p, G l) = e_y (p', l'), which is linear in their cosines and sines.
     """

@@ -47,7 +47,7 @@ class ToolFreedom(Enum):
 
 
 class Incompleteness(Flag):
-    """Why IK configurations of a pose may be missing; no flag: these are all.
+    """Reasons why IK configurations of a pose may be missing; no flag means that all are found.
 
     Attributes:
         SAMPLED: The arm is redundant. Its configurations form families, of which those at samples are listed.
@@ -78,7 +78,7 @@ class IkConfigurations:
 
     @property
     def complete(self) -> NDArray[np.bool_]:
-        """At which poses no configuration is missing. Shape (N,), bool."""
+        """For which poses all configurations are found. Shape (N,), bool."""
         return np.array([not reason for reason in self.reasons], dtype=bool)
 
     def at(self, pose: int) -> Array:
@@ -91,7 +91,7 @@ class IkConfigurations:
 
 
 def idle_positions(lower: Array, upper: Array) -> Array:
-    """Return positions for joints without effect: the middle of their limits, else the value next to 0."""
+    """Return positions for joints without effect: mid-range, or the allowed value nearest to 0."""
     with np.errstate(invalid="ignore"):
         middle = (lower + upper) / 2
     return np.asarray(np.where(np.isfinite(middle), middle, np.clip(0.0, lower, upper)))
@@ -121,8 +121,8 @@ class IkSolver:
         Args:
             machine: Machine on a fixed base.
             link, point: Link of the tip, and its origin in the frame of the link, (3,), m; None: the tip of the robot.
-            free: What of the orientation is open. ROLL: the angle about `tool_axis`; CONE: also the direction of this
-                axis, within a cone; ROTATION: all.
+            free: Part of the orientation that the task leaves free. ROLL: the angle about `tool_axis`; CONE: also the
+                direction of this axis, within a cone; ROTATION: all.
             tool_axis: In the frame of the tip. Shape (3,).
             within: Half-angle of the cone, rad, between 0 and pi.
             limits: Whether the position limits of the robot apply.
@@ -180,13 +180,13 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class PreparedArm:
-    """A prepared arm, see `IkSolver`.
+    """Arm prepared for repeated inverse kinematics, see `IkSolver`.
 
     Attributes:
         arm: Solver of the arm.
-        free: What of the orientation is open.
+        free: Part of the orientation that the task leaves free.
         tool_axis: Axis of the roll in the frame of the tip.
-        sampled_angles: Number of open angles that are sampled.
+        sampled_angles: Number of free angles that are sampled.
         within: Half-angle of the cone, rad.
         names: Names of the joints.
     """
@@ -220,7 +220,7 @@ class PreparedArm:
 
     @property
     def complete(self) -> bool:
-        """Whether no parameter is sampled."""
+        """Whether all solutions can be found without sampling a parameter."""
         return not (self.sampled_angles or self.arm.solvers[0].redundant)
 
     def parameters(self, solver: PoseSolver) -> tuple[str, ...]:
@@ -270,11 +270,11 @@ class PreparedArm:
 
     @cached_property
     def _idle(self) -> NDArray[np.bool_]:
-        """Which joints do not move the tip. Shape (n,)."""
+        """Which joints have no effect on the tip. Shape (n,)."""
         return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
 
     def _rotations(self, shares: Array) -> Array:
-        """Return rotations of the tip in its own frame at shares of the open angles. Shape (S, 3, 3)."""
+        """Return rotations of the tip in its own frame at fractions (0 to 1) of the free angles. Shape (S, 3, 3)."""
         rolled = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return np.asarray(rolled.as_matrix())
@@ -347,7 +347,7 @@ class IkBranches:
         return IkConfigurations(joints, np.zeros(len(joints), dtype=np.intp), tuple(names), (reason,))
 
     def _rotation(self, targets: Array) -> Array:
-        """Return a rotation of the tip that does the task. Shape (3, 3)."""
+        """Return a rotation of the tip that satisfies the task. Shape (3, 3)."""
         if self._task.direction is not None:
             axis, direction = np.array(self._task.tool_axis), targets[6:9] / np.linalg.norm(targets[6:9])
             return np.asarray(
@@ -393,7 +393,7 @@ def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranc
 def ik_configurations(
     machine: Machine, task: TipTask, *, time: float = 0.0, limits: bool = True, samples: int = 36
 ) -> IkConfigurations:
-    """Return the IK configurations of an arm on all branches of a pose task, and whether they are all.
+    """Return the IK configurations of an arm on all branches of a pose task, and whether the set is complete.
 
     For many poses of one arm, prepare an `IkSolver`.
 

@@ -156,7 +156,7 @@ def inverse_kinematics(
     scene: CollisionScene | None = None,
     options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
-    """Return distinct joint positions at which the machine does its pose tasks, the best first.
+    """Return distinct joint vectors at which the machine satisfies its pose tasks, the best first.
 
     If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches, see
     `ik_configurations`. With more joints than rows they form families, of which members at samples of the free
@@ -283,7 +283,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return solutions on all branches, (K, n), and how many random starts make up for missing ones."""
+        """Return solutions on all known branches, (K, n), and the number of random starts for missing ones."""
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count
@@ -303,7 +303,7 @@ class _MultiStart:
         return gauss_newton(function, joints, self.lower, self.upper, **options)
 
     def rank(self, joints: Array, errors: Array) -> list[IkSolution]:
-        """Return the distinct solutions among candidates, the best first."""
+        """Sort candidates by quality and return the distinct solutions, the best first."""
         solved, lower, upper = np.flatnonzero(errors <= self.options.tolerance), self.lower, self.upper
         if not solved.size:
             return []
@@ -464,7 +464,7 @@ def unreachable_error(
     upper: Array,
     misses: tuple[float, float],
 ) -> Unreachable:
-    """Return the error for a pose without solution, with the nearest miss.
+    """Return the error for a pose without solution, with the smallest pose error that was reached.
 
     Args:
         misses: Distance, m, and angle, rad, of the nearest miss.
@@ -487,6 +487,6 @@ def unreachable_error(
 
 
 def describe_miss(distance: float, angle: float) -> str:
-    """Return the words for a distance, m, and an angle, rad; without the one that is only rounding beside the other."""
+    """Describe a pose error by its distance, m, and angle, rad; a part at rounding level is left out."""
     parts = [(distance, "m"), (angle, "rad")]
     return " and ".join(f"{value:.3g} {unit}" for value, unit in parts if value > 1e-9 * (distance + angle)) or "0 m"

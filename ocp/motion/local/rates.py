@@ -1,4 +1,4 @@
-"""Instantaneous redundancy resolution at velocity level: the least joint rates that do the task at each time.
+"""Instantaneous redundancy resolution at velocity level: the least joint rates that perform the task at each time.
 
 This is the classical method to which optimal plans are compared. `resolve` integrates one motion accurately.
 `track_tasks` tracks tasks from many start configurations at once, on one grid of times and within the joint limits, at
@@ -39,7 +39,7 @@ MAX_INTEGRATOR_STEPS = 20000
 
 @dataclass(frozen=True)
 class LocalSolution:
-    """Motion by instantaneous resolution, at M sampled times.
+    """Motion from local redundancy resolution, at M sample times.
 
     Attributes:
         t: Times, the first 0. Shape (M,), s.
@@ -131,7 +131,7 @@ def resolve(
     scene: CollisionScene | None = None,
     options: RateOptions | None = None,
 ) -> LocalSolution:
-    """Integrate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the motion of the base.
+    """Integrate the pseudo-inverse solution x2' = G# v, equation (26) of the free-floating paper, and the base motion.
 
     The drift of the machine at rest and the feedback of pose tasks are part of v.
 
@@ -157,7 +157,7 @@ def resolve(
     duration = horizon_of([part.task for part in equations.bound], horizon)
     rate_weights = checked_weights(own.weights, machine.joint_size)
     checked_tasks(equations, base, joints, duration)
-    times = _times(samples, duration)
+    times = _sample_times(samples, duration)
     if own.damping == 0 and (rows_dependent := dependent_rows(equations, base, joints)):
         words = (
             f"{rows_dependent} is singular at the start joints {joints.tolist()}; "
@@ -193,8 +193,8 @@ def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any
     return ca.mtimes(weighted, solve_spd(square, velocity))
 
 
-def _times(samples: Any, horizon: float) -> Array:
-    """Return the times of the samples, checked."""
+def _sample_times(samples: Any, horizon: float) -> Array:
+    """Return the sample times of a count or an array of times; raise ProblemError unless they cover the horizon."""
     if not isinstance(samples, list | tuple | np.ndarray):
         count = real(samples)
         if not (2 <= count <= INPUT_LIMITS.count and count == int(count)):
@@ -214,7 +214,7 @@ def _times(samples: Any, horizon: float) -> Array:
 
 
 class _Model:
-    """Rates of the state (base, joints) and reported outputs as CasADi functions of (time, state)."""
+    """Differential equations of (base, joints) and the reported outputs, as CasADi functions of (time, state)."""
 
     def __init__(self, equations: TaskEquations, weights: Array, damping: float, symbols: Any) -> None:
         machine = equations.machine
@@ -254,7 +254,7 @@ def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: floa
 
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
-    """Return states and costs at all reachable times, and the reason if these are not all."""
+    """Return states and costs at all times that integration reaches, and the reason if it stops early."""
     try:
         result = model.integrator(times[0], times[1:], tolerance)(x0=first)
         states = np.vstack([first, np.array(result["xf"]).T])
@@ -339,7 +339,7 @@ class LocalMotion:
 
     @classmethod
     def stationary(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
-        """Return motions at rest.
+        """Return motions that stay at their configurations.
 
         Args:
             times: Shape (M,), s.
@@ -360,19 +360,19 @@ class LocalMotion:
 
     @classmethod
     def joined(cls, motions: Sequence[LocalMotion]) -> LocalMotion:
-        """Return the motions of several sets over the same times as one set."""
+        """Join several sets of motions over the same times into one."""
         names = ("base", "joints", "rates", "cost", "pose_error", "worst_time")
         return cls(motions[0].t, *(np.concatenate([getattr(motion, name) for motion in motions]) for name in names))
 
     def straight_to(self, joints: Array) -> LocalMotion:
-        """Return motions that lead from the same starts straight to joints (K, joint_size), without a task."""
+        """Return motions straight in joint space from given starts to joints (K, joint_size), without a task."""
         share = ((self.t - self.t[0]) / (self.t[-1] - self.t[0]))[:, None]
         displacement = (joints - self.joints[:, 0])[:, None]
         rates = np.repeat(displacement / (self.t[-1] - self.t[0]), len(self.t), axis=1)
         return replace(self, joints=self.joints[:, :1] + share * displacement, rates=rates)
 
     def take(self, rows: Any) -> LocalMotion:
-        """Return the motions at these indices."""
+        """Return the motions with the given indices."""
         fields = (self.base, self.joints, self.rates, self.cost, self.pose_error, self.worst_time)
         return LocalMotion(self.t, *(value[rows] for value in fields))
 
@@ -482,7 +482,7 @@ def _cone_function(equations: TaskEquations) -> Any:
 def _damped_rates(
     matrix: Array, velocities: Array, weights: Array, damping: float, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the least weighted rates (K, n) for velocities (K, m), joints fixed at limits that they would leave."""
+    """Return the least weighted rates (K, n) for task velocities (K, m); joints about to leave their limits stop."""
     finite: Any = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(velocities).all(axis=1)
     matrix, velocities = np.where(finite[:, None, None], matrix, 0.0), np.where(finite[:, None], velocities, 0.0)
     size = np.sqrt((matrix**2).sum(axis=(1, 2)) / max(matrix.shape[1], 1))

@@ -1,4 +1,4 @@
-"""The front door: a machine and its tasks in, the lowest-cost motion that passes its audit out."""
+"""Planning: from a machine and its tasks to the lowest-cost motion that passes its audit."""
 
 from ocp.motion.plan.dispatch import plan, plan_problem
 from ocp.motion.result.candidate import Candidate, Reason, Rejection

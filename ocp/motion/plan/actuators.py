@@ -1,4 +1,4 @@
-"""Motions along tasks within limits of torque, power, acceleration and jerk, or at a cost beside the squared rates.
+"""Motions along tasks within limits of torque, power, acceleration and jerk, or with other costs than squared rates.
 
 The guess is a motion without these limits, of least squared rates, whose problem has the rates as controls. The problem
 solved from it has accelerations as controls.
@@ -46,7 +46,7 @@ ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 
 
 def limits_actuators(limits: Limits) -> bool:
-    """Return whether anything but positions and rates is limited."""
+    """Return whether limits apply to more than positions and rates."""
     return any(getattr(limits, quantity) is not None for quantity in ACTUATOR_LIMITS)
 
 
@@ -56,12 +56,12 @@ def weights_actuators(cost: Cost) -> bool:
 
 
 def without_actuators(limits: Limits) -> Limits:
-    """Return the limits of positions and rates alone."""
+    """Return the limits with position and rate limits only."""
     return replace(limits, acceleration=None, jerk=None, torque=None, power=None)
 
 
 def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
-    """Return the cost of the motion of a plan by the trapezoidal rule, without the joints that it holds."""
+    """Return the cost of the motion of a plan by the trapezoidal rule; joints that the plan holds do not count."""
     machine = hold_joints(plan.machine, plan.held) if plan.held else plan.machine
     sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
     free = [name not in plan.held for name in plan.names]
@@ -139,7 +139,7 @@ class ActuatorDemand:
 
 
 def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
-    """Return a motion within the actuator limits and at the cost of a request, from one without.
+    """Solve again within the actuator limits, with a motion without these limits as the guess.
 
     Args:
         request: The request. If many starts are equally good, the motion has its own start.
@@ -185,7 +185,7 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
 
 
 def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError:
-    """Return the error with the demand of the motion without the limits."""
+    """Return the error extended by the actuator demand of the motion that ignores the limits."""
     details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
     words = "no motion within the actuator limits was found"
     if demand is not None:

@@ -43,7 +43,7 @@ class Solver:
         raise NotImplementedError
 
     def collision(self, candidate: Candidate) -> Reason | None:
-        """Return the reason if bodies collide in its motion; else None."""
+        """Return the rejection reason if bodies collide during the motion of a candidate; else None."""
         return None
 
     def same_path(self, solution: Solution, reference: Solution) -> bool:
@@ -71,13 +71,13 @@ class Solver:
         return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, with the others."""
+        """Return the plan of the first candidate, which also stores the other candidates."""
         raise NotImplementedError
 
 
 @dataclass
 class _Motion:
-    """Motion to which candidates of a batch converged: the first of them, and those that wait."""
+    """Motion to which candidates of a batch converge: the first of them, and duplicates that wait for its result."""
 
     first: Candidate
     waiting: list[Candidate] = field(default_factory=list)
@@ -114,17 +114,17 @@ class CandidateQueue:
 
     @property
     def collided(self) -> bool:
-        """Whether a candidate was rejected for a collision."""
+        """Whether a candidate was rejected because of a collision."""
         return any(c.reason is not None and c.reason.kind is Rejection.COLLISION for c in self.candidates)
 
     @property
     def exhausted(self) -> bool:
-        """Whether candidates have failed, none has passed, and the time for refusals is over."""
+        """Whether candidates have failed without a collision, none has passed, and the time for failures is over."""
         seconds = time.thread_time() - self._began
         return seconds > self.settings.refusal_time and bool(self.candidates) and not (self.passed or self.collided)
 
     def run(self, seeds: Iterable[Candidate], include_costlier: bool = False) -> None:
-        """Advance a batch of seeds until no candidate can become cheaper than the best that passed.
+        """Advance a batch of seeds until no candidate can cost less than the best one that passed.
 
         Args:
             seeds: Seeds in the order of their first solve.
@@ -182,7 +182,7 @@ class CandidateQueue:
         heappush(self._heap, (cost, -candidate.stage, self._pushed, candidate))
 
     def _find_motion(self, candidate: Candidate) -> _Motion | None:
-        """Return the known motion to which a candidate converged in its first solve; else None."""
+        """Return the known motion to which a candidate converged on its first mesh; None for a new one."""
         if candidate.stage not in (Stage.COARSE, Stage.FINE) or candidate.separations or candidate.solution is None:
             return None
         if any(motion.first.seed is candidate.seed for motion in self._motions):
@@ -219,7 +219,7 @@ class CandidateQueue:
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, candidate: Candidate) -> bool:
-        """Return whether a candidate of the same cost passed, of the same motion if all motions are needed."""
+        """Return whether a candidate of equal cost has passed; if all motions are needed, also of equal path."""
         passed = [c for c in self.candidates if c.passed]
         same = [c for c in passed if abs(candidate.cost - c.cost) <= self.settings.same_cost * c.cost]
         if not self._always_costlier or candidate.solution is None:
@@ -227,7 +227,7 @@ class CandidateQueue:
         return any(c.solution is not None and self.solver.same_path(candidate.solution, c.solution) for c in same)
 
     def _take(self, previous: Candidate, advanced: Candidate) -> None:
-        """Store or push the result of an advance."""
+        """Process the result of an advance: store a finished candidate, or push it to the queue again."""
         if not advanced.passed:
             self.candidates.append(advanced)
             self._failures += previous.stage is not Stage.SEED
@@ -245,14 +245,14 @@ class CandidateQueue:
             self._push(advanced)
 
     def _replace(self, rejected: Candidate) -> None:
-        """Let the candidates that waited for a rejected one continue."""
+        """Resume the candidates that waited for a candidate that was rejected."""
         for motion in [motion for motion in self._motions if motion.first.seed is rejected.seed]:
             self._motions.remove(motion)
             for candidate in motion.waiting:
                 self._push(candidate)
 
     def _learn_error(self, coarse: Candidate, fine: Candidate) -> None:
-        """Update the error of the coarse mesh, unless the candidate became another motion."""
+        """Update the estimated error of the coarse mesh, unless the candidate converged to another motion."""
         assert coarse.solution is not None
         assert fine.solution is not None
         if self.solver.same_path(coarse.solution, fine.solution):

@@ -98,18 +98,18 @@ class CandidateSolver(Solver):
         return [advanced, *self._free_start(advanced)]
 
     def with_own_cost(self) -> CandidateSolver:
-        """Return the solver that also solves at the cost of the request."""
+        """Return the solver with a last stage that minimises the cost of the request instead of the joint rates."""
         solver = copy(self)
         solver.last = Stage.ACTUATED
         return solver
 
     def own_cost(self, candidate: Candidate) -> float:
-        """Return the cost that the request has for the motion of an audited candidate."""
+        """Return the cost, as the request defines it, of the motion of an audited candidate."""
         assert self.request.cost is not None
         return cost_of_motion(self.plan([candidate]), self.request.cost)
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
-        """Return whether the tasks along a local motion are nearly dependent, so that its candidate relaxes them."""
+        """Return whether the tasks are nearly dependent along a local motion; its candidate then relaxes them."""
         return self._can_relax and is_nearly_singular(self.motion.stretches, local)
 
     @property
@@ -117,14 +117,14 @@ class CandidateSolver(Solver):
         return self.request.time_cost is None
 
     def _may_relax(self, candidate: Candidate) -> bool:
-        """Return whether a rejected candidate is solved again with relaxed tasks: not if bodies collided."""
+        """Return whether to solve a rejected candidate again with relaxed tasks; not if bodies collide."""
         seed, reason = candidate.seed, candidate.reason
         if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or _is_separated(candidate):
             return False
         return self._can_relax and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
-        """Return the reason that the solver found no motion: where the last iterate, or else the seed, fails."""
+        """Return the reason why the solver found no motion: the violation of its last iterate, or else of the seed."""
         samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
         if not samples:
             return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
@@ -134,7 +134,7 @@ class CandidateSolver(Solver):
         return limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
 
     def _turned_over(self, solution: Solution) -> Reason | None:
-        """Return the reason that a tool points the opposite way at a free start, where the equations hold as well."""
+        """Return a rejection reason if a tool is upside down at a free start; the task equations hold there as well."""
         if self.request.start is not None:
             return None
         for sample in self._motion_samples(solution):
@@ -166,7 +166,7 @@ class CandidateSolver(Solver):
         return self._solve(candidate, Stage.SEPARATED if separated else Stage.COARSE, seed.guess)
 
     def _separate(self, candidate: Candidate) -> Candidate:
-        """Separate the bodies that collide on the coarse mesh; without collisions go on to the fine mesh."""
+        """Separate the bodies that collide on the coarse mesh; if none do, continue on the fine mesh."""
         collisions = self.collisions(candidate)
         if not collisions:
             return self._solve(candidate, Stage.FINE, candidate.solution)
@@ -176,7 +176,7 @@ class CandidateSolver(Solver):
         return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
-        """Separate the bodies that collide on the fine mesh; without collisions refine it for tips and joint limits."""
+        """Separate the bodies that collide on the fine mesh; if none do, refine the mesh for tips and joint limits."""
         if collisions := self.collisions(candidate):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
@@ -193,7 +193,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.REFINED, cost=solution.cost, solution=solution)
 
     def _audit(self, candidate: Candidate) -> Candidate:
-        """Audit a candidate, refine its mesh if that may correct a failure, and widen separations that are too small.
+        """Audit a candidate; on failure refine its mesh or widen separations, if that may help.
 
         If many starts are equally good, the optimality of one of them is undetermined. The motion is then solved and
         audited with its start fixed.
@@ -237,7 +237,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return a new candidate with a free start for one that passed with a fixed start."""
+        """Return a new candidate with a free start, from one that passed with a fixed start."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints
@@ -311,7 +311,7 @@ class CandidateSolver(Solver):
     def _options(
         self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return options of a solve with separated bodies: an initial barrier parameter in proportion to the cost.
+        """Return solver options for a problem with separated bodies: the cost bounds the initial barrier parameter.
 
         An interior-point method with barrier parameter mu leads to a point whose cost exceeds the least one by mu for
         each limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier
@@ -444,7 +444,7 @@ class CandidateSolver(Solver):
 
     @property
     def no_clear_configuration(self) -> bool:
-        """Whether at some time no configuration that does the tasks is collision-free."""
+        """Whether at some time every configuration that satisfies the tasks is in collision."""
         return any(isinstance(value, Unreachable) for value in self._clear_counts.values())
 
     def _count_clear_at(self, time: float) -> int | Unreachable | None:
@@ -460,7 +460,7 @@ class CandidateSolver(Solver):
     # ---- results -----------------------------------------------------------------------------------------------------
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error that none passes; with collisions, about the lowest-cost candidate in collision."""
+        """Return the error that no candidate passes; if bodies collide, it describes the lowest-cost candidate."""
         error = super().failure(candidates)
         reasons = ((candidate, candidate.reason) for candidate in candidates)
         colliding = [c for c, reason in reasons if reason is not None and reason.kind is Rejection.COLLISION]
@@ -475,7 +475,7 @@ class CandidateSolver(Solver):
         return SolveError(words, error.solution, error.conflicts, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, with the others."""
+        """Return the first candidate as a plan that also stores the other candidates."""
         best, parts = candidates[0], parts_of(self.motion.stretches)
         assert best.solution is not None
         if self.request.time_cost is not None:

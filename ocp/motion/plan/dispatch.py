@@ -1,4 +1,4 @@
-"""One verb for every motion: a machine and what is asked of it in, the lowest-cost motion that passes its audit out."""
+"""The function `plan` for all kinds of motions, which selects the planner for the given tasks and goals."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def plan(
     time_limit: float | None = None,
     progress: Callable[[str], Any] | bool | None = None,
 ) -> Plan:
-    """Plan the lowest-cost motion that does the tasks: the least integral of half the squared joint rates.
+    """Plan the lowest-cost motion that satisfies the tasks: the least integral of half the squared joint rates.
 
     Args:
         machine: A machine on a fixed or floating base, or standing, see `plan_to_stand`.
@@ -130,7 +130,7 @@ def _plan(
     search: Search,
     seed: int,
 ) -> Plan:
-    """Hand the arguments of `plan` to the planner of the tasks."""
+    """Select the planner for the tasks and pass the arguments of `plan` to it."""
     options: dict[str, Any] = {"cost": cost, "limits": limits, "seed": seed}
     wrenches = scene.wrenches if isinstance(scene, Scene) else None
     if wrenches is not None and (not isinstance(machine, Standing) or isinstance(tasks, Steps)):
@@ -175,7 +175,7 @@ def _plan(
 
 
 def _is_sequence(tasks: Any) -> bool:
-    """Return whether parts are done one after the other of which not all are goals, or which are tasks at once.
+    """Return whether tasks are a sequence of goals and tasks, or of groups of tasks; not goals or tasks alone.
 
     Raises:
         ProblemError: A part is neither a goal nor tasks.
@@ -214,7 +214,7 @@ def plan_problem(
     limits: Limits | None = None,
     scene: Scene | Literal[False] | None = None,
 ) -> Problem:
-    """Declare the problem that `plan` solves, without a search: the start is given or near one configuration.
+    """Declare the problem that `plan` solves, without a search over start configurations.
 
     The clearance of the scene is proven by the audit of a solution, but no pair of bodies is separated yet, see
     `ClearanceConstraints.holding`. Poses of goals need joints here. Limits of actuators beside tip tasks, and a free

@@ -126,7 +126,7 @@ class GoalRequest:
 
 @dataclass(frozen=True, eq=False)
 class GoalTask:
-    """Checked request: bounds, start, goals with their turns, metric, and the proofs of clearance."""
+    """Checked request: bounds, start, goals in all turns, metric, and collision checks."""
 
     request: GoalRequest
     bounds: JointBounds
@@ -148,7 +148,7 @@ class GoalTask:
 
     @property
     def moves(self) -> bool:
-        """Whether the machine moves at the start or at the end."""
+        """Whether the machine has a velocity at the start or at the end."""
         return not all(isinstance(velocity, str) and velocity == "rest" for velocity in self.end_velocities)
 
     @property
@@ -158,7 +158,7 @@ class GoalTask:
 
     @property
     def is_fastest(self) -> bool:
-        """Whether the time alone is the cost, and free, and no power is limited."""
+        """Whether the motion is time-optimal: only a free time is the cost, and no power is limited."""
         is_free = self.request.horizon is None and self.request.cost.terms == ("time",)
         return is_free and not np.isfinite(self.bounds.power).any()
 
@@ -201,7 +201,7 @@ def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
 
 
 def synchronised_candidates(task: GoalTask) -> list[Candidate]:
-    """Return the audited fastest motion to a goal without obstacles if it is clear of them; a list of at most one.
+    """Return the fastest motion without obstacles, audited, if it happens to be collision-free; else no motion.
 
     No motion is faster unless torques slow it down.
     """
@@ -217,12 +217,12 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
             if task.motions.are_clear(samples[:-1], samples[1:]).all():
                 joints = np.array([task.start, task.goals[goal]])
                 path = JointPath(joints, goal, path_length(samples, task.scale))
-                return [_ProblemOf(task, path, motion, None).candidate("synchronises the joints")]
+                return [_PathProblem(task, path, motion, None).candidate("synchronises the joints")]
     return []
 
 
 def _fastest(task: GoalTask, path: JointPath) -> Candidate:
-    """Return the audited locally fastest motion near a path, or one that stops at corners if none is found."""
+    """Return the locally fastest motion near a path, audited; if none is found, one that stops at corners."""
     settings = task.request.settings.fastest
     ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
     limits = MotionLimits(task.motions, task.bounds, task.torques, *ends)
@@ -230,7 +230,7 @@ def _fastest(task: GoalTask, path: JointPath) -> Candidate:
         for _ in range(task.request.settings.margins):
             with time_limited(task.request.settings.search_share * time_left()):
                 motion = fastest_motion_near(limits, path.joints, settings)
-            candidate = _ProblemOf(task, path, motion, None).candidate("is a locally fastest spline")
+            candidate = _PathProblem(task, path, motion, None).candidate("is a locally fastest spline")
             task.report(f"path of length {path.length:.4g}: {candidate}")
             if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:
                 break
@@ -244,7 +244,7 @@ def _fastest(task: GoalTask, path: JointPath) -> Candidate:
 
 
 def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return the audited motions within actuator limits: with stops at corners, and where time is left without."""
+    """Return audited motions within actuator limits: with stops at corners and, if time is left, without."""
     request, settings, bounds = task.request, task.request.settings, task.bounds
     candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
     for path in paths:
@@ -259,7 +259,7 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
     is_free = request.horizon is None and request.cost.time > 0
     shortest = min((motion.duration for _, motion in motions), default=0.0)
     fixed = settings.spare * shortest if request.horizon is None else float(request.horizon)
-    problems = [_ProblemOf(task, path, motion, None if is_free else fixed) for path, motion in motions]
+    problems = [_PathProblem(task, path, motion, None if is_free else fixed) for path, motion in motions]
     stopping = [(problem, problem.stopping()) for problem in problems]
     for problem, candidate in sorted(stopping, key=lambda pair: (not pair[1].passed, pair[1].cost)):
         enough = attains_bound(task, candidate) or (candidate.passed and (problem.path.length == 0 or task.is_fastest))
@@ -270,7 +270,7 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
 
 
 def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
-    """Return whether a candidate passed its audit and costs hardly more than any motion does."""
+    """Return whether a candidate passed its audit and its cost is within tolerance of the lower bound."""
     if not candidate.passed or candidate.solution is None:
         return False
     bound = cost_bound(task, candidate.solution.horizon)
@@ -278,8 +278,8 @@ def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _ProblemOf:
-    """Motions within actuator limits along one path.
+class _PathProblem:
+    """Problem of moving along one path within actuator limits.
 
     Attributes:
         task: Checked request.
@@ -316,7 +316,7 @@ class _ProblemOf:
         return dynamics_problem(task.request.machine, (), horizon, **ends, limits=limits, cost=cost, setup=setup)
 
     def stopping(self) -> Candidate:
-        """Return the audited motion that stops at corners, slowed down to a fixed horizon."""
+        """Return the motion that stops at corners, slowed down to a fixed horizon, with its audit."""
         task, factor = self.task, self.horizon_guess / self.motion.duration
         if task.request.cost.energy or np.isfinite(task.bounds.power).any() or task.moves:
             words = "motions with stops are not offered where power counts, or the machine moves at an end"
@@ -329,12 +329,12 @@ class _ProblemOf:
         return replace(self, motion=self.motion.slower(factor)).candidate("stops at the corners of a path")
 
     def candidate(self, method: str) -> Candidate:
-        """Return the audited motion; `method` says what it does."""
+        """Audit the motion and return it as a candidate; `method` describes how it was found."""
         problem = self.declare(self.task.request.clearance_constraints)
         return _audited(self.task, self.motion.solution(problem, method), self.path)
 
     def smooth(self) -> Candidate:
-        """Return the audited motion without stops that a solver finds from the path."""
+        """Solve for a motion without stops, with the path as the guess, and return it with its audit."""
         task, joints = self.task, self.path.joints
         settings, duration = task.request.settings, self.horizon_guess
         times = np.linspace(0.0, duration, settings.guess_times)

@@ -40,7 +40,7 @@ __all__ = ["plan_to_goal"]
 
 @interruptible
 def plan_to_goal(request: GoalRequest) -> SolvedPlan:
-    """Return the lowest-cost motion found from the start to one of the goals, at rest at both ends if actuators count.
+    """Return the lowest-cost motion found from the start to one of the goals; with actuators, at rest at both ends.
 
     Raises:
         ProblemError: Sizes do not match; the start, or every goal, is outside the limits or collides: names the pair of
@@ -104,7 +104,9 @@ def _checked(request: GoalRequest) -> GoalTask:
             kept.append(joints)
     if not kept:
         raise errors[0]
-    turned = [shifted for goal in kept for shifted in _turned(space, bounds, start, goal, request.settings.turns)]
+    turned = [
+        shifted for goal in kept for shifted in _equivalent_goals(space, bounds, start, goal, request.settings.turns)
+    ]
     return GoalTask(request, bounds, start, np.array(turned), scale, motions, space, TorqueLimits(machine, bounds))
 
 
@@ -126,8 +128,8 @@ def _collision(scene: Any, name: str, collision: Any) -> ProblemError:
     return ProblemError(words, name=f"{first} and {second}", value=collision.distance, limit=scene.clearance)
 
 
-def _turned(space: JointSpace, bounds: JointBounds, start: Array, goal: Array, turns: int) -> list[Array]:
-    """Return a goal with its joints of more than two turns at the nearest turn to the start, and at further ones."""
+def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal: Array, turns: int) -> list[Array]:
+    """Return the goal with joints shifted by full turns within their limits, the nearest to the start first."""
     nearest = start + space.difference(goal, start)
     shifts = []
     for joint in range(len(goal)):
@@ -142,7 +144,7 @@ def _turned(space: JointSpace, bounds: JointBounds, start: Array, goal: Array, t
 
 
 def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
-    """Return paths of several classes, the shortest first.
+    """Search collision-free paths of several homotopy classes, the shortest first.
 
     Raises:
         SolveError: None was found.
@@ -175,7 +177,7 @@ def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
 
 
 def _best(task: GoalTask, candidates: list[Candidate]) -> SolvedPlan:
-    """Return the plan of the candidate of least cost, with a lower bound of the cost of all motions.
+    """Return the plan of the lowest-cost candidate, with a lower bound of the cost of all motions.
 
     Raises:
         SolveError: None passed its audit.

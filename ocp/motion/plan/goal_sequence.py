@@ -130,13 +130,13 @@ def plan_goal(
         ProblemError, SolveError: As `plan_to_goal` or `plan_sequence`.
     """
     options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "constraints": constraints, "seed": seed}
-    if isinstance(machine, FixedBase) and _is_simple(goal):
+    if isinstance(machine, FixedBase) and _has_only_target(goal):
         return plan_to_goal(_goal_request(machine, goal, horizon, **options))
     return plan_sequence(machine, (goal,), horizon, **options)
 
 
-def _is_simple(goal: Goal) -> bool:
-    """Return whether nothing is asked on the way to a goal, and the machine stays as it is."""
+def _has_only_target(goal: Goal) -> bool:
+    """Return whether a goal has no tasks on the way and changes neither the machine nor the base."""
     has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
     return not has_tasks and goal.machine is None and goal.base is None
 
@@ -234,7 +234,7 @@ def with_joints(goal: Goal, joints: Array) -> Goal:
 
 
 def _phased(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
-    """Return the plan of a solution with phases."""
+    """Return the plan of a solution that has phases."""
     candidate = Candidate(start, solution.cost, None, Stage.AUDITED, solution)
     return PhasedPlan(machine, solution, parts_of_phases(solution), (candidate,))
 

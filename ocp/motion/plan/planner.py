@@ -1,4 +1,4 @@
-"""One call from a machine and its tasks to the lowest-cost motion that passes its audit.
+"""Planner of tip tasks: from start configurations to the lowest-cost motion that passes its audit.
 
 If the start is not given, inverse kinematics finds start configurations on every branch and spread over the
 self-motion. Resolved-rate control tracks the tasks from each of them. These local motions are the seeds of candidates,
@@ -70,7 +70,7 @@ __all__ = [
 def plan_from_configurations(
     request: PlanRequest, configurations: Array, solver: CandidateSolver
 ) -> tuple[SolvedPlan, float | None]:
-    """Return the plan that start configurations lead to, and a lower bound of its cost or None.
+    """Return the plan that results from start configurations, and a lower bound of its cost or None.
 
     Args:
         request: The request.
@@ -112,7 +112,7 @@ def plan_from_configurations(
 
 
 def _finished(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
-    """Return the plan of least cost.
+    """Return the plan of the lowest-cost candidate.
 
     If the request has another cost than the squared rates, all motions that passed are solved again at that cost, in
     the order of the cost that they have without a change.
@@ -130,7 +130,7 @@ def _finished(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates of local motions: those that do their tasks first, then by rising cost.
+    """Return candidates of local motions: those that satisfy their tasks first, then by increasing cost.
 
     Args:
         motions: K local motions through each stretch.
@@ -156,7 +156,7 @@ def _repair(
     configurations: Array,
     seeds: list[Candidate],
 ) -> None:
-    """Try seeds again that collided; if none did, try other guesses, and diagnose conflicts."""
+    """Solve seeds in collision again; without collisions, try other guesses and diagnose conflicting constraints."""
     if queue.collided and not solver.no_clear_configuration:
         _try_alternatives(queue, solver, seeds)
     if queue.passed or queue.collided or queue.exhausted:
@@ -185,7 +185,7 @@ def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configuratio
 
 
 def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch) -> None:
-    """Run the classes of motions that may hold the optimum; if none passes, one motion of every class.
+    """Solve the classes of motions that may contain the optimum; if none passes, try one motion of every class.
 
     A free start and a coarse mesh may lead away from a nearly optimal motion. Motions of the search that promise a
     lower cost than the plan are therefore also solved with their start fixed, until the plan is close to its bound.
@@ -219,7 +219,7 @@ def _check_dead_end(search: TaskSearch) -> None:
 def _search_cells(
     queue: CandidateQueue, solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array
 ) -> None:
-    """Run the motions of a floating machine that a search over exact states finds, and its local motions.
+    """Solve candidates from a cell search over the states of a floating machine, and from its local motions.
 
     Raises:
         Unreachable, DeadEnd: As in `CellSearch`, if no local motion leads to a plan either.
@@ -255,7 +255,7 @@ def _search_cells(
 
 
 def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Rerun candidates in collision: from their own local motions, then from fixed, collision-free starts.
+    """Solve candidates in collision again: from their own local motions, then from fixed, collision-free starts.
 
     Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
     motions belong to different homotopy classes; those without collision, or with the least, come first. A free start
@@ -265,7 +265,7 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
     finished_by_seed = {id(candidate.seed): candidate for candidate in queue.candidates}
     rerouted = []
     local = {id(seed): solver.local_collisions(seed.seed) for seed in seeds}
-    distances = {key: min((each.distance for each in found), default=np.inf) for key, found in local.items()}
+    distances = {key: min((each.distance for each in pairs), default=np.inf) for key, pairs in local.items()}
     for seed in seeds:
         finished = finished_by_seed[id(seed.seed)]
         colliding = solver.collisions(finished)
@@ -308,7 +308,7 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
 
 
 def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
-    """Plan a request with held joints; `whole` is the request before joints were held.
+    """Plan a request with held joints; `whole` is the request before any joints were held.
 
     Raises:
         ProblemError, SolveError: As in `plan`.
@@ -331,7 +331,7 @@ def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
 def clearance_for(
     machine: Machine, limits: Limits | None, scene: Scene | Literal[False] | None
 ) -> ClearanceConstraints | None:
-    """Return the clearance constraints of a motion in a scene, or None if no pair of bodies has to be checked.
+    """Return the clearance constraints of a motion in a scene; None if no pair of bodies needs a check.
 
     Raises:
         ProblemError: A value of the scene is invalid, or does not fit the machine.
@@ -412,7 +412,7 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
-    """Return the cost of tip tasks, with its weights checked.
+    """Check the weights of the cost of tip tasks and return the cost.
 
     Args:
         free: Whether the horizon is free.

@@ -70,13 +70,13 @@ class SequenceRequest:
 
     @property
     def smooth(self) -> bool:
-        """Whether rates must be continuous, since actuators are limited or weighted."""
+        """Whether joint rates must be continuous, because actuators are limited or weighted."""
         limits = self.limits or Limits()
         return limits_actuators(limits) or (self.cost is not None and weights_actuators(self.cost))
 
 
 class _State(NamedTuple):
-    """Configuration and joint velocities between two motions; None where they are not known yet."""
+    """Configuration and joint velocities at the junction of two motions; None where they are still unknown."""
 
     joints: Array | None
     base: Array
@@ -84,13 +84,13 @@ class _State(NamedTuple):
 
     @classmethod
     def end_of(cls, plan: SolvedPlan, smooth: bool) -> _State:
-        """Return the state at the end of a motion, at rest if rates may jump."""
+        """Return the state at the end of a motion; the rates are zero if they may jump."""
         at = plan.at(plan.horizon)
         return cls(at["joints"], at.get("base", np.zeros(0)), _velocity(at["rates"], smooth))
 
 
 def _velocity(rates: Array, smooth: bool) -> Any:
-    """Return the velocity at a junction, "rest" if it is zero or may jump."""
+    """Return the joint velocity at a junction: "rest" if it is zero or may jump."""
     return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
 
 
@@ -154,7 +154,7 @@ class _Sequence:
         self.state = _State.end_of(plan, self.request.smooth)
 
     def _joints_near(self, goal: Goal) -> Array | None:
-        """Return the joints of a goal as far as they are known, the others as they are before it."""
+        """Return the joint values of a goal; joints that the goal leaves open keep their current values."""
         if goal.joints is None or self.state.joints is None:
             return self.state.joints
         joints = floats(goal.joints).ravel()
@@ -197,7 +197,7 @@ class _Sequence:
         return plan_request(checked)
 
     def _approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
-        """Add the motion to the start of a task, and return the motion along the task."""
+        """Add the motion to the start of a task and return the motion along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
@@ -237,14 +237,14 @@ def _is_at_start(machine: Machine, tasks: Any, joints: Array) -> bool:
 
 
 def _misses(equations: TaskEquations, joints: Array) -> float:
-    """Return the largest pose error of joints at the time 0, m and rad; axes may lie in their cones."""
+    """Return the largest pose errors of joints at time 0, m and rad; axes may lie anywhere in their cones."""
     at: tuple[Any, ...] = np.zeros(1), None, joints[None]
     errors = equations.errors(*at), equations.cone_violations(*at)
     return max(float(np.abs(each).max(initial=0.0)) for each in errors)
 
 
 def _led_to(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return a goal with the joints and the velocity at the start of a task, if these are at the goal."""
+    """Return a goal with the joints and the velocity at the start of a task, if that start satisfies the goal."""
     first = plan.at(0.0)
     if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
         return goal
@@ -277,7 +277,7 @@ def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:
 
 @contextmanager
 def _named(part: str) -> Iterator[None]:
-    """Name the part of a sequence in the errors of its planner."""
+    """Add the name of a part of a sequence to the errors that its planner raises."""
     try:
         yield
     except (ProblemError, SolveError) as error:
@@ -359,7 +359,7 @@ def plan_in_segments(
 
 
 def _plan_segment(request: PlanRequest, begin: float, end: float) -> SolvedPlan:
-    """Plan the tasks from one time to another.
+    """Plan the part of the tasks between two times as one segment.
 
     Raises:
         ProblemError, SolveError: As in `plan`.
@@ -371,7 +371,7 @@ def _plan_segment(request: PlanRequest, begin: float, end: float) -> SolvedPlan:
 
 
 def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
-    """Return the part of a task between two times, which starts at 0; None if it is empty."""
+    """Return the part of a task between two times, with its start at time 0; None if it is empty."""
     first, last = max(task.begin, begin), min(task.end, end)
     if last <= first:
         return None

@@ -38,7 +38,7 @@ SINGULAR = SingularSettings()
 
 
 def is_nearly_singular(stretches: Sequence[Stretch], motions: Sequence[LocalMotion]) -> bool:
-    """Return whether the rows of the tasks are nearly dependent somewhere along a single local motion."""
+    """Return whether the task rows become nearly dependent somewhere along a local motion."""
     for stretch, motion in zip(stretches, motions, strict=True):
         if stretch.equations is None or not stretch.equations.size:
             continue
@@ -69,11 +69,11 @@ class MotionSample:
 
     @classmethod
     def of_local(cls, stretch: Stretch, motion: LocalMotion) -> MotionSample:
-        """Return the samples of the first of some local motions."""
+        """Sample the first of several local motions."""
         return cls(stretch, motion.t, motion.base[0], motion.joints[0], motion.rates[0])
 
     def misses(self) -> tuple[Array, Array]:
-        """Return the position errors, m, and the orientation errors, rad, of the worst task. Shapes (M,).
+        """Return the position errors, m, and orientation errors, rad, of the worst task. Shapes (M,).
 
         The error of a velocity task is the integral of its velocity error.
         """
@@ -99,7 +99,7 @@ class MotionSample:
 
 
 def limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason | None:
-    """Return the reason that a motion exceeds the limit of a joint's rate by the largest share, or None."""
+    """Return the reason that joint rates exceed their limits, about the joint with the largest excess; else None."""
     reasons = []
     for sample in samples:
         shares = _rate_shares(request, sample.rates)
@@ -146,7 +146,7 @@ def describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) ->
 
 
 def _rate_shares(request: PlanRequest, rates: Array) -> Array:
-    """Return rates relative to their limits, zero for joints that do not move."""
+    """Return rates relative to their limits; joints that do not move have zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.nan_to_num(np.abs(rates) / request.bounds.velocity, nan=0.0)
 

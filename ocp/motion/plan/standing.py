@@ -38,7 +38,8 @@ def plan_to_stand(
     constraints: ClearanceConstraints | None,
     wrenches: External | None,
 ) -> SolvedPlan:
-    """Plan a motion that does the tasks with the zero moment point inside the foot, at the cost of `solve_standing`.
+    """Plan a motion that satisfies the tasks with the zero moment point inside the foot, at the cost of
+    `solve_standing`.
 
     The joints start and end at rest if their tasks do; else they may move there. Candidates start from every
     configuration that inverse kinematics finds and that stands; with search "start", from the best conditioned one that

@@ -281,7 +281,7 @@ class _WaypointPlanner:
     # ---- searched waypoints ------------------------------------------------------------------------------------------
 
     def _strides(self) -> tuple[list[int], int]:
-        """Return the strides of the searches in order, and how many of the searches are always done."""
+        """Return the strides of the searches in order, and how many of them always run."""
         settings, count = self.settings, len(self.positions)
         if self._section_joint is None:
             halves = int(np.log2(settings.stride)) + 1
@@ -292,7 +292,7 @@ class _WaypointPlanner:
         return [-(-count // settings.first_steps), *strides], 2
 
     def _search_with_stride(self, stride: int, known: AtlasSearch | None = None) -> AtlasSearch | None:
-        """Return a search of every so many-th waypoint; the stride is doubled while the atlas needs too many charts.
+        """Search every n-th waypoint; the stride n is doubled while the atlas needs too many charts.
 
         None if it has no more waypoints than a known search.
         """
@@ -311,7 +311,7 @@ class _WaypointPlanner:
             stride *= 2
 
     def _search_at_failures(self, search: AtlasSearch, path: _Path | None) -> AtlasSearch | None:
-        """Return a search that includes the waypoints where a path is invalid; None if there are none or too many."""
+        """Search again with the waypoints where a path is invalid; None if there are none or too many."""
         chosen = search.times.astype(int)
         if path is None or self._section_joint is not None or np.isin(path.invalid, chosen).all():
             return None
@@ -323,7 +323,7 @@ class _WaypointPlanner:
             return None
 
     def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
-        """Return the search of some waypoints: all configurations, or with two free directions those on sections."""
+        """Return the search over some waypoints: all configurations, or sections if two directions are free."""
         manifolds = SelfMotionManifolds(self.space, self.manifolds.equations, self.manifolds.targets[chosen])
         distances = np.diff(chosen)[:, None]
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
@@ -341,7 +341,7 @@ class _WaypointPlanner:
         return SectionSearch(*arguments, **options, **sections, joint=joint)
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
-        """Return the error about where paths end, refined to the waypoints between searched ones."""
+        """Return the error about where all paths end, located among the waypoints between the searched ones."""
         error, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
         if error is None:
             return SolveError("no path goes through the waypoints", name="waypoints")
@@ -350,7 +350,7 @@ class _WaypointPlanner:
         return (None if len(refined) == len(chosen) else dead_end(self._search(refined), WAYPOINT)) or error
 
     def _negligibly_relaxed_paths(self, search: AtlasSearch) -> list[_Path]:
-        """Return paths that a diagnosis finds with a negligible pose relaxation, though the search found none.
+        """Return paths with a negligible pose relaxation, which a diagnosis finds where the search found none.
 
         Raises:
             SolveError: There is none.
@@ -421,7 +421,7 @@ class _WaypointPlanner:
         return joints
 
     def _check_path(self, joints: Array, breaks: tuple[int, ...]) -> tuple[str, NDArray[np.intp]]:
-        """Return which limit a path violates, "" if none, and the waypoints where it violates one."""
+        """Return the limit that a path violates, "" if none, and the waypoints at which it is violated."""
         names, indices = self.machine.robot.joint_names, np.arange(len(joints))
         errors = np.abs(self.manifolds.linearize(indices, joints)[0]).max(axis=1)
         excess = np.maximum(joints - self.upper, self.lower - joints)
@@ -463,7 +463,7 @@ def _path_weights(weights: Any, size: int) -> Array:
 
 
 def _step(step: Any, size: int) -> Array:
-    """Return the largest step of each joint, (n,)."""
+    """Check the largest displacement between waypoints and return it for each joint. Shape (n,)."""
     try:
         steps = floats(step)
         if steps.shape in ((), (1,), (size,)) and (steps > 0).all():

@@ -21,7 +21,7 @@ __all__ = ["Candidate", "Reason", "Rejection", "Seed", "Stage", "collision_reaso
 
 
 class Stage(IntEnum):
-    """Stage that a candidate has reached."""
+    """Stage of the solution process that a candidate has reached."""
 
     SEED = 0  # guess, mostly a local motion
     COARSE = 1  # solved on the coarse mesh
@@ -33,7 +33,7 @@ class Stage(IntEnum):
 
 
 class Rejection(Enum):
-    """Reasons for which a candidate is not the plan."""
+    """Kinds of reasons for rejecting a candidate."""
 
     COLLISION = "collides"
     COSTLIER = "costlier"
@@ -48,7 +48,7 @@ class Rejection(Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """Why a candidate is not the plan.
+    """Reason why a candidate was rejected.
 
     Attributes:
         kind: Kind of the reason.
@@ -69,12 +69,12 @@ class Reason:
         return self.kind.value + (self.detail and f": {self.detail}") + (self.remedy and f"; {self.remedy}")
 
     def record(self) -> dict[str, Any]:
-        """Return the record that a file holds."""
+        """Return the reason as data for a file."""
         return {**asdict(self), "kind": self.kind.name}
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Reason:
-        """Return the reason of a record, which is not trusted.
+        """Return the reason stored in a record; its values are checked because files are not trusted.
 
         Raises:
             KeyError, TypeError, ValueError: The record is damaged.
@@ -177,16 +177,16 @@ class Candidate:
 
     @property
     def passed(self) -> bool:
-        """Whether it has no reason for rejection."""
+        """Whether the candidate was not rejected."""
         return self.reason is None
 
     def rejected(self, reason: Reason) -> Candidate:
-        """Return the candidate with a reason; separated bodies are named as the first reason."""
+        """Return the candidate, rejected for a reason; if bodies were separated, their collision is named first."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
 
     def finished(self) -> Candidate:
-        """Return the candidate as a plan lists it."""
+        """Return the candidate in the form in which a plan lists it, without intermediate data."""
         solution = self.solution if self.stage >= Stage.FINE else None
         return Candidate(self.start, self.cost, self.reason, self.stage, solution, audit=self.audit)

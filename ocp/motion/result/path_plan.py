@@ -39,7 +39,7 @@ UNDECIDED = "a path through waypoints is compared with its lower bound, not with
 
 
 class PathPoses(NamedTuple):
-    """What a path through waypoints has to keep.
+    """Tool poses that a path through waypoints must keep, and the largest step between them.
 
     Attributes:
         positions, rotations: Poses of the tip at the waypoints, in world. Shapes (N, 3), m, and (N, 3, 3).
@@ -90,7 +90,7 @@ class PathPlan(Plan):
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
-        """A path through waypoints solves no optimal control problem.
+        """None, because a path through waypoints solves no optimal control problem.
 
         Raises:
             ProblemError: Always.
@@ -114,7 +114,7 @@ class PathPlan(Plan):
 
     @property
     def horizon(self) -> float:
-        """Time in which the path is passed at the velocity limits, s."""
+        """Duration of the path at the velocity limits, s."""
         return float(self.t[-1])
 
     @property
@@ -223,7 +223,7 @@ class PathPlan(Plan):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> PathPlan:
-        """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
+        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
         try:
             numbers = {name: arrays[f"path.{name}"] for name in ARRAY_NAMES}
             head = unpack_record(read_head(path, arrays["path"]), numbers)
@@ -254,7 +254,7 @@ class PathPlan(Plan):
 
 
 def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
-    """Return the joints and poses of a file; raise ValueError if they do not fit a machine of this many joints."""
+    """Return joints and poses read from a file; raise ValueError if they do not fit the number of joints."""
     count = len(head["joints"])
     shapes: dict[str, tuple[int, ...]] = {"joints": (count, size)}
     written = {"joints": head["joints"]}

@@ -90,7 +90,7 @@ class Plan(ABC):
 
     @property
     def gap(self) -> float | None:
-        """Share of the cost by which it may exceed the lowest one, by the bound; None without a bound."""
+        """Relative amount by which the cost may exceed the lowest one, according to the bound; None without a bound."""
         if self.bound is None:
             return None
         return (self.cost - self.bound) / self.cost if self.cost > 0 else 0.0
@@ -108,7 +108,7 @@ class Plan(ABC):
     @property
     @abstractmethod
     def t(self) -> Array:
-        """Times of the plan's own grid; where the motion changes abruptly, a time is there twice. Shape (M,), s."""
+        """Times of the plan's own grid, s; a time at which the motion changes abruptly occurs twice. Shape (M,)."""
 
     @abstractmethod
     def _values(self, name: str) -> Array:
@@ -154,7 +154,7 @@ class Plan(ABC):
         return PlanSample(t, at["joints"], at["rates"], accelerations, tips)
 
     def task_share(self, times: Any) -> Array:
-        """Return the share of the tasks' own time that has passed at times (M,), s. Shape (M,).
+        """Return the fraction of the task time that has passed at times (M,), s. Shape (M,).
 
         It equals the share of the horizon unless the pace of the tasks is planned, or the tasks wait.
 
@@ -165,7 +165,7 @@ class Plan(ABC):
 
     @abstractmethod
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solutions of which the plan consists at increasing times (M,), s, in order.
+        """Return, in order, the solutions that make up the plan at increasing times (M,), s.
 
         Each comes with the suffix of the names of its states, and with the times in it, shape (K,), s; all K add up to
         M. The list is empty for a plan that solves no optimal control problem.
@@ -184,11 +184,11 @@ class Plan(ABC):
 
     @abstractmethod
     def _audit(self, **settings: Any) -> Audit:
-        """Check the motion."""
+        """Check the motion without using the cache."""
 
     @property
     def audits(self) -> tuple[Audit, ...]:
-        """Cached audits, the first one first."""
+        """Cached audits, in the order in which they were made."""
         return tuple(self._audits.values())
 
     def limit_findings(self) -> list[Finding]:

@@ -78,7 +78,7 @@ TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingO
 
 
 def _machine_of(arguments: Mapping[str, Any]) -> Machine:
-    """Return the machine of a motion by the arguments of its builder."""
+    """Return the machine among the arguments of a problem builder."""
     if "steps" in arguments:
         steps: Steps = arguments["steps"]
         return steps.stances[0]
@@ -106,7 +106,7 @@ class MotionRequest:
 
     @property
     def held(self) -> Mapping[str, float]:
-        """Positions of the joints of the machine that the problem does not have, by name."""
+        """Positions of the joints that the machine has but the problem does not, by name."""
         held: Mapping[str, float] = self.arguments.get("held", {})
         return held
 
@@ -139,7 +139,7 @@ def declared_motion(
     actuation: Actuation | None = None,
     relaxed: bool = False,
 ) -> ToolMotion:
-    """Declare the problem of a motion, which keeps its origin.
+    """Declare the optimal control problem of a request; the result remembers how to declare it again.
 
     Args:
         request: The request.
@@ -213,7 +213,7 @@ def request_of(problem: Problem | None) -> MotionRequest | None:
 
 
 def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record of names, numbers and arrays.
+    """Return a request as a record of names, numbers and arrays.
 
     Raises:
         ProblemError: An argument is not data, such as a machine of another kind or a Python callback.
@@ -284,13 +284,13 @@ def _scene_fields(scene: CollisionScene) -> dict[str, Any]:
 
 
 def _put_track(name: str, track: Callable[[Any], Any], writer: FunctionWriter) -> dict[str, Any]:
-    """Return the record of a function of time and of its rate, if it has one."""
+    """Return a function of time, and its rate if it has one, as a record."""
     parts = {"track": track, "rate": getattr(track, "rate", None)}
     return {role: writer.write(_traced(name, part)) for role, part in parts.items() if part is not None}
 
 
 def _traced(name: str, track: Callable[[Any], Any]) -> Any:
-    """Return a function of time as a CasADi function."""
+    """Turn a function of time into a CasADi function by calling it with a symbol."""
     for symbols in (ca.SX, ca.MX):
         time = symbols.sym("time")
         try:
@@ -304,7 +304,7 @@ def _traced(name: str, track: Callable[[Any], Any]) -> Any:
 
 
 def restored_request(record: Any) -> MotionRequest:
-    """Return the request of a record of `stored_request`. Nothing in the record is trusted.
+    """Rebuild a request from a record of `stored_request`, whose contents are checked because files are not trusted.
 
     Raises:
         ProblemError: The record is damaged.
@@ -331,7 +331,7 @@ def restored_request(record: Any) -> MotionRequest:
 
 
 def _read(value: Any, functions: list[Any], machines: tuple[Machine, Machine] | None) -> Any:
-    """Return the value of a record; `machines` are the machine and the same with its held joints locked."""
+    """Rebuild a value from a record; `machines` are the machine, and the machine with its held joints locked."""
 
     def read(part: Any) -> Any:
         return _read(part, functions, machines)

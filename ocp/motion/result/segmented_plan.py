@@ -35,7 +35,7 @@ JUMP_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Reconfiguration:
-    """Motion between two segments, to the same place of the tasks in another configuration.
+    """Motion between two segments to another configuration with the same tool pose.
 
     Attributes:
         time: Time of the tasks, which wait, s.
@@ -65,7 +65,7 @@ class Reconfiguration:
 
 
 class Piece(NamedTuple):
-    """Plan that begins at a time of the whole, s, with its name."""
+    """One of several consecutive plans, with its name and start time, s."""
 
     begin: float
     plan: SolvedPlan
@@ -73,7 +73,7 @@ class Piece(NamedTuple):
 
 
 class ConsecutivePlans(Plan):
-    """Plan that consists of other plans, each from where the one before ends.
+    """Plan that consists of consecutive plans; each starts where the previous one ends.
 
     Attributes:
         machine, candidates, bound, targets: As in `Plan`.
@@ -89,7 +89,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def _plans(self) -> tuple[SolvedPlan, ...]:
-        """Plans whose costs, bounds and candidates are those of the whole."""
+        """Plans whose costs, bounds and candidates make up those of the whole plan."""
         return tuple(piece.plan for piece in self.pieces)
 
     # ---- values ------------------------------------------------------------------------------------------------------
@@ -101,13 +101,13 @@ class ConsecutivePlans(Plan):
 
     @property
     def bound(self) -> float | None:  # type: ignore[override]
-        """Lower bound of the cost with the same ends of all plans; None if that of a plan is not known."""
+        """Lower bound of the cost for fixed ends of all plans; None if the bound of a plan is unknown."""
         bounds = [plan.bound for plan in self._plans]
         return None if None in bounds else float(sum(bounds))  # type: ignore[arg-type]
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:  # type: ignore[override]
-        """Candidates of all plans."""
+        """Candidates of all consecutive plans."""
         return tuple(candidate for plan in self._plans for candidate in plan.candidates)
 
     @property
@@ -119,7 +119,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
-        """The solution, if there is one plan.
+        """The solution, if the plan consists of a single one.
 
         Raises:
             ProblemError: There are several.
@@ -137,7 +137,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def t(self) -> Array:
-        """Times of the grids of all pieces, with both copies of the times between them. Shape (M,), s."""
+        """Times of the grids of all segments, s; a time between two segments occurs twice. Shape (M,)."""
         return np.concatenate([piece.begin + piece.plan.t for piece in self.pieces])
 
     def _values(self, name: str) -> Array:
@@ -154,7 +154,7 @@ class ConsecutivePlans(Plan):
         return values
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the parts of all pieces; see `Plan.solved_parts`."""
+        """Return the solved parts of all segments; see `Plan.solved_parts`."""
         pieces = self.pieces
         which = np.searchsorted([piece.begin for piece in pieces], times, side="right") - 1
         parts: list[tuple[Solution, str, Array]] = []
@@ -166,7 +166,7 @@ class ConsecutivePlans(Plan):
     # ---- audit -------------------------------------------------------------------------------------------------------
 
     def _audit(self, **settings: Any) -> Audit:
-        """Return the findings of the audits of all pieces, of the joints between them, and of the cost lost."""
+        """Audit all segments and the junctions between them, and sum up the suboptimality of the segments."""
         findings: list[Finding] = []
         undecided, clearances, losses = "", dict[str, Clearance](), list[float]()
         for piece in self.pieces:
@@ -189,7 +189,7 @@ class ConsecutivePlans(Plan):
         return Audit(self.kind, tuple(findings), undecided, clearances=clearances)
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the findings of the junctions: by how much joints and base jump there."""
+        """Return the findings at the junctions: how far joints and base jump there."""
         names = ("joints", *(("base",) if self.machine.base_size else ()))
         return [self._jump_finding(name) for name in names] if len(self.pieces) > 1 else []
 
@@ -237,7 +237,7 @@ class SequencePlan(ConsecutivePlans):
         return poses
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the findings of the junctions: by how much joints and base jump, and rates where they may not."""
+        """Return the findings at the junctions: how far joints and base jump, and rates that must be continuous."""
         rates = [self._jump_finding("rates")] if self.smooth and len(self.parts) > 1 else []
         return super()._junction_findings() + rates
 
@@ -260,7 +260,7 @@ class SequencePlan(ConsecutivePlans):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SequencePlan:
-        """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
+        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
         try:
             head = read_head(path, arrays[cls.kind])
             phases = tuple(str(name) for name in head["phases"])
@@ -282,7 +282,7 @@ def _plan_of(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], prefix
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SegmentedPlan(ConsecutivePlans):
-    """Motions that do the tasks one after the other, and reconfigurations between them while the tasks wait.
+    """Motions along consecutive segments of the tasks, with reconfigurations between them while the tasks pause.
 
     Attributes:
         machine: The arm.
@@ -327,7 +327,7 @@ class SegmentedPlan(ConsecutivePlans):
         return tuple(map(Piece, begins, plans, names))
 
     def task_share(self, times: Any) -> Array:
-        """Return the share of the tasks' own time that has passed; they wait during reconfigurations."""
+        """Return the fraction of the task time that has passed; it stands still during reconfigurations."""
         pieces = self.pieces
         waits = [piece.plan.horizon * all(piece.plan is not segment for segment in self.segments) for piece in pieces]
         ends, lost = [piece.begin + piece.plan.horizon for piece in pieces], np.cumsum(waits)
@@ -336,7 +336,7 @@ class SegmentedPlan(ConsecutivePlans):
         return np.asarray(np.minimum(task_times / self.task_horizon, 1.0))
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the number of reconfigurations without a motion, and by how much joints jump."""
+        """Return the number of reconfigurations without a motion, and how far joints jump."""
         if not self.reconfigurations:
             return []
         missing = [each for each in self.reconfigurations if each.motion is None]
@@ -381,7 +381,7 @@ class SegmentedPlan(ConsecutivePlans):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SegmentedPlan:
-        """Return the plan of the arrays of a file, which are not trusted; raise as `Plan.load`."""
+        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
         try:
             numbers = {name: arrays[f"segments.{name}"] for name in ARRAY_NAMES}
             head = unpack_record(read_head(path, arrays["segments"]), numbers)

@@ -80,7 +80,7 @@ class SolvedPlan(Plan):
 
     @property
     def t(self) -> Array:
-        """Times of the plan's own grid, with both copies of the times between parts. Shape (M,), s."""
+        """Times of the plan's grid, s; a time between two parts occurs twice. Shape (M,)."""
         if CLOCK in self.solution.states:
             return np.asarray(self.solution[CLOCK][:, 0])
         share = self.solution.t / self.solution.horizon
@@ -93,7 +93,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, np.concatenate([self.solution[own + part.suffix] for part in self.parts]))
 
     def _of_all_joints(self, name: str, values: Array) -> Array:
-        """Return values of the solution by name, (M, m), extended by the joints that stand still."""
+        """Return joint values of the solution by name, (M, m), extended by the joints that are held."""
         return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
 
     def _values_at(self, name: str, times: Array) -> Array:
@@ -141,7 +141,7 @@ class SolvedPlan(Plan):
     # ---- targets -----------------------------------------------------------------------------------------------------
 
     def with_targets(self, tasks: Sequence[TipTask]) -> SolvedPlan:
-        """Return the plan with the targets of the tasks that it does, at TARGET_TIMES times."""
+        """Return the plan with the task targets at TARGET_TIMES times."""
         times = np.linspace(0.0, self.horizon, TARGET_TIMES)
         clock = times
         if CLOCK in self.solution.states:
@@ -190,7 +190,7 @@ class SolvedPlan(Plan):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SolvedPlan:
-        """Return the plan of the arrays of a file, which are not trusted; raise as `load`."""
+        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
         solution = Solution.of_arrays(path, arrays)
         if "plan" not in arrays:
             words = f"{path} holds a solution and no plan; read it with Solution.load"
@@ -273,7 +273,7 @@ class SolvedPlan(Plan):
         return np.asarray((low + high) / 2)
 
     def _over(self, times: Array, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate each part at the fractions of the times (M,) that it covers; the later one where two meet."""
+        """Evaluate each part at the times (M,) that it covers; where two parts meet, the later one counts."""
         begins = [part.begin for part in self.parts]
         which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(self.parts) - 1)
         result: Array | None = None
@@ -292,7 +292,7 @@ def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PhasedPlan(SolvedPlan):
-    """Plan of several phases, one after the other, such as motions to several goals with different loads.
+    """Plan of several consecutive phases, such as motions to several goals with different loads.
 
     The suffix of a part is the name of its phase; `plan.solution.phase(name)` is the phase over its own time.
 
@@ -317,8 +317,8 @@ class PhasedPlan(SolvedPlan):
         return {name: self.solution.phase(name) for name in self.phases}
 
     @cached_property
-    def _orders(self) -> dict[str, NDArray[np.intp]]:
-        """Places of the joints of the first machine among those of each phase, by phase. Shape (n,)."""
+    def _joint_indices(self) -> dict[str, NDArray[np.intp]]:
+        """Indices of the joints of the first machine in the joint vector of each phase, by phase. Shape (n,)."""
         orders = {}
         for name, machine in zip(self.phases, self.machines, strict=True):
             joints = list(machine.robot.joint_names)
@@ -327,7 +327,7 @@ class PhasedPlan(SolvedPlan):
 
     @property
     def t(self) -> Array:
-        """Times of the grids of all phases, with both copies of the times between them. Shape (M,), s."""
+        """Times of the grids of all phases, s; a time between two phases occurs twice. Shape (M,)."""
         return np.concatenate([part.begin + self._solutions[part.suffix].t for part in self.parts])
 
     def _values(self, name: str) -> Array:
@@ -342,8 +342,8 @@ class PhasedPlan(SolvedPlan):
         )
 
     def _in_order(self, part: Part, name: str, values: Array) -> Array:
-        """Return values of joints in the order of the first machine."""
-        return values if name == "base" else values[:, self._orders[part.suffix]]
+        """Return joint values of a phase in the joint order of the first machine."""
+        return values if name == "base" else values[:, self._joint_indices[part.suffix]]
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
         poses = np.full((len(times), 7), np.nan)
@@ -351,7 +351,7 @@ class PhasedPlan(SolvedPlan):
         which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(begins) - 1)
         for number in np.unique(which):
             machine, rows = self.machines[number], which == number
-            order = np.argsort(self._orders[self.phases[number]])
+            order = np.argsort(self._joint_indices[self.phases[number]])
             poses[rows] = tip_poses(machine, bases[rows], joints[rows][:, order])
         return poses
 

@@ -144,7 +144,7 @@ def fastest_motion_near(
 
 
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
-    """Return the fastest feasible motion of a sequence of linear programs, and the last trust region.
+    """Run the sequence of linear programs; return the fastest feasible motion and the last trust region.
 
     It is the last motion if none is feasible. The sequence ends when the duration decreases by less than `least_gain`.
 
@@ -180,7 +180,7 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Motion with its linearised constraints.
+    """Iterate of the search: a motion with its linearised constraints.
 
     Attributes:
         points: Control points. Shape (K, n).
@@ -198,7 +198,7 @@ class _State:
 
     @property
     def excess(self) -> float:
-        """Largest usage beyond what is allowed, 0 if the motion is feasible."""
+        """Largest violation of a limit, relative to it; 0 if the motion is feasible."""
         return max(0.0, float((self.usages - self.allowed).max(initial=0.0)))
 
     @property
@@ -206,7 +206,7 @@ class _State:
         return self.excess == 0
 
     def merit(self, penalty: float) -> float:
-        """Return the logarithm of the duration and a penalty of the excess."""
+        """Return the merit of the iterate: the logarithm of the duration plus a penalty of the excess."""
         return float(np.log(self.duration)) + penalty * self.excess
 
 
@@ -215,7 +215,7 @@ _Rows: TypeAlias = tuple[Any, Array, Array, float]
 
 
 class _Search:
-    """Linear programs for the motions along one spline basis."""
+    """Sequence of linear programs for motions in one spline basis."""
 
     def __init__(self, limits: MotionLimits, path: Array, settings: FastestMotionSettings) -> None:
         self.limits, self.settings, bounds = limits, settings, limits.bounds
@@ -243,7 +243,7 @@ class _Search:
         self._fix_ends()
 
     def _breaks(self, path: Array) -> Array:
-        """Return the bounds of the intervals, shares of the duration: short ones at both ends, equal ones between."""
+        """Return the knots as fractions of the duration: short intervals at both ends, equal ones between."""
         bounds, settings = self.limits.bounds, self.settings
         with np.errstate(divide="ignore", invalid="ignore"):
             build_up = np.where(np.isfinite(bounds.acceleration), bounds.acceleration / bounds.jerk, 0.0).max()
@@ -260,12 +260,15 @@ class _Search:
         return np.asarray(breaks / breaks[-1])
 
     def _values(self, places: Array, order: int) -> Any:
-        """Return the matrix from control points to values of a derivative at places. Shape (M, K)."""
+        """Return the matrix that maps control points to values of a derivative at given places. Shape (M, K)."""
         knots = self.knots[order : len(self.knots) - order]
         return BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
 
     def _fix_ends(self) -> None:
-        """Set the free control points, and the others as `fixed` + T `moving`: at rest, or at a constant velocity."""
+        """Fix the control points that the end conditions determine, as `fixed` + T `moving`; the others are free.
+
+        A joint is at rest at an end, or has a given velocity there and no acceleration.
+        """
         free = np.ones((self.count, self.size), dtype=bool)
         self.fixed, self.moving = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
         away = np.append(0.0, np.cumsum(-1 / self.derivatives[1].diagonal()))[: self.degree]  # equal at both ends
@@ -281,7 +284,9 @@ class _Search:
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
     def guess(self, path: Array) -> tuple[Array, float]:
-        """Return control points along a path, and a duration that keeps the limits if both ends are at rest."""
+        """Return initial control points along a path, and a duration with which a motion from rest to rest keeps its
+        rate limits.
+        """
         p, ramp = self.degree, self.settings.ramp
         at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
         top = 1 / (1 - ramp)
@@ -297,7 +302,7 @@ class _Search:
         return points, duration if duration > 0 else 1.0
 
     def evaluate(self, points: Array, duration: float) -> _State:
-        """Return the state of control points, of which the free ones count, and a duration."""
+        """Evaluate the constraints of a motion, given its duration and its free control points."""
         inner = points.ravel()[self.free]
         points = (self.fixed + duration * self.moving).ravel()
         points[self.free] = inner
@@ -351,7 +356,7 @@ class _Search:
             yield sign * matrix, sign * by_duration.ravel(), sign * (values * scale).ravel(), (1 - share) / 2
 
     def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
-        """Return rows by all control points, from their weights in each row (R, K) and slopes by joints (R, n)."""
+        """Return constraint rows by control points, from weights (R, K) and derivatives by joints (R, n)."""
         weights = sp.coo_array(basis)
         row = np.repeat(weights.row, self.size)
         column = (weights.col[:, None] * self.size + np.arange(self.size)).ravel()
@@ -384,7 +389,7 @@ class _Search:
         return self.evaluate(moved.reshape(self.count, self.size), state.duration * (1 + change[count]))
 
     def add_places(self, state: _State) -> bool:
-        """Add the closest approaches between the samples that are not clear enough; return whether there were any."""
+        """Add constraints at collisions between the samples; return whether there were any."""
         dense = np.linspace(0.0, 1.0, self.settings.finer * (len(self.breaks) - 1) + 1)[1:-1]
         at, pair, distance, _ = self.limits.motions.near_pairs(self._values(dense, 0) @ state.points, 0.0)
         worst = {each: at[pair == each][distance[pair == each].argmin()] for each in np.unique(pair).tolist()}
@@ -392,7 +397,7 @@ class _Search:
         return bool(worst)
 
     def motion(self, state: _State) -> ConstantJerkMotion:
-        """Return the motion of a state."""
+        """Return an iterate as a motion of constant jerk."""
         duration = state.duration
         joints, rates = (self._values(self.breaks[:-1], order) @ state.points for order in (0, 1))
         accelerations = (self.derivatives[2] @ state.points)[: len(self.breaks) - 1] / duration**2

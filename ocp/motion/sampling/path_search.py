@@ -50,7 +50,7 @@ class RandomTreeSettings:
 
 @dataclass(frozen=True, eq=False)
 class TreeSearch:
-    """Request for paths between a start and goals.
+    """Request for a path between a start and goals by random trees.
 
     Attributes:
         motions: Proofs of clearance.
@@ -67,7 +67,7 @@ class TreeSearch:
 
 
 class _Tree:
-    """Tree of configurations with the index of each one's parent."""
+    """Tree of configurations, each with the index of its parent."""
 
     def __init__(self, roots: Array) -> None:
         self.nodes, self.parents = roots.copy(), np.full(len(roots), -1)
@@ -94,7 +94,7 @@ class _Tree:
 def connect(
     search: TreeSearch, start: Array, goals: Array, *, random: np.random.Generator, most_samples: int
 ) -> Array | None:
-    """Return a path of straight motions, each proven clear, from the start to a goal; None if none was found.
+    """Return a path of straight motions, each proven collision-free, from the start to a goal; None if none is found.
 
     Args:
         search: Proofs of clearance, box and metric.
@@ -118,7 +118,7 @@ def connect(
         tree, other = trees[growing], trees[1 - growing]
         samples = lower + (upper - lower) * random.random((settings.batch, len(lower)))
         parents = tree.nearest(samples, search.scale)
-        nodes = _towards(tree.nodes[parents], samples, step, search.scale)
+        nodes = _step_towards(tree.nodes[parents], samples, step, search.scale)
         clear = search.motions.are_clear(tree.nodes[parents], nodes)
         new = tree.add(nodes[clear], parents[clear])
         if len(new):
@@ -133,14 +133,14 @@ def connect(
     return None
 
 
-def _towards(starts: Array, targets: Array, step: float, scale: Array) -> Array:
-    """Return configurations at most a step away from the starts (K, n), towards the targets."""
+def _step_towards(starts: Array, targets: Array, step: float, scale: Array) -> Array:
+    """Move configurations (K, n) towards their targets by at most one step, as in a random tree."""
     length = np.linalg.norm((targets - starts) * scale, axis=1, keepdims=True)
     return np.where(length <= step, targets, starts + (targets - starts) * (step / np.maximum(length, step)))
 
 
 def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step: float) -> tuple[int, int] | None:
-    """Grow a tree from new nodes towards targets (K, n) of the other tree, step by step.
+    """Extend a tree from new nodes towards targets (K, n) of the other tree, step by step.
 
     Returns:
         Which of the targets is reached, and the tree's node there; None if none is.
@@ -148,7 +148,7 @@ def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step
     places = np.arange(len(new))
     while len(places):
         starts = tree.nodes[new]
-        ends = _towards(starts, targets[places], step, search.scale)
+        ends = _step_towards(starts, targets[places], step, search.scale)
         clear = search.motions.are_clear(starts, ends)
         places, parents, ends = places[clear], new[clear], ends[clear]
         new = tree.add(ends, parents)
@@ -250,7 +250,7 @@ def _path_of(joints: Array, goals: Array, scale: Array) -> JointPath:
 
 
 def _with_path(search: TreeSearch, paths: list[JointPath], path: JointPath) -> list[JointPath]:
-    """Return the paths with another one, the shortest first, and of each class the shortest only."""
+    """Add a path to paths sorted by length; only the shortest one of each homotopy class stays."""
     others = []
     for other in paths:
         if other.goal == path.goal and same_class(search.motions, other.joints, path.joints, search.scale):

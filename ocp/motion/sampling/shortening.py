@@ -54,7 +54,7 @@ def path_length(path: Array, scale: Array) -> float:
 
 
 def points_along(path: Array, scale: Array, shares: Array) -> Array:
-    """Return the configurations of a path (M, n) at shares (K,) of its length. Shape (K, n)."""
+    """Return the configurations at fractions (K,) of the length of a path (M, n). Shape (K, n)."""
     places = _places(path, scale)
     return np.column_stack([np.interp(shares * places[-1], places, column) for column in path.T])
 
@@ -67,7 +67,7 @@ def shorten(
     random: np.random.Generator,
     settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
-    """Return a path of at most the same length, each straight motion of which is proven clear.
+    """Return a path that is not longer and consists of straight motions that are proven collision-free.
 
     Args:
         motions: Proofs of clearance.
@@ -95,7 +95,7 @@ def shorten(
 
 
 def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, *, rungs: int = 32) -> bool:
-    """Return whether straight motions from one path (M, n) to another (K, n) are clear at equal shares of their length.
+    """Return whether two paths are homotopic: straight motions between points at equal fractions are collision-free.
 
     Paths of one homotopy class need not satisfy this; paths that do can replace each other as guesses. They are
     compared at as many places as there are `rungs`.
@@ -105,12 +105,12 @@ def same_class(motions: StraightMotions, first: Array, second: Array, scale: Arr
 
 
 def _places(path: Array, scale: Array) -> Array:
-    """Return the length of the path up to each of its configurations. Shape (M,)."""
+    """Return the arc length at each configuration of the path. Shape (M,)."""
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1)))
 
 
 def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Callable[[Array], Array]) -> Array:
-    """Return the path of least cost from the first to the last corner along clear straight motions between corners.
+    """Return the lowest-cost path from the first to the last corner along collision-free straight motions.
 
     Args:
         motions: Proofs of clearance.
@@ -136,7 +136,7 @@ def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Ca
 
 
 def _cut(motions: StraightMotions, path: Array, scale: Array, random: np.random.Generator, batch: int) -> Array:
-    """Return the path with clear shortcuts between random places, those that save most first."""
+    """Replace parts of the path by straight shortcuts between random points, those that save most first."""
     places = _places(path, scale)
     ends = np.sort(random.random((batch, 2)) * places[-1], axis=1)
     begins, stops = (points_along(path, scale, ends[:, side] / places[-1]) for side in (0, 1))
@@ -199,7 +199,7 @@ def optimise_length(
     limits: tuple[Array, Array],
     settings: LengthSettings = LengthSettings(),
 ) -> Array:
-    """Return a path of at most the same length, each straight motion of which is proven clear.
+    """Minimise the length of a path locally; each straight motion of the result is proven collision-free.
 
     Args:
         motions: Proofs of clearance.
@@ -232,7 +232,7 @@ def optimise_length(
 
 
 def _resampled(motions: StraightMotions, path: Array, scale: Array, count: int) -> Array:
-    """Return a path of about equal motions that are proven clear, with old corners where that needs them.
+    """Divide the path into about equal motions that are proven collision-free; keep old corners where necessary.
 
     It is the old path if the motions cannot be proven, since halves of a proven motion need not be.
     """
@@ -288,7 +288,7 @@ def _step(
 
 
 def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
-    """Return the point z nearest to a target with rows z >= least, which z = 0 satisfies."""
+    """Project a target onto the polyhedron rows z >= least, which contains z = 0."""
     needed = least - rows @ target
     active = np.flatnonzero(needed > -np.inf)
     if not len(active) or needed.max() <= 0:
@@ -304,7 +304,7 @@ def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
 
 
 def _clear_step(motions: StraightMotions, chain: Array, moved: Array, smallest: float) -> tuple[Array, Array]:
-    """Return the chain with steps shortened, each by itself, so that its motions stay clear, and the shares taken."""
+    """Shorten each step of the chain until its motions are collision-free; return the chain and the fractions used."""
     shares = np.ones(len(chain))
     while True:
         trial = chain + shares[:, None] * (moved - chain)

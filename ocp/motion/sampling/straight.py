@@ -53,7 +53,7 @@ class StraightMotionSettings:
 
 
 class StraightMotions:
-    """Proofs of clearance of straight motions of a machine on a fixed base among fixed obstacles.
+    """Collision proofs for straight joint motions of a machine on a fixed base among fixed obstacles.
 
     Attributes:
         scene: Collision scene; None if nothing can collide.
@@ -95,7 +95,7 @@ class StraightMotions:
         return at, pair, gap - self.scene.clearance, gradient
 
     def are_clear(self, starts: Array, ends: Array) -> NDArray[np.bool_]:
-        """Return which straight motions are proven clear. Shape (M,).
+        """Return which straight motions are proven collision-free. Shape (M,).
 
         Args:
             starts, ends: Configurations at both ends. Shape (M, n), rad or m.
@@ -123,7 +123,7 @@ class StraightMotions:
         clear: NDArray[np.bool_],
         intervals: tuple[Indices, Array, Array],
     ) -> None:
-        """Halve intervals until all pairs are decided; mark motions that are not clear.
+        """Halve intervals until all pairs are decided; mark motions that may collide.
 
         Args:
             lines: Starts and ends of the motions.
@@ -173,7 +173,7 @@ class StraightMotions:
             middle = np.concatenate([middle[kept] - shift, middle[kept] + shift])
 
     def _frames_on(self, lines: tuple[Array, Array], motion: Indices, places: Array) -> Frames:
-        """Return the frames of the bodies at places, shares from 0 to 1, of motions (K,)."""
+        """Return the frames of the bodies on straight motions (K,), each at a fraction from 0 to 1 of its length."""
         starts, ends = lines[0][motion], lines[1][motion]
         return self._frames(starts + places[:, None] * (ends - starts))
 

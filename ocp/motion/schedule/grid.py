@@ -94,7 +94,7 @@ class Grid:
     sharp: bool = True
 
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
-        """Return the rows at the first and at the last place of the intervals between two nodes. Shape (N,) each.
+        """Return the limit rows at the start and at the end of the intervals between two nodes. Shape (N,) each.
 
         They are evaluated on request: all rows of a long path would fill the memory.
         """
@@ -107,7 +107,7 @@ class Grid:
         return rows.take(slice(count)), rows.take(right)
 
     def parts(self) -> list[tuple[int, int]]:
-        """Return the first and last nodes of parts of bounded length."""
+        """Split the nodes into blocks of bounded size; return the first and last node of each."""
         ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]
         return list(pairwise(ends))
 
@@ -163,7 +163,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
 def _halved(
     path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, requested: tuple[Array, Array]
 ) -> _Cells:
-    """Return the intervals between places, halved until their rows vary almost linearly.
+    """Halve the intervals between places until their limit rows vary almost linearly.
 
     Args:
         path, limits, joints: As for `make_grid`.
@@ -192,7 +192,7 @@ def _halved(
 
 
 def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
-    """Return the first nodes of a path without halving: enough to find where limits are active."""
+    """Return initial nodes of a path, not halved, that are fine enough to find where limits are active."""
     bounds = np.asarray(path.bounds, dtype=float)
     s = np.unique(np.concatenate([path.sample_distances(SETTINGS.cells, 1), bounds]))
     requested = np.asarray(path.by_piece(limits.speed)[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
@@ -210,7 +210,7 @@ def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:
 
 
 def _separate(places: Array, nodes: Array) -> Array:
-    """Return the places in order, without those too close to a node or to one another."""
+    """Return the places in order, without those too close to a node or to each other."""
     s = np.unique(places)
     for _ in range(3):
         gap = np.diff(s)
@@ -232,7 +232,7 @@ def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Arr
 
 
 def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
-    """Return which intervals have middles that differ from the mean of their ends, at the top speed. Shape (N,)."""
+    """Return which intervals have middle values that differ from the mean of their ends, at top speed. Shape (N,)."""
     sides = left, middle, right
     kinds = (
         # by the squared speed, as the rows of speed are in the program
@@ -274,7 +274,7 @@ def _acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> 
 
 
 def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
-    """Return squared speeds at nodes that keep the caps and the accelerations in the intervals."""
+    """Return the highest squared speeds at nodes within the caps and the acceleration bounds of the intervals."""
     gain = np.concatenate([[0.0], np.cumsum(2 * rates * np.diff(distance))])
     squares = caps.copy()
     squares[[i for i, rest in zip((0, -1), at_rest, strict=True) if rest]] = 0.0
@@ -284,7 +284,7 @@ def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tupl
 
 
 def _time_nodes(cells: _Cells, length: float) -> Array:
-    """Return nodes that split intervals into ones that are short in time too and shrink towards both ends."""
+    """Split intervals so that they are also short in time and shrink towards both ends; return the nodes."""
     _, top, rates, acceleration, jerk = cells
     s = np.append(cells.begin, length)
     caps = np.minimum(np.append(top, np.inf), np.insert(top, 0, np.inf)) ** 2

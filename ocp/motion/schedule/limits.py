@@ -170,7 +170,7 @@ class LineLimits:
         return np.asarray(self._of_joints(count, ("torque",))[0])
 
     def _of_joints(self, count: int, names: tuple[str, ...]) -> Array:
-        """Return the limits of these names for `count` joints, checked."""
+        """Check the limits with these names and return them for `count` joints."""
         joints = self.joints or JointLimits()
         rows = []
         for name in names:
@@ -208,7 +208,7 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, ze
 
 
 def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> JointPath | None:
-    """Return the limited joints, None if no joint is limited.
+    """Check the limits of a path and return the limited joints, or None.
 
     Raises:
         ProblemError: Path, limits or joints have the wrong type, or there are joint limits without joints.
@@ -256,7 +256,7 @@ def check_joints(joints: JointPath) -> None:
 
 
 def rates_along(joints: JointPath, distance: Array) -> JointRates:
-    """Return the joints at distances (M,), checked.
+    """Return joints and their derivatives at distances (M,), after checks.
 
     Raises:
         ProblemError: A shape is not (M, n), or a value is not finite.
@@ -298,7 +298,7 @@ def curvature_along(path: PathLike, distance: Array) -> Array:
 
 
 def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
-    """Return the torques at distances (M,), checked.
+    """Return torque coefficients at distances (M,), after checks.
 
     Raises:
         ProblemError: The joints have no torques, a shape is not (M, n), or a value is not finite.
@@ -344,7 +344,7 @@ def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -
 
 
 class Rows(NamedTuple):
-    """Rows of the limits at S places.
+    """Coefficients of all limits at S places of a path.
 
     Attributes:
         speed: k of each row. Shape (S, K), s/m.
@@ -357,11 +357,13 @@ class Rows(NamedTuple):
     jerk: Array
 
     def take(self, places: NDArray[np.intp] | slice) -> Rows:
-        """Return the rows at some of the places."""
+        """Return the coefficients at some of the places."""
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
     def steady(self) -> tuple[Array, NDArray[np.intp]]:
-        """Return the greatest steady speed at each place, m/s, and its row in `limit_names`. Shape (S,) each."""
+        """Return the greatest steady speed at each place, m/s, and the index of its limit in `limit_names`. Shape (S,)
+        each.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             available = 1 - np.sign(self.acceleration[:, :, 1]) * self.acceleration[:, :, 2]
             speeds = np.concatenate(
@@ -379,11 +381,13 @@ class Rows(NamedTuple):
 
     @property
     def total(self) -> int:
-        """Number of rows at a place."""
+        """Number of limit rows at a place."""
         return sum(kind.shape[1] for kind in self)
 
     def usage(self, motion: LineMotion) -> Array:
-        """Return each row of `limit_names` over its limit, signed, in a motion at the places. Shape (S, K + L + P)."""
+        """Return the value of each limited quantity over its limit, signed, in a motion at the places. Shape (S, K + L
+        + P).
+        """
         v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
         acceleration, jerk = self.acceleration, self.jerk
         return np.concatenate(
@@ -421,7 +425,7 @@ def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[s
 
 
 def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
-    """Return the number of rows of acceleration that are torques; they come last."""
+    """Return the number of acceleration rows that are torques; they come last."""
     if joints is None or not np.isfinite(limits.torques(len(joints.names))).any():
         return 0
     return len(joints.names)
@@ -430,7 +434,7 @@ def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
 def limit_rows(
     path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array, *, torques: bool = True
 ) -> Rows:
-    """Return the rows of `limit_names` at distances (S,) of a path, with zero torques unless `torques`.
+    """Return the limit coefficients at distances (S,) of a path; torques are zero unless `torques`.
 
     Raises:
         ProblemError: Curvature or joints are not finite, as at a singular arm, or have a wrong shape.
@@ -449,7 +453,7 @@ def limit_rows(
 
 
 def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
-    """Return the rows at distances of one block."""
+    """Return the limit coefficients at the distances of one block."""
     speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _names_by_kind(limits, joints))
     if not s.size:
         return Rows(speed[:, :, 0], acceleration, jerk)

@@ -69,7 +69,7 @@ SETTINGS = ScheduleSettings()
 
 
 def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
-    """Return a motion from rest to rest within the limits of the line and of centripetal acceleration.
+    """Return a motion from rest to rest within line limits and below the maximum velocity curve.
 
     Raises:
         ProblemError: The curvature is not finite, or no plan below the curve is found.
@@ -85,7 +85,7 @@ def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfil
 
 
 def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
-    """Return distances, the permitted speed at them (G,), and the requested one in each interval (G - 1,)."""
+    """Return distances, the maximum velocity curve there (G,), and the requested speed between them (G - 1,)."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
@@ -104,7 +104,7 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
 def _refined(
     path: PathLike, limits: LineLimits, s: Array, bounds: Array, of_pieces: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the `_velocity_curve` over some segments, refined from these distances until they resolve it."""
+    """Refine the distances of the `_velocity_curve` over some segments until they resolve it."""
 
     def permitted_at(places: Array) -> Array:
         with np.errstate(divide="ignore"):
@@ -126,10 +126,9 @@ def _refined(
 
 
 def _unresolved(length: float, s: Array, permitted: Array, requested: Array, acceleration: float) -> NDArray[np.bool_]:
-    """Return which intervals do not resolve the permitted speed where it matters.
+    """Return which intervals are too coarse for the permitted speed where it limits the motion.
 
-    It matters where it is near or below the requested speed and a motion slow enough in the neighbourhood can get near
-    it.
+    It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.
     """
     low = np.minimum(permitted[:-1], permitted[1:])
     gain = 2 * acceleration * (s - s[0])
@@ -154,7 +153,7 @@ def _constant_zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
 
 
 def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, everywhere: bool) -> bool:
-    """Lower speeds, in place, where a profile is faster than permitted; return whether there was any."""
+    """Lower zone speeds, in place, where a profile is too fast; return whether there was any."""
     speeds = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // BLOCK_SIZE + 1)])
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
@@ -182,7 +181,7 @@ def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfil
 
 @dataclass(frozen=True)
 class Dip:
-    """Stretch in which the schedule is slower than requested.
+    """Part of a path on which the schedule is slower than requested.
 
     Attributes:
         start, end: Distances along the path, m.
@@ -302,7 +301,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
 
 def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
-    """Return the line profile where it keeps all limits, and the fastest motion elsewhere."""
+    """Return the speed profile of the line where it satisfies all limits, and the fastest motion elsewhere."""
     count = len(grid.requested)
     if line_profile is None:
         return fastest_profile(Stretch(grid, 0, count))
@@ -359,7 +358,7 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
 
 
 def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float) -> list[tuple[int, int]]:
-    """Return first and last nodes of the stretches to plan again, between steady speeds or the ends of the path.
+    """Return first and last nodes of the stretches to plan again; they end at steady speeds or at path ends.
 
     They extend beyond the violated intervals by `extent` times the length of a ramp to rest.
     """
@@ -386,7 +385,7 @@ def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], e
 
 
 def _reaches_speed_at_ends(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
-    """Return whether a motion keeps the requested speed near the ends of its stretch, except at path ends."""
+    """Return whether a motion has the requested speed near the ends of its stretch, except at path ends."""
     length = motion.distance[-1] - motion.distance[0]
     for node, inside in ((first, first), (last, last - 1)):
         if node in (0, len(grid.requested)):

@@ -122,7 +122,7 @@ class SpeedProfile:
         return motion
 
     def at_distance(self, distance: ArrayLike) -> LineMotion:
-        """Return the motion at distances from the start, shape (M,), m; the first time if the line rests there.
+        """Return the motion at distances from the start, shape (M,), m; at a place of rest, its first time.
 
         Raises:
             ProblemError: A distance is nan, or off the path by more than rounding.
@@ -135,7 +135,7 @@ class SpeedProfile:
         return self._motion(segment, np.where(s == length, np.diff(self.t)[-1], inside))
 
     def peaks(self) -> LineMotion:
-        """Return the motion at all candidates for the largest speed: segment bounds and zeros of the acceleration."""
+        """Return the motion at all candidates for the largest speed: segment ends and zeros of the acceleration."""
         with np.errstate(divide="ignore", invalid="ignore"):
             zero = -self.acceleration[:-1] / self.jerk
         inside = np.flatnonzero((zero > 0) & (zero < np.diff(self.t)))
@@ -165,7 +165,7 @@ class SpeedProfile:
         return LineMotion(self.t[segment] + t, s + distance, np.maximum(speed, 0.0), acceleration, j)
 
     def _time_inside(self, segment: NDArray[np.intp], distance: Array) -> Array:
-        """Return the times (M,) after the start of segments (M,) at which these cover distances (M,)."""
+        """Return the times (M,) after the start of segments (M,) at which given distances (M,) are covered."""
         v, a, j, high = self.speed[segment], self.acceleration[segment], self.jerk[segment], np.diff(self.t)[segment]
         even = (a == 0) & (j == 0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -193,7 +193,7 @@ class SpeedProfile:
 
 
 def profile_through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
-    """Return segments of constant jerk through nodes: two of equal duration between neighbours, one next to rest.
+    """Return two segments of constant jerk between each two nodes, and one beside a node at rest.
 
     Over a distance h, T follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, which two jerks of T/2 each satisfy.
 

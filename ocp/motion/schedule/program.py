@@ -76,7 +76,7 @@ INTERIOR = ProgramSettings()
 
 
 class SplineRows(NamedTuple):
-    """Rows c . (x, x', x'') <= bound, or <= bound x^(-1/2).
+    """Constraint rows c . (x, x', x'') <= bound, or <= bound x^(-1/2) for jerk limits.
 
     Attributes:
         interval: Interval of the place. Shape (M,).
@@ -105,7 +105,7 @@ class Spline:
         self.share = before / self.width
 
     def part(self, at: NDArray[np.intp]) -> Spline:
-        """Return the spline of some coefficients as if they were neighbours."""
+        """Return the spline with a subset of the coefficients, as if these were neighbours."""
         part, last = copy(self), len(self.h)
         part.h = self.h[np.minimum(at[:-2], last - 1)]
         nodes = np.minimum(at[:-1], last)
@@ -122,9 +122,7 @@ class Spline:
         return np.append(x - self.share * self.width * slope / 2, x[-1])
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
-        """Return (x, x', x'') at places as linear functions of the three coefficients of their interval. Shape (3, 3,
-        M).
-        """
+        """Return (x, x', x'') at places as linear functions of their interval's three coefficients. Shape (3, 3, M)."""
         h, share = self.h[interval], self.share[interval]
         inside = fraction * h
         first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
@@ -156,8 +154,8 @@ class Program(NamedTuple):
     fixed: NDArray[np.intp]
 
     def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
-        """Return the program of some intervals (B,) between fixed motions, and the indices of its coefficients in this
-        one.
+        """Return the program of some intervals (B,) with fixed motion between them, and the indices of its
+        coefficients.
         """
         count = len(self.spline.h)  # stretches are concatenated, with two intervals without rows between them
         cuts = np.flatnonzero(np.diff(free) > 1)
@@ -185,7 +183,7 @@ class Program(NamedTuple):
 
 
 class _EndConditions:
-    """Coefficients that are not free: fixed ones, and the outer one at rest, which follows from its neighbour."""
+    """End conditions on the coefficients: fixed ones, and one that follows from its neighbour at rest."""
 
     def __init__(self, program: Program) -> None:
         n, h, (first, last) = len(program.upper), program.spline.h, program.rest
@@ -201,7 +199,7 @@ class _EndConditions:
         return b
 
     def follow(self, change: Array) -> None:
-        """Make a change of the coefficients satisfy the end conditions, in place."""
+        """Adjust a change of the coefficients to the end conditions, in place."""
         change[self.fixed] = 0.0
         for outer, inner, ratio in self.sides:
             change[outer] = ratio * change[inner]
@@ -213,8 +211,7 @@ class _EndConditions:
         slope[self.fixed] = 0.0
 
     def band(self, main: Array, first: Array, second: Array) -> Array:
-        """Return the diagonals of a Hessian reduced to the free coefficients, for `_BandSolver`; fixed ones are
-        decoupled.
+        """Return the diagonals of a Hessian, reduced to the free coefficients, for `_BandSolver`.
 
         Args:
             main, beside, apart: Its diagonals by all coefficients, changed in place. Shape (n,), (n - 1,), (n - 2,).
@@ -251,12 +248,12 @@ class _BandSolver:
         raise np.linalg.LinAlgError("the equations of a step are not positive definite")
 
     def solve(self, right: Array) -> Array:
-        """Return the solution for a right side."""
+        """Solve the factorised linear system for a right-hand side."""
         return np.asarray(scipy.linalg.lapack.dpbtrs(self.factors, right, lower=1)[0])
 
 
 class _Constraints:
-    """All constraints of a program: positive coefficients, their upper bounds, and the rows, those of jerk last.
+    """Constraints of a program: positive coefficients, their upper bounds, and the rows, jerk limits last.
 
     Values of constraints, shape (M,), are in this order.
 
@@ -295,7 +292,7 @@ class _Constraints:
         self.middles = INTERIOR.block * np.arange(self.blocks.max() + 1) + (INTERIOR.block - 1) / 2
 
     def evaluate(self, b: Array) -> tuple[Array, Array]:
-        """Return violations and scales of the constraints; update the tangents of the rows of jerk at b."""
+        """Return violations and scales of the constraints at b, and linearise the jerk constraints there."""
         coefficients, sharp = self._coefficients(b), self.alone + self.jerk
         at = _weighted_sum(self.square, [each[self.jerk :] for each in coefficients])
         root = self.sharp / np.sqrt(at)
@@ -315,14 +312,14 @@ class _Constraints:
         return self._all_values(change, _weighted_sum(self.gradients, self._coefficients(change)))
 
     def gathered(self, values: Array) -> Array:
-        """Return the sum of values times gradients, by coefficient. Shape (N + 2,)."""
+        """Return the sum of row gradients, weighted by values, for each coefficient. Shape (N + 2,)."""
         out = self._spread(self.gradients * values[self.alone :])
         out[1:-1] -= values[: self.count]
         out[self.bounded] += values[self.count : self.alone]
         return out
 
     def squares(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return the diagonals of the sum of values times squared gradients. Shape (N + 2,), (N + 1,), (N,)."""
+        """Return the diagonals of the weighted sum of outer products of gradients. Shape (N + 2,), (N + 1,), (N,)."""
         g = self.gradients
         pulled = g * values[self.alone :]
         main = self._spread(g * pulled)
@@ -339,7 +336,7 @@ class _Constraints:
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
     def _spread(self, values: Iterable[Array]) -> Array:
-        """Return sums over the rows of each interval, by its first coefficient (or pair), its second one and so on.
+        """Sum over the rows of each interval and assign the sums to its coefficients, or pairs of these.
 
         Shapes (M - `alone`,) each to (N + number of values - 1,).
         """
@@ -350,7 +347,7 @@ class _Constraints:
         return out
 
     def longest(self, rates: Array, share: float, of_positive: float) -> Array:
-        """Return steps, at most 1, that vary slowly along the path, one for each interval. Shape (N,).
+        """Return step lengths of at most 1, one per interval, that vary slowly along the path. Shape (N,).
 
         Args:
             rates: Relative rates of change of values that stay positive. Shape (M,).
@@ -397,7 +394,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
     gap, size = constraints.evaluate(b)
     slack = np.maximum(-gap, 0.1 * size)
     slack[:count] = b[1:-1]
-    multiplier = center * _time(spline.share, cost_weights, b)[0] / len(gap) / slack
+    multiplier = center * _travel_time(spline.share, cost_weights, b)[0] / len(gap) / slack
 
     def solve(right: Array) -> Array:
         """Return the change of the coefficients."""
@@ -418,7 +415,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
             gap, size = constraints.evaluate(b)
             np.maximum(slack, -gap, out=slack)
             violation = _violations(gap, slack, size, count)
-        time, slope, *curvature = _time(spline.share, cost_weights, b)
+        time, slope, *curvature = _travel_time(spline.share, cost_weights, b)
         mean, worst = float(slack @ multiplier) / len(gap), float(violation.max())
         if not np.isfinite(mean + worst) or mean * len(gap) > INTERIOR.diverged * time:
             break
@@ -481,14 +478,17 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
 
 def _violations(gap: Array, slack: Array, size: Array, count: int) -> Array:
-    """Return violations beyond the slacks over the bounds; zero for the first `count`, which stay positive."""
+    """Return the relative violations that the slacks leave; zero for the first `count` rows, which always hold."""
     violation = (gap + slack) / size
     violation[:count] = 0.0
     return np.asarray(violation)
 
 
-def _time(share: Array, weights: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
-    """Return the time, its gradient and the three diagonals of its Hessian, from weights at the nodes."""
+def _travel_time(share: Array, weights: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
+    """Return the travel time, its gradient and the bands of its Hessian (main and two upper diagonals).
+
+    `weights` are the path lengths that the quadrature points represent.
+    """
     x = b[:-1] + share * np.diff(b)
     times = weights / np.sqrt(x)
     first, second = -0.5 * times / x, 0.75 * times / (x * x)

@@ -75,7 +75,7 @@ def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -
 
 
 def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Return the greatest speed (m/s) to which the speed can change within a distance (m), from ramp to ramp.
+    """Return the greatest speed (m/s) that can be reached within a distance (m), with zero acceleration at both ends.
 
     This is the inverse of ramp_distance; the same holds for slowing down from that speed.
     """
@@ -145,7 +145,7 @@ def fastest_motion(distance: float, first: float, last: float, limits: tuple[flo
 
 
 def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
-    """Return whether a motion ends at its distance and last speed, and keeps the speeds between the limits."""
+    """Return whether a motion ends at its distance and final speed, with all speeds within the limits."""
     s, v, a = 0.0, first, 0.0
     error = ROUNDING_SHARE * top
     for t, j in phases:
@@ -157,7 +157,7 @@ def _closes(phases: Phases, distance: float, first: float, last: float, top: flo
 
 
 def _two_ramps(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
-    """Return a ramp up to the highest speed that the distance allows, that speed, and a ramp down."""
+    """Return a motion that ramps up to the highest possible speed, keeps it, and ramps down."""
 
     def needed(peak: float) -> float:
         return ramp_distance(first, peak, acceleration, jerk) + ramp_distance(peak, last, acceleration, jerk)
@@ -219,7 +219,7 @@ def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
 
 
 def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
-    """Return the motions through the zones as one profile, from speeds at the bounds. Shape (Z + 1,), m/s."""
+    """Return the motions through all zones as one profile, given the speeds at their bounds. Shape (Z + 1,), m/s."""
     counts = np.array([len(phases) for phases in motions])
     durations, jerks = np.array([phase for phases in motions for phase in phases]).reshape(-1, 2).T
     if not durations.size or not np.isfinite(durations).all():
@@ -241,7 +241,7 @@ def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
 
 
 def _limited(speed: float, other_end: float, length: float, limits: tuple[float, float, float]) -> float:
-    """Return the greater speed at one end of a zone, lowered to what can be reached from the other end."""
+    """Return the greater speed at the ends of a zone, lowered to what is reachable from the other end."""
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
@@ -290,7 +290,7 @@ def reachability_passes(distance: Array, caps: Array, *, p: Array, q: Array, low
 
 
 def _feasible_squares(p: Array, q: Array, low: Array, high: Array, caps: Array) -> tuple[Array, Array]:
-    """Return bounds of the squared speeds at which the rows of an interval leave some acceleration. Shape (N,) each."""
+    """Return bounds of the squared speeds for which the rows of an interval permit an acceleration. Shape (N,) each."""
     floor, ceiling = np.zeros(len(p)), caps.copy()
     count = p.shape[1]
     with np.errstate(divide="ignore", invalid="ignore"):

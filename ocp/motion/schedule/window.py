@@ -56,7 +56,7 @@ Motion: TypeAlias = tuple[Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Part of a grid between two nodes.
+    """Part of a path grid between two nodes.
 
     Attributes:
         grid: The whole grid.
@@ -72,7 +72,7 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Window(Stretch):
-    """Stretch that is solved at once.
+    """Part of a stretch that is solved at once.
 
     Attributes:
         rows: Rows where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
@@ -102,7 +102,7 @@ class Window(Stretch):
         return cls(grid, first, last, ends, every, bends)
 
     def fine_rows(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
-        """Return rows at the inner ends of the `fine` parts of some intervals, place by place.
+        """Return the limit rows at the inner points that divide some intervals into `fine` parts, point by point.
 
         Shape ((SETTINGS.fine - 1) B,); with torques, which take longest, on request.
         """
@@ -119,7 +119,7 @@ class Window(Stretch):
 
     @property
     def torques(self) -> slice:
-        """Slice of the rows of `limit_names` that are torques."""
+        """Slice of `limit_names` that are torques."""
         speed, acceleration, _ = (kind.shape[1] for kind in self.rows[0])
         count = torque_rows(self.grid.limits, self.grid.joints)
         return slice(speed + acceleration - count, speed + acceleration)
@@ -131,7 +131,7 @@ class Window(Stretch):
 
 
 class Margins(NamedTuple):
-    """Shares of the bounds of speed, and of each row of acceleration and jerk, that intervals may use.
+    """Fractions of the speed, acceleration and jerk limits that each interval may use.
 
     Shape (N,), (N, L) and (N, P).
     """
@@ -141,17 +141,17 @@ class Margins(NamedTuple):
     jerk: Array
 
     def take(self, part: slice) -> Margins:
-        """Return views of the margins of some intervals."""
+        """Return the margins of some intervals, as views."""
         return Margins(*(margin[part] for margin in self))
 
     def times(self, share: Array) -> Margins:
-        """Return the margins times a share for each interval. Shape (N,)."""
+        """Return the margins multiplied by a factor for each interval. Shape (N,)."""
         return Margins(self.speed * share, self.acceleration * share[:, None], self.jerk * share[:, None])
 
 
 @dataclass(eq=False)
 class EnforcedRows:
-    """Rows that are enforced in a window, and their margins.
+    """Limit rows that are enforced in a window, with their margins.
 
     Attributes:
         margins: Shares of the bounds, lowered where bounds are violated although their rows are enforced there.
@@ -169,7 +169,7 @@ class EnforcedRows:
 
     @classmethod
     def build(cls, window: Window) -> EnforcedRows:
-        """Return the initial state of a window."""
+        """Return the initial set of enforced rows of a window."""
         count, rows = window.last - window.first, window.rows[0]
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
@@ -177,12 +177,12 @@ class EnforcedRows:
         return cls(margins, times, held, np.ones((len(HELD), count)))
 
     def part(self, first: int, last: int) -> EnforcedRows:
-        """Return a view of some intervals."""
+        """Return a view of the intervals from `first` up to `last`."""
         part = slice(first, last)
         return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
 
     def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
-        """Enforce rows close to their bounds, there and in neighbouring intervals, and some row of jerk in each.
+        """Enforce rows close to their bounds, also in neighbouring intervals, and one jerk row in each interval.
 
         Args:
             used, values: Usage of the limits, see `limit_usage`.
@@ -196,7 +196,7 @@ class EnforcedRows:
         self.hold_jerk(jerks)
 
     def release(self, values: Array, jerks: Array, seam: int) -> None:
-        """Release rows that stay away from their bounds, keeping some row of jerk in every interval.
+        """Release rows far from their bounds, but keep at least one jerk row in every interval.
 
         Intervals shared with the previous or next window keep all rows.
         """
@@ -205,13 +205,13 @@ class EnforcedRows:
         self.hold_jerk(jerks)
 
     def hold_jerk(self, jerks: Array) -> None:
-        """Enforce some row of jerk in every interval, since otherwise the second derivative is unbounded there."""
+        """Enforce at least one jerk limit in every interval; without one the second derivative is unbounded there."""
         first = self.held.shape[3] - jerks.shape[1]
         sign, free = np.nonzero(~self.held[:, :, :, first:].any(axis=(0, 3)))
         self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce rows (2, N, K + L + P) where they are used most; return which of them already were."""
+        """Enforce rows (2, N, K + L + P) where they are used most; return which of them were enforced before."""
         already = np.zeros(rows.shape, dtype=bool)
         sign, at, row = np.nonzero(rows)
         place = (values[:, at, row] * (1 - 2 * sign)).argmax(axis=0)
@@ -220,7 +220,7 @@ class EnforcedRows:
         return already
 
     def lower(self, used: Array, held: NDArray[np.bool_], rows: Rows, seam: int) -> None:
-        """Lower bounds violated by enforced rows (those of speed always are), more each time.
+        """Lower the bounds of violated rows that are enforced already, further at each call.
 
         Args:
             used: Usage of the limits. Shape (2, N, K + L + P).
@@ -243,7 +243,7 @@ class EnforcedRows:
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
-    """Return the motion with squared speeds, and slopes with jerk limits, at the first nodes of a stretch."""
+    """Return the motion with given squared speeds, and slopes with jerk limits, at the first nodes of a stretch."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     v = np.sqrt(x)
     if slope is not None:
@@ -255,7 +255,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProf
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return rows over their limits in some intervals (B,): the largest in each direction, and those at `HELD` places.
+    """Return use of limits in some intervals (B,): the largest in each direction, and that at the `HELD` places.
 
     Shapes (2, N, K + L + P) and (4, N, K + L + P), zero in the other intervals.
 
@@ -334,7 +334,7 @@ def _parabola_errors(rows: list[Array]) -> Array:
 
 
 def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
-    """Return rows that seem to be kept but may be violated between three places. Shape (N, K + L + P)."""
+    """Return rows that look satisfied but may be violated between three places. Shape (N, K + L + P)."""
     v, a, j = (
         np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
         for kind in ("speed", "acceleration", "jerk")
@@ -352,7 +352,7 @@ def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[Lin
 def _fine_usage(
     window: Window, profile: SpeedProfile, intervals: NDArray[np.intp], f: Array, known: Array, torques: bool
 ) -> Array:
-    """Return the largest usage in each direction in some intervals, from closely spaced places. Shape (2, B, R).
+    """Return the largest use of each limit, in both directions, by dense samples of some intervals. Shape (2, B, R).
 
     Args:
         window, profile: As for `limit_usage`.
@@ -381,7 +381,7 @@ def _fine_usage(
 
 
 def _vertex(values: Array, places: list[Array]) -> Array:
-    """Return the vertex of parabolas through three values if it lies between the first and the last, else the first."""
+    """Return the vertex of a parabola through three values if it lies between them, else the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -77,7 +77,7 @@ class CellSettings:
 
 
 def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArray[np.bool_]:
-    """Return which local motions (K,) reach their poses and follow most of the prescribed velocities."""
+    """Return which local motions (K,) reach their poses and track most of the prescribed velocities."""
     count = len(motions[0].cost)
     missing, prescribed = np.zeros(count), np.zeros(count)
     for stretch, motion in zip(request.stretches, motions, strict=True):
@@ -112,7 +112,7 @@ class _Layer:
 
 
 class CellSearch:
-    """Search for motions from some configurations through all stretches of a request."""
+    """Cell search for motions of a floating machine from start configurations through all stretches of a request."""
 
     def __init__(self, request: PlanRequest, configurations: Array, settings: CellSettings = CellSettings()) -> None:
         """
@@ -151,7 +151,7 @@ class CellSearch:
             max_cost, full = wanted, wanted >= max_cost / 2
 
     def _check_reach(self, error: DeadEnd) -> None:
-        """Raise Unreachable if a pose out of reach explains the dead end."""
+        """Raise Unreachable if the search ends because a pose is out of reach."""
         request, machine, bounds = self.request, self.request.machine, self.request.bounds
         if request.start is None or not isinstance(machine, FreeFloating):
             return  # the path of the centre of mass depends on the start
@@ -163,7 +163,7 @@ class CellSearch:
             raise locate_error(request, unreachable, unreachable.time) from error
 
     def _cost_estimate(self, configurations: Array) -> float:
-        """Estimate the cost of the tasks as if the machine moved as well as at the start at all times."""
+        """Estimate the cost of the tasks, as if the machine always moved as well as at the start."""
         request, total, count = self.request, 0.0, self._settings.seats
         base = np.tile(request.base, (len(configurations), 1))
         for stretch, kinematics in zip(request.stretches, self._kinematics, strict=True):
@@ -178,7 +178,7 @@ class CellSearch:
 
 
 class _CellPass:
-    """One pass of the search.
+    """One pass of the cell search, with limited cost and a limited number of states.
 
     Attributes:
         cost: Cost of the best path.
@@ -238,7 +238,7 @@ class _CellPass:
     def _expand(
         self, kinematics: ReducedKinematics, layer: _Layer, task: TaskKinematics, time: float, limited: bool
     ) -> tuple[_Layer | None, Counter[tuple[int, int]]]:
-        """Return the best state of each cell that is reached from a layer by a time, or None if there is none.
+        """Propagate the states of a layer to a time; return the best state of each cell, or None if there is none.
 
         Also count, if the joints are `limited`, the states that each limit of each joint stops, by (joint,
         `LimitSide`).
@@ -282,7 +282,7 @@ class _CellPass:
         return expanded.select(best), limit_counts
 
     def _sample_self_motions(self, count: int, r: int) -> Array:
-        """Return self-motions to be tried from each state, as coordinates in its null space. Shape (count, C, r)."""
+        """Sample self-motions of each state, as coordinates in its null space. Shape (count, C, r)."""
         levels = self._settings.levels
         share = np.linspace(-1.0, 1.0, levels)
         rates = self._max_rate * np.sign(share) * share**2  # finer near zero, where most motions are
@@ -295,7 +295,7 @@ class _CellPass:
         return np.asarray(samples)
 
     def _best_of_cells(self, base: Array, joints: Array, cost: Array, resize: bool) -> Indices:
-        """Return the cheapest state of each cell; cells grow to fit the number of states, or shrink with `resize`."""
+        """Return the lowest-cost state of each cell; `resize` lets cells grow or shrink to the number of states."""
         attitude = base[:, 2:] if base.shape[1] == 3 else 2 * base[:, 3:]
         points = np.hstack([joints * self.root, attitude * np.sqrt(np.mean(self.root**2))])
         hash_weights = np.random.default_rng(0).uniform(1.0, 2.0, size=points.shape[1])
@@ -319,7 +319,7 @@ class _CellPass:
         return best
 
     def _valid_states(self, kinematics: ReducedKinematics, layer: _Layer) -> NDArray[np.bool_]:
-        """Return which states keep tilt limits and clearance. Shape (K,)."""
+        """Return which states satisfy tilt limits and clearance. Shape (K,)."""
         valid, times = np.isfinite(layer.cost), np.full(len(layer.cost), layer.time)
         if kinematics.equations is not None and len(times):
             cone_violations = kinematics.equations.cone_violations(times, layer.base, layer.joints)
@@ -333,7 +333,7 @@ class _CellPass:
         return np.asarray(valid)
 
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
-        """Return states corrected to the poses of tasks that begin now."""
+        """Correct states to the poses of tasks that begin now, and return them."""
         states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
         corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
         base, joints, pose_error = corrected
@@ -344,7 +344,7 @@ class _CellPass:
         return _Layer(layer.time, base, joints, cost, np.arange(len(cost))).select(reached)
 
     def _dead_end_error(self, layer: _Layer, limit_counts: Counter[tuple[int, int]]) -> DeadEnd:
-        """Return the error that no state can be continued, with the limit that stops most of them."""
+        """Return the error that no state can be continued, with the limit that stops most states."""
         bounds, names = self.request.bounds, self.request.machine.robot.joint_names
         details: dict[str, Any] = {"time": layer.time, "name": "task"}
         words = "the joint rates would diverge: the tasks lead beyond the workspace or through a singularity"
@@ -388,7 +388,7 @@ class _CellPass:
         return motions
 
     def _local_motion(self, layers: Sequence[_Layer], paths: Indices) -> LocalMotion:
-        """Return the motions along paths, rows of states (L, K), through some layers."""
+        """Return the motions along paths through layers, given as rows of states (L, K)."""
         times = np.array([layer.time for layer in layers])
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)

@@ -1,4 +1,4 @@
-"""Atlas of the self-motion manifold: charts that cover all configurations which do a task at some time samples.
+"""Atlas of the self-motion manifold: charts that cover all configurations that perform a task at some time samples.
 
 If a task leaves r of n joint directions free, the configurations that do it at one time form curves (r = 1), surfaces
 (r = 2) or isolated points (r = 0). A chart consists of a configuration, an orthonormal basis of the tangent space
@@ -89,21 +89,21 @@ class Charts:
 
     @property
     def spans(self) -> Array:
-        """How far the boxes reach from their centres in each joint. Shape (N, n)."""
+        """Extent of the boxes from their centres in each joint. Shape (N, n)."""
         reach = np.maximum(np.abs(self.low), np.abs(self.high))
         return np.asarray((np.abs(self.tangents) * reach[:, None]).sum(axis=2) + self.max_deviation)
 
     @property
     def max_deviation(self) -> Array:
-        """How far the manifold leaves the boxes in each joint. Shape (N, n)."""
+        """Largest deviation of the manifold from its linear boxes in each joint. Shape (N, n)."""
         return np.asarray(np.abs(self.deviations).max(axis=1, initial=0.0))
 
     def points(self, places: Array) -> Array:
-        """Return the points (N, n) of the tangent spaces at places (N, r) in the boxes."""
+        """Return the points (N, n) of the tangent spaces at chart coordinates (N, r)."""
         return np.asarray(self.centers + np.einsum("knr,kr->kn", self.tangents, places))
 
     def curvature(self) -> tuple[Array, Array]:
-        """Fit a quadratic form to the deviations of the manifold from the boxes by least squares.
+        """Fit quadratic forms to the deviations of the manifold from the linear boxes by least squares.
 
         Returns:
             The form, (N, n, r, r), and the residuals at the rim, (N, c, n).
@@ -147,7 +147,7 @@ class SplitCharts(NamedTuple):
 
 
 class _Edges(NamedTuple):
-    """Points of the manifold at the edges of charts.
+    """Points of the manifold at the edges of charts, from which it is explored further.
 
     Attributes:
         layer, owners: Indices of the time samples and rows of the charts. Shape (E,).
@@ -200,7 +200,7 @@ class SelfMotionManifolds:
         return ik_branches(self.equations, self.space.lower, self.space.upper)
 
     def seeds(self, index: int, limits: Any, seed: int) -> Array:
-        """Return configurations (K, n) of a time sample within limits, on as many components as possible.
+        """Return configurations (K, n) of a time sample within limits that lie on as many components as possible.
 
         A solver lists some of every branch. Iterations from random starts add others, unless all are listed.
 
@@ -288,7 +288,7 @@ class SelfMotionManifolds:
         return self._clip_boxes(layer, joints, tangents, radii, deviations), points
 
     def _clip_boxes(self, layer: Indices, joints: Array, tangents: Array, radii: Array, deviations: Array) -> Charts:
-        """Return charts whose boxes end where no configuration beyond lies within the joint limits."""
+        """Shrink the boxes of charts so that they end where the joint limits do."""
         deviations = np.nan_to_num(deviations)
         max_deviation = np.abs(deviations).max(axis=1, initial=0.0)
         reach = np.abs(tangents) * radii[:, None, None]
@@ -305,7 +305,7 @@ class SelfMotionManifolds:
         return Charts(layer, joints, tangents, radii, -low, high, deviations)
 
     def _deviations(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
-        """Return the points of the manifold at the rims of boxes, nan if there are none, and their offsets."""
+        """Return the manifold points at the rims of boxes, nan where there are none, and their offsets."""
         rim = _rim(tangents.shape[2])
         tangent_points = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
         projected, converged = self.project(np.repeat(layer, len(rim)), tangent_points.reshape(-1, joints.shape[1]))
@@ -319,7 +319,7 @@ class SelfMotionManifolds:
         return np.asarray(reached & (charts.low <= charts.high).all(axis=1))
 
     def cover(self, layer: Indices, joints: Array, radius: float, max_charts: int) -> Charts:
-        """Cover all components connected with some configurations, within a time sample or across samples.
+        """Cover all manifold components that are connected with given configurations, within or across time samples.
 
         Args:
             layer, joints: Indices of time samples and configurations on their manifolds. Shapes (M,), (M, n).
@@ -349,7 +349,7 @@ class SelfMotionManifolds:
         return charts
 
     def _grow(self, atlas: Charts | None, layer: Indices, joints: Array, radius: float, max_charts: int) -> Charts:
-        """Return the atlas extended by the components of some configurations at their time samples."""
+        """Extend the atlas by the components that contain given configurations, at their time samples."""
         first = 0 if atlas is None else len(atlas)
         charts, edges = self._new_charts(layer, joints, np.full(len(layer), radius), None, first)
         charts = charts if atlas is None else concatenate([atlas, charts])
@@ -379,7 +379,7 @@ class SelfMotionManifolds:
         return charts
 
     def split(self, charts: Charts) -> SplitCharts:
-        """Replace charts by charts of half the radius; a chart whose halves cannot be projected stays."""
+        """Replace charts by charts of half the radius; a chart stays if its halves cannot be projected."""
         r = charts.tangents.shape[2]
         signs = np.array(list(product((-0.5, 0.5), repeat=r))).reshape(2**r, r)
         offsets = charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)
@@ -448,7 +448,7 @@ class SelfMotionManifolds:
         return covered
 
     def _thin_out(self, layer: Indices, joints: Array, radii: Array) -> Indices:
-        """Return the rows of configurations that are not within the radius of an earlier one."""
+        """Return the rows of configurations that are outside the radius of all earlier ones."""
         if not len(layer):
             return np.zeros(0, dtype=np.intp)
         pairs = self.space.tree(joints, layer).query_pairs(float(radii.max()), output_type="ndarray")
@@ -464,7 +464,7 @@ class SelfMotionManifolds:
     def _new_charts(
         self, layer: Indices, joints: Array, radii: Array, like: Array | None, first: int = 0
     ) -> tuple[Charts, _Edges]:
-        """Return charts at configurations, and their edge points within limits; `first` is the first row."""
+        """Return charts at configurations, and their edge points within limits, numbered from `first`."""
         if like is None:
             chosen = self._thin_out(layer, joints, radii)
             layer, joints, radii = layer[chosen], joints[chosen], radii[chosen]

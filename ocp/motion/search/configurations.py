@@ -44,7 +44,7 @@ REACH_TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class PlannerSettings:
-    """Settings of `ocp.motion.plan.plan`, chosen by the problem families of tests/sweep where no law gives them.
+    """Settings of `ocp.motion.plan.plan`; where theory gives no value, the problem families of tests/sweep do.
 
     Attributes:
         ik_starts: Random starts of inverse kinematics.
@@ -183,14 +183,14 @@ class PlanRequest:
 
     @cached_property
     def turning_joints(self) -> NDArray[np.intp]:
-        """Numbers of the joints of which whole turns are to be chosen; none if the start is given."""
+        """Indices of the joints that may start in several full turns; none if the start is given."""
         if self.start is not None:
             return np.zeros(0, dtype=np.intp)
         return turning_joints(self.machine.robot, self.bounds.lower, self.bounds.upper)
 
 
 def start_configurations(request: PlanRequest) -> Array:
-    """Return joint vectors at the start: collision-free ones first, then by condition. Shape (K, n)."""
+    """Return joint vectors at the start: collision-free ones first, then the best conditioned. Shape (K, n)."""
     if request.start is not None:
         return request.start[None]
     first = [request.tasks[i] for i in request.stretches[0].tasks if request.tasks[i].is_pose]
@@ -235,7 +235,7 @@ def check_clear_start(request: PlanRequest, configurations: Array) -> None:
 
 
 def count_clear_configurations(request: PlanRequest, time: float) -> int | Unreachable | None:
-    """Count the collision-free configurations that do the tasks at a time (s), or return why there is none.
+    """Count collision-free configurations that satisfy the tasks at a time (s), or say why none does.
 
     The result is None if it would prove nothing: no task gives a pose then, or the base may be elsewhere.
     """
@@ -279,7 +279,7 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
 
 
 def _track_within(request: PlanRequest, configurations: Array, lower: Array, upper: Array) -> list[LocalMotion]:
-    """Return local motions within limits, with the least damping for which one of them reaches its poses."""
+    """Return local motions within limits, with the least damping at which one of them reaches its poses."""
     settings, least_damped = request.settings, list[LocalMotion]()
     for damping in settings.dampings:
         motions: list[LocalMotion] = []
@@ -305,7 +305,7 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
 
 
 def _within_limits(request: PlanRequest, configurations: Array, motions: Sequence[LocalMotion]) -> list[LocalMotion]:
-    """Return motions shifted by whole turns into the limits, or tracked again; see `local_motions_from`."""
+    """Shift motions by full turns into the limits, or track them again; see `local_motions_from`."""
     turning, bounds = request.turning_joints, request.bounds
     limits = bounds.lower[turning], bounds.upper[turning]
     joints = np.concatenate([motion.joints for motion in motions], axis=1)[:, :, turning]
@@ -329,7 +329,7 @@ def _within_limits(request: PlanRequest, configurations: Array, motions: Sequenc
 def _joints_at_new_poses(
     request: PlanRequest, stretch: Stretch, base: Array, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the nearest joints (K, n) that meet the poses which begin in a stretch and the tasks until then."""
+    """Return the nearest joints (K, n) that satisfy the poses that begin in a stretch, and the earlier tasks."""
     before = request.stretches[request.stretches.index(stretch) - 1]
     if not any(request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)):
         return joints
@@ -354,7 +354,7 @@ def largest_pose_errors(motions: Sequence[LocalMotion]) -> list[float]:
 
 
 def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
-    """Raise Unreachable if no joints reach a pose that all motions miss; only for a fixed base."""
+    """Raise Unreachable if a pose that all motions miss is out of reach; only for a fixed base."""
     if request.machine.base_size:
         return
     limits, starts, seed = request.limits.joints, request.settings.ik_starts, request.seed
@@ -369,7 +369,7 @@ def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
 
 
 def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unreachable:
-    """Return the error with its time and the positions of the tasks then."""
+    """Add the time of an error, and the task positions at that time, to its message."""
     places = []
     for number, task in enumerate(request.tasks):
         if task.position is not None and task.begin <= time <= task.end:
@@ -381,7 +381,7 @@ def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unrea
 
 @dataclass(frozen=True)
 class ReachSettings:
-    """Settings of the search for the end of the reach.
+    """Settings of the search for the time at which tasks leave the reachable workspace.
 
     Attributes:
         intervals: Intervals of the stretch of time, at whose ends the reach is evaluated before the bisection.
@@ -401,7 +401,7 @@ REACH = ReachSettings()
 
 @dataclass
 class _Reach:
-    """IK solutions of tasks over time, each continued from those of the time before."""
+    """IK solutions of tasks over time, each continued from the solutions at the previous time."""
 
     equations: TaskEquations
     options: dict[str, Any]
@@ -411,7 +411,7 @@ class _Reach:
         self._targets = self.equations.target_function()
 
     def unreachable_at(self, time: float, limits: bool) -> Unreachable | None:
-        """Return the error at a time, or None and keep the solutions."""
+        """Update the solutions to a time; return the error if there are none, else None."""
         targets = np.array(self._targets(time)).ravel()
         options = {**self.options, "options": IkOptions(limits=limits, tolerance=REACH.tolerance)}
         for starts in (0, self.options["starts"]):
@@ -438,7 +438,7 @@ def end_of_reach(
     starts: int,
     seed: int,
 ) -> Unreachable | None:
-    """Return an error that names the end of the reach of a machine on a fixed base, and what ends it.
+    """Return an error that says where tasks leave the workspace of a machine on a fixed base, and why.
 
     The end is the first time at which no joint positions within the limits do the tasks. A joint ends the reach if it
     is at its limit there and the pose would be within reach without limits. Otherwise the tasks' Jacobian is singular.
@@ -490,7 +490,7 @@ def end_of_reach(
 
 
 def _joint_at_limit(machine: Machine, joints: Array) -> tuple[str, dict[str, Any]]:
-    """Return the words and fields about the joint that is nearest to its limit, if the limits end the reach."""
+    """Describe the joint nearest to its limit, if limits end the reach; return words and error fields."""
     moving = machine.robot.moving_joints
     limits = [min(joint.lower, joint.upper, key=lambda x: abs(x - q)) for joint, q in zip(moving, joints, strict=True)]
     nearest = int(np.abs(joints - limits).argmin())

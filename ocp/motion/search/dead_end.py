@@ -1,4 +1,4 @@
-"""Diagnosis of a task that no motion does: where motions end, what obstructs them, and by how much to relax the task.
+"""Diagnosis of a task without a motion: where motions end, what obstructs them, and by how much to relax the task.
 
 From the first time sample on, configurations are propagated from chart to chart by all steps within the limits. Each
 chart keeps the configuration whose path has the largest clearance. The task ends at the last sample that is reached,
@@ -54,7 +54,7 @@ class RelaxationKind(StrEnum):
 
 
 class Obstruction(NamedTuple):
-    """What obstructs motions where none can be continued.
+    """Constraint that prevents all motions from continuing.
 
     Attributes:
         kind: Position limit of a joint; largest step of a joint until the next sample; collision of two bodies; a pose
@@ -88,7 +88,7 @@ class Obstruction(NamedTuple):
 
 
 class Relaxation(NamedTuple):
-    """Motion that would do the task if a requirement were relaxed.
+    """Motion that would be possible if one requirement were relaxed.
 
     Attributes:
         kind: Deviation of the tip's position, m; rotation of its axes, rad; or the clearance that remains, m.
@@ -111,7 +111,7 @@ class Relaxation(NamedTuple):
 
 
 class DeadEnd(SolveError):
-    """No motion does the tasks, or a search over all motions found none.
+    """Error: no motion satisfies the tasks, or the search over all motions found none.
 
     Attributes:
         time: Time, s, or waypoint number, from which no motion can be continued.
@@ -149,7 +149,7 @@ class DeadEnd(SolveError):
 def dead_end(
     search: AtlasSearch, unit: str = "{:.4g} s", proven: bool = True, segments: int | None = None
 ) -> DeadEnd | None:
-    """Diagnose where the motions of a search end; return None if one comes through.
+    """Diagnose where the motions of a search end; None if a motion reaches the last sample.
 
     Args:
         unit: Format of its times.
@@ -189,7 +189,7 @@ def dead_end(
 
 
 class _Propagation:
-    """Propagation of configurations from sample to sample, one per chart.
+    """Configurations propagated from sample to sample, one for each chart that is reached.
 
     Attributes:
         layers: Charts of each sample, no wider than steps, including those in collision.
@@ -229,7 +229,9 @@ class _Propagation:
         return np.array(path[::-1])
 
     def _propagate(self, graph: ChartGraph, k: int) -> None:
-        """Step from a sample to the charts of the next one: from the largest clearance first, then the nearest."""
+        """Step from a sample to the charts of the next one; try configurations with large clearance first, then near
+        ones.
+        """
         space, limit, successor = self.search.space, self.search.limits[k], k + 1
         reached = np.isfinite(self.joints[k][:, 0])
         parts = [(i[reached[i]], j[reached[i]]) for i, j in graph.edges(k, successor)]
@@ -250,7 +252,7 @@ class _Propagation:
             self._record(successor, j[chosen], self.joints[k][i[chosen]] + displacement[chosen], i[chosen])
 
     def _record(self, k: int, charts: Indices, joints: Array, parents: Indices) -> None:
-        """Record configurations that do the task within limits and have more clearance than the recorded ones."""
+        """Record configurations that satisfy the task and the limits with more clearance than the recorded ones."""
         search = self.search
         sample, required = search.samples[k], self.required
         if k == 0 and search.start is not None:
@@ -277,7 +279,7 @@ class _Propagation:
 
 
 def _fine_charts(search: AtlasSearch) -> list[Charts]:
-    """Return charts of all configurations, split until steps cross them or there are too many."""
+    """Return charts of all configurations, split until steps can pass them or there are too many."""
     layers = search.atlas
     reach = search.limits.max(axis=1) / 2
     max_radius = np.minimum(np.append(reach, np.inf), np.append(np.inf, reach))
@@ -290,7 +292,7 @@ def _fine_charts(search: AtlasSearch) -> list[Charts]:
 
 
 def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruction]:
-    """Return what obstructs motions at the last sample reached: of each kind and name the least, the least first."""
+    """Return the smallest obstruction of each kind and name at the last sample reached, sorted by size."""
     space, scene, last = search.space, search.scene, front.last
     names, n, next_sample = search.samples[0].manifolds.equations.machine.robot.joint_names, len(space.scale), last + 1
     before, targets, converged = _continuations(search, front)
@@ -310,7 +312,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
     largest = excess[np.arange(len(worst)), worst]
 
     def obstruction_of(row: int) -> Obstruction:
-        """Return the obstruction of a row, by its worst column."""
+        """Return the obstruction that a row describes, by its worst column."""
         kind, joint = divmod(int(worst[row]) - 1, n)
         current, target = before[row], targets[row]
         if worst[row] == 0:
@@ -339,7 +341,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
 
 
 def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return configurations reached last (M, n), their targets (M, n), and whether these do the task (M,).
+    """Return the last reached configurations (M, n), targets at the next sample (M, n), and which meet the task (M,).
 
     Targets are the projection of each configuration to the next sample, and the configurations there which keep all
     limits but are too far away.
@@ -365,7 +367,7 @@ def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Arr
 
 
 def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Array:
-    """Return a path (K, n) as far as it is reached, then straight to the nearest chart of the last sample."""
+    """Return a path (K, n) to the last sample reached, continued straight to the nearest chart of the final sample."""
     space, last, count = search.space, max(front.last, 0), len(search.times)
     distances = np.nan_to_num(space.length(front.joints[last] - blocked), nan=np.inf)
     path = front.path(last, int(distances.argmin())) if np.isfinite(distances).any() else blocked[None]
@@ -376,7 +378,7 @@ def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Ar
 
 
 def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
-    """Return a motion near a path (K, n) whose tips deviate or rotate as little as possible, all else kept; or None."""
+    """Return the motion near a path (K, n) with the least deviation or rotation of the tips, or None."""
     if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
     scene, pairs = search.scene, list[int]()
@@ -398,7 +400,7 @@ def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: Rela
 
 
 class _RelaxedProblem:
-    """Nonlinear program for the motion that deviates or rotates the tips least, with some pairs separated."""
+    """Nonlinear program that minimises how far the tips deviate or rotate, with some pairs of bodies separated."""
 
     def __init__(self, search: AtlasSearch, turning: bool, pairs: list[int]) -> None:
         self.search, self.turning = search, turning
@@ -442,7 +444,7 @@ class _RelaxedProblem:
         return float(np.arcsin(min(largest, 1.0))) if self.turning else largest
 
     def solve(self, path: Array, scale: float | None) -> Array | None:
-        """Return the best joints (K, n) near a guess, row by row without a scale; None if the solver fails."""
+        """Return the optimal joints (K, n) near a guess; None if the solver fails."""
         search, slack = self.search, ca.MX.sym("slack")
         if scale is None:
             relaxed_constraints, slack_guess = ca.vertcat(self._relaxed_rows - slack, -self._relaxed_rows - slack), 0.1

@@ -55,7 +55,7 @@ class JointSpace:
         self.upper = np.where(self.periodic, np.inf, upper)
 
     def difference(self, to: Array, start: Array) -> Array:
-        """Return to - start, (..., n), periodic joints by the shorter way round."""
+        """Return end minus start, (..., n); periodic joints go the shorter way round."""
         delta = to - start
         turns = delta[..., self.periodic]
         delta[..., self.periodic] = turns - FULL_TURN * np.round(turns / FULL_TURN)
@@ -66,12 +66,12 @@ class JointSpace:
         return np.asarray(np.linalg.norm(displacement * self.scale, axis=-1))
 
     def within(self, joints: Array) -> NDArray[np.bool_]:
-        """Return which configurations (..., n) keep the limits."""
+        """Return which configurations (..., n) are within the joint limits."""
         with np.errstate(invalid="ignore"):
             return np.asarray(((joints >= self.lower - TOLERANCE) & (joints <= self.upper + TOLERANCE)).all(axis=-1))
 
     def shift_turns(self, path: Array, lower: Array, upper: Array) -> Array:
-        """Return a path (K, n) shifted by full turns so that it lies in the middle between limits (n,)."""
+        """Shift a path (K, n) by full turns towards the middle of the limits (n,)."""
         limited = np.flatnonzero(self.periodic & np.isfinite(lower) & np.isfinite(upper))
         middle = (lower[limited] + upper[limited] - path[:, limited].min(axis=0) - path[:, limited].max(axis=0)) / 2
         shifted = path.copy()
@@ -85,7 +85,10 @@ class JointSpace:
         return scipy.spatial.cKDTree(self.tree_points(joints, layer), boxsize=periods)
 
     def tree_points(self, joints: Array, layer: Indices | None = None) -> Array:
-        """Return the coordinates of configurations (M, n) in the tree; layers lie MAX_STEP apart. Shape (M, 1 + n)."""
+        """Return the coordinates of configurations (M, n) in the nearest-neighbour tree. Shape (M, 1 + n).
+
+        The first coordinate separates configurations of different layers by MAX_STEP.
+        """
         wrapped = joints.copy()
         wrapped[:, self.periodic] = np.remainder(wrapped[:, self.periodic], FULL_TURN)
         return np.column_stack([np.zeros(len(joints)) if layer is None else MAX_STEP * layer, wrapped * self.scale])
@@ -93,7 +96,7 @@ class JointSpace:
 
 @dataclass(frozen=True, eq=False)
 class TasksWithFixedJoints(TaskEquations):
-    """Task equations with further rows that fix some joints at the last of the targets.
+    """Task equations with additional rows that fix some joints; their values are the last targets.
 
     Attributes:
         fixed: Indices of the fixed joints.
@@ -128,7 +131,7 @@ class TasksWithFixedJoints(TaskEquations):
 
 
 def turning_joints(robot: Robot, lower: Array, upper: Array) -> NDArray[np.intp]:
-    """Return the numbers of the joints that a whole turn does not change, though they have limits.
+    """Return the indices of limited joints that can make full turns.
 
     They are revolute, have no followers, and their limits are at least a whole turn apart.
 
@@ -143,13 +146,13 @@ def turning_joints(robot: Robot, lower: Array, upper: Array) -> NDArray[np.intp]
 
 
 def whole_turns_between(start: Array, end: Array, lower: Any = -np.inf, upper: Any = np.inf) -> Array:
-    """Return the whole turns within limits that move angles as close as possible to others, rad."""
+    """Return the full turns, within limits, that bring angles as close as possible to others, rad."""
     least, greatest = np.ceil((lower - start) / FULL_TURN), np.floor((upper - start) / FULL_TURN)
     return np.asarray(FULL_TURN * np.clip(np.round((end - start) / FULL_TURN), least, greatest))
 
 
 def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the whole turns that move motions to the middle of the limits, and for which joints they then fit.
+    """Return the full turns that bring motions to the middle of the limits, and for which joints they then fit.
 
     Args:
         joints: Motions of k joints. Shape (K, M, k), rad.
@@ -168,7 +171,7 @@ def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, 
 
 
 def all_turns(joints: Array, known: Array, lower: Array, upper: Array) -> Array:
-    """Return a configuration with all combinations of whole turns of its joints within the limits.
+    """Return a configuration in all combinations of full turns of its joints within the limits.
 
     Args:
         joints: Angles. Shape (k,), rad.

@@ -66,7 +66,7 @@ class Segment(NamedTuple):
 def fewest_segments(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
 ) -> tuple[list[Segment], float] | None:
-    """Return the fewest segments through all samples at least cost, and a lower bound of this cost.
+    """Return a division into the fewest segments, of lowest cost, and a lower bound of this cost.
 
     Args:
         gap: Samples from the end of a segment to the start of the next one: 1, or 0 if the samples stand for a
@@ -86,7 +86,10 @@ def fewest_segments(
     segments = dict[Span, Segment | None]()
 
     def best_chain(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
-        """Return the best chain by costs or bounds of known segments, with or without bounds of the others."""
+        """Return the lowest-cost chain of segments, by the costs or the lower bounds of the solved ones.
+
+        Segments not solved yet count with their lower bounds if `bounded`, and are left out otherwise.
+        """
         costs = {span: np.inf if s is None else s.bound if bounds else s.cost for span, s in segments.items()}
         return _best_chain(*ranges, gap, (lower_bounds if bounded else {}) | costs)
 
@@ -103,7 +106,7 @@ def fewest_segments(
 
 
 def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
-    """Return where each of the fewest segments may begin and end, or None if the motion cannot be continued somewhere.
+    """Return where each of the fewest segments may begin and end; None if some sample cannot be passed.
 
     Segments extended greedily forwards give the latest ends, those extended backwards the earliest starts.
     """
@@ -127,7 +130,7 @@ def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> 
 def segment_ends(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False
 ) -> list[int]:
-    """Return the last samples of segments that each go as far as possible.
+    """Return the last samples of greedy segments, each as long as possible.
 
     The list ends with the last sample of all, or with the one from which the motion cannot be continued.
 
@@ -148,7 +151,7 @@ def segment_ends(
 
 
 def _is_barred(span: Span, gap: int, barred: Collection[Span]) -> bool:
-    """Return whether a span has no segment: it is empty, or contains a barred span."""
+    """Return whether no segment can cover a span: the span is empty, or contains one known to be infeasible."""
     return (span[0] == span[1] and not gap) or any(span[0] <= bar[0] and bar[1] <= span[1] for bar in barred)
 
 
@@ -187,7 +190,7 @@ def _last_reachable(
 
 
 def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: list[range]) -> dict[Span, float]:
-    """Return lower bounds of the cost of segments by their spans; those without a path may be missing."""
+    """Return lower bounds of the cost of segments by their spans; spans without a path may be missing."""
     bounds = dict[Span, float]()
     for starts, ends in zip(start_ranges, end_ranges, strict=True):
         if len(ends) == 1:  # one backward sweep serves all starts
@@ -222,7 +225,7 @@ def _best_chain(
 
 @dataclass(frozen=True)
 class SectionSettings:
-    """Settings of the sections on which curves are covered.
+    """Settings of the sections on which self-motion manifolds are searched.
 
     Attributes:
         radii: Radii of the charts for few and for many samples, rad or m.
@@ -255,7 +258,7 @@ def section_values(
 
 
 class SectionSearch(AtlasSearch):
-    """Search for paths on sections of the manifolds, in which one joint has one of several values."""
+    """Search for paths on sections of self-motion manifolds, on which one joint has one of several values."""
 
     def __init__(self, *args: Any, joint: int, values: Array, radius: float, charts: int, **options: Any) -> None:
         """
@@ -270,7 +273,7 @@ class SectionSearch(AtlasSearch):
         super().__init__(*args, **options)
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return charts of the curves of each sample, possibly none; their layers number values first, then samples."""
+        """Return charts of the section curves of each sample; layers are sorted by value, then sample."""
         manifolds, count = self.samples[0].manifolds, len(self.samples)
         indices, value_count = [sample.row for sample in self.samples], len(self._values)
         targets = np.tile(manifolds.targets[indices], (value_count, 1))
@@ -290,7 +293,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return the path found and the best paths on which the joint keeps a value, by rising cost; the bound is 0."""
+        """Return the best path, and the best one for each constant joint value, by rising cost; the bound is 0."""
         count = len(self.samples)
         paths = [path for path in (self.find_path(np.inf)[1],) if path is not None]
         for value in range(len(self._values)):

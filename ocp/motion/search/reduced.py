@@ -42,7 +42,7 @@ SIMPSON_STEPS = 400
 
 
 class LimitSide(IntEnum):
-    """Limits of a joint: of its position, and of its rate."""
+    """One of the four limits of a joint: lowest and highest position, lowest and highest rate."""
 
     LOW = 0
     HIGH = 1
@@ -86,7 +86,7 @@ class TaskKinematics(NamedTuple):
         return solutions[:, :, 0]
 
     def null_rates(self, rates: Array) -> Array:
-        """Return the components of scaled rates (K, n) in the null space."""
+        """Project scaled rates (K, n) onto the null space of the tasks."""
         projected: Array = self.row_space @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None])
         return np.asarray(rates - projected[:, :, 0])
 
@@ -96,7 +96,7 @@ class TaskKinematics(NamedTuple):
 
 
 class ReducedKinematics:
-    """Kinematics of a machine that does tasks, or none.
+    """Kinematics of a machine under task constraints, if it has tasks.
 
     Attributes:
         rows: Number of task rows.
@@ -137,7 +137,7 @@ class ReducedKinematics:
         return TaskKinematics(right, error, base_jacobian, drift, row_space, lower, null)
 
     def speed(self, base: Array, joints: Array, time: float) -> Array:
-        """Estimate the squared scaled rates (K,) that the tasks require at a time, far from singularities."""
+        """Estimate the squared scaled rates (K,) that the tasks require at a time, if not near singularities."""
         if self.equations is None:
             return np.zeros(len(joints))
         tasks = [part.task for part in self.equations.bound]
@@ -165,7 +165,7 @@ class ReducedKinematics:
         interval: tuple[float, float],
         tolerance: float,
     ) -> tuple[Array, Array, Array]:
-        """Advance states over an interval of time by the midpoint rule with the self-motions of scaled rates (K, n).
+        """Advance states by the midpoint rule over a time step, with the self-motions of scaled rates (K, n).
 
         Returns:
             Base (K, b), joints (K, n) and remaining pose errors (K,), which are corrected down to the tolerance.
@@ -198,7 +198,7 @@ class ReducedKinematics:
         max_steps: int = 3,
         remaining: Callable[[TaskKinematics, Array], Array] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Correct the pose errors of states by Newton steps; returns as in `step`.
+        """Correct the pose errors of states by Newton steps; the results are those of `step`.
 
         Args:
             tolerance: Pose error, m and rad, below which the iteration ends.
@@ -286,7 +286,7 @@ def check_floating_reach(
     bounds: JointBounds,
     seed: int = 0,
 ) -> None:
-    """Raise Unreachable if a pose is out of reach for any attitude, by multi-start inverse kinematics.
+    """Raise Unreachable if a pose is out of reach for every attitude, by inverse kinematics from many starts.
 
     Velocities in world axes are integrated to positions; orientations from velocities are ignored.
 
@@ -381,7 +381,7 @@ def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float,
 
 
 def _base_about_center_of_mass(machine: FreeFloating, base: Array, start: Array, z: Any, time: float) -> Any:
-    """Return the base at a time for joints and attitude z that keeps the centre of mass on its line."""
+    """Return the base that keeps the centre of mass on its line, for a time, joints and attitude z."""
     robot, frame, n = machine.robot, machine.world_from_base(ca.DM(base)), machine.joint_size
     joints, attitude = z[:n], z[n:]
     momentum = np.zeros(6)

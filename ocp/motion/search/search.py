@@ -163,7 +163,7 @@ class AtlasSearch:
         return np.asarray((distances + charts.spans @ scene.levers.joints.T >= scene.clearance).all(axis=1))
 
     def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
-        """Return the graph of steps between charts, each step costing at most `max_costs`, one or shape (K - 1,)."""
+        """Return the graph of steps between charts, with steps that cost at most `max_costs`, one or shape (K - 1,)."""
         max_costs = np.broadcast_to(max_costs, len(self.times) - 1)
         return ChartGraph(self.space, layers, self._steps, max_costs)
 
@@ -184,7 +184,7 @@ class AtlasSearch:
         return part
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return paths (K, n) by rising cost of their steps, and a lower bound of the cost of all."""
+        """Return paths (K, n) by increasing cost of their steps, and a lower bound of the cost of all paths."""
         path, bound = self.solve(np.inf)
         return [] if path is None else [path], bound
 
@@ -195,7 +195,7 @@ class AtlasSearch:
     # ---- classes of motions ------------------------------------------------------------------------------------------
 
     def class_representatives(self, max_cost: float, include_costlier: bool = False) -> list[Array]:
-        """Return the lowest-cost path (K, n) of each class of motions, by rising cost.
+        """Return the lowest-cost path (K, n) of each class of motions, by increasing cost.
 
         A class is represented by a chart through which a motion costs less than through its neighbours. After `solve`,
         only classes are returned that its bound does not exclude.
@@ -238,7 +238,7 @@ class AtlasSearch:
         cost_to_come: list[QuadraticBounds],
         cost_to_go: list[QuadraticBounds],
     ) -> Array | None:
-        """Return the lowest-cost path through a chart, or None if it cannot be continued."""
+        """Return the lowest-cost path through a chart; None if the path cannot be continued."""
         slope = cost_to_go[k].slope[chart] + (cost_to_come[k].slope[chart] if k else 0.0)
         start_chart = graph.layers[k].select([chart])
         place = np.where(slope > 0, start_chart.low[0], np.where(slope < 0, start_chart.high[0], 0.0))
@@ -266,7 +266,7 @@ class AtlasSearch:
         return np.array([path[number] for number in range(last + 1)])
 
     def project_in_box(self, k: int, box: Charts, place: Array) -> Array | None:
-        """Return the configuration at a place (r,) in a box, or nearer to its middle; None if none is valid.
+        """Return the valid configuration at box coordinates (r,), or nearer to the middle; None if there is none.
 
         A box reaches beyond the joint limits by the deviation of the manifold.
         """
@@ -309,11 +309,11 @@ class AtlasSearch:
 
     @property
     def _target_share(self) -> float:
-        """Share of the cost of a path at which the bound is tight enough."""
+        """Fraction of a path's cost that the lower bound must reach."""
         return 1 - self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
 
     def _solve(self, max_cost: float) -> tuple[Array | None, float]:
-        """As `solve`, for paths whose steps all cost at most `max_cost`."""
+        """Return the best path and a lower bound, as `solve`, among paths whose steps each cost at most `max_cost`."""
         target = self._target_share
         layers, best_path = self.find_path(max_cost)
         if not layers:
@@ -355,7 +355,7 @@ class AtlasSearch:
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
-        """Return the charts through which paths may pass whose steps cost at most `max_cost`, and one such path.
+        """Return the charts that paths with steps of at most `max_cost` may pass, and one such path.
 
         The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """
@@ -378,17 +378,17 @@ class AtlasSearch:
             layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
     def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
-        """Return a path along the least cost-to-go, shortened; None if it cannot be continued or is too fast."""
+        """Return the path of least cost-to-go, shortened; None if it cannot be continued or is too fast."""
         chart = int(graph.minima(cost_to_go[0], 0).argmin())
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 
     def _can_split(self, layers: list[Charts], max_charts: int) -> bool:
-        """Return whether charts of half the radius are at most `max_charts`, and not too small."""
+        """Return whether the charts may be halved: their number stays within `max_charts`, and none gets too small."""
         count = sum(2 ** charts.tangents.shape[2] * len(charts) for charts in layers)
         return count <= max_charts and max(float(charts.radii.max()) for charts in layers) >= self.settings.finest
 
     def _path_through_centers(self, graph: ChartGraph) -> Array | None:
-        """Return the lowest-cost path through centres of charts; too long steps are penalised."""
+        """Return the lowest-cost path through chart centres; steps that are too long are penalised."""
         layers = graph.layers
         cost, back_pointers = np.where(self._is_clear(layers[-1].centers, len(layers) - 1), 0.0, np.inf), list[Array]()
         for k in range(len(layers) - 2, -1, -1):
@@ -447,7 +447,7 @@ class AtlasSearch:
         return self.samples[k].manifolds.split(numbered)
 
     def _refine(self, charts: Charts, k: int, values: QuadraticBounds) -> tuple[Charts, QuadraticBounds]:
-        """Return the collision-free half charts that replace charts, and bounds on them."""
+        """Halve charts and return the halves that are not in collision, with bounds on them."""
         halves = self._split(charts, k)
         free = self._collision_free(halves.charts, k)
         values, low, high = values.select(halves.owners[free]), halves.low[free], halves.high[free]

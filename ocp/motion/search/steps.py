@@ -51,19 +51,19 @@ class QuadraticBounds(NamedTuple):
         return cls(least, np.zeros((len(least), free)), np.zeros((len(least), free, free)))
 
     def minimum(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """Return the minima in boxes (N, r), and where they lie."""
+        """Return the minima over the boxes (N, r), and where they are attained."""
         least, place = least_in_box(self.slope, self.curve, low, high)
         return self.least + least, place
 
     def at(self, places: Array) -> Array:
-        """Return the values (N,) at places (N, r)."""
+        """Return the values (N,) at chart coordinates (N, r)."""
         products = np.einsum("nab,nb->na", self.curve, places)
         return np.asarray(self.least + (places * (self.slope + products / 2)).sum(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Steps of motions from each of K time samples to the next.
+    """Steps between consecutive time samples, with their limits and durations.
 
     Attributes:
         times: Times of the samples, s. Shape (K,).
@@ -77,7 +77,7 @@ class Steps:
 
 
 class CurvedCharts(NamedTuple):
-    """Charts with the quadratic deviation of the manifold, bends[t, t] / 2, and its residuals.
+    """Charts with the quadratic deviation of the manifold, t . bends . t / 2, and the residual of this approximation.
 
     Attributes:
         charts: N charts.
@@ -95,13 +95,15 @@ class CurvedCharts(NamedTuple):
 
 
 class StepCost(ABC):
-    """Lower bound of the cost of a straight step."""
+    """Cost of a straight step between configurations, with lower bounds over charts."""
 
     @abstractmethod
     def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
     ) -> tuple[Array, Array]:
-        """Return costs (P,) and places (P, r) of the cheapest steps into P charts, with centres `delta` (P, n) away."""
+        """Return cost (P,) and chart coordinates (P, r) of the cheapest steps into P charts at distances `delta` (P,
+        n).
+        """
 
     @abstractmethod
     def lower_bounds(
@@ -115,12 +117,12 @@ class StepCost(ABC):
 
     @abstractmethod
     def reach(self, cost: float, seconds: float) -> float:
-        """Return the largest length, in the metric of the charts, of a step that costs at most `cost`."""
+        """Return the greatest length, in the metric of the charts, of a step that costs at most `cost`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SquaredRates(StepCost):
-    """Integral of half the weighted squared rates.
+    """Cost of steps: integral of half the weighted squared rates.
 
     A step d has a component along the chart that it enters and one across it. Along the chart, the cost is convex in
     both places, and its minimum over the place in the box is quadratic in the starting place, by the multipliers of the
@@ -228,7 +230,7 @@ def _symmetric_support(points: Array, directions: Array) -> Array:
 def _nearest_places(
     projection: Array, rotation: Array, start_box: Array, end_box: Array, slope: Array, curve: Array, seconds: float
 ) -> tuple[Array, Array]:
-    """Return places in boxes (2, r, P) between which the step along the charts costs little."""
+    """Return chart coordinates (2, r, P) in the boxes of both ends, between which the step costs little."""
     square, middle = curve + np.eye(len(projection))[:, :, None] / seconds, (start_box[0] + start_box[1]) / 2
     end_place = _least_in_box((projection - _apply(rotation, middle)) / seconds + slope, square, *end_box)[1]
     slope, square = -_apply_transposed(rotation, projection + end_place), _multiply_transposed(rotation, rotation)
@@ -237,7 +239,7 @@ def _nearest_places(
 
 @dataclass(frozen=True, eq=False)
 class SquaredRateBounds:
-    """Bounds of steps and of the cost after them, by the starting place t in the box `start_box`.
+    """Lower bounds of the cost of steps and of what follows, as functions of the start t in the box `start_box`.
 
     The bound is least + slope . t + t . level . t / 2, plus the minimum over t' in the box `end_box` of
     v . v / (2 dt) + after . t' + t' . after_curve . t' / 2. Here v = projection - rotation . t + t' is the step along
@@ -271,12 +273,12 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + _rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Return the step without t', and the least cost after it with the place t' in the end box."""
+        """Return the step for t' = 0, and the minimum of the remaining cost over t' in the end box."""
         start = self.projection - _apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        """Return values (P,) and slopes (P, r) at places (P, r)."""
+        """Return values (P,) and slopes (P, r) of the bounds at chart coordinates (P, r)."""
         places = _rows_last(places)
         start, after, end_place = self._minimize_after(places)
         products = _apply(self.level, places)
@@ -285,7 +287,7 @@ class SquaredRateBounds:
         return value + _dot(places, products / 2 + self.slope), _rows_first(slope)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return places (P, r) where the bounds, less slope . t + t . curve . t / 2, are lower."""
+        """Return chart coordinates (P, r) at which the bounds, less slope . t + t . curve . t / 2, are lower."""
         end_place = self._minimize_after(_rows_last(places))[2]
         gradient = -_apply_transposed(self.rotation, self.projection + end_place) / self.seconds
         square = _multiply_transposed(self.rotation, self.rotation) / self.seconds + self.level - _rows_last(curve)
@@ -299,7 +301,7 @@ def _rows_first(columns: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Homogeneous(StepCost):
-    """Cost that is proportional to the length of a step, with at most one free direction; its bounds are affine.
+    """Cost proportional to the length of a step, with at most one free direction; its bounds are affine.
 
     Attributes:
         weights: Weights of the joint displacements, 0 to ignore a joint. Shape (n,).
@@ -312,7 +314,7 @@ class Homogeneous(StepCost):
         """Return the gradients of the cost at displacements (P, n)."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return bounds (P,) of the cheapest steps into charts, multipliers (P, n) (gradients), and places (P, 1)."""
+        """Return lower bounds (P,) of the cost of steps into charts, gradients there (P, n), and minimisers (P, 1)."""
         count = len(delta)
         if not target.tangents.shape[2]:
             return self.evaluate(delta, 1.0) + after.least, self.gradient(delta), np.zeros((count, 0))
@@ -320,12 +322,14 @@ class Homogeneous(StepCost):
         box = target.low[:, 0], target.high[:, 0]
 
         def linearize(place: Array) -> list[Array]:
-            """Return place, gradient there, its value at the origin, and the slope of the total."""
+            """Return a place, the gradient there, its value at the origin, and the slope of the total cost."""
             gradient = self.gradient(delta + along * place[:, None])
             return [place, gradient, (gradient * delta).sum(axis=1), (gradient * along).sum(axis=1) + slope]
 
         def intersect() -> Array:
-            """Return where the tangents at both ends intersect; an end that does not descend is the minimum."""
+            """Return where the tangents at both ends of the bracket intersect; an end that does not descend is the
+            minimum.
+            """
             with np.errstate(divide="ignore", invalid="ignore"):
                 crossing = np.clip(np.nan_to_num((first[2] - last[2]) / (last[3] - first[3])), first[0], last[0])
             return np.where(first[3] >= 0, first[0], np.where(last[3] <= 0, last[0], crossing))
@@ -360,7 +364,7 @@ class Homogeneous(StepCost):
 
 
 class PathLength(Homogeneous):
-    """Weighted sum of the absolute joint displacements."""
+    """Cost of steps: weighted sum of the absolute joint displacements."""
 
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).sum(axis=-1))
@@ -373,7 +377,7 @@ class PathLength(Homogeneous):
 
 
 class LargestMotion(Homogeneous):
-    """Largest weighted joint displacement; with weights of one over the velocity limits, the least duration."""
+    """Cost of steps: largest weighted displacement, a duration if the weights are one over the velocity limits."""
 
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).max(axis=-1))
@@ -433,7 +437,7 @@ def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[
 
 
 def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """As `least_in_box`, with the axis of the functions last."""
+    """Return the minima as `least_in_box` does; the last axis numbers the functions."""
     r, count = slope.shape
     if not r:
         return np.zeros(count), np.zeros(slope.shape)

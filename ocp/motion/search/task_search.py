@@ -1,4 +1,4 @@
-"""Global search over all motions that do the tasks in their own time: choice of the time samples, and bounds."""
+"""Global search over all motions that perform the tasks at their times: choice of the time samples, and bounds."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = ["TaskSearch"]
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """Settings of the time samples.
+    """Settings of the choice of time samples.
 
     Attributes:
         lost: Share of the cost that straight steps between the samples may lose, by the number of free directions. With
@@ -155,7 +155,7 @@ class TaskSearch:
         return [stretch.equations for stretch in self.request.stretches if stretch.equations is not None]
 
     def dead_end(self) -> DeadEnd | None:
-        """Return where motions end and why, or None if one does not."""
+        """Diagnose where and why motions end; None if a motion reaches the end."""
         if self._path is not None:
             return None
         ends = segment_ends(self._search, 0)
@@ -163,7 +163,7 @@ class TaskSearch:
         return dead_end(self._search, proven=not np.isfinite(self.bound), segments=len(ends) if through else None)
 
     def segments(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
-        """Return begin and end of the fewest segments at least cost, and a lower bound of their number.
+        """Return start and end of the fewest segments of least cost, and a lower bound of their number.
 
         Args:
             barred: Begin and end, s, of intervals that are known not to be done in one segment.
@@ -192,15 +192,15 @@ class TaskSearch:
 
     @property
     def _can_subdivide(self) -> NDArray[np.bool_]:
-        """Mask of the steps between samples that are long enough to be subdivided."""
+        """Which steps between samples are long enough to be subdivided, as a mask."""
         return np.asarray(np.diff(self.times) > self._settings.closest * self.request.horizon)
 
     def _with_samples(self, times: Array) -> list[Array]:
-        """Return the times of each stretch with further samples."""
+        """Return the sample times of each stretch with additional samples."""
         return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._times_by_stretch]
 
     def refine_samples(self) -> bool:
-        """Add samples where the best path is nearly at a limit and search again; return whether any was added."""
+        """Add samples where the best path is close to a limit, and search again; return whether any was added."""
         if self._path is None:
             return False
         settings, bounds, path = self._settings, self.request.bounds, self._path
@@ -214,7 +214,7 @@ class TaskSearch:
         return True
 
     def _seeds(self, k: int) -> Array:
-        """Return configurations at a sample from closed forms and from inverse kinematics with random starts."""
+        """Return configurations at a sample, from closed forms and from inverse kinematics with random starts."""
         manifolds, index = self._samples[k]
         try:
             return manifolds.seeds(index, self.request.limits.joints, self.request.seed + k)
@@ -252,7 +252,7 @@ class TaskSearch:
 def choose_samples(
     t: Array, joints: Array, weights: Array, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Return as few times of a motion (M,) as possible such that straight steps lose at most a share of its cost.
+    """Choose the fewest times of a motion (M,) for which straight steps lose at most a given fraction of its cost.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.

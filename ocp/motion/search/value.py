@@ -101,7 +101,7 @@ class ChartGraph:
     def cost_to_come(
         self, cost_to_go: list[QuadraticBounds] | None = None, max_cost: float = np.inf
     ) -> list[QuadraticBounds]:
-        """Return lower bounds of the cost-to-come on the charts of each sample, likewise."""
+        """Return lower bounds of the cost-to-come on the charts of each sample."""
         return self._sweep(range(len(self.layers)), 1, cost_to_go, max_cost)
 
     def reachable(self) -> list[NDArray[np.bool_]]:
@@ -118,7 +118,7 @@ class ChartGraph:
         return masks
 
     def edges(self, k: int, neighbour: int) -> Iterator[tuple[Indices, Indices]]:
-        """Yield, in batches, pairs of charts of a sample and of its neighbour between which a step is possible."""
+        """Yield, in batches, pairs of charts of two consecutive samples between which a step is possible."""
         source, target = self.layers[k], self.layers[neighbour]
         if not len(source) or not len(target):
             return
@@ -150,7 +150,7 @@ class ChartGraph:
     def successors(
         self, joints: Array, k: int, neighbour: int, after: QuadraticBounds
     ) -> Iterator[tuple[Charts, Array]]:
-        """Yield the charts of a neighbouring sample to which a configuration (n,) can go, the cheapest first.
+        """Yield the charts of a neighbouring sample that a configuration (n,) can reach, the cheapest first.
 
         Yields:
             A single chart, shifted by full turns to the configuration, and the place in its box, (r,).
@@ -231,7 +231,7 @@ class ChartGraph:
 
     @staticmethod
     def _raise_to_floor(values: QuadraticBounds, charts: Charts, floor: Array) -> QuadraticBounds:
-        """Replace bounds by constants where these are higher, in the sum of middle and minimum."""
+        """Replace bounds by a constant where it exceeds the mean of their middle value and their minimum."""
         least = values.minimum(charts.low, charts.high)[0]
         higher = values.at((charts.low + charts.high) / 2) + least < 2 * floor
         return QuadraticBounds(
@@ -251,14 +251,14 @@ class ChartGraph:
 
 
 def _bound_with_rest(steps: StepBounds, charts: Charts, known_bounds: QuadraticBounds) -> Array:
-    """Return lower bounds of steps from charts plus known bounds of the rest of the motion. Shape (P,)."""
+    """Return lower bounds of steps from charts plus bounds of the remaining motion. Shape (P,)."""
     middle, curve = (charts.low + charts.high) / 2, steps.curve
     total = _tangent_bounds(middle, steps.at(middle), curve, -known_bounds.curve, -known_bounds.slope)
     return known_bounds.least + total.minimum(charts.low, charts.high)[0]
 
 
 def _least_of_groups(values: Array, groups: Indices) -> Array:
-    """Return for each value the least of its group; groups are contiguous. Shape (P,)."""
+    """Return, for each value, the least value of its contiguous group. Shape (P,)."""
     starts = np.flatnonzero(np.diff(groups, prepend=-1))
     return np.repeat(np.minimum.reduceat(values, starts), np.diff(np.append(starts, len(values))))
 
@@ -266,7 +266,7 @@ def _least_of_groups(values: Array, groups: Indices) -> Array:
 def _bound_charts(
     steps: StepBounds, charts: Charts, starts: Indices, max_costs: Array, settings: GraphSettings
 ) -> QuadraticBounds:
-    """Return one lower bound for each chart from the bounds of its steps, which are contiguous from `starts` on.
+    """Combine the bounds of steps, contiguous from `starts`, into one lower bound for each chart.
 
     Values above `max_costs`, shape (M,), need not be resolved.
     """
@@ -339,14 +339,14 @@ def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> 
 def _tangent_bounds(
     places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
 ) -> QuadraticBounds:
-    """Return tangent bounds of functions at places, less tilt . t + t . common . t / 2."""
+    """Return affine lower bounds of functions at given places, less tilt . t + t . common . t / 2."""
     value, slope = values
     at_origin = value - (places * slope).sum(axis=1) + _quadratic(curve, places)
     return QuadraticBounds(at_origin, slope - np.einsum("pab,pb->pa", curve, places) - tilt, curve - common)
 
 
 def _concavity(values: Array, half: Array, curve: Array) -> Array:
-    """Return the concavity of functions in boxes, (M, r, r), from values in the middle and at the ends of each axis.
+    """Estimate the concavity of functions in boxes, (M, r, r), from values in the middle and at the ends of each axis.
 
     The total curvature does not become negative by it.
     """
@@ -358,7 +358,7 @@ def _concavity(values: Array, half: Array, curve: Array) -> Array:
 
 
 def _secant_slopes(values: list[Array], half: Array) -> Array:
-    """Return slopes (M, r) of functions in boxes from values in the middle and at the ends of each axis.
+    """Return secant slopes (M, r) of functions in boxes, from values in the middle and at the ends of each axis.
 
     A concave function gets the slope from end to end, a convex one the flattest slope.
     """
@@ -403,7 +403,7 @@ def shorten_path(
     widths: tuple[float, float],
     settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
-    """Return a nearby path of lower cost, or one that keeps limits better. Shape (K, n).
+    """Return a nearby path of lower cost, or one with smaller violations of limits. Shape (K, n).
 
     Args:
         path: Configurations that do the tasks at the samples. Shape (K, n).
@@ -459,7 +459,7 @@ def shorten_path(
 def _violation(
     candidates: Array, times: Array, bounds: tuple[Array, Array], scene: CollisionScene | None, margin: float
 ) -> Array:
-    """Return how far candidates (K, s, n) around a path violate limits and clearance, rad and m. Shape (K, s)."""
+    """Return how far candidate configurations (K, s, n) violate limits and clearance, rad and m. Shape (K, s)."""
     excess = np.maximum(np.maximum(candidates - bounds[1], bounds[0] - candidates), 0.0).sum(axis=2)
     if scene is None:
         return np.asarray(excess)

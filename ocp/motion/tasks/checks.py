@@ -178,7 +178,7 @@ def checked_tasks(
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
-    """Return a name of the task if its rows are linearly dependent there, to rounding, else None."""
+    """Return the name of a task whose rows are linearly dependent, to rounding; None if there is none."""
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
@@ -186,7 +186,7 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joints have no effect on what tasks and base require of the joint rates. Shape (n,).
+    """Return which joints do not affect what tasks and base require of the joint rates. Shape (n,).
 
     Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
     and the cones of tool axes do not depend on such a joint.
@@ -213,7 +213,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the twist rows of a single task, else the numbers of the stacked rows."""
+    """Return the names of the twist rows of a single task, or the indices of the stacked rows of several."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -232,7 +232,7 @@ def _sampled(equations: TaskEquations, horizon: float, count: int) -> tuple[Arra
 
 
 def _parts(equations: TaskEquations, values: Array) -> list[tuple[BoundTask, Array]]:
-    """Return each task with its rows of the targets."""
+    """Pair each task with its rows of the targets."""
     ends = np.cumsum([target_size(part.task) for part in equations.bound])
     return list(zip(equations.bound, np.split(values, ends[:-1]), strict=True))
 
@@ -305,7 +305,7 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
 
 
 def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
-    """Raise ProblemError if target positions in the world are further from the first joint than the arm is long."""
+    """Raise ProblemError if target positions are further from the first joint than the arm is long."""
     for part in equations.bound:
         task = part.task
         if task.position is None or task.axes != "world" or task.relative_to is not None or part.tip.base_size:
@@ -324,7 +324,7 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
 
 
 def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:
-    """Raise ProblemError if a task is faster than joints at their rate limits can move the tip in any configuration.
+    """Raise ProblemError if a task is faster than the tip can move in any configuration at the joint rate limits.
 
     A revolute joint moves the tip at most by its rate times the length of the links from its axis to the tip.
 
@@ -381,7 +381,7 @@ def _task_speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
 
 
 def _chain_length(machine: Machine, joints: Sequence[Joint]) -> float:
-    """Return the length of a chain of joints to the tip, m: its links, and its slides at their longest."""
+    """Return an upper bound of the length of a joint chain to the tip, m, with prismatic joints fully extended."""
     length = float(np.linalg.norm(machine.robot.tip_translation))
     length += sum(float(np.linalg.norm(joint.translation)) for joint in joints)
     return length + sum(max(abs(joint.lower), abs(joint.upper)) for joint in joints if joint.kind == "prismatic")
@@ -413,14 +413,14 @@ def _rate_rows(task: TipTask) -> list[int]:
 
 
 def _integral(values: Array, step: float) -> Array:
-    """Return the integral over equidistant samples, an odd number, by Simpson's rule. Shapes (k, samples) to (k,)."""
+    """Integrate an odd number of equidistant samples by Simpson's rule. Shapes (k, samples) to (k,)."""
     weights = np.ones(CHECKS.closure_samples)
     weights[1:-1:2], weights[2:-1:2] = 4, 2
     return np.asarray(values @ weights * step / 3)
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:
-    """Return the angle, rad, of the rotation that an angular velocity in world axes, (3, samples), integrates to."""
+    """Return the angle, rad, of the rotation that results from an angular velocity in world axes, (3, samples)."""
     rotation = np.eye(3)
     # fourth-order Magnus expansion over two steps at a time
     for k in range(0, CHECKS.closure_samples - 1, 2):

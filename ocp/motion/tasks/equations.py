@@ -71,7 +71,7 @@ class TaskEquations:
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Which joints move neither the frame of a task nor its reference, by the kinematic tree. Shape (joint_size,).
+        """Which joints affect no task frame and no reference frame, by the kinematic tree. Shape (joint_size,).
 
         On a floating base or a standing machine no joint is idle: each one moves the base or the balance.
         """
@@ -152,7 +152,7 @@ class TaskEquations:
 
     @on_scalars
     def right(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return b, the part of the task velocities that the joint rates add to the drift. Shape (size, 1)."""
+        """Return the right side b of J u = b: the task velocities minus the drift. Shape (size, 1)."""
         return -self.residual(base, joints, ca.DM(self.machine.joint_size, 1), targets)
 
     @on_scalars
@@ -177,7 +177,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
-        """Return the deviations of the tips from their tasks as arguments of `Problem.watch`, by name.
+        """Return the deviations of the tips from their tasks, by name, as arguments of `Problem.watch`.
 
         For poses these are their errors, "task position" and "task orientation"; for velocities the integral of their
         residual, "task displacement" and "task rotation"; each is judged relative to the path of the tips. If a task is
@@ -256,13 +256,13 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Return pose minus target pose in the rows of poses, `residual` in those of velocities. Shape (size, 1)."""
+        """Return pose minus target pose in pose rows, and `residual` in velocity rows. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         return ca.vertcat(*((-error if is_pose else residual)[i] for i, is_pose in enumerate(self.pose_rows)))
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return the deviation from the poses as one column that, unlike `error`, is not zero half a turn away.
+        """Return a column of pose deviations that, unlike `error`, does not vanish half a turn away.
 
         In m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad). If all rotation is
         prescribed, these are the differences of the frame axes over sqrt 2, otherwise the rows of the half-angle
@@ -297,7 +297,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def misses(self, base: Any, joints: Any, targets: Any) -> tuple[float, float]:
-        """Return the largest distance, m, and the largest angle, rad, of a tip from its target pose at numbers."""
+        """Return the largest position error, m, and angle error, rad, of the tips for numeric arguments."""
         distance = angle = 0.0
         for part, target in self._with_targets(ca.DM(targets)):
             task = part.task
@@ -336,7 +336,7 @@ class TaskEquations:
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def holding(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return pose at (at_base, at_joints) minus pose at (base, joints) in the rows of the velocity tasks.
+        """Return the pose error of the velocity tasks at (base, joints) against the pose at (at_base, at_joints).
 
         For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
         """
@@ -352,7 +352,7 @@ class TaskEquations:
         return ca.vertcat(*rows)
 
     def _with_targets(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
-        """Iterate over the tasks with their targets."""
+        """Yield each task with its targets."""
         at = 0
         for part in self.bound:
             size = target_size(part.task)
@@ -366,7 +366,7 @@ class TaskEquations:
         return np.array(self.function.map(count)(bases.T, positions.T, targets)[2]).reshape(-1, count).T
 
     def _along(self, t: Any, base: Any, joints: Any) -> tuple[Array, Array, Any]:
-        """Return base (M, base_size), joints (M, joint_size) and targets, as columns, along a motion."""
+        """Return base (M, base_size), joints (M, joint_size) and targets as columns, at samples of a motion."""
         times, positions = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
         bases = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
         return bases, positions, self.target_function().map(len(times))(times[None, :])
@@ -422,7 +422,7 @@ class TaskEquations:
         return on_symbols(build)
 
     def closing(self, base: Array, joints: Array) -> Array:
-        """Return the directions of the task rows that close by themselves in a cyclic motion. Shape (size, k).
+        """Return the combinations of task rows whose integral vanishes in a cyclic motion. Shape (size, k).
 
         If the joints return to their start, part of the closure conditions follows from the task: all of its rows on a
         fixed base; on a floating base the combinations of rows that are independent of the base pose while the centre

@@ -20,7 +20,7 @@ __all__ = ["Cost", "Goal", "Scene", "Start", "Waypoints"]
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where and how fast a machine starts.
+    """Start of a motion: configuration and velocity of a machine.
 
     Attributes:
         joints: Joints, rad or m, shape (n,); None: searched.
@@ -35,7 +35,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Return a start, its checked joints (n,) or None, and its base (base_size,).
+        """Split a start into its checked joints (n,) or None, and its base (base_size,).
 
         Args:
             value: A start, joints, or None.
@@ -138,7 +138,7 @@ class Goal:
 
     @property
     def task(self) -> TipTask:
-        """Task of the tip to be at the goal; at the centre of its region."""
+        """Task that holds the tip at the goal, or at the centre of its region."""
         center = self.position if self.region is None else self.region.position
         return TipTask(
             position=center,
@@ -152,7 +152,7 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """Poses that the tip passes one after the other, without times.
+    """Sequence of tool poses without times.
 
     Attributes:
         positions: Positions of the tip in world. Shape (N, 3), m.
@@ -224,7 +224,7 @@ class Cost:
         return tuple(name for name in (*self._single, *PER_JOINT) if np.any(np.asarray(getattr(self, name))))
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Cost:
-        """Return the cost of a machine with the chosen joints alone. Shape (n,)."""
+        """Return the cost with only the selected joints. Shape (n,)."""
         names = ("effort", "acceleration", "weights")
         own: dict[str, Any] = {name: floats(getattr(self, name)) for name in names if np.ndim(getattr(self, name))}
         return replace(self, **{name: values[chosen] for name, values in own.items()})
@@ -244,7 +244,7 @@ class Cost:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Obstacles around a machine, the distance that it keeps from them and between its own links, and external forces.
+    """Obstacles around a machine, required clearances, and external forces.
 
     The values are checked when a motion is planned in the scene, together with the machine; see
     `models.CollisionScene`.

@@ -45,7 +45,7 @@ class InFoot:
             raise ProblemError(words, name="margin", value=self.margin, limit=0.0)
 
     def check(self, machine: Standing) -> None:
-        """Raise ProblemError if no point of the support has the margin."""
+        """Raise ProblemError if the support polygon is too small for the margin."""
         directions, support = machine.moving_directions, machine.support
         half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
         largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
@@ -66,7 +66,7 @@ class IndexAtLeast:
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return the least and greatest (x, y) with that index. Shape (2,) each, m."""
+        """Return the lower and upper corner (x, y) of the region with at least that index. Shape (2,) each, m."""
         radius = machine.half_widths * np.sqrt(1 - self.value)
         return machine.most_stable_point - radius, machine.most_stable_point + radius
 
@@ -127,7 +127,7 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the edges of the support, moved inwards by a margin, that a rule does not imply by itself.
+    """Return the support edges, moved inwards by a margin, that a rule does not already guarantee.
 
     Returns:
         Inward normals n and offsets o: n . point >= o. Shapes (k, 2) and (k,).
@@ -174,7 +174,7 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 
 
 def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the coordinates of the zero moment point that a motion can move out of the region of the index.
+    """Return the coordinates of the zero moment point that motion can move out of the region of the index.
 
     Args:
         machine, zmp, point, external: As for foot_rows.
@@ -196,7 +196,7 @@ def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool)
 
 
 def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
-    """Raise ProblemError if a rule has the wrong type, leaves the support, or cannot be met in it."""
+    """Raise ProblemError if a rule for the zero moment point has the wrong type or leaves the support polygon."""
     if not isinstance(zmp, ZmpRule):
         words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
         raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))
@@ -291,7 +291,7 @@ class Limits:
         return 0.1 * machine.weight if self.vertical_force is None else float(self.vertical_force)
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Limits:
-        """Return the limits of some joints of a machine. Shape (n,), bool."""
+        """Return the limits of a subset of the joints of a machine. Shape (n,), bool."""
         values = {kind: getattr(self, kind) for kind in LIMITED}
         own: dict[str, Any] = {
             kind: _numbers(value)[chosen]

@@ -1,4 +1,4 @@
-"""Targets of tasks over time: their poses in the world next to a motion, and the nodes that a mesh needs for them."""
+"""Targets of tasks over time: their poses in the world along a motion, and the nodes that a mesh needs for them."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def targets_along(
     joints: Array,
     shown_times: Array | None = None,
 ) -> tuple[Target, ...]:
-    """Return the target of each pose task along a motion; the motion moves the targets that are relative to a link.
+    """Return the target poses of each pose task along a motion, which moves targets relative to a link.
 
     Args:
         machine: The machine that does the tasks.
@@ -103,7 +103,7 @@ def targets_along(
 
 
 def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
-    """Return the breaks at which a mesh needs nodes to follow the targets of pose tasks; the first and last are kept.
+    """Return the breaks at which a mesh needs nodes to follow the targets, including the first and the last.
 
     Between two nodes, the interpolants of the targets at the points of an interval deviate by no more than `NODES`
     allows. Intervals with larger deviations are bisected at the break nearest to their middle. A path of many short
@@ -140,7 +140,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def _largest_errors(equations: TaskEquations, values: Array) -> Array:
-    """Return the largest error of each entry of the targets of pose tasks, from samples (M, size). Shape (size,)."""
+    """Return the largest interpolation error of each target entry, from samples (M, size). Shape (size,)."""
     largest, at = np.full(values.shape[1], NODES.pose_error), 0
     for bound in equations.bound:
         task = bound.task

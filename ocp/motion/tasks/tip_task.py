@@ -35,7 +35,7 @@ ANGULAR, LINEAR = (0, 1, 2), (3, 4, 5)
 
 @dataclass(frozen=True, eq=False)
 class TipTask:
-    """Task of one frame: either `velocity`, or a pose by `position` and one of `orientation` and `direction`.
+    """Task of one frame: a `velocity`, or a pose by `position` and one of `orientation` and `direction`.
 
     Tracks are differentiated with respect to their time symbol; a track with a method `rate` is asked for its rate
     instead. A list of tasks stacks them: one for each arm, or one that keeps the base from rotating (rows 0, 1, 2 of
@@ -200,7 +200,7 @@ class TipTask:
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Rows of the twist that the task prescribes; those of the tilt come before them."""
+        """Rows of the twist that the task prescribes, without those of the tilt."""
         return tuple(self.rows or ())
 
     @property
@@ -210,12 +210,12 @@ class TipTask:
 
     @property
     def along_reference(self) -> bool:
-        """Whether the rows are taken along the axes in which the pose is given."""
+        """Whether the rows refer to the axes of the frame in which the pose is given."""
         return self.axes == "reference" or (self.axes == "world" and self.relative_to is None)
 
     @property
     def tilts(self) -> bool:
-        """Whether the direction prescribes the two rows of the tilt: not if the axis may move in a cone."""
+        """Whether the direction prescribes two tilt rows; it does not if the axis may move in a cone."""
         return self.direction is not None and self.within is None
 
     @property
@@ -374,7 +374,7 @@ def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> An
 
 
 def is_holonomic(part: BoundTask) -> Array:
-    """Return which rows of a task have an integral that does not depend on the path. Shape (size,), bool."""
+    """Return which task rows integrate to a pose, independent of the path. Shape (size,), bool."""
     task = part.task
     if task.is_pose:
         return np.ones(task.size, dtype=bool)
@@ -384,7 +384,7 @@ def is_holonomic(part: BoundTask) -> Array:
 
 
 def movable_angular_rows(part: BoundTask) -> list[int]:
-    """Return the angular rows, in world axes, that some joint moves."""
+    """Return the angular rows, in world axes, that at least one joint can move."""
     base, joints = ca.SX.sym("base", part.tip.base_size), ca.SX.sym("joints", part.tip.joint_size)
     jacobian = part.tip.tip_jacobian(base, joints)
     return [row for row in ANGULAR if not all(entry.is_zero() for entry in ca.horzsplit(jacobian[row, :]))]
@@ -417,8 +417,7 @@ def angular_velocity(rotation: Any, rate: Any) -> Any:
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return combinations of the selected rows that no base motion changes while the centre of mass stays. Shape (m,
-    k).
+    """Return combinations of rows that no base motion changes while the centre of mass is fixed. Shape (m, k).
 
     Raises:
         ProblemError: The momentum moves the centre of mass, and the joints cannot return.

@@ -97,7 +97,7 @@ class Cone:
         require.positive("cone: depth", self.depth)
 
     def inside(self, place: Expression) -> Expression:
-        """Return a function that is not negative inside the cone, m. Shape (1, 1).
+        """Return a function of the tip position that is positive inside the cone, m. Shape (1, 1).
 
         Args:
             place: Position of the tip in the grasped frame. Shape (3, 1), m.
@@ -260,7 +260,7 @@ def chained_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> tuple[Solution, Solution]:
-    """Solve the approach at its own least cost, then the detumbling from its end; `solve_capture` costs less.
+    """Solve the approach alone, then the detumbling from its end; the joint solution of `solve_capture` costs less.
 
     Args, Raises: As for `solve_capture`.
 
@@ -302,7 +302,7 @@ def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFl
 
 @dataclass(frozen=True, eq=False)
 class _Capture:
-    """Checked arguments of a capture; `pair` is both bodies as one machine, with their momentum at the start."""
+    """Checked arguments of a capture; `pair` is the machine of both bodies, with their initial momentum."""
 
     chaser: FreeFloating
     capture: Capture
@@ -341,7 +341,7 @@ class _Capture:
 
     @property
     def arm(self) -> Array:
-        """Return 1 for joints and 0 for wheels, whose angles each phase counts from zero. Shape (n,)."""
+        """Return 1 for arm joints and 0 for reaction wheels, whose angles start from zero in each phase. Shape (n,)."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
@@ -415,7 +415,7 @@ class _Capture:
         return problem
 
     def grasp(self, problem: Problem, base: Any, joints: Any, rates: Any, goal: Any) -> None:
-        """Constrain the tip to the grasped frame with the same twist at the end of a problem."""
+        """Constrain the tip to the pose and twist of the grasped frame at the end of a problem."""
         chaser, target, none = self.chaser, self.capture.target, ca.DM(0, 1)
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
         turned = ca.mtimes(grasped.rotation.T, tip.rotation)
@@ -428,7 +428,8 @@ class _Capture:
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base at a time from its attitude and the joints alone, because no force acts on the chaser.
+        """Return the base at a time from its attitude and the joints; no force acts, so the centre of mass moves
+        evenly.
 
         The position of the centre of mass and the norm of the quaternion are conserved by the dynamics. Continuity of
         them would be a condition that no control influences, and would leave the second-order conditions undetermined.
@@ -449,7 +450,7 @@ class _Capture:
 
 
 def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return joints, velocities and base at the end of the guess of an approach."""
+    """Return joints, velocities and base at the end of the guess of the approach."""
     end = np.array([guessed_horizon(problem)])
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)
@@ -457,7 +458,7 @@ def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
 
 
 def _of_unit_length(machine: FreeFloating, base: Any) -> Any:
-    """Return the configuration with a unit quaternion."""
+    """Return the base configuration with its quaternion normalised."""
     if machine.base == "planar":
         return base
     return ca.vertcat(base[:3], base[3:] / ca.norm_2(base[3:]))

@@ -1,4 +1,4 @@
-"""Chaser and target of a capture: both as one machine, bounds that refuse impossible captures, and the first guess.
+"""Chaser and target of a capture: both as one machine, bounds that reject impossible captures, and the first guess.
 
 The twists match at the grasp, so that there is no impact. The momentum of the pair about its common centre of mass is
 
@@ -62,7 +62,7 @@ def joined(chaser: Robot, target: Robot) -> Robot:
 
 
 def checked_pair(chaser: Any, target: Any) -> Robot:
-    """Return the robot of both, see `joined`.
+    """Check a chaser and its target and return both as one robot, see `joined`.
 
     Raises:
         ProblemError: Machines of other kinds, without tips, with links of the same name, or a target with joints.
@@ -106,7 +106,7 @@ def pair_momentum(
 
 
 def motion_of(problem: Problem) -> tuple[Any, Any, Any]:
-    """Return the symbols of base, joints and velocities."""
+    """Return the state symbols of a problem: base, joints and velocities."""
     states = problem.declared.states
     return states["base"].symbol, states["joints"].symbol, states["velocities"].symbol
 
@@ -175,7 +175,7 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
 
 
 def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:
-    """Set the guess of an approach; a free time gets the first duration that ends in the grasp, or the closest to it.
+    """Set the guess of the approach; a free duration gets the shortest value that reaches the grasp, or the closest.
 
     Args:
         start: State of the capture; free velocities are guessed as zero.
@@ -222,7 +222,7 @@ class _TipTracker:
         self.fastest = constant(states["velocities"].upper)
 
     def follow(self, times: Array, path: tuple[Array, Array], joints: Array, base: Array) -> tuple[float, Guesses]:
-        """Return the distance of the tip from the end of the path, m and rad, and the guesses; wheel speeds stay."""
+        """Track a path with the tip at constant wheel speeds; return the final distance, m and rad, and the guesses."""
         places, turns = path
         step = times[1]
         speed = self.rates.copy()
@@ -257,7 +257,7 @@ def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
 def _tip_path(
     chaser: FreeFloating, target: FreeFloating, times: Array, bases: Array, start: tuple[Array, Array], out: Array
 ) -> tuple[Array, Array]:
-    """Return positions (M, 3) and rotations (M, 3, 3) of the tip, from rest onto the grasped frame."""
+    """Return positions (M, 3) and rotations (M, 3, 3) of the tip along the approach, from rest to the grasp."""
     b = ca.SX.sym("b", target.base_size)
     pose = target.tip_pose(b, ca.DM(0, 1))
     pose_at = ca.Function("pose", [b], [pose.position, ca.vec(pose.rotation)])
@@ -317,7 +317,7 @@ def guess_braking(problem: Problem, pair: FreeFloating, begin: tuple[Array, Arra
 
 
 def _stepper(machine: FreeFloating) -> Any:
-    """Return a function that steps the base by Heun's rule, with constant joints and rates."""
+    """Return a function that advances the base by one step of Heun's method, with constant joint rates."""
     b, q, v = (ca.SX.sym("z", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
     step = ca.SX.sym("step")
     rate = ca.Function("rate", [b, q, v], [machine.base_rate(b, q, v)])
@@ -330,7 +330,7 @@ def _stepper(machine: FreeFloating) -> Any:
 
 
 def _motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
-    """Return the guesses of a sampled motion."""
+    """Return the guesses that sampled joints, velocities and base define."""
     second = np.gradient(velocities, times, axis=0)
     tables = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
     return {name: _curve(times, samples) for name, samples in tables.items()}
@@ -365,7 +365,7 @@ ROUNDING = 1e-9
 
 
 class State(NamedTuple):
-    """State of a capture, and its longest durations.
+    """Initial state of a capture, and its longest durations.
 
     Attributes:
         base, joints, velocities: State of the chaser; nan for free velocities.
@@ -474,7 +474,7 @@ def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
 
 
 def _longest(robot: Robot, link: str, point: object) -> float:
-    """Return an upper bound of a point's distance from the root, m; inf beyond an unlimited prismatic joint."""
+    """Return an upper bound of a point's distance from the root, m; inf with an unlimited prismatic joint."""
     length = float(np.linalg.norm(np.asarray(point, dtype=float)))
     for joint in robot.path_to(link):
         slides = max(abs(joint.lower), abs(joint.upper)) if joint.kind == "prismatic" else 0.0

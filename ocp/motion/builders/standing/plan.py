@@ -118,7 +118,7 @@ def guess_in_time(
 
 
 def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]) -> Phases:
-    """Declare the same steps with durations of at least `seconds`; prices scale with the mean duration."""
+    """Declare the same steps with durations of at least `seconds`; weights are scaled to the mean duration."""
     phases = [
         replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.guess * each))
         if (each := seconds.get(name)) is not None
@@ -162,7 +162,7 @@ def _check_conflicts(problem: Phases, coarse: Solution) -> None:
 def _too_fast(
     problem: Phases, coarse: Solution, seconds: Mapping[str, float], spans: Mapping[str, float]
 ) -> SolveError:
-    """Return the error that the quickest steps take longer, with the phases and their active limits."""
+    """Return the error that the steps need more time, with the phases and their active limits."""
     late = sorted(seconds, key=lambda name: -spans[name] / seconds[name])
     late = [name for name in late if spans[name] > (1 + PACE.error) * seconds[name]]
     lines = [
@@ -177,7 +177,7 @@ def _too_fast(
 
 
 def _active_limits(problem: Phases, coarse: Solution, phase: str) -> str:
-    """Return in words which limits are active in a phase, and for which share of it."""
+    """Describe which limits are active in a phase, and for which share of it."""
     form = Formulation.of(problem)
     at = np.linspace(0.0, 1.0, PACE.samples)
     x, u = coarse.state_interpolant(at), coarse.control_interpolant(at)
@@ -334,7 +334,7 @@ def _first_accepted(
     judge: _Judge,
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
-    """Return the first plan accepted among the formulations and meshes of `solve_standing`.
+    """Return the first accepted plan among the formulations and meshes of `solve_standing`.
 
     Raises:
         SolveError, ProblemError: As `solve_standing`; at once if collisions are all that is wrong with a plan.
@@ -414,7 +414,7 @@ def _tip(level: Level | None) -> str:
 
 @dataclass(frozen=True)
 class _Judge:
-    """Runs a solve and judges its result.
+    """Runs solves, audits their results and accepts or rejects them.
 
     Attributes:
         tolerances: Tolerances of the audit.

@@ -1,4 +1,4 @@
-"""Least-cost motions of a machine that stands on the ground, does tasks with its tips, and must not tip over.
+"""Least-cost motions of a machine that stands on the ground, performs tasks with its tips, and must not tip over.
 
 This is the planned counterpart of local.accelerations (Yoo et al. 2004), for any Standing machine, planar or spatial,
 and any tasks: positions, orientations, free tool axes, several arms. Joint accelerations (or jerks) are the control.
@@ -163,7 +163,7 @@ def standing_problem(
     limits: Limits | None = None,
     setup: StandingSetup | None = None,
 ) -> Problem:
-    """Declare a standing motion of least cost along tip tasks.
+    """Declare a standing motion of lowest cost along tip tasks.
 
     The states are "joints", "velocities", and "accelerations" if the jerk is the control. The controls are
     "accelerations" or "jerks". With tasks along a parameter there are the states "path" from 0 to 1 and "path_rate" >=
@@ -310,7 +310,7 @@ def _motion(
     guess: Mapping[str, Any],
     setup: StandingSetup,
 ) -> tuple[tuple[Any, Any, Any], Any]:
-    """Declare the joints and return (positions, velocities, accelerations), and jerks, empty if not a control."""
+    """Declare joint positions, velocities and accelerations; also jerks, empty if these are no controls."""
     n = len(begin)
     joints = problem.state(
         "joints", n, initial=begin, terminal=setup.end, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"],
@@ -335,7 +335,7 @@ def _motion(
 
 
 def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
-    """Declare and return the path parameter from 0 to 1, its rate and its acceleration."""
+    """Declare the path parameter from 0 to 1; return it with its rate and acceleration."""
     at = problem.state("path", initial=0.0, terminal=1.0, lower=0.0, upper=1.0, guess=guess["path"])
     first, last = (0.0 if rest else None for rest in rests)
     rate = problem.state("path_rate", lower=0.0, guess=guess["path_rate"], initial=first, terminal=last, unit="1/s")

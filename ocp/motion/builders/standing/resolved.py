@@ -73,7 +73,7 @@ class StepsMotion:
     balance: Array
 
     def held(self, foot: str) -> NDArray[np.bool_]:
-        """Return at which times a foot is held. Shape (M,), bool."""
+        """Return at which times a foot is on the ground. Shape (M,), bool."""
         by_phase = np.array([foot in phase.footholds for phase in self.steps.phases], dtype=bool)
         return np.asarray(by_phase[self.phase.astype(int)], dtype=bool)
 
@@ -87,18 +87,18 @@ class StepsMotion:
         return np.asarray(points)
 
     def _force(self, foot: str) -> Array:
-        """Return the force on a foot in the axes of its sole. Shape (M, 3), N."""
+        """Return the contact force on a foot in the axes of its sole. Shape (M, 3), N."""
         return np.asarray(np.einsum("kji,kj->ki", self.sole_rotation[foot], self.loads[foot][:, 3:]))
 
     def friction(self, foot: str) -> Array:
-        """Return the needed friction coefficient, tangential over normal force; nan in the air. Shape (M,)."""
+        """Return the required friction coefficient, tangential over normal force; nan in the air. Shape (M,)."""
         force = self._force(foot)
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
         return np.asarray(np.where(self.held(foot), needed, np.nan))
 
     def summary(self) -> dict[str, float]:
-        """Return the extreme values by name."""
+        """Return duration, smallest margins and largest loads of the motion by name, with their units."""
         soles = [name for name, foot in self.steps.feet.items() if foot.sole is not None]
         return {
             "duration_s": float(self.t[-1]),
@@ -156,7 +156,7 @@ def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion
 def sample_stance(
     steps: Steps, stance: Stance, motion: tuple[Array, ...], foot_loads: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return the quantities of `StepsMotion` for a motion in one stance, by name. Shape (M, ...) each.
+    """Evaluate the quantities of `StepsMotion` along a motion in one stance; return them by name. Shape (M, ...) each.
 
     Args:
         motion: q, q', q'' in the stance's order. Shape (M, n) each.
@@ -209,7 +209,7 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
 
 
 def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsMotion:
-    """Take steps with the least joint rates at every instant, by `resolve`.
+    """Take steps with the least joint rates at every time, by local resolution; see `resolve`.
 
     A lifted foot moves to its next foothold from rest to rest. Seen from above its path is straight; at the share s of
     the path it is raised by 64 s^3 (1 - s)^3 times the steps' clearance. A foot without a next foothold follows the

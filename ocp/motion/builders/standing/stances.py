@@ -42,7 +42,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class StancePhase:
-    """Feet held on footholds for some time.
+    """Period during which some feet are held on footholds.
 
     Attributes:
         footholds: Footholds by the names of the feet; the machine is rooted at the first.
@@ -73,7 +73,7 @@ class StancePhase:
 
 @dataclass(frozen=True, eq=False)
 class Swing:
-    """Foot in the air during a phase.
+    """Motion of a foot through the air during a phase.
 
     Attributes:
         name: Name of the foot.
@@ -174,14 +174,14 @@ class Steps:
         return tuple(swings)
 
     def standing(self, k: int) -> Stance:
-        """Return the stance of all feet held just before or just after the start of phase k (or the end)."""
+        """Return the stance on all feet that are held just before or just after the start of phase k (or the end)."""
         footholds: dict[str, Foothold] = {}
         for phase in self.phases[max(k - 1, 0) : k + 1]:
             footholds |= phase.footholds
         return Stance.on(self.robot, self.feet, footholds, self.gravity)
 
     def balanced(self, k: int) -> Array:
-        """Return a good place of the center of mass at the start of phase k: between the feet held before and after.
+        """Return a balanced position of the center of mass at the start of phase k: between the feet before and after.
 
         It is the mean of the centers of their soles, or of their footholds if none has a sole. Shape (2,), m.
         """
@@ -196,7 +196,7 @@ class Steps:
         return np.asarray(np.mean(points, axis=0))
 
     def in_order(self, stance: Stance, values: Array) -> Array:
-        """Return joint vectors of a stance in the robot's order. Shape (M, n)."""
+        """Reorder joint vectors of a stance to the order of the robot's joints. Shape (M, n)."""
         reordered = np.empty_like(values)
         reordered[:, self.order(stance)] = values
         return reordered
@@ -354,13 +354,13 @@ def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]
 
 
 def _configuration(steps: Steps, stance: Stance, near: Array, over: Array) -> Array:
-    """Return a standing configuration in the robot's order."""
+    """Return a balanced configuration of a stance near a given one, with the joints in the order of the robot."""
     joints = standing_configuration(stance, near[steps.order(stance)], over)
     return np.asarray(steps.in_order(stance, joints[None])[0])
 
 
 def _raised(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
-    """Return the poses of swinging feet halfway between their footholds."""
+    """Return the poses of swinging feet midway between their footholds."""
     raised = {}
     for swing in swings:
         if swing.lifted is None or swing.landing is None:

@@ -69,7 +69,7 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
 def check_freedom(
     machine: Standing, size: int, zmp: ZmpRule, *, along_parameter: bool, tip_level: str, ends_at_rest: bool
 ) -> None:
-    """Raise ProblemError if tasks, zero moment point and rest at the end need more freedom than the joints have.
+    """Raise ProblemError if tasks, zero moment point and final rest require more degrees of freedom than there are.
 
     Args:
         size: Rows of all tasks.
@@ -88,7 +88,7 @@ def check_freedom(
 
 
 def check_slope(equations: TaskEquations, joints: Array) -> None:
-    """Raise ProblemError if the manipulability, part of the cost, has no finite gradient at the start."""
+    """Raise ProblemError if the manipulability in the cost has no finite gradient at the start."""
     q = ca.SX.sym("q", len(joints))
     slope = ca.Function("slope", [q], [ca.gradient(equations.manipulability(ca.DM(0, 1), q), q)])
     if not np.isfinite(np.array(slope(joints))).all():
@@ -199,7 +199,7 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 def _least_violations(
     at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """Return the violations of the rows, of least sum; None if the tasks' demand cannot be met anyway."""
+    """Return violations of the rows with the least sum; None if even then the tasks cannot be satisfied."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):
@@ -231,7 +231,7 @@ def local_guess(
     by_parameter: bool,
     external: External | None,
 ) -> dict[str, Any]:
-    """Return guesses by name; from where the local motion breaks down or becomes too fast, its last joints."""
+    """Return guesses by name from a local motion; once it breaks down or is too fast, its last joints stay."""
     tasks = [part.task for part in equations.bound]
     if by_parameter:
         tasks = [timed(task, lambda time: rest_to_rest(time / horizon)) for task in tasks]

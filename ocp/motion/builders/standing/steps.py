@@ -82,7 +82,7 @@ class _Options:
 @remembers_request("steps")
 @interruptible
 def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, limits: Limits | None = None) -> Phases:
-    """Declare a motion through consecutive stances, from rest to rest, of least cost.
+    """Declare a motion through consecutive stances, from rest to rest, that minimises a cost.
 
     The phases have the names `Steps.names`; joint vectors of a phase are in its stance's order. The states are "joints"
     and "velocities". The controls are "accelerations", and "FOOT load" of each held foot but the first, in the rows
@@ -226,7 +226,7 @@ def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
 
 
 def _load(problem: Problem, stance: Stance, name: str) -> Any:
-    """Return the load of a foot other than the first, a control in its held rows. Shape (6, 1)."""
+    """Return the load on a foot other than the first; its free rows are a control. Shape (6, 1)."""
     rows = stance.load_rows[name]
     share = stance.weight / len(stance.footholds)
     guess = [share * (row == 5) for row in rows]
@@ -251,7 +251,7 @@ def _limit_load(problem: Problem, stance: Stance, name: str, load: Any, options:
 def _swing(
     problem: Problem, stance: Stance, swing: Swing, motion: tuple[Any, Any], share: Any, clearance: float
 ) -> None:
-    """Keep the sole of a swinging foot above the ground, and land it at rest on its foothold."""
+    """Keep the sole of a swinging foot above the ground and land it on its foothold at rest."""
     joints, rates = motion
     none = ca.DM(0, 1)
     foot = stance.feet[swing.name]
@@ -289,7 +289,7 @@ def _distinct_rows(rows: Any, joints: Any) -> list[int]:
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return the center of mass' distances from those support edges on which the joints act. Shape (k, 1), m."""
+    """Return the distances of the center of mass from those support edges that joints influence. Shape (k, 1), m."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))
