@@ -303,7 +303,7 @@ class _MultiStart:
         return gauss_newton(function, joints, self.lower, self.upper, **options)
 
     def rank(self, joints: Array, errors: Array) -> list[IkSolution]:
-        """Sort candidates by quality and return the distinct solutions, the best first."""
+        """Return the distinct solutions among candidates, the best first."""
         solved, lower, upper = np.flatnonzero(errors <= self.options.tolerance), self.lower, self.upper
         if not solved.size:
             return []

@@ -131,7 +131,7 @@ def resolve(
     scene: CollisionScene | None = None,
     options: RateOptions | None = None,
 ) -> LocalSolution:
-    """Integrate the pseudo-inverse solution x2' = G# v, equation (26) of the free-floating paper, and the base motion.
+    """Integrate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the motion of the base.
 
     The drift of the machine at rest and the feedback of pose tasks are part of v.
 

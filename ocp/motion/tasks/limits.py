@@ -196,7 +196,7 @@ def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool)
 
 
 def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
-    """Raise ProblemError if a rule for the zero moment point has the wrong type or leaves the support polygon."""
+    """Raise ProblemError if a rule has the wrong type, leaves the support, or cannot be met in it."""
     if not isinstance(zmp, ZmpRule):
         words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
         raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))
