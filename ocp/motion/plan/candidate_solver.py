@@ -95,6 +95,10 @@ class CandidateSolver(Solver):
             advanced = failed.rejected(self._failure_reason(failed, str(error)))
         if self._may_relax(advanced):
             return [Candidate(candidate.start, candidate.seed.cost, seed=replace(candidate.seed, relaxed=True))]
+        if not advanced.passed and candidate.seed.relaxed and np.isnan(self._start(candidate)).any():
+            # the conditions of a free start may depend on each other where the tasks do: hold it
+            held = replace(candidate.seed, fixed=True)
+            return [advanced, Candidate(candidate.start, candidate.seed.cost, seed=held)]
         return [advanced, *self._free_start(advanced)]
 
     def with_own_cost(self) -> CandidateSolver:
