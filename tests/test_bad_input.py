@@ -61,7 +61,15 @@ CREATED_BY_THE_PACKAGE = {
 """Results, protocols and constants: their methods are in the panels, but nobody makes them."""
 WITHOUT_ARGUMENTS = {"Anywhere", "SolverStatus", "paper_example", "reference_tunnel", "standing_example"}
 RAISED = {"DeadEnd", "Unreachable"}
-CHECKED_BY_PROBLEMS = {"DynamicsSetup", "Following", "Pinned", "RollObstacles", "RollSettings", "StandingSetup"}
+CHECKED_BY_PROBLEMS = {
+    "DynamicsSetup",
+    "Following",
+    "Pinned",
+    "RollObstacles",
+    "RollSettings",
+    "StandingSetup",
+    "VelocitySetup",
+}
 """Options that a builder checks: their fields are in the panels of dynamics_problem, standing_problem, roll_problem."""
 
 

@@ -71,9 +71,9 @@ def judged(kind: str, seed: int) -> dict[str, Any]:
 
     begun, steps, bound = time.process_time(), np.inf, np.inf
     try:
-        instants = [TimeSample(sets, k) for k in range(TIME_SAMPLES)]
+        time_samples = [TimeSample(sets, k) for k in range(TIME_SAMPLES)]
         search = AtlasSearch(
-            space, instants, Steps(times, price, np.repeat(most[None], TIME_SAMPLES - 1, axis=0)), seeds=seeds
+            space, time_samples, Steps(times, price, np.repeat(most[None], TIME_SAMPLES - 1, axis=0)), seeds=seeds
         )
         path, bound = search.solve(np.inf)
         steps = np.inf if path is None else search.path_cost(path)

@@ -278,19 +278,19 @@ def test_the_joint_limit_index_and_excess_have_their_closed_forms() -> None:
     lower, upper = EXAMPLE.robot.lower, EXAMPLE.robot.upper
     beyond = upper + np.array([0, 0, 0.2, 0, 0])
     q = np.array([lower, upper, (lower + upper) / 2, beyond])
-    found = standing_motion(EXAMPLE, np.arange(4.0), q, 0 * q, joint_accelerations=0 * q)
-    np.testing.assert_allclose(found.joint_limit_index[:3], [5 / 4, 5 / 4, 0], atol=1e-12)
-    np.testing.assert_allclose(found.joint_excess[[0, 1, 3]], [0, 0, 0.2], atol=1e-12)
-    assert found.joint_excess[2] < 0
-    assert not found.stays_in_limits
+    outcome = standing_motion(EXAMPLE, np.arange(4.0), q, 0 * q, joint_accelerations=0 * q)
+    np.testing.assert_allclose(outcome.joint_limit_index[:3], [5 / 4, 5 / 4, 0], atol=1e-12)
+    np.testing.assert_allclose(outcome.joint_excess[[0, 1, 3]], [0, 0, 0.2], atol=1e-12)
+    assert outcome.joint_excess[2] < 0
+    assert not outcome.stays_in_limits
     assert standing_motion(EXAMPLE, np.arange(3.0), q[:3], 0 * q[:3], joint_accelerations=0 * q[:3]).stays_in_limits
 
 
 def test_a_joint_without_limits_adds_nothing_to_the_index() -> None:
     free = Standing(planar_chain([1.0, 1.0], [1.0, 1.0]), support=FOOT)
-    found = standing_motion(free, [0.0], [[5.0, -9.0]], [[0.0, 0.0]], joint_accelerations=[[0.0, 0.0]])
-    assert found.joint_limit_index.tolist() == [0.0]
-    assert found.joint_excess.tolist() == [-np.inf]
+    outcome = standing_motion(free, [0.0], [[5.0, -9.0]], [[0.0, 0.0]], joint_accelerations=[[0.0, 0.0]])
+    assert outcome.joint_limit_index.tolist() == [0.0]
+    assert outcome.joint_excess.tolist() == [-np.inf]
 
 
 @pytest.mark.parametrize(

@@ -73,8 +73,8 @@ def test_torques_and_reaction_equal_those_of_an_independent_library(
         rtol=0,
         atol=LIBRARY,
     )
-    found = numeric(base_reaction(robot, q, qd, qdd, wrenches=wrenches, gravity=gravity)).ravel()
-    np.testing.assert_allclose(found, reaction, rtol=0, atol=LIBRARY)
+    outcome = numeric(base_reaction(robot, q, qd, qdd, wrenches=wrenches, gravity=gravity)).ravel()
+    np.testing.assert_allclose(outcome, reaction, rtol=0, atol=LIBRARY)
 
 
 @given(seeds, st.integers(1, 6), bases)
@@ -98,8 +98,8 @@ def test_power_of_the_torques_and_wrenches_is_the_rate_of_energy(seed: int, size
     wrench = hand_wrench(rng, robot.tip_link)
     torques = inverse_dynamics(robot, q, qd, qdd, wrenches=[wrench], gravity=gravity, world_from_base=placement)
     jacobian = frame_jacobian(robot, q, wrench.link, point=wrench.point, world_from_base=placement)
-    given = ca.dot(ca.vertcat(wrench.moment, wrench.force), ca.mtimes(jacobian, qd))
-    balance = ca.Function("balance", [q, qd, qdd], [along(energy, q, qd, qdd), ca.dot(qd, torques) + given])
+    external_power = ca.dot(ca.vertcat(wrench.moment, wrench.force), ca.mtimes(jacobian, qd))
+    balance = ca.Function("balance", [q, qd, qdd], [along(energy, q, qd, qdd), ca.dot(qd, torques) + external_power])
     rate, power = (float(value) for value in balance(*random_motion(rng, robot.dof)))
     assert rate == pytest.approx(power, rel=1e-9, abs=1e-8)
 
@@ -116,12 +116,12 @@ def test_momentum_its_rate_and_the_centre_of_mass_follow_from_the_frames(seed: i
     center = center_of_mass(robot, q, placement)
     expected = [truth, along(truth, q, qd, qdd), center, directional(center, q, qd)]
     expected.append(along(expected[3], q, qd, qdd))
-    found = [
+    outcome = [
         momentum(robot, q, qd, about=about, world_from_base=placement),
         momentum_rate(robot, q, qd, qdd, about=about, world_from_base=placement),
     ]
-    found += center_of_mass_motion(robot, q, qd, qdd, world_from_base=placement)
-    function = ca.Function("both", [q, qd, qdd], [*expected, *found])
+    outcome += center_of_mass_motion(robot, q, qd, qdd, world_from_base=placement)
+    function = ca.Function("both", [q, qd, qdd], [*expected, *outcome])
     values = [numeric(value) for value in function(*random_motion(rng, robot.dof))]
     for truth_value, value in zip(values[:5], values[5:], strict=True):
         np.testing.assert_allclose(value, truth_value, rtol=1e-9, atol=1e-9)
@@ -164,10 +164,10 @@ def test_the_reaction_is_the_rate_of_momentum_less_weight_and_wrenches(seed: int
     weight = robot.total_mass * np.concatenate([np.cross(center, gravity), gravity])
     outside = numeric(external_wrench(robot, motion[0], [wrench], placement)).ravel()
     expected = numeric(momentum_rate(robot, *motion, world_from_base=placement)).ravel() - weight - outside
-    found = numeric(
+    outcome = numeric(
         base_reaction(robot, *motion, wrenches=[wrench], gravity=gravity, world_from_base=placement)
     ).ravel()
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(outcome, expected, rtol=1e-10, atol=1e-10)
 
 
 @given(seeds, st.integers(1, 6))

@@ -68,9 +68,9 @@ def dynamics(robot: Robot, rng: np.random.Generator, place: Any) -> list[Array]:
     q, qd, qdd = (rng.normal(size=robot.dof) for _ in range(3))
     motion, push = rng.normal(size=6), rng.normal(size=6)
     moving: Any = {"world_from_base": place, "base_motion": (motion, push)}
-    found = [robot_inertia(robot, q, place), momentum_matrix(robot, q, place), *tip_pose(robot, q, place)]
-    found += [tip_jacobian(robot, q, place), inverse_dynamics(robot, q, qd, qdd, **moving)]
-    return [numeric(each) for each in (*found, base_reaction(robot, q, qd, qdd, **moving))]
+    outcome = [robot_inertia(robot, q, place), momentum_matrix(robot, q, place), *tip_pose(robot, q, place)]
+    outcome += [tip_jacobian(robot, q, place), inverse_dynamics(robot, q, qd, qdd, **moving)]
+    return [numeric(each) for each in (*outcome, base_reaction(robot, q, qd, qdd, **moving))]
 
 
 def assert_same_dynamics(robot: Robot, other: Robot, seed: int) -> None:

@@ -82,8 +82,8 @@ intervals = st.tuples(ends, ends).map(sorted)
 
 
 def bounds(values: Any, symbol: Any, low: Any, high: Any) -> tuple[Any, Any]:
-    found = Enclosures(values, symbol)(*(np.atleast_1d(np.asarray(end, float)) for end in (low, high)))
-    return found.low, found.high
+    outcome = Enclosures(values, symbol)(*(np.atleast_1d(np.asarray(end, float)) for end in (low, high)))
+    return outcome.low, outcome.high
 
 
 def assert_inside(values: Any, low: float, high: float, parts: tuple[Any, ...] = ()) -> None:

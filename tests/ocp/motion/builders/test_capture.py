@@ -331,8 +331,8 @@ def test_wheels_about_any_axes_hold_their_farthest_sum(count: int) -> None:
 
 
 def test_a_wheel_on_the_arm_holds_its_momentum_to_any_side() -> None:
-    asked = capture(np.zeros(3))
-    robot = with_wheels(asked["chaser"].robot, [[1, 0, 0]], 0.02, momentum=2.0, link="link2")
+    request = capture(np.zeros(3))
+    robot = with_wheels(request["chaser"].robot, [[1, 0, 0]], 0.02, momentum=2.0, link="link2")
     machine, size = FreeFloating(robot), robot.dof
     start = State(machine.base_home(), np.zeros(size), np.zeros(size), machine.base_home(), 50.0, 50.0)
     assert wheel_capacity(machine, Limits().bounds(machine), start) == pytest.approx(4.0 * np.sqrt(3.0) + 2.0)

@@ -163,8 +163,8 @@ NONE = np.zeros(2, dtype=bool)
 
 def test_time_samples_are_omitted_up_to_a_share_of_the_cost() -> None:
     t = np.linspace(0, 2, 81)
-    bent = np.column_stack([np.abs(t - 1), np.where(t < 1, 0.0, 2 * (t - 1))])
-    assert choose_samples(t, bent, np.ones(2), 1e-9, min_steps=2, periodic=NONE) == pytest.approx([0, 1, 2])
+    perturbed = np.column_stack([np.abs(t - 1), np.where(t < 1, 0.0, 2 * (t - 1))])
+    assert choose_samples(t, perturbed, np.ones(2), 1e-9, min_steps=2, periodic=NONE) == pytest.approx([0, 1, 2])
     round_way = np.column_stack([np.sin(3 * t), np.cos(3 * t)])
     weights = np.array([1.0, 1.0])
 

@@ -312,7 +312,7 @@ def test_times_distances_and_periods_out_of_range_are_named_errors() -> None:
         schedule(smooth(Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)]), 0.1), LineLimits([1, 2, 3], 5.0, 200.0))
 
 
-@pytest.mark.parametrize("wrong", ["x", None, {}, 1j, [[0.1]]])
+@pytest.mark.parametrize("wrong", ["x", None, {}, 1j, [[0.1, 0.2]]])
 def test_arguments_that_are_no_numbers_are_named_errors(wrong: Any) -> None:
     path = smooth(Path.through([(0, 0, 0), (1, 0, 0), (1, 1, 0)]), 0.1)
     plan = schedule(path, LIMITS)

@@ -154,8 +154,8 @@ def searched(machine: FixedBase, places: Array, step: float) -> AtlasSearch:
         return np.array([one.joints for one in inverse_kinematics(machine, task, starts=16, seed=k)])
 
     far = np.full((len(places) - 1, 3), step)
-    instants, times = [TimeSample(sets, k) for k in range(len(places))], np.linspace(0, 1, len(places))
-    return AtlasSearch(space, instants, Steps(times, PathLength(np.ones(3)), far), seeds=seeds)
+    time_samples, times = [TimeSample(sets, k) for k in range(len(places))], np.linspace(0, 1, len(places))
+    return AtlasSearch(space, time_samples, Steps(times, PathLength(np.ones(3)), far), seeds=seeds)
 
 
 @pytest.mark.parametrize(("reach", "count"), [(0.45, 1), pytest.param(0.1, 0, marks=pytest.mark.long)])

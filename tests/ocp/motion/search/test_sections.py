@@ -180,7 +180,7 @@ def test_where_nothing_is_clear_at_the_first_waypoint_none_begins() -> None:
 
 
 def test_where_the_joint_is_held_at_no_value_that_does_the_waypoint_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waypoints, "section_values", lambda *_: np.array([10.0]))
+    monkeypatch.setattr(waypoints, "section_values", lambda *_, **__: np.array([10.0]))
     machine = problem_of("fetch__square").machine
     with pytest.raises(SolveError, match="at waypoint 0 on the sections of 'torso_lift_joint'") as refused:
         plan(machine, Waypoints(*task(40), step=STEP), scene=False)
