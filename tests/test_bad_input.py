@@ -62,15 +62,10 @@ CREATED_BY_THE_PACKAGE = {
 WITHOUT_ARGUMENTS = {"Anywhere", "SolverStatus", "paper_example", "reference_tunnel", "standing_example"}
 RAISED = {"DeadEnd", "Unreachable"}
 CHECKED_BY_PROBLEMS = {
-    "DynamicsSetup",
-    "Following",
-    "Pinned",
-    "RollObstacles",
-    "RollSettings",
-    "StandingSetup",
-    "VelocitySetup",
-}
-"""Options that a builder checks: their fields are in the panels of dynamics_problem, standing_problem, roll_problem."""
+    "AccelerationOptions", "DynamicsSetup", "Following", "IkOptions", "Pinned", "RateOptions", "RollObstacles",
+    "RollSettings", "StandingSetup", "VelocitySetup",
+}  # fmt: skip
+"""Options whose fields are in the panels of the functions that take them, such as `dynamics_problem` and `resolve`."""
 
 
 def test_everything_a_user_types_is_in_a_panel() -> None:
