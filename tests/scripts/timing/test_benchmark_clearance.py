@@ -10,6 +10,7 @@ from scripts import benchmark
 from scripts.timing import clearance
 
 
+@pytest.mark.long
 def test_plans_and_proofs_are_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clearance, "SEEDS", 1)
     monkeypatch.setattr(clearance, "CASES", {"Panda": clearance.CASES["Panda"]})

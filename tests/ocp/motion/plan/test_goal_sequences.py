@@ -123,6 +123,7 @@ def test_steps_are_planned_and_read_again_with_their_stances(tmp_path: Path) -> 
     same(planned, Plan.load(tmp_path / "steps.npz"))
 
 
+@pytest.mark.long
 def test_joints_of_all_stances_are_continuous_in_one_order() -> None:
     """The stances are rooted at different feet; in the order of the first one no joint jumps."""
     steps = replace(planar_steps(1, 0.8, 0.8), margin=0.01)

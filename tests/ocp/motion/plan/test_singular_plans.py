@@ -137,7 +137,9 @@ def turning(angle: float, duration: float) -> TipTask:
 # ---- reasons ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("angle", "duration"), [(np.radians(170), 0.4), (np.radians(100), 0.2)])
+@pytest.mark.parametrize(
+    ("angle", "duration"), [(np.radians(170), 0.4), pytest.param(np.radians(100), 0.2, marks=pytest.mark.long)]
+)
 def test_a_tool_that_turns_too_fast_names_joint_time_and_limit(angle: float, duration: float) -> None:
     with pytest.raises(SolveError) as caught:
         plan_bare(machine("panda"), turning(angle, duration), search="start")

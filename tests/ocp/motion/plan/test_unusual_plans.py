@@ -186,6 +186,7 @@ def test_holding_the_goal_costs_zero(first: Callable[[], TipTask], rows: tuple[i
     np.testing.assert_allclose(result.at(4.0)["joints"], alone["joints"][-1], atol=1e-5)
 
 
+@pytest.mark.long
 def test_two_that_follow_each_other_with_a_rest_between_them_are_one_after_the_other() -> None:
     """A place held, a velocity, and the place it leads to: the cost is that of the velocity alone, from its start."""
     _, at = pose(panda(), (), PANDA_START)

@@ -102,6 +102,7 @@ def test_poses_out_of_reach_at_a_fixed_height_are_reached_by_lifting() -> None:
             plan(arm, Waypoints(places, turns, step=STEP), scene=False)
 
 
+@pytest.mark.long
 def test_the_reversed_path_is_as_long_and_weights_increase_the_cost() -> None:
     machine, result = problem_of("fetch__square").machine, planned(40)
     places, turns = task(40)
@@ -117,6 +118,7 @@ def test_more_waypoints_of_one_path_change_little(count: int) -> None:
     assert planned(count).cost == pytest.approx(planned(40).cost, rel=0.03)
 
 
+@pytest.mark.long
 def test_where_there_are_more_charts_than_memory_is_for_fewer_waypoints_are_searched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -130,6 +132,7 @@ def test_where_there_are_more_charts_than_memory_is_for_fewer_waypoints_are_sear
     assert refused.value.name == "configurations"
 
 
+@pytest.mark.long
 def test_obstacles_are_named_with_the_waypoint() -> None:
     machine = problem_of("fetch__square").machine
     places, turns = task(40)
