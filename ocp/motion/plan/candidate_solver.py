@@ -96,9 +96,9 @@ class CandidateSolver(Solver):
         if self._may_relax(advanced):
             return [Candidate(candidate.start, candidate.seed.cost, seed=replace(candidate.seed, relaxed=True))]
         if not advanced.passed and candidate.seed.relaxed and np.isnan(self._start(candidate)).any():
-            # the conditions of a free start may depend on each other where the tasks do: hold it
-            held = replace(candidate.seed, fixed=True)
-            return [advanced, Candidate(candidate.start, candidate.seed.cost, seed=held)]
+            # IPOPT may stall at a free start whose conditions depend on each other: fix it, at a higher cost
+            seed = replace(candidate.seed, fixed=True)
+            return [advanced, Candidate(candidate.start, seed.cost, seed=seed)]
         return [advanced, *self._free_start(advanced)]
 
     def with_own_cost(self) -> CandidateSolver:
