@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
 from models import FixedBase, FreeFloating, Machine, Standing
+from models.checks import NOT_NUMBERS, check_entries
 from ocp.console import TimeLimitReached, interruptible, shown_progress, time_limited
 from ocp.errors import ProblemError, SolveError, checked_time_limit, require
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -182,6 +183,10 @@ def _is_sequence(tasks: Any) -> bool:
     """
     if not isinstance(tasks, Sequence) or isinstance(tasks, str):
         return False
+    try:
+        check_entries(tasks)
+    except NOT_NUMBERS:
+        return False  # refused as tasks
     goals = [isinstance(part, Goal) for part in tasks]
     if all(goals) or all(isinstance(part, TipTask) for part in tasks):
         return False
