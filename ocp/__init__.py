@@ -1,8 +1,7 @@
 """Optimal control: declare a problem, transcribe it, solve it, audit it; ready problems and plans for machines."""
 
 from ocp.audit.audit import Audit, Finding
-from ocp.direct.collocation import Collocation
-from ocp.direct.shooting import MultipleShooting
+from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.errors import (
     AuditError,
     BoundWarning,

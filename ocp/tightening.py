@@ -20,7 +20,7 @@ import numpy as np
 from ocp.console import interruptible, time_left, time_limited
 from ocp.curves import differentiation_matrix, lagrange, quadrature_weights
 from ocp.direct.assembly import Transcription
-from ocp.direct.collocation import Collocation
+from ocp.direct.discretisation import Collocation
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import check_meshed
 from ocp.errors import SolveError, SolverStatus, checked_time_limit, require

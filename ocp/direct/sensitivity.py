@@ -13,11 +13,10 @@ import scipy
 
 from ocp.direct.active_set import RESOLVED, Conditions, conditions
 from ocp.direct.assembly import Program, Transcription, assemble
-from ocp.direct.collocation import Collocation
 from ocp.direct.diagnosis import variable_names
+from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.direct.nlp import Outcome, controls_at
 from ocp.direct.scaling import Pattern, compute_scales, sizes_along
-from ocp.direct.shooting import MultipleShooting
 from ocp.errors import ProblemError, require
 from ocp.problem.formulation import Formulation
 from ocp.problem.invariants import bounds_to_solve

@@ -23,7 +23,7 @@ import numpy as np
 
 from ocp.console import interruptible, time_limited
 from ocp.curves import PiecewisePolynomial
-from ocp.direct.collocation import Collocation
+from ocp.direct.discretisation import Collocation
 from ocp.direct.nlp import SOLVERS
 from ocp.errors import Interrupted, ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.indirect.boundary import LOBATTO, BoundaryProblem, NewtonResult, newton

@@ -28,7 +28,7 @@ from ocp.app.files.safe_files import read_tree
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.plan.goal_motions import GoalRequest
 from ocp.motion.plan.goal_plan import plan_to_goal
-from ocp.motion.sampling.straight import StraightMotions
+from ocp.motion.sampling.joint_paths import StraightMotions
 from tests.sweep.results import Row, Sweep, parser
 
 SCENES = ("bookshelf_small", "bookshelf_tall", "bookshelf_thin", "box", "cage", "table_pick", "table_under_pick")

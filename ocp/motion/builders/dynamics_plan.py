@@ -25,7 +25,7 @@ import numpy as np
 from models import FreeFloating, Machine
 from ocp.audit.audit import Audit
 from ocp.console import interruptible
-from ocp.direct.collocation import Collocation
+from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, SolveError, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import (

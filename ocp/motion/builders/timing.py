@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.console import interruptible
-from ocp.direct.collocation import Collocation
+from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, require
 from ocp.methods import solve
 from ocp.motion.builders.timing_tables import (

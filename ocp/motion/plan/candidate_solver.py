@@ -18,7 +18,7 @@ import numpy as np
 from models.checks import Array
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.clearance import ClosestPair
-from ocp.direct.collocation import Collocation
+from ocp.direct.discretisation import Collocation
 from ocp.direct.prepared import Prepared
 from ocp.errors import RefinementWarning, SolveError
 from ocp.methods import solve

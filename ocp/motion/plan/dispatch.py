@@ -21,10 +21,9 @@ from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED
 from ocp.motion.plan.actuators import limits_actuators
-from ocp.motion.plan.goal_sequence import plan_capture, plan_goal, plan_sequence, plan_steps
+from ocp.motion.plan.declared_plans import plan_capture, plan_goal, plan_sequence, plan_steps, plan_to_stand
 from ocp.motion.plan.planner import PlanOptions, checked_request, clearance_for, plan_request
 from ocp.motion.plan.sequence import SequenceRequest, plan_consecutive, plan_in_segments
-from ocp.motion.plan.standing import plan_to_stand
 from ocp.motion.plan.waypoints import plan_path
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.plan import Plan

@@ -36,9 +36,8 @@ from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.plan.actuators import limits_actuators
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.sampling.fastest_motion import FastestMotionSettings, MotionLimits, fastest_motion_near
+from ocp.motion.sampling.joint_paths import StraightMotions, path_length, points_along, shortest_through_corners
 from ocp.motion.sampling.path_search import JointPath, PathSearchSettings
-from ocp.motion.sampling.shortening import path_length, points_along, shortest_through_corners
-from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits

@@ -16,7 +16,7 @@ from models import FixedBase
 from models.checks import Array
 from ocp.console import TimeLimitReached, interruptible, time_limited
 from ocp.errors import ProblemError, SolveError, require
-from ocp.motion.builders.constant_jerk import TorqueLimits  # fmt: skip
+from ocp.motion.builders.constant_jerk import TorqueLimits
 from ocp.motion.plan.goal_motions import (
     GoalRequest,
     GoalTask,
@@ -27,8 +27,8 @@ from ocp.motion.plan.goal_motions import (
 )
 from ocp.motion.result.candidate import Candidate, Reason, Rejection
 from ocp.motion.result.solved_plan import Part, SolvedPlan
+from ocp.motion.sampling.joint_paths import StraightMotions
 from ocp.motion.sampling.path_search import JointPath, TreeSearch, find_paths
-from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.search import checked_bound
 from ocp.motion.tasks.checks import checked_configuration, checked_weights, clip_to_limits

@@ -27,9 +27,9 @@ from ocp.motion.builders.tool_motion import Stretch, stretches_of
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.actuators import limits_actuators, weights_actuators
+from ocp.motion.plan.declared_plans import plan_goal, with_joints
 from ocp.motion.plan.goal_motions import GoalRequest
 from ocp.motion.plan.goal_plan import plan_to_goal
-from ocp.motion.plan.goal_sequence import plan_goal, with_joints
 from ocp.motion.plan.planner import PlanOptions, checked_request, clearance_for, plan_request
 from ocp.motion.result.segmented_plan import JUMP_TOLERANCE, Reconfiguration, SegmentedPlan, SequencePlan
 from ocp.motion.result.solved_plan import SolvedPlan

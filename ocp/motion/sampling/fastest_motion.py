@@ -31,8 +31,7 @@ from models.checks import Array
 from ocp.console import TimeLimitReached, check_time
 from ocp.errors import SolveError
 from ocp.motion.builders.constant_jerk import ConstantJerkMotion, TorqueLimits
-from ocp.motion.sampling.shortening import points_along
-from ocp.motion.sampling.straight import StraightMotions
+from ocp.motion.sampling.joint_paths import StraightMotions, points_along
 from ocp.motion.tasks.limits import JointBounds
 
 __all__ = ["FastestMotionSettings", "MotionLimits", "fastest_motion_near"]

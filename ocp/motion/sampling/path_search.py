@@ -1,8 +1,8 @@
 """Collision-free joint paths of several homotopy classes, found by random trees, shortened and locally optimised.
 
 Two trees of straight motions grow from the start and from the goals towards random configurations, and towards each
-other (RRT-Connect: Kuffner & LaValle 2000). Every edge is proven clear (`ocp.motion.sampling.straight`). Many edges are
-proven at once: an edge of a Panda among boxes takes 0.5 ms in a batch and 9 ms by itself.
+other (RRT-Connect: Kuffner & LaValle 2000). Every edge is proven clear (`ocp.motion.sampling.joint_paths`), many at
+once: an edge of a Panda among boxes takes 0.5 ms in a batch and 9 ms by itself.
 
 Searches with different seeds find paths on different sides of obstacles. Two paths count as one class if one deforms
 into the other through clear configurations along straight motions; of these the shorter one is kept.
@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 
 from models.checks import Array
 from ocp.console import TimeLimitReached, check_time
-from ocp.motion.sampling.shortening import (
+from ocp.motion.sampling.joint_paths import (
     LengthSettings,
     ShorteningSettings,
+    StraightMotions,
     optimise_length,
     path_length,
     same_class,
     shorten,
 )  # fmt: skip
-from ocp.motion.sampling.straight import StraightMotions
 
 __all__ = ["JointPath", "PathSearchSettings", "RandomTreeSettings", "TreeSearch", "connect", "find_paths"]
 

@@ -28,7 +28,7 @@ from models import FreeFloating, center_of_mass, find_wheels
 from models.checks import NOT_NUMBERS, Array, floats, real
 from models.spatial import Expression
 from ocp.console import interruptible
-from ocp.direct.collocation import Collocation
+from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem, end_velocities

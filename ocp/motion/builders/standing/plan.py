@@ -22,8 +22,7 @@ import numpy as np
 from models.machines.standing import Standing
 from ocp.audit.audit import Audit
 from ocp.console import interruptible, time_left, time_limited
-from ocp.direct.collocation import Collocation
-from ocp.direct.shooting import MultipleShooting
+from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.errors import ProblemError, SolveError, SolverStatus, checked_time_limit, require
 from ocp.methods import solve
 from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, solve_with_clearance

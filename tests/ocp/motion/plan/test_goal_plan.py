@@ -18,8 +18,8 @@ from ocp.motion.local.collisions import distances_along
 from ocp.motion.plan.goal_motions import GoalRequest, GoalSettings
 from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.result.candidate import Rejection
+from ocp.motion.sampling.joint_paths import StraightMotions
 from ocp.motion.sampling.path_search import PathSearchSettings
-from ocp.motion.sampling.straight import StraightMotions
 from ocp.motion.tasks.goals import Cost
 from tests.ocp.motion.sampling.sliders import RADIUS, gap, slider
 

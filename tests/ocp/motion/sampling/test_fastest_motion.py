@@ -14,7 +14,7 @@ from models.examples import example_robot
 from ocp import Limits, SolveError
 from ocp.motion.builders.constant_jerk import TorqueLimits, least_durations, stopping_motion
 from ocp.motion.sampling.fastest_motion import FastestMotionSettings, MotionLimits, fastest_motion_near
-from ocp.motion.sampling.straight import StraightMotions
+from ocp.motion.sampling.joint_paths import StraightMotions
 from tests.ocp.motion.sampling.sliders import gap, slider
 
 REST = np.zeros(2)

@@ -8,9 +8,15 @@ import pytest
 from models import Box, CollisionScene
 from models.checks import Array
 from ocp.console import TimeLimitReached, time_limited
+from ocp.motion.sampling.joint_paths import (
+    StraightMotions,
+    optimise_length,
+    path_length,
+    points_along,
+    same_class,
+    shorten,
+)
 from ocp.motion.sampling.path_search import JointPath, PathSearchSettings, TreeSearch, connect, find_paths
-from ocp.motion.sampling.shortening import optimise_length, path_length, points_along, same_class, shorten
-from ocp.motion.sampling.straight import StraightMotions
 from tests.ocp.motion.sampling.sliders import RADIUS, dense, gap, slider
 
 ONES = np.ones(2)

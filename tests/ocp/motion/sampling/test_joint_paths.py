@@ -10,7 +10,7 @@ from models.checks import Array
 from models.examples import example_robot
 from models.shapes.shapes import Shape
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.sampling.straight import StraightMotions
+from ocp.motion.sampling.joint_paths import StraightMotions
 from tests.ocp.motion.sampling.sliders import gap, slider
 
 
