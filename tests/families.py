@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
 
 
-def some(members: Sequence[Any], daily: int | Iterable[Any]) -> list[Any]:
+def some(family: Iterable[Any], daily: int | Iterable[Any]) -> list[Any]:
     """Parameters of a family: the daily members as they are, the others marked long.
 
     Args:
-        members: Parameters, each of one value, or as `pytest.param`.
+        family: Parameters, each of one value, or as `pytest.param`.
         daily: Which ones, or how many, spread evenly over the family.
     """
+    members = list(family)
     if isinstance(daily, int):
         step = len(members) / min(daily, len(members))
         chosen = [members[int(k * step)] for k in range(min(daily, len(members)))]

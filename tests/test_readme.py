@@ -105,6 +105,7 @@ def normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+@pytest.mark.long
 def test_the_readme_runs_with_its_stated_requirements(tmp_path: Path) -> None:
     """In a folder that is empty, in processes of their own: without extras but those that a block is said to need."""
     (tmp_path / "hiding").mkdir()

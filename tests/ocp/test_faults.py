@@ -36,6 +36,7 @@ from ocp import (
 from ocp.console import TimeLimitReached, casadi_silenced, check_time, interruptible, time_left, time_limited
 from ocp.direct.prepared import Prepared
 from ocp.errors import Interrupted, SolverStatus
+from tests.families import some
 from tests.ocp.problems import SOLVERS, energy, van_der_pol
 from tests.ocp.test_tightening import beyond, walled
 
@@ -160,6 +161,7 @@ def lines(code: str) -> list[list[str]]:
     return [line.split(" | ") for line in done.stdout.splitlines()]
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_a_solve_at_once_with_its_iterate() -> None:
     *result, afterwards = lines(DIRECT)
     with_a_plan = ["ipopt", "ipopt without check", "fatrop"]
@@ -171,6 +173,7 @@ def test_ctrl_c_ends_a_solve_at_once_with_its_iterate() -> None:
     assert afterwards == ["True False"]
 
 
+@pytest.mark.long
 def test_ctrl_c_during_a_check_is_no_verdict() -> None:
     result = lines(CHECKS)
     assert [name for name, _, _ in result] == [
@@ -518,7 +521,7 @@ together(lambda: [float(form.sampled([form.f, form.running], x, u, t, 1.0, p)[0]
 }
 
 
-@pytest.mark.parametrize("what", SHARED)
+@pytest.mark.parametrize("what", some(SHARED, 2))
 def test_threads_that_share_objects_get_the_same_results(what: str) -> None:
     done = run(f"{THREADS}\n{SHARED[what]}\n{REPORT}")
     assert done.returncode == 0, (done.returncode, done.stderr)

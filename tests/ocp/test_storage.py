@@ -112,6 +112,7 @@ write_arrays(sys.argv[1], {"a": np.ones(100)})
 """
 
 
+@pytest.mark.long
 def test_remains_of_a_killed_save_are_removed_and_those_of_a_running_one_are_not(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     writers = [

@@ -42,6 +42,7 @@ def test_a_trajectory_is_a_table_without_formulas(name: str, tmp_path: Path) -> 
     assert JointTrajectory.read_csv(tmp_path / "a.csv").names == (name,)
 
 
+@pytest.mark.long
 def test_every_writer_of_tables_names_its_columns_here() -> None:
     """A module with a method `write_csv`, or that uses a writer of csv or numpy, takes names or cells from here."""
     writers = []

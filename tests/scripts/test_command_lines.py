@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.families import some
+
 FOLDER = Path(__file__).resolve().parents[2] / "scripts"
 OPTIONS = {
     "free_floating": ["--out"],
@@ -21,7 +23,7 @@ OPTIONS = {
 """What each of them tells of its options."""
 
 
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize("name", some(OPTIONS, 3))
 def test_every_script_is_short_and_runs_as_a_file_from_anywhere(name: str, tmp_path: Path) -> None:
     file = FOLDER / f"{name}.py"
     assert len(file.read_text(encoding="utf-8").splitlines()) < 100
@@ -30,6 +32,7 @@ def test_every_script_is_short_and_runs_as_a_file_from_anywhere(name: str, tmp_p
     assert all(option in report for option in OPTIONS[name])
 
 
+@pytest.mark.long
 def test_a_script_runs_as_a_module() -> None:
     command = [sys.executable, "-m", "scripts.reproduce", "--help"]
     report = subprocess.run(command, cwd=FOLDER.parent, capture_output=True, text=True, check=True, timeout=120).stdout

@@ -9,23 +9,25 @@ import pytest
 from scipy.optimize import linprog
 
 from ocp import Collocation, solve
+from tests.families import some
 from tests.sweep.judging import OPTIMA, QUADRATIC, judged, table
 from tests.sweep.optima import FAMILIES, fastest, miss
 from tests.sweep.quadratics import least_curvature, random_quadratic
 
 
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", some(range(16), 5))
 def test_no_extremal_that_is_no_minimum_passes_and_the_minima_do(seed: int) -> None:
     result = judged(QUADRATIC, seed, ["drawn"])
     assert {verdict.outcome for verdict in result} <= {"pass", "fail"}, table(result)
 
 
-@pytest.mark.parametrize("family", OPTIMA)
+@pytest.mark.parametrize("family", some(OPTIMA, 2))
 def test_no_plan_passes_whose_cost_is_off_and_the_optima_do(family: str) -> None:
     matches = [verdict for seed in (0, 3, 10) for verdict in judged(family, seed, ["held", "linear", "radau"])]
     assert {verdict.outcome for verdict in matches} <= {"pass", "fail"}, table(matches)
 
 
+@pytest.mark.long
 def test_conjugate_points_are_those_of_the_dense_second_variation() -> None:
     """Two truths that share nothing: the argument of a Lagrangian frame, and the eigenvalues of a large matrix."""
     for seed in (0, 8, 12, 20):

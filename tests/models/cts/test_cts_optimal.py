@@ -109,6 +109,7 @@ def test_other_rigs_tunnels_and_branches(sizes: list[float], seed: int, branch: 
     check_against_grid(rig, tunnel, branch, targets, rng.uniform(-3, 3, 40), 240, rate_weight)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("yaw", "limits"),
     [

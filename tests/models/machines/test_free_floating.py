@@ -321,6 +321,7 @@ def test_point_masses_on_a_folded_arm_have_enough_inertia() -> None:
     close(machine.momentum_residual(place, q, rate, rates), np.zeros(6), 1e-14)
 
 
+@pytest.mark.long
 @few
 @given(cases)
 def test_momentum_makes_base_and_tip_move_affinely_with_the_generalized_jacobian_unchanged(case: Case) -> None:

@@ -112,6 +112,7 @@ def test_joints_are_continuous_where_their_angles_pass_half_a_turn() -> None:
     assert np.ptp(q[:, 0]) > 2 * np.pi - 0.5
 
 
+@pytest.mark.long
 @settings(max_examples=10)
 @given(seeds)
 def test_a_joint_limit_that_only_a_place_between_samples_breaks_is_seen(seed: int) -> None:

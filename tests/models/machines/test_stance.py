@@ -23,6 +23,7 @@ few = settings(max_examples=8, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
+@pytest.mark.long
 @given(seeds, st.integers(2, 8))
 @few
 def test_a_robot_bears_the_same_whatever_link_it_is_rooted_at(seed: int, size: int) -> None:

@@ -242,6 +242,7 @@ def test_a_spring_pulls_back_to_its_rest() -> None:
     assert wrench.link == EXAMPLE.robot.tip
 
 
+@pytest.mark.long
 @given(cases)
 @few
 def test_a_sampled_motion_is_evaluated_point_by_point(case: Case) -> None:

@@ -118,6 +118,7 @@ def test_the_curvature_is_that_of_the_place(seed: int) -> None:
     np.testing.assert_allclose(path.curvature(s), np.linalg.norm(path.at(s).curvature, axis=1), rtol=1e-12, atol=1e-9)
 
 
+@pytest.mark.long
 @few
 @given(seeds, st.integers(2, 8), st.sampled_from(["cubic", "quintic"]), st.floats(-3.5, -1))
 def test_random_paths_stay_within_the_deviation(seed: int, count: int, kind: Any, exponent: float) -> None:

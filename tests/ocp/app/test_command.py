@@ -149,6 +149,7 @@ def test_a_report_stands_alone(capsys: Any) -> None:
     assert len(text) < 2_000_000
 
 
+@pytest.mark.long
 def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> None:
     t, q, v, a = smooth()
     write_table(tmp_path / "m.csv", t, q, v, a)
@@ -243,6 +244,7 @@ LIFTED = """<robot name="lifted"><link name="ground"/><link name="column"/><link
 """The shoulder limited: on either side of a line across the elbow has to be on the other one."""
 
 
+@pytest.mark.long
 def test_segmented_plans_are_written_with_reconfigurations_and_fail_where_one_is_missing(
     tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

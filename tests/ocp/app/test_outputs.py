@@ -162,6 +162,7 @@ def test_each_command_asks_before_it_overwrites(tmp_path: Path, capsys: Any) -> 
     assert run(capsys, *calls[2], "--quiet")[0] == 0  # now it is our own
 
 
+@pytest.mark.long
 def test_a_task_runs_again_over_its_own_outputs(tmp_path: Path, capsys: Any) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(planned(), folder)
@@ -198,6 +199,7 @@ def test_names_in_a_head_mean_nothing_to_spreadsheets_and_shells(names: list[str
     assert next(csv.reader([text])) == table_head(names)
 
 
+@pytest.mark.long
 @given(names=UNIQUE)
 def test_tables_are_read_back_with_their_names(names: list[str], tmp_path_factory: pytest.TempPathFactory) -> None:
     file = tmp_path_factory.getbasetemp() / "named.csv"

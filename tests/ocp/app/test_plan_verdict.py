@@ -81,6 +81,7 @@ def test_a_path_passes_at_its_velocity_limits_and_not_beyond(period: float) -> N
     assert verdict_of(slow, slow.sample(period), "path").check.passed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("plan", [segmented_plan, path], ids=["segments", "path"])
 def test_it_is_reported_and_shown_with_that_verdict(plan: Any) -> None:
     report, shown = report_of_plan(plan(), 0.01, "a motion"), animate_plan(plan())

@@ -219,6 +219,7 @@ def test_only_an_empty_figure_is_drawn_into(wrong: Any) -> None:
             motion().plot(figure=figure)
 
 
+@pytest.mark.long
 def test_notebook_output_is_one_valid_element_without_requests() -> None:
     for shown in (motion()._repr_html_(), sprint()._repr_html_(), sprint().plot()._repr_svg_()):
         root = ElementTree.fromstring(shown)

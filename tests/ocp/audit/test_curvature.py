@@ -51,6 +51,7 @@ def oscillator(horizon: float, stiffness: float = 1.0, unit: float = 1.0, price:
     return problem
 
 
+@pytest.mark.long
 @given(st.floats(0.2, 8.0), st.floats(0.1, 30.0), st.sampled_from([1e-6, 1.0, 1e6]), st.sampled_from([1e-3, 1.0, 1e5]))
 def test_a_plan_is_a_minimum_until_the_conjugate_point(share: float, k: float, unit: float, price: float) -> None:
     assume(abs(share - np.pi) >= 0.02)
@@ -105,6 +106,7 @@ def test_the_verdict_is_that_of_the_reduced_hessian(fixed: bool, bounded: bool) 
     assert {True, False} <= set(verdicts)
 
 
+@pytest.mark.long
 def test_the_direction_that_is_returned_lowers_the_cost() -> None:
     rng = np.random.default_rng(3)
     seen = 0

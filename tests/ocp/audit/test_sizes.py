@@ -47,7 +47,7 @@ def test_the_scale_of_a_state_is_its_range() -> None:
 
 
 @given(*(st.floats(-9.0, 9.0) for _ in range(3)))
-@settings(max_examples=15)
+@settings(max_examples=6)
 def test_sizes_follow_the_units(length: float, force: float, time: float) -> None:
     """The plan of 1 m in 1 s, written in other units: no solver has a part in it."""
     length, force, time = 10.0**length, 10.0**force, 10.0**time

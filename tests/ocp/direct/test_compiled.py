@@ -28,6 +28,7 @@ from ocp.direct.code_generation import CompilerError, Library, build_library
 from ocp.problem.formulation import Formulation
 from tests.conformance import brachistochrone, bryson_denham
 from tests.conformance.case import Case
+from tests.families import some
 from tests.ocp.problems import SWING, plant, swing, van_der_pol
 
 ROOT = Path(__file__).parents[3]
@@ -362,7 +363,7 @@ time.sleep(float(sys.argv[1]))
 """
 
 
-@pytest.mark.parametrize("how", [None, signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("how", some([None, signal.SIGINT, signal.SIGKILL], 1))
 def test_a_process_that_ends_takes_its_compiler_along(
     own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: signal.Signals | None
 ) -> None:

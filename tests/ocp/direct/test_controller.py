@@ -43,6 +43,7 @@ def of(plan: Solution, times: Array) -> Array:
     return np.hstack([at[name].reshape(len(times), -1) for name in (*plan.states, *plan.controls)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_the_program_tells_the_plan_and_its_functions_are_those_solved_with(case: str, tmp_path: Path) -> None:
     method, solver = CASES[case]

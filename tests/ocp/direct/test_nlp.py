@@ -19,6 +19,7 @@ import pytest
 from ocp import Collocation, MultipleShooting, Problem, ProblemError, SolveError, prepare, solve
 from ocp.direct import nlp, prepared
 from ocp.errors import SolverStatus
+from tests.families import some
 from tests.ocp.problems import METHODS, SOLVERS, SWING, Method, energy, plant, relative, swing, van_der_pol
 
 FINE: dict[str, Method] = {
@@ -347,7 +348,7 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", some(SOLVERS, 1))
 def test_ctrl_c_stops_a_solve_and_carries_the_last_iterate(solver: str) -> None:
     done = run(f"SOLVER = {solver!r}\n{INTERRUPTED}")
     assert done.stdout.splitlines() == [

@@ -454,6 +454,7 @@ def test_the_wrong_branch_of_a_heading_is_no_extremal() -> None:
         solve(compass(), Indirect(), guess=turned)
 
 
+@pytest.mark.long
 def test_costates_of_the_wrong_sign_are_mended_or_fail_with_words() -> None:
     case = EXTREMA["heading"]
     seed = solve(case.build(), case.direct, parameters=case.parameters)

@@ -109,14 +109,14 @@ def assert_inside(values: Any, low: float, high: float, parts: tuple[Any, ...] =
 
 @pytest.mark.parametrize("name", ONE)
 @given(interval=intervals)
-@settings(max_examples=60)
+@settings(max_examples=25)
 def test_no_sample_of_a_function_lies_outside(name: str, interval: list[float]) -> None:
     assert_inside(ONE[name](T), interval[0], interval[1])
 
 
 @pytest.mark.parametrize("name", TWO)
 @given(interval=intervals, shift=st.floats(-3, 3), rate=st.sampled_from([-2.0, -0.5, 0.0, 1.0]))
-@settings(max_examples=60)
+@settings(max_examples=25)
 def test_no_sample_of_a_function_of_two_lies_outside(
     name: str, interval: list[float], shift: float, rate: float
 ) -> None:
@@ -137,6 +137,7 @@ def random_expression(rng: np.random.Generator, depth: int, parts: list[Any]) ->
     return result
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**32 - 1), intervals)
 @settings(max_examples=400)
 def test_no_sample_of_a_tree_of_functions_lies_outside(seed: int, interval: list[float]) -> None:

@@ -385,6 +385,7 @@ def _half() -> Problem:
 # ---- published flights -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_two_burns_raise_an_orbit_as_published() -> None:
     """Betts' transfer: a weight of 0.2367249 arrives (PSOPT)."""
     plan = solve(two_burns(), Collocation(40, 4), guess=solve(two_burns(), Collocation(20, 5)))
@@ -392,6 +393,7 @@ def test_two_burns_raise_an_orbit_as_published() -> None:
     assert plan.audit().feasible
 
 
+@pytest.mark.long
 def test_the_launch_of_a_delta_carries_the_published_mass() -> None:
     """Four stages that burn out: 7529.712 kg (Betts; GPOPS). PSOPT's 7529.661 is what its coarse mesh comes to."""
     plan = solve(launch(), Collocation(10, 5))

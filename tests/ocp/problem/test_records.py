@@ -32,6 +32,7 @@ from ocp import (
 )
 from ocp.problem.record_reader import unpack_record
 from ocp.problem.record_writer import pack_record
+from tests.families import some
 from tests.ocp.problems import SWING, energy, plant, swing, van_der_pol
 from tests.ocp.test_faults import run
 
@@ -76,7 +77,7 @@ PROBLEMS: dict[str, tuple[Callable[[], Problem], dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("what", PROBLEMS)
+@pytest.mark.parametrize("what", some(PROBLEMS, 2))
 def test_a_saved_plan_is_audited_in_another_process(what: str, tmp_path: Path) -> None:
     build, parameters = PROBLEMS[what]
     plan = solve(build(), Collocation(6), parameters=parameters)

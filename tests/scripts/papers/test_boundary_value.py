@@ -88,6 +88,7 @@ def test_part_of_the_angular_velocity_has_no_gauge(rows: list[int]) -> None:
     assert np.abs(outside).max() > ABOVE_ROUNDING * np.abs(change).max()
 
 
+@pytest.mark.long
 def test_with_part_of_the_angular_velocity_fixed_equation_35_allows_other_motions() -> None:
     """Backward from one end, with costates zero and J^T mu there: both satisfy (35), only the first is optimal."""
     case = spatial_case(3)
@@ -101,6 +102,7 @@ def test_with_part_of_the_angular_velocity_fixed_equation_35_allows_other_motion
     assert moved["partly angular"] > ABOVE_ROUNDING
 
 
+@pytest.mark.long
 def test_the_printed_boundary_value_is_degenerate_and_zero_costates_are_not() -> None:
     """Along extremals of the paper's example: 2 of the 6 costates at the start are undetermined by (35)."""
     case = example()

@@ -108,6 +108,7 @@ def functions() -> dict[str, Any]:
     return rig_functions(reference_rig(), reference_tunnel())
 
 
+@pytest.mark.long
 def test_generated_c_called_from_c_gives_the_joints_of_python(tmp_path: Path, functions: dict[str, Any]) -> None:
     example = tmp_path / "example"
     shutil.copytree(EXAMPLE, example, ignore=shutil.ignore_patterns("build"))

@@ -25,6 +25,7 @@ def measured_audit(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict
         return folder, benchmark.run_part("audit", folder, 1)
 
 
+@pytest.mark.long
 def test_every_case_is_timed_on_every_number_of_intervals(measured_audit: tuple[Path, dict[str, Any]]) -> None:
     _, numbers = measured_audit
     named = [(row["case"], row["intervals"]) for row in numbers["rows"]]

@@ -17,6 +17,7 @@ from scripts.papers.cts.results import sweep_targets
 from scripts.timing import cts as benchmark_cts
 
 
+@pytest.mark.long
 def test_a_part_is_run_and_its_tables_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark_cts, "COUNT", 8)
     monkeypatch.setattr(benchmark_cts, "PEER_COUNT", 2)
@@ -34,6 +35,7 @@ def test_a_part_is_run_and_its_tables_written(tmp_path: Path, monkeypatch: pytes
         assert picture.width > 600
 
 
+@pytest.mark.long
 def test_compiled_functions_equal_python_and_a_bad_row_affects_no_other() -> None:
     function = optimal_inverse(reference_rig(**benchmark_cts.LIMITS), reference_tunnel())
     rows = np.vstack([benchmark_cts.random_reachable(60), sweep_targets(20)])

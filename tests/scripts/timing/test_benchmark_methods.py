@@ -29,6 +29,7 @@ def test_the_loop_of_constraints_finds_the_optimum_of_the_package(
     assert {path.name for path in tmp_path.iterdir()} == {f"build_and_solve.{ending}" for ending in endings}
 
 
+@pytest.mark.long
 def test_costates_are_timed_by_four_methods(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(costate_rate, "JOINTS", (3, 7))
     numbers = costate_rate.run(1)

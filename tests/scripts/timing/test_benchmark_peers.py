@@ -109,6 +109,7 @@ def test_a_peer_that_is_not_installed_is_left_out_by_name(monkeypatch: pytest.Mo
     assert "rockit: not installed" in optimal_control.report({**numbers, "rows": [], "first": [{"tool": "-"}]})
 
 
+@pytest.mark.long
 def test_pages_are_drawn(tmp_path: Path) -> None:
     for module, name in ((optimal_control, "optimal_control"), (arms, "arms")):
         numbers = json.loads((ROOT / f"results/benchmark/{name}.json").read_text(encoding="utf-8"))

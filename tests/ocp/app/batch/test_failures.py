@@ -46,6 +46,7 @@ def started(folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.long
 def test_a_script_whose_file_is_missing_ends_with_status_1_and_is_done_when_the_file_is_there(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
     report = started(tmp_path)

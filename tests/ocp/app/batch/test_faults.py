@@ -23,6 +23,7 @@ def test_workers_and_drivers_are_killed_and_nothing_is_lost_or_done_twice(tmp_pa
     check_disturbed(tmp_path / "b", 60, 10)
 
 
+@pytest.mark.long
 def test_a_driver_waits_for_another_and_completes_its_tasks(tmp_path: Path) -> None:
     log, gate = tmp_path / "log", tmp_path / "gate"
     tasks = [{"x": i, "log": str(log), **({"gate": str(gate)} if i > 3 else {})} for i in range(12)]

@@ -165,6 +165,7 @@ def test_errors_and_numbers_that_are_none_are_failures_with_their_reason_and_not
     assert sum(after[name][0] != before[name][0] for name in before) == len(by_name)
 
 
+@pytest.mark.long
 def test_a_task_that_always_ends_its_worker_is_set_aside_and_the_others_are_done(tmp_path: Path) -> None:
     log = tmp_path / "log"
     tasks = [{"x": i, "kill": i == 2, "log": str(log)} for i in range(6)]
@@ -212,6 +213,7 @@ GUARD = "if __name__ == '__main__':\n    print(run_batch(double, [1.5, 2.5], 'b'
 SCRIPT = "from ocp.app.batch import run_batch\ndef double(task):\n    return 2 * task\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("end", "says"),
     [(GUARD, "b: 2 done"), (GUARD.partition("\n")[2].lstrip(), "call it under if __name__ == '__main__'")],

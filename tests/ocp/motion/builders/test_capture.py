@@ -133,6 +133,7 @@ def test_the_grasp_asks_for_nothing_that_the_dynamics_keep_anyway(planar_base: b
         assert of_base[:, 3:] @ at["approach.base"][3:] == pytest.approx(0.0, abs=1e-14)
 
 
+@pytest.mark.long
 def test_the_wheel_takes_the_momentum_of_the_target() -> None:
     request, end = planar_capture(), planar().phase("detumble").at_fraction(1.0)
     spin = 0.15 * 3.0
@@ -273,6 +274,7 @@ def test_a_capture_in_another_unit_of_length_is_the_same() -> None:
     assert plan.audit().passed
 
 
+@pytest.mark.long
 def test_a_wheel_is_one_wherever_it_stands_among_the_joints() -> None:
     request = planar_capture() | SHORT
     *arm, wheel = request["chaser"].robot.joints

@@ -92,6 +92,7 @@ def test_planning_ahead_beats_the_roll_that_looks_back() -> None:
     assert result.cost < 0.95 * greedy
 
 
+@pytest.mark.long
 def test_the_plan_avoids_an_obstacle_by_its_free_roll() -> None:
     around = CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 6.0]), INCH * np.array([80.0, -4.0, 0.0])),))
     free = optimal_inverse(RIG, TUNNEL).map(101)(targets_at(np.linspace(0, HORIZON, 101)), np.zeros((1, 101)))[0]
@@ -132,6 +133,7 @@ def test_a_course_goes_through_the_gap_that_costs_least_and_starts_where_it_must
     assert course(cost, t, lower=100.0, upper=106.0).min() >= 100.0
 
 
+@pytest.mark.long
 def test_clearance_in_the_index_keeps_away_without_a_constraint() -> None:
     around = CollisionScene(solids=(Box(INCH * np.array([6.0, 4.0, 4.0]), INCH * np.array([80.0, -9.0, 3.0])),))
 

@@ -180,6 +180,7 @@ def test_a_velocity_from_an_interpolant_is_met() -> None:
     assert solution.cost == pytest.approx((2.0 - np.sin(4.0) / 2) / 8, abs=1e-5)
 
 
+@pytest.mark.long
 def test_the_guess_is_the_local_motion_in_steps_of_first_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four times as many steps leave a quarter of the difference. It is looked at before the first singular passage."""
     machine, errors = paper_example(), []

@@ -27,6 +27,8 @@ from tests.ocp.motion.builders.bipeds import FRICTION, mirrored, resized
 from tests.ocp.motion.builders.steps_replay import replay
 from tests.ocp.problem.test_phases import failed, moved
 
+pytestmark = pytest.mark.xdist_group("steps")  # one process, so that the step is planned once
+
 MARGIN = 0.01
 FIRM = 0.03  # m: with this much TALOS stands still on the corner of a sole, see below; a walk in balance stays there
 GROUND: dict[str, Any] = {"limits": Limits(friction=FRICTION)}
@@ -268,6 +270,7 @@ def on_the_corner_of_a_sole(steps: Steps, margin: float, seconds: float) -> Step
     return motion_of(one, [{"t": np.array([0.0, seconds]), "phase": np.zeros(2), **result}])
 
 
+@pytest.mark.long
 def test_soft_ground_reduces_the_margin_at_the_corner_of_a_sole() -> None:
     """It is as good as rigid to the plan; in the simulation it sinks by a millimeter, and joints on servos give too."""
     steps = talos_steps(1, 1.0, 1.0)
@@ -311,6 +314,7 @@ def test_steps_that_cannot_be_are_refused_by_name(step: tuple[Steps, Solution, S
             call()
 
 
+@pytest.mark.long
 def test_a_step_that_is_too_fast_is_refused_with_the_time_that_it_takes() -> None:
     """Given that time, it can be taken."""
     fast = planar_steps(1, 0.05, 0.06)

@@ -177,6 +177,7 @@ def test_layers_in_sequence_follow_the_corrected_printed_form_and_their_tasks() 
         np.testing.assert_allclose([float(part) for part in request(q0, qd0, push)], [-0.3, 0.2], atol=1e-6)
 
 
+@pytest.mark.long
 def test_both_forms_are_equal_on_random_trees_and_starts() -> None:
     """The least acceleration that does both tasks, whichever is written first; where the tasks are independent."""
     rng, tried = np.random.default_rng(11), 0
@@ -318,6 +319,7 @@ def test_a_tip_that_is_lost_by_long_steps_is_no_success() -> None:
     assert "leaves_path" in result.failures
 
 
+@pytest.mark.long
 @given(seeds)
 @settings(max_examples=8)
 def test_random_machines_stop_for_a_named_reason_or_reach_the_horizon_with_sound_numbers(seed: int) -> None:

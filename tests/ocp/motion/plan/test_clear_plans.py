@@ -146,6 +146,7 @@ def test_a_moving_obstacle_is_avoided() -> None:
     assert least_apart(plain, [still]) > 0  # where it ends it is in nobody's way
 
 
+@pytest.mark.long
 def test_the_search_finds_a_collision_free_configuration() -> None:
     task = TipTask(position=lambda t: ca.DM(FIRST) + smooth_step(t) * ca.DM(DISPLACEMENT), duration=SECONDS)
     result = plan(ARM, task, scene=Scene(obstacles=[POST], clearance=0.02))
@@ -154,6 +155,7 @@ def test_the_search_finds_a_collision_free_configuration() -> None:
     assert result.cost < planned(POST, clearance=0.02).cost
 
 
+@pytest.mark.long
 def test_joints_without_a_task_are_in_mid_range_or_clear() -> None:
     """A flag beside a planar arm, whose middle is in a ball: the arm moves as it does without the ball."""
     arm = planar(np.array([0.4, 0.3, 0.3])).robot
@@ -281,6 +283,7 @@ def rotation_about_y(angle: float) -> np.ndarray:
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
+@pytest.mark.long
 def test_every_motion_along_a_seam_is_clear_or_names_the_collision() -> None:
     machine = torch_ur5()
     around = CollisionScene(machine)
@@ -358,6 +361,7 @@ def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> 
     )
 
 
+@pytest.mark.long
 def test_without_a_collision_free_configuration_no_alternatives_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     def alternatives(*_: object) -> None:
         raise AssertionError

@@ -55,6 +55,7 @@ def test_a_problem_without_limits_does_not_excuse_a_motion_beyond_those_of_its_m
     assert "may be run" not in page.read_text()
 
 
+@pytest.mark.long
 def test_limits_of_a_request_beyond_those_of_the_machine_are_no_licence(tmp_path: Path) -> None:
     chain = planar_chain([0.5, 0.4], [1.0, 1.0])
     slow = replace(chain, joints=tuple(replace(joint, velocity=0.2) for joint in chain.joints))

@@ -14,6 +14,7 @@ from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.result.candidate import Reason, Rejection
 from ocp.motion.search.search import AtlasSearch, checked_bound
 from ocp.motion.search.task_search import choose_samples
+from tests.families import some
 from tests.ocp.motion.search.test_charts import moved, planar
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 
@@ -192,7 +193,7 @@ def line(first: np.ndarray, way: tuple[float, float], seconds: float) -> Any:
     return lambda t: ca.DM(first) + t / seconds * ca.DM(way)
 
 
-@pytest.mark.parametrize("case", ["gap", "longer than its task", "round", "cyclic"])
+@pytest.mark.parametrize("case", some(["gap", "longer than its task", "round", "cyclic"], 2))
 def test_stretches_of_time_are_searched_together(case: str) -> None:
     machine, start = planar(np.array([0.5, 0.4, 0.3])), np.array([0.5, 1.2, -1.4])
     at = np.array(ca.DM(machine.tip_pose((), start).position)).ravel()[:2]

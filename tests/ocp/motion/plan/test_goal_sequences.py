@@ -106,6 +106,7 @@ def test_a_load_is_carried_in_its_own_phase(tmp_path: Path) -> None:
     same(planned, again)
 
 
+@pytest.mark.long
 def test_steps_are_planned_and_read_again_with_their_stances(tmp_path: Path) -> None:
     steps = replace(planar_steps(1, 0.8, 0.8), margin=0.01)
     stance = steps.stances[0]

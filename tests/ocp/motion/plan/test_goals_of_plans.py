@@ -125,6 +125,7 @@ def test_a_tool_axis_a_cone_and_a_region_are_reached() -> None:
     assert np.arccos(np.clip(turn[:, 2] @ rotation[:, 2], -1.0, 1.0)) <= 0.3 + 1e-6
 
 
+@pytest.mark.long
 def test_obstacles_are_avoided_at_a_cost_and_proven() -> None:
     """A wall between start and goal: longer than the straight motion, clear between the samples."""
     there = START + np.array([1.6, 0.0, 0.0, 0.0, 0.0, 0.0])

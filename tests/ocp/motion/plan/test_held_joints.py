@@ -13,6 +13,7 @@ from models import CollisionShape, FixedBase, Joint, Link, ModelWarning, Robot, 
 from ocp import Cost, Limits, ProblemError, Scene, TipTask, inverse_kinematics, plan
 from ocp.motion.result.plan import Plan
 from ocp.motion.search.held_joints import all_joints
+from tests.families import some
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import Array
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, panda
@@ -61,7 +62,7 @@ def panda_seam() -> TipTask:
     return TipTask(position=lambda t: ca.DM(first) + t * ca.DM([0, 0.06, 0]), direction=axis, duration=DURATION)
 
 
-@pytest.mark.parametrize("search", ["configurations", "global"])
+@pytest.mark.parametrize("search", some(["configurations", "global"], ["configurations"]))
 def test_a_gripper_that_is_locked_by_hand_gives_the_same_plan(search: Any) -> None:
     whole = whole_panda()
     locked = FixedBase(lock_joints(whole.robot, {"panda_finger_joint1": 0.02}))
@@ -92,6 +93,7 @@ def test_a_plan_with_held_joints_is_saved_and_audited_again(tmp_path: Path) -> N
     assert not sample.accelerations[:, 1].any()
 
 
+@pytest.mark.long
 def test_limits_of_each_joint_keep_their_joint_when_others_are_held() -> None:
     machine = person()
     start = np.array([0.2, 0.7, 0.3, 1.1, 0.8])
@@ -106,6 +108,7 @@ def test_limits_of_each_joint_keep_their_joint_when_others_are_held() -> None:
     assert np.abs(result["rates"][:, 0]).max() <= 0.02 * (1 + 1e-6)
 
 
+@pytest.mark.long
 def test_a_global_search_holds_the_torso_and_says_so() -> None:
     """Two torso joints and three of the arm for a position: three free, the one at the root is held."""
     machine = person(torso=2)

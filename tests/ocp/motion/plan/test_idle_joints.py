@@ -101,6 +101,7 @@ def test_a_gripper_leaves_the_closed_forms_of_its_arm(arm: Any) -> None:
     np.testing.assert_allclose(results[0][:, n], 0.5)  # the middle of its limits
 
 
+@pytest.mark.long
 def test_fingers_cost_nothing_in_a_global_plan_of_a_whole_hand() -> None:
     """The file as it comes, fingers that slide, one of them a follower: cost and bound of the arm alone."""
     whole = FixedBase(Robot.from_urdf(PANDA_URDF, tip="panda_hand"))
@@ -161,6 +162,7 @@ def test_configurations_that_differ_by_fingers_count_once() -> None:
     assert result.cost == pytest.approx(bare.cost, rel=1e-6)
 
 
+@pytest.mark.long
 def test_fingers_collide_where_they_stand() -> None:
     """A ball beside the cheapest motion, which a finger touches: a detour with the finger as it is."""
     machine = handed(planar_chain([0.4, 0.3, 0.2], [1.0] * 3), GRIPPER)
@@ -190,6 +192,7 @@ def test_a_task_of_the_fingers_counts_as_one() -> None:
     assert np.ptp(result["joints"][:, 3]) > 0.01
 
 
+@pytest.mark.long
 def test_waypoints_are_planned_with_a_hand() -> None:
     places = np.array([0.45, 0.1, 0.35]) + np.linspace(0, 1, 12)[:, None] * np.array([0.0, 0.2, 0.05])
     quaternion = np.tile([0.0, 1.0, 0.0, 0.0], (12, 1))

@@ -12,6 +12,7 @@ from ocp import Scene, SolveError, TipTask, plan
 from tests.ocp.motion.tasks.space_tasks import ur5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("half", [pytest.param(0.03, marks=pytest.mark.long), 0.1])
 def test_a_ball_that_darts_through_the_forearm_is_no_proven_clearance(half: float) -> None:
     """It comes and goes at constant speed within 60 or 200 ms, for as long as its height is 1 of its way."""

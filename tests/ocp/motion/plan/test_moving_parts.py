@@ -61,6 +61,7 @@ def test_a_task_on_a_locked_table_is_the_same_task_in_the_world() -> None:
     assert on_table.cost == pytest.approx(in_world.cost, rel=1e-5)
 
 
+@pytest.mark.long
 def test_a_table_that_turns_costs_no_more_than_one_that_is_locked() -> None:
     """The table has the start of the locked one and more freedom; its global bound holds for both."""
     robot, task = with_table(), line(np.array([0.0, -0.1, 0.2]), np.array([0.1, 0.2, 0.0]), relative_to="table_table")

@@ -14,6 +14,7 @@ from models import Path, smooth
 from ocp import Cost, Limits, TipTask
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.tip_task import timed
+from tests.families import some
 from tests.models.robot.trees import Array
 from tests.ocp.motion.plan.motions import DOWN, angled_ur5, angled_ur5_arm, plan_bare
 from tests.ocp.motion.plan.replay import deviation_of
@@ -100,7 +101,7 @@ def test_a_gap_is_closed_as_fast_as_the_task_says_however_long_it_lasts() -> Non
 TIME_COSTS = (0.1, 0.2, 0.4)
 
 
-@pytest.mark.parametrize("time_cost", TIME_COSTS)
+@pytest.mark.parametrize("time_cost", some(TIME_COSTS, 1))
 def test_without_limits_the_effort_equals_the_time_cost_at_all_times(time_cost: float) -> None:
     """A clock that may run as it likes makes the Hamiltonian zero: 1/2 |rates|^2 = time_cost."""
     result = free(time_cost)
@@ -171,6 +172,7 @@ def costs(limited: bool) -> tuple[Array, list[Plan]]:
     return prices, [free(price, 1.0 if limited else FAST, limited) for price in prices]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("limited", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_a_higher_time_cost_is_never_slower_and_the_cost_rises_with_it_by_the_time(limited: bool) -> None:
     """The least of functions linear in the time cost is concave in it, and its slope is the time."""
@@ -184,6 +186,7 @@ def test_a_higher_time_cost_is_never_slower_and_the_cost_rises_with_it_by_the_ti
     assert (slope >= times[1:] * (1 - 1e-6)).all()
 
 
+@pytest.mark.long
 def test_towards_least_time_a_joint_or_the_task_itself_is_at_its_limit_everywhere() -> None:
     """Where neither were, that piece could be done faster."""
     result = free(200.0, 1.0, True)

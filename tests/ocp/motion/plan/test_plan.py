@@ -35,7 +35,7 @@ CLOSE = 1e-6
 """m and rad."""
 DAILY = (
     *("three_lanes_panda", "seam_ur5", "seam_panda", "contour_panda", "contour_ur5", "contour_space_arm"),
-    *("poses_ur5", "finishing_ur5", "two_arms", "helix_ur5", "poses_panda"),
+    *("poses_ur5", "finishing_ur5", "helix_ur5", "poses_panda"),
 )
 EACH = some([pytest.param(name, marks=pytest.mark.xdist_group(f"plan {name}"), id=name) for name in PLAN_CASES], DAILY)
 """One process for each motion, so that it is planned once."""
@@ -278,6 +278,7 @@ def test_between_two_tasks_joints_go_straight_at_constant_rate() -> None:
     assert np.abs(rate).max() > 0.01
 
 
+@pytest.mark.long
 def test_a_task_in_two_segments_is_the_same_motion() -> None:
     """One task over the whole time, and two that follow each other: their union asks for the same."""
     path = smooth(Path.through([(0.45, -0.1, 0.25), (0.45, 0.1, 0.25)]), deviation=0.004)

@@ -116,6 +116,7 @@ def test_the_cost_is_the_integral_of_squared_accelerations() -> None:
     assert reached().cost == pytest.approx(EFFORT.acceleration * effort(reached()), rel=1e-6)
 
 
+@pytest.mark.long
 def test_a_narrow_foot_is_used_to_its_edge_and_a_wider_one_never_costs_more() -> None:
     """Where no edge is reached its place does not matter."""
     wide, wider = reached((-3.0, 3.0)), reached((-6.0, 6.0))

@@ -52,6 +52,7 @@ def test_a_relaxed_motion_does_its_task_within_the_bound() -> None:
     assert np.abs(errors).max() < 1e-7
 
 
+@pytest.mark.long
 def test_a_free_start_at_a_singularity_is_planned() -> None:
     """The tool points along the plane's normal, the wrist is singular all along."""
     motion = Motion("ur5", "straight", "in", True, 3.0)
@@ -76,6 +77,7 @@ OUTWARDS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("arm", "start", "displacement", "held"), OUTWARDS, ids=["ur5", "panda"])
 def test_the_end_of_the_reach_is_the_one_of_a_dense_sweep_for_every_search(
     arm: str, start: Any, displacement: Any, held: bool
@@ -137,6 +139,7 @@ def turning(angle: float, duration: float) -> TipTask:
 # ---- reasons ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("angle", "duration"), [(np.radians(170), 0.4), pytest.param(np.radians(100), 0.2, marks=pytest.mark.long)]
 )

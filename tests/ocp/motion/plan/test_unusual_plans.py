@@ -14,6 +14,7 @@ from models import FixedBase, Machine, Path, Robot, SmoothPath, lock_joints, pla
 from ocp import ProblemError, SolveError, TipTask
 from ocp.motion.plan import Plan
 from ocp.motion.tasks.equations import bind, task_errors
+from tests.families import some
 from tests.models.robot.pinocchio_robots import ROBOTS, urdf_file
 from tests.models.robot.trees import numeric
 from tests.ocp.motion.plan.motions import DOWN, angled_ur5, plan_bare
@@ -109,7 +110,7 @@ MOTIONS: list[Callable[[], PlanCase]] = [
 ]
 
 
-@pytest.mark.parametrize("make", MOTIONS)
+@pytest.mark.parametrize("make", some(MOTIONS, 5))
 def test_the_motion_passes_and_does_its_tasks(make: Callable[[], PlanCase]) -> None:
     machine, tasks, options = make()
     result = plan_bare(machine, tasks, search="start", **options)

@@ -91,6 +91,7 @@ def test_an_additional_joint_never_lengthens_the_path() -> None:
     assert tips == pytest.approx(report[0], abs=1e-8)
 
 
+@pytest.mark.long
 def test_length_time_and_largest_displacement_are_least_where_they_are_the_cost() -> None:
     """The sum of the largest displacements is the time at velocity limits of 1."""
     places, turns = poses(panda(), PANDA_START, 21)

@@ -52,6 +52,7 @@ def test_a_motion_a_thousand_times_slower_or_faster_has_the_limits_that_it_would
     assert planned(path, other, joints).duration == pytest.approx(slower * plan.duration, rel=1e-4)
 
 
+@pytest.mark.long
 @settings(max_examples=12)
 @given(seeds, st.sets(st.sampled_from(KINDS), min_size=1), st.floats(0, 3))
 def test_low_limits_of_some_kinds_take_no_longer_than_low_limits_of_all(seed: int, kinds: set[str], x: float) -> None:

@@ -42,6 +42,7 @@ def example_arm(kind: str = "quintic") -> ScaraPath:
     return scara_along(ARM, example(kind), "right")
 
 
+@pytest.mark.long
 @settings(max_examples=12)
 @given(seeds, st.booleans(), st.booleans())
 def test_random_arms_keep_all_limits_between_samples(seed: int, jerks: bool, centripetal: bool) -> None:

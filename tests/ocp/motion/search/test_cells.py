@@ -19,6 +19,7 @@ from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.cells import CellSearch
 from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.tasks.equations import task_errors
+from tests.families import some
 from tests.sweep.passages import passage, planned
 
 START = np.radians([45.0, 60.0, -60.0])
@@ -34,6 +35,7 @@ def example(horizon: float) -> TipTask:
     return TipTask(velocity=[-1.0, -1.0], rows=[3, 4], duration=horizon)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "horizon", [each if each == 3.5 else pytest.param(each, marks=pytest.mark.long) for each in EXTREMALS]
 )
@@ -65,7 +67,7 @@ def farthest_from_center() -> float:
 
 
 @pytest.mark.parametrize("search", ["global", "configurations"])
-@pytest.mark.parametrize("report", ["velocity", "place"])
+@pytest.mark.parametrize("report", some(["velocity", "place"], ["place"]))
 def test_paths_out_of_reach_are_refused_with_their_time(search: Any, report: str) -> None:
     machine = paper_example()
     first = np.array(ca.DM(machine.tip_pose(np.zeros(3), START).position)).ravel()
@@ -83,6 +85,7 @@ def test_paths_out_of_reach_are_refused_with_their_time(search: Any, report: str
     assert caught.value.name == "link3"
 
 
+@pytest.mark.long
 def test_limits_that_stop_a_motion_are_named() -> None:
     robot = paper_example().robot
     slow = tuple(replace(joint, velocity=0.6) for joint in robot.joints)
@@ -96,7 +99,7 @@ def test_limits_that_stop_a_motion_are_named() -> None:
 
 
 @pytest.mark.parametrize("momentum", [None, (30.0, 5.0, -5.0)], ids=["at rest", "with momentum"])
-@pytest.mark.parametrize("report", ["velocity", "place"])
+@pytest.mark.parametrize("report", some(["velocity", "place"], ["velocity"]))
 def test_every_motion_does_its_task_within_limits_and_conserves_momentum(report: str, momentum: Any) -> None:
     robot = paper_example().robot
     joints = tuple(replace(joint, lower=-2.0, upper=2.0, velocity=1.5) for joint in robot.joints)
@@ -136,6 +139,7 @@ def test_paths_past_singularities_that_can_be_done_are_planned(seed: int) -> Non
     assert result.cost < options.cost
 
 
+@pytest.mark.long
 def test_tasks_one_after_the_other_are_searched_together() -> None:
     machine = paper_example()
     first = np.array(ca.DM(machine.tip_pose(np.zeros(3), START).position)).ravel()
@@ -150,6 +154,7 @@ def test_tasks_one_after_the_other_are_searched_together() -> None:
     assert len(result.parts) == 3
 
 
+@pytest.mark.long
 def test_of_failing_motions_a_few_of_each_search_are_tried_and_the_others_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -15,6 +15,7 @@ from ocp import IkOptions, ProblemError, TipTask, inverse_kinematics
 from ocp.motion.search.charts import Charts, SelfMotionManifolds
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.tasks.equations import bind
+from tests.families import some
 from tests.ocp.motion.tasks.space_tasks import PANDA_START, UR5_START, panda, ur5
 
 SECONDS, TIME_SAMPLES, RADIUS = 4.0, 6, 0.05
@@ -90,7 +91,7 @@ CASES: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", some(CASES, 3))
 def test_every_solution_of_inverse_kinematics_lies_in_a_chart(case: str) -> None:
     make, start, rows = CASES[case]
     machine = make()
@@ -126,6 +127,7 @@ def test_task_errors_of_configurations_in_a_chart_grow_quadratically_within_thei
     assert np.abs(orthonormal - np.eye(sets.size)).max() < 1e-12
 
 
+@pytest.mark.long
 def test_halves_cover_their_chart() -> None:
     machine = panda()
     task = moved(machine, PANDA_START, "pose")

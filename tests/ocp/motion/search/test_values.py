@@ -28,6 +28,7 @@ from ocp.motion.search.steps import (
 )
 from ocp.motion.search.value import GraphSettings, _bound_charts, _bound_with_rest, _secant_slopes
 from ocp.motion.tasks.equations import bind
+from tests.families import some
 from tests.ocp.motion.search.test_charts import planar
 
 SECONDS, TIME_SAMPLES = 3.0, 6
@@ -100,7 +101,7 @@ def search_of(machine: FixedBase, places: Array, cost: StepCost) -> AtlasSearch:
 
 
 @pytest.mark.parametrize("kind", [SquaredRates, PathLength, LargestMotion])
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", some(range(25), 8))
 def test_the_bound_is_below_brute_force_and_near_it(seed: int, kind: Any) -> None:
     machine, lengths, places, weights = random_case(seed)
     cost = kind(weights)

@@ -138,6 +138,7 @@ def test_the_base_is_held_still_by_a_task_of_the_root_link() -> None:
     assert np.abs(local.joints[-1] - PANDA_START).max() > 0.01
 
 
+@pytest.mark.long
 def test_two_arms_move_one_thing_relative_to_each_other() -> None:
     """The left hand on a line, the right one fixed in the left one's frame."""
     machine = two_pandas(MOMENTUM)
