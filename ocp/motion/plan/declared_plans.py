@@ -61,12 +61,9 @@ def plan_sequence(
     machine: Machine,
     goals: Sequence[Goal],
     total: float | None,
+    options: PlanOptions,
     *,
-    start: Any,
-    cost: Cost | None,
-    limits: Limits | None,
     constraints: ClearanceConstraints | None,
-    seed: int,
 ) -> PhasedPlan:
     """Plan the motion to goals one after the other, as the phases of one problem of least total cost.
 
@@ -76,34 +73,32 @@ def plan_sequence(
         machine: Arm on a fixed or floating base; each goal may have its own, with the same joints.
         goals: The goals, each with a duration in s, or FreeTime(...).
         total: Duration of all of them together, s, if some are free; None leaves it free.
-        start: Joints at the start, or a `Start`.
-        cost: Weights of the cost; the squared torques if None.
-        limits: Limits of joints and actuators, the robot's own torque limits included.
+        options: Start, which is required; cost, the squared torques if None; limits, beside which the robot's own
+            torque limits hold; and seed.
         constraints: Clearance constraints, or None.
-        seed: Seed of inverse kinematics.
 
     Raises:
         ProblemError: As `dynamics_phases`; or the start is missing.
         SolveError: No motion satisfies its limits.
     """
     motors, goals = checked_motors("plan", machine), require.each("goals", goals, Goal)
-    state, joints, base = Start.of(start, motors)
+    state, joints, base = Start.of(options.start, motors)
     if joints is None:
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
-    own_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
-    own_cost = None if cost is None else require.instance("cost", cost, Cost)
+    own_limits = Limits() if options.limits is None else require.instance("limits", options.limits, Limits)
+    cost = None if options.cost is None else require.instance("cost", options.cost, Cost)
     if len(goals) == 1 and goals[0].duration is None:  # one motion has the horizon
         goals, total = [replace(goals[0], duration=total)], None
     near, resolved = joints, list[Goal]()
     for goal in goals:
         if goal.has_pose:
-            near = nearest_configuration(goal.machine or motors, goal, near, limits=own_limits, seed=seed)
+            near = nearest_configuration(goal.machine or motors, goal, near, limits=own_limits, seed=options.seed)
             goal = with_joints(goal, near)
         elif goal.joints is not None:
             near = np.where(np.isnan(np.asarray(goal.joints, dtype=float)), near, goal.joints)
         resolved.append(goal)
     machines = machines_of(motors, resolved)  # checks them before anything is solved
-    smooth = own_limits.jerk is not None or (own_cost is not None and bool(own_cost.jerk))
+    smooth = own_limits.jerk is not None or (cost is not None and bool(cost.jerk))
     control: Literal["acceleration", "jerk"] = "jerk" if smooth else "acceleration"
     setup = DynamicsSetup(start_velocity=state.velocity, start_base=base, control=control)
 
@@ -118,15 +113,7 @@ def plan_sequence(
 
 
 def plan_goal(
-    machine: Machine,
-    goal: Goal,
-    horizon: Any,
-    *,
-    start: Any,
-    cost: Cost | None,
-    limits: Limits | None,
-    constraints: ClearanceConstraints | None,
-    seed: int,
+    machine: Machine, goal: Goal, horizon: Any, options: PlanOptions, constraints: ClearanceConstraints | None
 ) -> SolvedPlan:
     """Plan the motion to one goal: around obstacles, or with its tasks, machine and base as one phase of a problem.
 
@@ -134,15 +121,14 @@ def plan_goal(
         machine: Arm on a fixed or floating base.
         goal: The goal.
         horizon: s, "free", or None for the duration of the goal.
-        start, cost, limits, constraints, seed: As in `plan_sequence`.
+        options, constraints: As in `plan_sequence`; the horizon is least without a cost if it is free.
 
     Raises:
         ProblemError, SolveError: As `plan_to_goal` or `plan_sequence`.
     """
-    options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "constraints": constraints, "seed": seed}
     if isinstance(machine, FixedBase) and _has_only_target(goal):
-        return plan_to_goal(_goal_request(machine, goal, horizon, **options))
-    return plan_sequence(machine, (goal,), horizon, **options)
+        return plan_to_goal(_goal_request(machine, goal, horizon, options, constraints=constraints))
+    return plan_sequence(machine, (goal,), horizon, options, constraints=constraints)
 
 
 def _has_only_target(goal: Goal) -> bool:
@@ -152,41 +138,32 @@ def _has_only_target(goal: Goal) -> bool:
 
 
 def _goal_request(
-    machine: FixedBase,
-    goal: Goal,
-    horizon: Any,
-    *,
-    start: Any,
-    cost: Cost | None,
-    limits: Limits | None,
-    constraints: ClearanceConstraints | None,
-    seed: int,
+    machine: FixedBase, goal: Goal, horizon: Any, options: PlanOptions, constraints: ClearanceConstraints | None
 ) -> GoalRequest:
     """Return the request for a motion to one goal.
 
     Raises:
         ProblemError: The start is missing, or as in `goal_configurations`.
     """
-    state, joints, _ = Start.of(start, machine)
+    state, joints, _ = Start.of(options.start, machine)
     if joints is None:
         raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
-    own_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
-    places: dict[str, Any] = {"limits": own_limits, "constraints": constraints, "seed": seed}
+    limits = Limits() if options.limits is None else require.instance("limits", options.limits, Limits)
     is_free = isinstance(horizon, str)
     if is_free:
         require.choice("horizon", horizon, ("free",))
-    own_cost = Cost(time=float(is_free)) if cost is None else require.instance("cost", cost, Cost)
+    cost = Cost(time=float(is_free)) if options.cost is None else require.instance("cost", options.cost, Cost)
     return GoalRequest(
         machine,
         joints,
-        goal_configurations(machine, goal, joints, **places),
+        goal_configurations(machine, goal, joints, limits=limits, constraints=constraints, seed=options.seed),
         horizon=goal.duration if horizon is None or is_free else horizon,
-        limits=own_limits,
-        cost=own_cost,
+        limits=limits,
+        cost=cost,
         start_velocity=state.velocity,
         end_velocity=goal.velocity,
         clearance_constraints=constraints,
-        seed=seed,
+        seed=options.seed,
         time_limit=time_left() if np.isfinite(time_left()) else None,
         progress=report,
     )

@@ -157,6 +157,7 @@ def _plan(
         own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
         return plan_consecutive(own, tasks)
     constraints = clearance_for(machine, limits, scene)
+    own_options = PlanOptions(start, cyclic, cost, limits, search, seed)
     if isinstance(tasks, Capture):
         _check_unused("a capture, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
         return plan_capture(machine, tasks, start=start, cost=cost, limits=limits, constraints=constraints)
@@ -164,10 +165,8 @@ def _plan(
     if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
         _check_unused("a motion to goals", cyclic=cyclic or None)
         if len(goals) == 1:
-            return plan_goal(machine, goals[0], horizon, constraints=constraints, **options)
-        return plan_sequence(machine, goals, horizon, constraints=constraints, **options)
-    options |= {"search": search, "cyclic": cyclic}
-    own_options = PlanOptions(**options)
+            return plan_goal(machine, goals[0], horizon, own_options, constraints=constraints)
+        return plan_sequence(machine, goals, horizon, own_options, constraints=constraints)
     if isinstance(machine, Standing):
         return plan_to_stand(machine, tasks, horizon, own_options, constraints=constraints, wrenches=wrenches)
     request = checked_request(machine, tasks, horizon, own_options)

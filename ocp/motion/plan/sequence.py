@@ -173,11 +173,9 @@ class _Sequence:
             raise ProblemError("a load is picked up or put down at rest", name="machine", value=goal.machine)
         self.machine = own
         start = Start(self.state.joints, self.state.base if own.base_size else None, self.state.rates)
-        options: dict[str, Any] = {"cost": request.cost, "limits": request.limits, "seed": request.seed}
-        constraints = self._constraints()
-        goal = replace(goal, machine=None)
+        options = PlanOptions(start, cost=request.cost, limits=request.limits, seed=request.seed)
         horizon = "free" if request.free else None
-        return plan_goal(own, goal, horizon, start=start, constraints=constraints, **options)
+        return plan_goal(own, replace(goal, machine=None), horizon, options, constraints=self._constraints())
 
     def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
         """Return the motion along tasks: from the joints `near` if these are at their start, else from any joints."""
