@@ -113,7 +113,7 @@ def plan_sequence(
 
 
 def plan_goal(
-    machine: Machine, goal: Goal, horizon: Any, options: PlanOptions, constraints: ClearanceConstraints | None
+    machine: Machine, goal: Goal, horizon: Any, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> SolvedPlan:
     """Plan the motion to one goal: around obstacles, or with its tasks, machine and base as one phase of a problem.
 
@@ -138,7 +138,7 @@ def _has_only_target(goal: Goal) -> bool:
 
 
 def _goal_request(
-    machine: FixedBase, goal: Goal, horizon: Any, options: PlanOptions, constraints: ClearanceConstraints | None
+    machine: FixedBase, goal: Goal, horizon: Any, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> GoalRequest:
     """Return the request for a motion to one goal.
 
