@@ -34,11 +34,14 @@ class SolveError(DetailedError, RuntimeError):
         solution: The last iterate as an unsuccessful solution, or None.
         conflicts: The constraints that would have to be relaxed (:class:`ocp.direct.diagnosis.Conflict`), the worst
             first.
+        candidates: The motions that a planner tried, each with the reason of its rejection
+            (:class:`ocp.motion.result.candidate.Candidate`).
     """
 
     def __init__(self, message: str = "", solution: Any = None, conflicts: Sequence[Any] = (), **details: Any) -> None:
         super().__init__(message, **details)
         self.solution, self.conflicts = solution, tuple(conflicts)
+        self.candidates: tuple[Any, ...] = ()
 
 
 class Interrupted(KeyboardInterrupt):

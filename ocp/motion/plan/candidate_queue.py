@@ -56,19 +56,16 @@ class Solver:
         listed = "\n".join(f"  {count} of {len(candidates)} candidates: {reason}" for reason, count in reasons)
         last = next((candidate.solution for candidate in candidates if candidate.solution is not None), None)
         words, cause = f"no motion passes its audit:\n{listed}", self.error
+        located = (c.reason for c in candidates if c.reason is not None and c.reason.time is not None)
+        fault = cause or next(located, None)
+        details: dict[str, Any] = {key: getattr(fault, key, None) for key in ("name", "value", "limit", "time")}
+        details["name"] = details["name"] or "plan"
         if cause is None:
-            located = (c.reason for c in candidates if c.reason is not None and c.reason.time is not None)
-            if (reason := next(located, None)) is None:
-                return SolveError(words, last, name="plan")
-            fields: dict[str, Any] = {
-                "name": reason.name,
-                "value": reason.value,
-                "limit": reason.limit,
-                "time": reason.time,
-            }
-            return SolveError(words, last, **fields)
-        details = {"name": cause.name or "plan", "value": cause.value, "limit": cause.limit, "time": cause.time}
-        return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)
+            error = SolveError(words, last, **details)
+        else:
+            error = SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)
+        error.candidates = tuple(candidates)
+        return error
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, which also stores the other candidates."""
