@@ -34,7 +34,7 @@ KINK = 1e-12
 
 
 class LinkCapsule(NamedTuple):
-    """A capsule of a link; radius in m, ends of the segment as expressions in world. Shape (3, 1), m."""
+    """A link of the rig as a capsule. Its ends are expressions in world, shape (3, 1), m; its radius is in m."""
 
     radius: float
     start: Expression
@@ -48,7 +48,7 @@ def _finite_axes(point: Expression, box: Box) -> Expression:
 
 
 def _half_size(box: Box) -> Expression:
-    """Return half of the finite edges of a box, m."""
+    """Return half the edge lengths of a box along its finite axes, m."""
     return ca.DM(box.size[np.isfinite(box.size)] / 2)
 
 
@@ -163,7 +163,7 @@ class Radii:
 
 @dataclass(frozen=True)
 class CollisionScene:
-    """Obstacles of the rig.
+    """Obstacles around the rig.
 
     Attributes:
         walls: The hollow tunnel; its floor is a wall. None for no walls.
@@ -245,7 +245,7 @@ def checked_clearance(clearance: float) -> float:
 
 @dataclass(frozen=True)
 class Avoidance:
-    """How the rig avoids obstacles: clearance as a constraint, as a term of the index, or both.
+    """Settings by which the rig avoids obstacles: clearance as a constraint, as a term of the index, or both.
 
     Attributes:
         scene: Obstacles.
@@ -275,7 +275,7 @@ class Avoidance:
 def collision_free_inverse(
     rig: Rig, tunnel: Tunnel, avoidance: Avoidance, branch: Branch = HOME, *, rate_weight: float = 0.0
 ) -> Any:
-    """Return the Function (target, previous) -> (joints, cost, active, status, gap): `optimal_inverse` among obstacles.
+    """Return `optimal_inverse` among obstacles: the Function (target, previous) -> (joints, cost, active, status, gap).
 
     Args:
         avoidance: Obstacles, clearance and proximity term.
@@ -335,7 +335,7 @@ def collision_free_inverse(
 
 
 def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the function (grid merits) -> columns (angle, merit, step) of the lowest minima."""
+    """Return inputs and outputs of the function (merits on a grid) -> lowest minima, columns (angle, merit, step)."""
     merits = ca.SX.sym("merits", 1, samples)
     angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
     remaining = []
@@ -364,7 +364,7 @@ def _least_value(count: int) -> tuple[list[Any], list[Any]]:
 
 
 def _pattern_search(merit: Any) -> Any:
-    """Return the Function (states, inputs) -> states after a pattern search about each state (angle, merit, step).
+    """Return the Function (states, inputs) -> states that improves each state (angle, merit, step) by a pattern search.
 
     Inputs are target and previous roll.
     """

@@ -59,7 +59,7 @@ class Table:
 
     @property
     def ok(self) -> Any:
-        """Whether each row has joints. Shape (samples,), bool."""
+        """Whether each target has a solution. Shape (samples,), bool."""
         return np.array([status == "ok" for status in self.status])
 
 
@@ -155,7 +155,7 @@ class RollInterval:
 
 
 def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[RollInterval]:
-    """Return all rolls, modulo a turn, that reach a target within joint limits, with start in [-pi, pi).
+    """Return all intervals of roll, modulo a turn, that reach a target within joint limits, with start in [-pi, pi).
 
     Args:
         target: Shape (5,), m and rad.
@@ -190,7 +190,7 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
 
 @lru_cache(maxsize=16)
 def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
-    """Return Functions (target) -> points with all arc ends, rows cosine, sine, code; (target, roll) -> feasible."""
+    """Return the Functions (target) -> ends of feasible roll intervals and (target, roll) -> whether it is feasible."""
     target, roll = ca.SX.sym("target", 5), ca.SX.sym("roll")
     angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in arc_ends(rig, target, branch)])
     x = ca.MX.sym("target", 5)
@@ -206,7 +206,7 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
 
 
 def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Branch, Array]]:
-    """Return every branch that reaches a target with a given roll, and its joints, shape (6,), without joint limits.
+    """Return the joints, shape (6,), of every branch that reaches a target with a given roll, without joint limits.
 
     Raises:
         ModelError: The target or roll is not finite, or no branch reaches the pose (names the link).

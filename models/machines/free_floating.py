@@ -106,7 +106,7 @@ class FreeFloating:
 
     @property
     def twist_rows(self) -> list[int]:
-        """Rows of a spatial twist or momentum that the base has: (rotation z, x, y) if planar, else all six."""
+        """Indices of the twist components that the base has: (rotation about z, x, y) if planar, else all six."""
         return PLANAR_ROWS if self.base == "planar" else list(range(6))
 
     def base_home(self) -> Array:
@@ -293,7 +293,7 @@ class FreeFloating:
     def _reaction(
         self, q: Expression, joint_rates: Expression | None, base: Expression = None, tip: bool = False
     ) -> _Reaction:
-        """Return the base reaction, including the momentum if joint rates are given."""
+        """Return the base motion that joint rates cause; with joint rates given, include the conserved momentum."""
         carried = None
         if joint_rates is not None and (momentum := self._spatial_momentum()) is not None:
             turn = self.world_from_base(base).rotation

@@ -78,7 +78,7 @@ class Machine(Protocol):
         """Return the time derivative of the base configuration, including the drift. Shape (base_size, 1)."""
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Return the manipulability of the task that fixes these rows of the tip's twist, see jacobian_manipulability.
+        """Return the manipulability of a task that fixes some rows of the tip's twist, see jacobian_manipulability.
 
         Shape (1, 1).
         """
@@ -138,9 +138,7 @@ class FixedBase:
 
     @cached_property
     def _pose_function(self) -> Any:
-        """Cached CasADi Function from joints to the pose of the tip; inlining it is faster than building its
-        expressions.
-        """
+        """Cached CasADi Function from joints to the tip's pose; inlining it is faster than building its expressions."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_pose", [q], [*map(ca.densify, tip_pose(self.robot, q, self.world_from_base()))])
 
@@ -161,7 +159,7 @@ class FixedBase:
         return type(joint_vector(self.robot, joint_rates, "joint_rates"))(0, 1)
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Return the manipulability, see jacobian_manipulability. Shape (1, 1)."""
+        """Return Yoshikawa's manipulability of the tip Jacobian, see jacobian_manipulability. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 
 

@@ -130,7 +130,7 @@ def _motion_signs(
 
 
 def _leader_columns(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
-    """Return the matrix that adds the columns of followers to those of their leaders, or None without followers."""
+    """Return the matrix that adds the columns of followers to those of their leaders; None without followers."""
     robot, size = machine.robot, machine.base_size
     matrix = np.zeros((size + len(joints), size + robot.dof))
     matrix[:size, :size] = np.eye(size)

@@ -249,7 +249,7 @@ class Stance(FixedBase):
 
     @cached_property
     def load_rows(self) -> dict[str, tuple[int, ...]]:
-        """Rows of the twist of each foot but the first, world axes, that the joints can move.
+        """Twist components of each foot but the first, in world axes, that the joints can change.
 
         They are all six, or three in a plane, also for feet in the air. The load of a foot has the same rows: nothing
         resists the others.
@@ -282,7 +282,7 @@ class Stance(FixedBase):
         return rows_of_feet
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """Return the full load (6, 1) of a foot from its free rows `load_rows`; the other rows are zero."""
+        """Return the full load (6, 1) of a foot from its components in `load_rows`; the other components are zero."""
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
@@ -317,7 +317,7 @@ class Stance(FixedBase):
         return rows[self._edges(name, margin)]
 
     def _edges(self, name: str, margin: float) -> list[int]:
-        """Return the edges of a sole relative to which motion can shift the center of pressure."""
+        """Return the indices of the sole's edges towards which motion can shift the center of pressure."""
         sole = self.feet[name].sole
         assert sole is not None
         distances = self._sampled_pressures[name] @ sole.normals.T - (sole.normals * sole.vertices).sum(axis=1)

@@ -361,7 +361,7 @@ class StandingMotion:
 
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
-    """Return the CasADi Function (time, q, qd, qdd) -> attributes of a StandingMotion from `joint_torques` on.
+    """Return the CasADi function (time, q, qd, qdd) -> the computed attributes of a `StandingMotion`, torques first.
 
     Its symbols are SX, or MX if `external` requires it.
     """

@@ -123,7 +123,7 @@ class Path:
         return _angles(self.at(index, self.lengths[:-1])[1], self.tangent[1:])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = (1.0, 0.0, 0.0, 0.0)) -> Path:
-        """Return the path in a world in which its own axes have a given pose; the tool turns with it.
+        """Return the path moved to a given pose in the world; tool orientations rotate with it.
 
         Args:
             position: Origin of the path's axes in that world. Shape (3,), m.

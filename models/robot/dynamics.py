@@ -243,7 +243,7 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Return a less gravity, shape (3, 1), and U, shape (3, 3), of each link in its own axes, by name; see _efforts."""
+    """Return acceleration less gravity (3, 1) and acceleration field (3, 3) of each link in its own axes, by name."""
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
@@ -357,7 +357,7 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
 def joint_momenta(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
 ) -> Expression:
-    """Return momentum_matrix from the axes of frames_and_axes and the moments of subtree_moments."""
+    """Return the momentum matrix from the axes of frames_and_axes and the moments of subtree_moments."""
     children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
     momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
     return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, momenta))
@@ -372,7 +372,7 @@ def momentum(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return (moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
+    """Return (angular momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     motions = propagate_motions(robot, frames, axes, qd=qd, qdd=ca.DM(robot.dof, 1))
     place = checked_vector("about", about, 3, "a point of the world")

@@ -100,7 +100,7 @@ class VisualShape(CollisionShape):
         object.__setattr__(self, "color", color)
 
     def _check_size(self, size: Array, owner: str) -> None:
-        """Accept every size."""
+        """Accept shapes of any size, because they are for display only."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -196,12 +196,12 @@ class Robot:
         return tuple(joint.name for joint in self.moving_joints)
 
     def unit(self, per: str = "") -> str:
-        """Return the unit of the joint vector, or of its rates with `per` "/s": "rad", "m" or "rad, m" in its order."""
+        """Return the units of the joint vector, "rad", "m" or both in order of appearance, each with `per` appended."""
         return ", ".join(dict.fromkeys(joint.unit + require.text("unit: per", per) for joint in self.moving_joints))
 
     @property
     def effort_unit(self) -> str:
-        """Unit of the efforts of the joint vector: "N m", "N" or "N m, N" in its order."""
+        """Unit of the efforts of the joint vector: "N m", "N", or both in order of appearance."""
         return ", ".join(dict.fromkeys(joint.effort_unit for joint in self.moving_joints))
 
     @property
@@ -225,12 +225,12 @@ class Robot:
 
     @property
     def upper(self) -> Array:
-        """Upper position limits, likewise. Shape (dof,), rad or m."""
+        """Upper position limits of the joint vector, including those of followers. Shape (dof,), rad or m."""
         return self._limits["upper"].copy()
 
     @property
     def velocity(self) -> Array:
-        """Speed limits, likewise; infinite if unknown. Shape (dof,), rad/s or m/s."""
+        """Speed limits of the joint vector and of its followers; infinite if unknown. Shape (dof,), rad/s or m/s."""
         return self._limits["velocity"].copy()
 
     @property

@@ -218,7 +218,7 @@ class StoppedGradients:
         self._values: list[Expression] = []
 
     def __call__(self, value: Expression) -> Expression:
-        """Return a new symbol that replaces an expression, so that derivatives treat it as a constant."""
+        """Return a new symbol for an expression, so that differentiation treats the expression as a constant."""
         if not isinstance(value, ca.MX) or value.is_constant():
             return value
         self._symbols.append(ca.MX.sym("stopped", value.shape))
@@ -276,7 +276,7 @@ def _check_kind(kind: Any, what: str) -> None:
 def _distance_of_columns(
     kinds: tuple[Any, Any], entries: Sequence[Sequence[Expression]], rounding: float, stop_gradient: StopGradient
 ) -> Any:
-    """Return the signed distance of two shapes of these kinds, given as columns."""
+    """Return the signed distance of two shapes of the given kinds, each described by a column of numbers."""
     first, second = map(_core_of_column, kinds, entries)
     swept_radius = sum(own[-1] for kind, own in zip(kinds, entries, strict=True) if kind in (Sphere, Capsule))
     if isinstance(first, PlaneCore):
@@ -335,7 +335,7 @@ def _as_number(entry: Expression) -> Expression:
 
 
 def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) -> Expression:
-    """Return the least height of a core above a plane, or a smooth lower bound, at most `rounding` below."""
+    """Return the least height of a core above a plane, or a smooth lower bound of it within `rounding`."""
     if isinstance(core, SegmentCore):
         heights = [dot(normal, subtract(end, point)) for end in core.points]
         middle, reaches = sum(heights) / len(heights), [(heights[-1] - heights[0]) / 2][: len(heights) - 1]
@@ -350,7 +350,7 @@ def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) ->
 
 
 def _smooth_minimum(values: Sequence[Expression], rounding: float) -> Expression:
-    """Return the smallest value, or a smooth lower bound, at most `rounding` below."""
+    """Return the smallest value, or a smooth lower bound of it within `rounding`."""
     if rounding == 0 or len(values) == 1:
         return reduce(ca.fmin, values)
     return soft_minimum(values, rounding / log(len(values)))
@@ -372,7 +372,7 @@ def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
 
 
 def _edge_directions(hull: Hull) -> Array:
-    """Return bisectors of normals of faces that share an edge or corner, all more than pi/4 apart. Shape (k, 3).
+    """Return bisectors of the normals of faces that meet, where the normals differ by more than pi/4. Shape (k, 3).
 
     Beyond an edge whose faces' normals differ by an angle a, the normals alone see at most cos(a/2) of a distance, 92 %
     at pi/4.
@@ -394,7 +394,7 @@ def _edge_directions(hull: Hull) -> Array:
 
 
 def _in_frame(core: Core, centre: Triple, axes: Sequence[Triple]) -> Core:
-    """Return the core in coordinates of these axes and centre."""
+    """Return the core in the coordinates of a frame with this centre and these axes."""
     if isinstance(core, SegmentCore):
         return SegmentCore(tuple(in_axes(subtract(point, centre), axes) for point in core.points))
     assert not isinstance(core, PlaneCore)

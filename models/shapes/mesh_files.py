@@ -55,7 +55,7 @@ class Triangles(NamedTuple):
 
 
 def without_colors(vertices: Array, faces: Faces) -> Triangles:
-    """Return the triangles of vertices and faces, all without a colour."""
+    """Return the triangles of a mesh without colours from vertices and faces."""
     return Triangles(vertices, faces, np.full((len(faces), 4), np.nan))
 
 
@@ -76,7 +76,7 @@ def mesh_error(file: Path, what: str, value: object = None, limit: object = None
 
 
 def numbered_lines(file: Path, data: bytes) -> Iterator[tuple[int, str]]:
-    """Yield the numbers, from 1, and the texts of the lines; raise a ModelError if the text is too long."""
+    """Yield each line's number, from 1, and its text; raise a ModelError if the text is too long."""
     if len(data) > INPUT_LIMITS.mesh_text_bytes:
         raise mesh_error(file, f"it has {len(data)} bytes of text", len(data), INPUT_LIMITS.mesh_text_bytes)
     return enumerate(TextIOWrapper(BytesIO(data), "utf-8", errors="replace"), start=1)
@@ -204,7 +204,7 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
 
 
 def _read_stl(file: Path, data: bytes) -> Triangles:
-    """Read an STL file. Some binary files begin with "solid" as texts do, so the number of triangles decides."""
+    """Read a binary or text STL file. The number of triangles decides, as both kinds may begin with "solid"."""
     count = (
         int.from_bytes(data[STL_HEADER_BYTES - 4 : STL_HEADER_BYTES], "little") if len(data) >= STL_HEADER_BYTES else -1
     )
@@ -398,7 +398,7 @@ def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
 
 
 def _check_numbers(file: Path, root: ElementTree.Element) -> None:
-    """Refuse elements that pycollada reads in part or misinterprets; normalise the axes of rotations."""
+    """Reject elements that pycollada reads in part or misinterprets; normalise the axes of rotations."""
     for part in root.iter():
         several = part.tag in ("triangles", "polylist") and len(part.findall("p")) > 1
         if several or part.tag in ("lookat", "skew", "ph"):
@@ -428,7 +428,7 @@ def _check_numbers(file: Path, root: ElementTree.Element) -> None:
 
 
 def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
-    """Replace instances by their nodes; limit the number of nodes, which nested instances make grow exponentially."""
+    """Replace instances by their nodes; limit the number of nodes, because nested instances multiply it."""
     nodes = {each.get("id"): each for each in root.iter("node")}
     counts: dict[ElementTree.Element, int] = {}
 

@@ -52,7 +52,7 @@ class _Posed(_SweptCore):
     """Base class of shapes with a pose of their own."""
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
-        """Return the shape in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        """Return the shape in another frame, given rotation (3, 3) and position (3,) of its present frame in it, m."""
         turn, shift = _motion(rotation, translation)
         own: Any = copy(self)  # shares the hull, which is costly to compute
         object.__setattr__(own, "position", frozen(turn @ own.position + shift))
@@ -90,7 +90,7 @@ class Sphere(_SweptCore):
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Sphere:
-        """Return the sphere in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        """Return the sphere in another frame, given rotation (3, 3) and position (3,) of its present frame in it, m."""
         turn, shift = _motion(rotation, translation)
         return Sphere(self.radius, turn @ self.position + shift)
 
@@ -130,7 +130,7 @@ class Capsule(_SweptCore):
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Capsule:
-        """Return the capsule in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        """Return the capsule in another frame, given rotation (3, 3) and position (3,), m, of its present frame."""
         turn, shift = _motion(rotation, translation)
         return Capsule(self.radius, turn @ self.start + shift, turn @ self.end + shift)
 
@@ -167,7 +167,7 @@ class Cylinder(_Posed):
 
     @property
     def core(self) -> Array:
-        """Corners of the prism. Shape (2 SIDES, 3), m."""
+        """Corners of the prism that represents the cylinder. Shape (2 SIDES, 3), m."""
         return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
 
     @cached_property
@@ -250,12 +250,12 @@ class HalfSpace(_SweptCore):
         return np.array([self.point])
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> HalfSpace:
-        """Return the half-space in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        """Return the half-space in another frame, given rotation (3, 3) and position (3,), m, of its present frame."""
         turn, shift = _motion(rotation, translation)
         return HalfSpace(turn @ self.normal, turn @ self.point + shift)
 
     def reach(self, point: ArrayInput) -> float:
-        """Return inf: a half-space is unbounded."""
+        """Return inf, because a half-space is unbounded."""
         require.array("half-space: point", point, (3,))
         return np.inf
 
