@@ -95,7 +95,7 @@ def line_error(file: Any, number: int, text: str, why: str, *, limit: Any = None
 
 
 def missing_package(task: str, package: str, extra: str) -> ProblemError:
-    """Return the error of a task that needs a package of an extra that is not installed."""
+    """Return the error that a task needs an optional package which is not installed."""
     commands = f'pip install "selfmotion[{extra}]", or from a clone pip install ".[{extra}]"'
     return ProblemError(f"{task} needs the package {package}: {commands}", name=extra, value=package)
 
@@ -174,7 +174,7 @@ class _Container:
         self.value, self.anchor, self.count, self.key = value, anchor, 1, _NO_KEY
 
     def add(self, value: Any, count: int) -> None:
-        """Append a value, or the key or value of an entry, that counts as `count` values."""
+        """Append a list value, or the key or value of a mapping entry; it counts as `count` values."""
         self.count += count
         _check_count(self.count)
         if isinstance(self.value, list):
@@ -238,7 +238,7 @@ def _checked_tag(event: Any) -> Any:
 
 
 def _check_count(count: int) -> None:
-    """Raise ValueError if there are too many values."""
+    """Raise ValueError if a file contains more values than allowed."""
     if count > INPUT_LIMITS.tree_values:
         raise ValueError(f"it contains {count} values; at most {INPUT_LIMITS.tree_values} are allowed")
 

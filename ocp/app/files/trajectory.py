@@ -165,7 +165,7 @@ def _read_table(
 
 
 def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str, width: int) -> Array:
-    """Return the numbers of a table, nan for empty cells. Shape (M, width)."""
+    """Return the numbers of a table; empty cells become nan. Shape (M, width)."""
     split = [split_cells(row, delimiter) for row in rows]
     for row, number, cells in zip(rows, numbers, split, strict=True):
         if len(cells) != width:
@@ -257,7 +257,7 @@ def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
 
 
 def _from_points(file: FileName, tree: Any) -> RawTrajectory:
-    """Return the trajectory of a tree with joint names and trajectory points."""
+    """Return the trajectory in a tree of values that has joint names and trajectory points."""
     message = _trajectory_in(tree)
     if message is None:
         words = f"{file} contains no joint trajectory; joint_names and points are expected"
@@ -297,7 +297,7 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
 
 
 def _rows(file: FileName, word: str, points: list[Any], width: int) -> Array:
-    """Return one kind of values of all trajectory points. Shape (M, width)."""
+    """Return one kind of values, such as the velocities, of all trajectory points. Shape (M, width)."""
     rows = np.full((len(points), width), np.nan)
     for number, point in enumerate(points, 1):
         if not isinstance(point, list) or len(point) != width:

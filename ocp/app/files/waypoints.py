@@ -222,7 +222,7 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
 
 
 def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
-    """Return number, text and cells of each row; a comment before them that names the columns is the first row."""
+    """Return number, text and cells of each row; the first row may be a comment that names the columns."""
     rows: list[tuple[int, str, list[str]]] = []
     delimiter: str | None = None
     last_comment = (0, "")
@@ -243,7 +243,7 @@ def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
 
 
 def _name(cell: str) -> str:
-    """Return the standard name of a column, or "" if it has none."""
+    """Return the standard name of a column from its cell in the header, or "" if it has none."""
     match = HEAD.match(" ".join(cell.lower().split()))
     name = match[1].removeprefix("pose.") if match else ""
     return OTHER_NAMES.get(name, name)

@@ -40,7 +40,7 @@ SCRIPTS = ("scene.js", "curves.js", "player.js")
 
 
 class Buffers:
-    """Arrays in one block of bytes, referred to by their offsets."""
+    """Arrays in one block of bytes, each referred to by its offset."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -72,7 +72,7 @@ class Page(NamedTuple):
 def build_page(
     shown: Sequence[Animation], *, title: str = "", folders: Sequence[Any] = (), meshes: bool = True
 ) -> Page:
-    """Return the page of one motion, or of a motion and others to compare it with.
+    """Return the page that plays one motion, or a motion and others to compare it with.
 
     Args:
         shown: The motions.
@@ -187,7 +187,7 @@ def _surface(vertices: Array, normals: Array, faces: NDArray[np.intp], buffers: 
 
 
 def _poses(frames: Frames, names: Sequence[str]) -> Array:
-    """Return positions and quaternions, with signs continuous over time. Shape (M, k, 7)."""
+    """Return positions and quaternions whose signs are continuous over time. Shape (M, k, 7)."""
     poses = []
     for name in names:
         quaternions = quaternion_from_rotation(frames.rotations[name])
@@ -275,7 +275,7 @@ def _solid(vertices: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[s
 
 
 def _plain(value: float | None) -> float | None:
-    """Return a number for JSON: None if it is not finite."""
+    """Return a number for JSON, or None if it is not finite."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
@@ -334,7 +334,7 @@ def _listening(page: bytes, port: int) -> ThreadingHTTPServer:
                 self.wfile.write(page)
 
         def log_message(self, *words: object) -> None:
-            """Log nothing: the user is the only visitor."""
+            """Suppress the log of requests, because the user is the only visitor."""
 
     if not 0 <= port < 65536:
         raise ProblemError(f"port {port} is invalid; use 0 to 65535", name="port", value=port, limit=(0, 65535))

@@ -307,7 +307,7 @@ def html_of_solution(solution: Solution) -> str:
 
 
 def _widths(solution: Solution) -> dict[str, int]:
-    """Return the numbers of entries of states and controls."""
+    """Return the number of entries of each state and control by name."""
     return {name: values.shape[1] for name, values in {**solution.states, **solution.controls}.items()}
 
 
@@ -329,7 +329,7 @@ def _local(other: LocalSolution) -> dict[str, Array]:
 
 
 def _along(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times, s, and values of states and controls by name; a node has a value from either side.
+    """Return times (s) and values of states and controls by name; at a node both one-sided values are listed.
 
     States and controls of a phase are given over the interval of that phase.
     """
