@@ -427,9 +427,7 @@ def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray 
 
 
 def _control_curvature(along: Linearisation) -> np.ndarray | None:
-    """Return T H_uu at the points without path constraints, (M, nu, nu); None unless limits may act at single
-    points.
-    """
+    """Return T H_uu at the points without path constraints, (M, nu, nu); None if no limit acts at single points."""
     form = along.form
     near = along.state_limits.near.any() or along.node_limits.near.any()
     single = along.nodal and (along.mixed.size > 0 or near)

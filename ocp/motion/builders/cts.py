@@ -41,7 +41,7 @@ LARGEST_SINE = 1 - 1e-9  # sine of q4 and cosine of q2, just below the end of th
 
 @dataclass(frozen=True)
 class RollGuessSettings:
-    """Settings of the first guess, a shortest path over a grid of times and rolls, refined in a tube.
+    """Settings of the first guess: a shortest path through a grid of times and rolls, then through finer grids near it.
 
     Attributes:
         times: Times of the grid.
@@ -131,7 +131,7 @@ class RollSettings:
 
 @dataclass(frozen=True, eq=False)
 class RollObstacles:
-    """Obstacles of `roll_problem`, and how the rig avoids them.
+    """Obstacles of `roll_problem`, with the settings by which the rig avoids them.
 
     Attributes:
         scene: Obstacles.
@@ -264,7 +264,7 @@ def roll_problem(
     target = _column(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Evaluate an expression at the target of each time."""
+        """Evaluate an expression of target and roll at all times."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
@@ -299,13 +299,13 @@ def _column(targets: Targets, time: Any) -> Any:
 
 
 def _curve(targets: Targets, symbols: Any) -> Any:
-    """Return the targets as a casadi function of time."""
+    """Return the targets as a casadi function of time from a function or a table."""
     time = symbols.sym("time")
     return ca.Function("target", [time], [_column(targets, time)])
 
 
 def _violation(value: Any, lower: Any, upper: Any) -> Any:
-    """Return the sum of all violations of bounds."""
+    """Return the sum of all violations of lower and upper bounds."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
 
 

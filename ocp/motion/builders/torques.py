@@ -106,7 +106,7 @@ def joint_torques(
 
 
 def checked_motors(name: str, machine: Any) -> Motors:
-    """Return the machine; raise ProblemError unless joint torques alone determine its motion."""
+    """Return the machine; raise ProblemError unless the joint torques alone determine its motion."""
     if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
         words = f"{name}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; use "
         words += "standing_problem for a standing machine"
@@ -116,7 +116,7 @@ def checked_motors(name: str, machine: Any) -> Motors:
 
 @dataclass(frozen=True, eq=False)
 class Actuation:
-    """Options of a motion whose controls are accelerations, or jerks if these are limited or weighted.
+    """Options of a motion whose controls are accelerations, or jerks if jerks are limited or weighted.
 
     Attributes:
         cost: Weights of all terms but the time; None for half the squared rates.
@@ -188,7 +188,7 @@ def declare_actuators(
 
 
 def weights_torques(cost: Cost) -> bool:
-    """Return whether a cost depends on the joint torques."""
+    """Return whether a cost depends on joint torques."""
     return bool(np.any(np.asarray(cost.effort))) or bool(cost.energy)
 
 

@@ -131,7 +131,7 @@ class Grasp:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Approach, grasp and detumbling of a tumbling body by a free-floating chaser, its tip on the grasped frame.
+    """Approach, grasp and detumbling of a tumbling body by a free-floating chaser whose tip moves to the grasped frame.
 
     Attributes:
         target: Machine of one link without joints, on the same kind of base as the chaser, with its momentum. Its tip
@@ -292,7 +292,7 @@ def chained_capture(
 
 
 def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:
-    """Return the machines of both phases: the chaser, and the pair with the joints of the chaser.
+    """Return the machines of both phases: the chaser, and chaser and target as one machine after the grasp.
 
     Raises:
         ProblemError: As `capture_problem`.
@@ -302,7 +302,7 @@ def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFl
 
 @dataclass(frozen=True, eq=False)
 class _Capture:
-    """Checked arguments of a capture; `pair` is the machine of both bodies, with their initial momentum."""
+    """Checked arguments of a capture; `pair` is the machine of chaser and target, with their initial momentum."""
 
     chaser: FreeFloating
     capture: Capture
@@ -341,7 +341,7 @@ class _Capture:
 
     @property
     def arm(self) -> Array:
-        """Return 1 for arm joints and 0 for reaction wheels, whose angles start from zero in each phase. Shape (n,)."""
+        """Weights that are 1 for arm joints and 0 for reaction wheels, whose angles restart from zero. Shape (n,)."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
@@ -392,7 +392,7 @@ class _Capture:
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
 
     def detumbling(self, start: Mapping[str, Array] | None) -> Problem:
-        """Declare the second phase, from the end of an approach, or free to be joined to one."""
+        """Declare the second phase, from the end of an approach or, with a free start, to be joined to one."""
         pair, capture = self.pair, self.capture
         wheels, rest = find_wheels(pair.robot), capture.rest
         still = np.array([np.nan if name in wheels else 0.0 for name in pair.robot.joint_names])
@@ -450,7 +450,7 @@ class _Capture:
 
 
 def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return joints, velocities and base at the end of the guess of the approach."""
+    """Return joints, velocities and base at the end of the approach's guess."""
     end = np.array([guessed_horizon(problem)])
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)
@@ -458,7 +458,7 @@ def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
 
 
 def _of_unit_length(machine: FreeFloating, base: Any) -> Any:
-    """Return the base configuration with its quaternion normalised."""
+    """Return the base configuration with a quaternion of unit length."""
     if machine.base == "planar":
         return base
     return ca.vertcat(base[:3], base[3:] / ca.norm_2(base[3:]))
