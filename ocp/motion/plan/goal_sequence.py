@@ -58,7 +58,7 @@ def plan_sequence(
     constraints: ClearanceConstraints | None,
     seed: int,
 ) -> PhasedPlan:
-    """Plan the motion to goals one after the other, as the phases of one problem of least total cost.
+    """Plan motions to consecutive goals as the phases of one problem, which minimises their total cost.
 
     A pose is reached in the configuration that is nearest to the goal before it.
 
@@ -118,7 +118,7 @@ def plan_goal(
     constraints: ClearanceConstraints | None,
     seed: int,
 ) -> SolvedPlan:
-    """Plan the motion to one goal: around obstacles, or with its tasks, machine and base as one phase of a problem.
+    """Plan the motion to one goal: around obstacles, or as one phase of a problem with its own tasks and machine.
 
     Args:
         machine: Arm on a fixed or floating base.
@@ -136,7 +136,7 @@ def plan_goal(
 
 
 def _has_only_target(goal: Goal) -> bool:
-    """Return whether a goal has no tasks on the way and changes neither the machine nor the base."""
+    """Return whether a goal is only a target: without tasks on the way, and without change of machine or base."""
     has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
     return not has_tasks and goal.machine is None and goal.base is None
 
@@ -234,13 +234,13 @@ def with_joints(goal: Goal, joints: Array) -> Goal:
 
 
 def _phased(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
-    """Return the plan of a solution that has phases."""
+    """Return the plan whose motion is a solution with phases."""
     candidate = Candidate(start, solution.cost, None, Stage.AUDITED, solution)
     return PhasedPlan(machine, solution, parts_of_phases(solution), (candidate,))
 
 
 def nearest_configuration(machine: Machine, goal: Goal, near: Array, *, limits: Limits, seed: int) -> Array:
-    """Return the joints at the pose of a goal that are nearest to others. Shape (n,).
+    """Return the joints at the pose of a goal that are nearest to the given ones. Shape (n,).
 
     Raises:
         Unreachable, ProblemError: As `inverse_kinematics`.
@@ -254,7 +254,7 @@ def nearest_configuration(machine: Machine, goal: Goal, near: Array, *, limits: 
 def goal_configurations(
     machine: Machine, goal: Goal, near: Array, *, limits: Limits, constraints: ClearanceConstraints | None, seed: int
 ) -> Array:
-    """Return configurations at a goal that keep limits and clearance, the nearest to others first. Shape (K, n).
+    """Return configurations at a goal within limits and clearance, sorted by distance from `near`. Shape (K, n).
 
     The tip of a goal with a region is at the centre of the region, and at random places in it. Joints that do not move
     the tip stay where they are.
@@ -292,7 +292,7 @@ def goal_configurations(
 
 
 def _points_inside(region: Box | Sphere | None, seed: int) -> Array:
-    """Return random points of a region in world, none without one. Shape (K, 3), m."""
+    """Return random points in a region, in world; none without a region. Shape (K, 3), m."""
     if region is None:
         return np.zeros((0, 3))
     center: Array = np.array(region.position, dtype=float)

@@ -38,8 +38,7 @@ def plan_to_stand(
     constraints: ClearanceConstraints | None,
     wrenches: External | None,
 ) -> SolvedPlan:
-    """Plan a motion that satisfies the tasks with the zero moment point inside the foot, at the cost of
-    `solve_standing`.
+    """Plan a motion that satisfies the tasks while the zero moment point stays inside the foot.
 
     The joints start and end at rest if their tasks do; else they may move there. Candidates start from every
     configuration that inverse kinematics finds and that stands; with search "start", from the best conditioned one that
@@ -91,7 +90,7 @@ def plan_to_stand(
 
 @dataclass
 class _StandingSolver(Solver):
-    """Solver of the candidates of a standing machine in one stage: `solve_standing` solves, refines and audits."""
+    """Solver of the candidates of a standing machine, with one stage, in which `solve_standing` does everything."""
 
     machine: Standing
     tasks: list[TipTask]
@@ -100,7 +99,7 @@ class _StandingSolver(Solver):
     start_is_fixed: bool
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """Return the candidate, audited or rejected.
+        """Return the candidate after its solve: audited, or rejected.
 
         Raises:
             ProblemError, SolveError: Errors of a given start.
@@ -114,7 +113,7 @@ class _StandingSolver(Solver):
         return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, with the others."""
+        """Return the first candidate as the plan, which also lists the others."""
         best = candidates[0].solution
         assert best is not None
         parts = (Part(0.0, self.duration, ""),)
@@ -131,7 +130,7 @@ def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
 
 
 def _takes_scalars(equations: TaskEquations) -> bool:
-    """Return whether the tracks can be expressed by SX symbols."""
+    """Return whether the functions of time in the tasks accept SX symbols."""
     try:
         equations.targets(ca.SX.sym("time"))
     except (RuntimeError, NotImplementedError):
@@ -142,7 +141,7 @@ def _takes_scalars(equations: TaskEquations) -> bool:
 def _start_configurations(
     machine: Standing, tasks: list[TipTask], start: Any, limits: Limits | None, seed: int
 ) -> list[Array]:
-    """Return the joints at the start, the best conditioned first."""
+    """Return joint vectors at the start, in order of their conditioning."""
     if start is not None:
         return [start]
     poses = [task for task in tasks if task.is_pose]

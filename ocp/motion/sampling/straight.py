@@ -68,14 +68,14 @@ class StraightMotions:
             self._levers, self._turns = self.scene.levers.joints, self.scene.levers.joint_turns
 
     def collisions(self, joints: Array) -> list[Collision]:
-        """Return the pairs closer than the clearance in a configuration (n,), the worst first."""
+        """Return the pairs closer than the clearance in a configuration (n,), in order of severity."""
         if self.scene is None:
             return []
         collisions = find_collisions(self.scene, np.zeros(0), joints[None], np.zeros(1))
         return [collision for collision in collisions if collision.distance < self._required]
 
     def near_pairs(self, joints: Array, reach: float) -> tuple[Indices, Indices, Array, Array]:
-        """Return the pairs of bodies closer than the clearance plus a reach, m, in configurations (M, n).
+        """Return the pairs closer than clearance plus `reach`, m, in configurations (M, n).
 
         Returns:
             Configuration and pair of each, their distance beyond the clearance, m, shape (K,) each, and its gradient,
@@ -123,7 +123,7 @@ class StraightMotions:
         clear: NDArray[np.bool_],
         intervals: tuple[Indices, Array, Array],
     ) -> None:
-        """Halve intervals until all pairs are decided; mark motions that may collide.
+        """Bound the distances on halved intervals until each suffices; mark motions that may collide in `clear`.
 
         Args:
             lines: Starts and ends of the motions.
@@ -173,7 +173,7 @@ class StraightMotions:
             middle = np.concatenate([middle[kept] - shift, middle[kept] + shift])
 
     def _frames_on(self, lines: tuple[Array, Array], motion: Indices, places: Array) -> Frames:
-        """Return the frames of the bodies on straight motions (K,), each at a fraction from 0 to 1 of its length."""
+        """Return the frames of the bodies on K straight motions, each at a fraction of its length."""
         starts, ends = lines[0][motion], lines[1][motion]
         return self._frames(starts + places[:, None] * (ends - starts))
 
