@@ -82,7 +82,7 @@ class FirstIntegrals:
 
 
 def coupled_parts(form: Formulation) -> list[np.ndarray]:
-    """Group the states that relevant first integrals may contain by the coupled parts of the dynamics.
+    """Group the states that relevant first integrals may contain, by coupling in the dynamics.
 
     Only states with end conditions are relevant. If f_i is the only rate among these that contains a control u_j, or
     another state, then grad I . f = 0 for all u_j implies that I does not depend on x_i.
@@ -130,7 +130,7 @@ def sample_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
-    """Return the bound table for a solve, without end conditions implied by the start and first integrals.
+    """Return the bound table for a solve, without the end conditions that first integrals make redundant.
 
     Of a redundant set the least informative condition is relaxed, of a quaternion its largest entry, up to a leeway.
     """
@@ -147,7 +147,7 @@ def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
 def implied_conditions(
     form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.ndarray
 ) -> list[tuple[int, float]]:
-    """Return the end conditions that first integrals imply: indices in the bound table, and tolerances."""
+    """Return the end conditions that first integrals imply, as indices in the bound table, with tolerances."""
     nx, places = form.nx, form.bounds.places
     index = np.concatenate([places[kind] for kind in ("initial", "start", "terminal", "end")])
     low, high = (side[index] for side in bounds)
@@ -197,7 +197,7 @@ def null_projector(rows: np.ndarray) -> np.ndarray:
 
 
 def rows_of_ends(form: Formulation) -> ca.Function:
-    """Return all conditions on both ends, with their Jacobian, as a Function of (x0, x1, T) and p."""
+    """Return a Function of (x0, x1, T) and p to all conditions on both ends and their Jacobian."""
     z = form.sym("z", 2 * form.nx + 1)
     x0, x1, horizon = z[: form.nx], z[form.nx : -1], z[-1]
     zero = form.problem.symbols(ca.DM.zeros(form.nu))
