@@ -180,7 +180,7 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
 
 
 def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
-    """Return the joints with some locked at given positions (rad or m, by name), and their followers with them.
+    """Return the joints after locking some, and their followers, at given positions (rad or m, by name).
 
     Joints that cannot move are locked too: followers of a locked joint, followers of a fixed joint (which counts as
     being at 0), and followers with multiplier 0. A follower that is locked itself follows no longer.

@@ -223,7 +223,7 @@ def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """Return the second-order cost that controls within their limits could still save in each interval. Shape (N,).
+    """Return the cost, to second order, that controls could still save in each interval within limits. Shape (N,).
 
     A control moves within its limits, and at most by its size if the Hamiltonian does not curve along it. Rows with
     multipliers stay active.

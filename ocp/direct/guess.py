@@ -96,7 +96,7 @@ def guessed_names(form: Formulation, guess: Guess) -> set[str]:
 
 
 def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the counterpart of each variable and row that is some equal intervals later.
+    """Return, for each variable and row, the index of the same quantity a number of equal intervals later.
 
     The index itself where the horizon ends earlier.
     """

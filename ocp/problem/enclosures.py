@@ -67,7 +67,7 @@ class Enclosures:
         check_instructions(what, self._function)
 
     def __call__(self, low: np.ndarray, high: np.ndarray) -> Enclosure:
-        """Return bounds, valid while the symbol varies from ``low`` to ``high``; shape (M,), finite and in order."""
+        """Return bounds of the expressions over M intervals of the symbol, from ``low`` to ``high``, (M,) each."""
         jets = self._jets(_Jet(Interval(low, high), constant(1.0, low)))
         return Enclosure(*(np.column_stack([side(jet) for jet in jets]) for side in _SIDES))
 
@@ -305,7 +305,7 @@ def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[
 
 
 def _coordinates(core: np.ndarray) -> np.ndarray:
-    """Return the matrix from a frame's entries to the corners of a bounding box in world. Shape (3 C, 12)."""
+    """Return the matrix that maps the 12 entries of a frame to bounding box corners in world. Shape (3 C, 12)."""
     ends = np.stack([core.min(axis=0), core.max(axis=0)])
     corners = np.unique(np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3), axis=0)
     with_one = np.column_stack([corners, np.ones(len(corners))])

@@ -284,7 +284,7 @@ class Formulation:
         return ca.Function(name, [v, d, self.p], outputs, {"cse": True})
 
     def parameter_vector(self, values: dict[str, Any] | None) -> np.ndarray:
-        """Return the stacked parameters. Shape (np,).
+        """Return the values of all parameters as one vector. Shape (np,).
 
         Raises:
             ProblemError: A parameter is missing, unknown, of the wrong size or not finite.

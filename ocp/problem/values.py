@@ -80,7 +80,7 @@ def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
 
 
 def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise ProblemError if a value is infinite or outside its bounds; nan values are free, nan bounds unknown."""
+    """Raise ProblemError if a value is infinite or outside its bounds; nan marks a free value or unknown bound."""
     for i, (number, low, high) in enumerate(zip(value, lower, upper, strict=True)):
         details: dict[str, Any] = {"value": float(number), "limit": (float(low), float(high))}
         if np.isinf(number):

@@ -51,7 +51,7 @@ DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 class WorkerFailure(OSError):
-    """A worker failed for a reason that is not the task's, such as a full disk."""
+    """Error that a worker failed for a reason other than its task, such as a full disk."""
 
 
 # ---- one task ----------------------------------------------------------------------------------------------------

@@ -342,7 +342,7 @@ class _Sun:
 
     @classmethod
     def on(cls, mesh: _Mesh, camera: Camera) -> _Sun:
-        """Return the sun for a scene: its direction is relative to the camera, and its depth map shows shadows."""
+        """Return the light source of a scene, in a direction relative to the camera, with its depth map for shadows."""
         back = camera.axes[2]
         azimuth, elevation = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
         to_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])

@@ -98,7 +98,7 @@ class ClearanceConstraints:
         return replace(self, margins={**margins, **self.margins})
 
     def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
-        """Return the constraints; the separation margin of each violating pair is increased by its violation."""
+        """Return constraints in which the separation margin of each violating pair is larger by its violation."""
         return replace(self, margins=widened(self.margins, self.scene.labels, proofs))
 
     def declare(
@@ -167,7 +167,7 @@ class Separating(Protocol):
     """Interface of constraints that separate pairs of bodies by margins."""
 
     def widened(self, proofs: Sequence[Clearance]) -> Self:
-        """Return the constraints; the separation margin of each violating pair is increased by its violation."""
+        """Return constraints in which the separation margin of each violating pair is larger by its violation."""
 
 
 def widened(

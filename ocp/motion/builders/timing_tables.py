@@ -155,7 +155,7 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 
 def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Return the ratio of each quantity to its limit at unit line speed v, and its exponent p, as it grows with v^p.
+    """Return each quantity's ratio to its limit at line speed v = 1, and the exponent p of its growth with v^p.
 
     The rows are the centripetal acceleration, then velocity, acceleration and jerk of each joint. Shapes (C, M), (C,).
     """

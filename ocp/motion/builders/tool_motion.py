@@ -347,7 +347,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
 
 
 def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
-    """Declare the problem of `tool_motion_problem` with free time: a state over the task time s.
+    """Declare the problem of `tool_motion_problem` with free time, which is a state over the task time s.
 
     With q' = dq/ds and z = dt/ds the cost is the integral of (time_cost + q. W q. / 2) dt = (time_cost z + q' W q'/(2
     z)) ds, which is convex in q' and z. The tasks, J q' = v(s), and the rate limits, |q'| <= v z, are linear in them.

@@ -30,7 +30,7 @@ __all__ = ["StraightMotionSettings", "StraightMotions"]
 
 @dataclass(frozen=True)
 class StraightMotionSettings:
-    """Resolution of the proofs.
+    """Resolution of the collision proofs for straight motions.
 
     Attributes:
         finest: Approach of two bodies within half an interval below which it is not halved again, m. The motion counts
@@ -123,7 +123,7 @@ class StraightMotions:
         clear: NDArray[np.bool_],
         intervals: tuple[Indices, Array, Array],
     ) -> None:
-        """Bound the distances on halved intervals until each suffices; mark motions that may collide in `clear`.
+        """Bound distances on ever shorter intervals, and unset `clear` for motions that may collide.
 
         Args:
             lines: Starts and ends of the motions.

@@ -251,7 +251,7 @@ class _BandSolver:
 
 
 class _Constraints:
-    """Constraints of a program: coefficients are positive and bounded, and rows hold, those of jerk limits last.
+    """Constraints of a program: positive coefficients, bounded coefficients, then limit rows with jerk limits last.
 
     Values of constraints, shape (M,), are in this order.
 

@@ -106,7 +106,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
 def _solve_window(
     window: Window, seam: int, before: EnforcedRows | None
 ) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
-    """Return the motion of a window up to its seam, with limits tightened until it satisfies them beyond the seam.
+    """Return the motion of a window up to the start of the next one, with limits tightened as far as necessary.
 
     Args:
         window: The window.

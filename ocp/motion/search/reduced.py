@@ -356,7 +356,7 @@ def check_floating_reach(
 
 
 def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, *, base: Any = ()) -> TipTask | None:
-    """Return the pose task that a task amounts to at a time; None if the pose depends on the path.
+    """Return the pose task to which a task is equivalent at a time; None if the pose depends on the path.
 
     Args:
         machine, task: The machine and its task.
