@@ -130,14 +130,14 @@ class Checks:
         return self.error(words, name=str(name) or kind, value=name, limit=tuple(names))
 
     def number(self, label: str, value: Any, *, finite: bool = True, unit: str = "") -> float:
-        """Return a number as a float; infinity is accepted unless `finite`."""
+        """Return a value as a float after checking that it is a number; with `finite`, infinity is rejected."""
         number = real(value)
         if isnan(number) or (finite and isinf(number)):
             raise self.invalid(label, ("a finite number" if finite else "a number") + _in(unit), value)
         return number
 
     def positive(self, label: str, value: Any, *, below: float = inf, unit: str = "") -> float:
-        """Return a number as a float that is above zero and less than `below`."""
+        """Return a value as a float after checking that it is a number above zero and less than `below`."""
         number = real(value)
         if not 0 < number < below:
             kind = "positive and finite" if below == inf else f"between 0 and {below:g}"
@@ -145,7 +145,7 @@ class Checks:
         return number
 
     def nonnegative(self, label: str, value: Any, *, unit: str = "") -> float:
-        """Return a number as a float that is finite, zero or above."""
+        """Return a value as a float after checking that it is a finite number, zero or above."""
         number = real(value)
         if not 0 <= number < inf:
             raise self.invalid(label, "a finite number, zero or above" + _in(unit), value, 0.0)
@@ -201,7 +201,7 @@ class Checks:
         return tuple(self.instance(label, item, kind) for item in items)
 
     def mapping(self, label: str, values: Any, keys: type = str) -> dict[Any, Any]:
-        """Return a copy of a dictionary with keys of one class, empty for None."""
+        """Return a copy of a dictionary after checking the class of its keys; an empty one for None."""
         if not isinstance(values, Mapping | None) or not all(isinstance(key, keys) for key in values or ()):
             raise self.invalid(label, "a dictionary by name", values)
         return dict(values or {})
@@ -257,7 +257,7 @@ class Checks:
         sign: Sign = "any",
         unit: str = "",
     ) -> Array:
-        """Return one float for each of `count` items, from one number or from one each. Shape (count,).
+        """Return one float for each of `count` items, from one number for all or one for each. Shape (count,).
 
         Args:
             items: Plural noun for messages.
@@ -281,7 +281,7 @@ class Checks:
         return indices.astype(np.intp)
 
     def rotation(self, label: str, value: ArrayInput) -> Array:
-        """Return a read-only rotation matrix. One printed with few digits is projected onto the nearest rotation."""
+        """Return a read-only rotation matrix; a matrix with rounded digits is projected onto the nearest rotation."""
         matrix = self.array(label, value, (3, 3))
         error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost
@@ -352,7 +352,7 @@ def warn_of_millimetres(label: str, lengths: ArrayInput, name: str | None = None
 
 
 def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tuple[float, float], words: str) -> None:
-    """Warn of the first entry whose magnitude lies in a range."""
+    """Warn about the first entry whose magnitude suggests another unit."""
     low, high = range_
     for value in np.ravel(values).tolist():  # faster than array operations on few entries
         if low < abs(value) < high:

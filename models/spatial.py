@@ -123,7 +123,7 @@ def skew(vector: Expression) -> Expression:
 
 
 def cross(a: Expression, b: Expression) -> Expression:
-    """Return the vector product; unlike CasADi's, it keeps structural zeros. Shape (3, 1)."""
+    """Return the vector product; unlike that of CasADi, it keeps structural zeros. Shape (3, 1)."""
     a, b = expression(a), expression(b)
     return ca.vertcat(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 

@@ -209,7 +209,7 @@ _FILTER_LOCK = threading.Lock()
 
 @contextmanager
 def casadi_silenced() -> Iterator[None]:
-    """Suppress what CasADi writes to ``sys.stderr`` from this thread when an expected evaluation fails.
+    """Suppress CasADi's messages on ``sys.stderr`` from this thread, for evaluations that are expected to fail.
 
     It would print the function's inputs, and no option of its functions prevents that.
     """
@@ -289,7 +289,7 @@ def _is_interactive() -> bool:
 
 
 class Progress:
-    """Progress line of a command or call; in a log, lines at the start, every 30 s, and at the end.
+    """Progress display of a command or call; in a log, a line at the start, every 30 s, and at the end.
 
     The line appears on a terminal or in a notebook after `delay` seconds.
     """

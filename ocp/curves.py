@@ -82,7 +82,7 @@ def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
-    """Return derivatives of the Lagrange basis at its nodes: row j, column i is l_i'(node_j). Shape (d, d)."""
+    """Return derivatives of the Lagrange basis at its nodes; row j, column i is l_i'(node_j). Shape (d, d)."""
     weights = barycentric_weights(nodes)
     difference = nodes[:, None] - nodes[None, :]
     np.fill_diagonal(difference, 1.0)
@@ -148,7 +148,7 @@ def integrator(
     smooth: bool = True,
     start: float = 0.0,
 ) -> Any:
-    """Return a casadi integrator (cvodes: variable step and order) of ``dae`` from ``start`` to each of ``places``.
+    """Return a casadi integrator (CVODES, variable step and order) of ``dae`` from ``start`` to all ``places``.
 
     Args:
         dae: casadi's dictionary: x, t, p, ode and, if any, quad, which is under error control too.

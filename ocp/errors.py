@@ -101,7 +101,7 @@ class SolverStatus(Enum):
 
     @property
     def message(self) -> str:
-        """The status with advice on what to try next; "" for a success."""
+        """Text of the status with advice on what to try next; "" for a success."""
         if self.is_success:
             return ""
         return f"{self.value}: {ADVICE[self]}" if self in ADVICE else self.value
@@ -128,7 +128,7 @@ ADVICE = {
 
 @contextmanager
 def error_names(name: str) -> Iterator[None]:
-    """Name the exceptions raised inside that have no name yet."""
+    """Set the name of exceptions that are raised in this block without one."""
     try:
         yield
     except DetailedError as error:
@@ -140,7 +140,7 @@ require = Checks(ProblemError)
 
 
 def format_distinct(*numbers: float) -> list[str]:
-    """Format numbers with six digits, or with as many more as it takes to distinguish unequal numbers."""
+    """Format numbers with six digits, or with more if unequal numbers would look equal."""
     candidates = [[f"{number:.{digits}g}" for number in numbers] for digits in range(6, 18)]
     different = len({repr(number) for number in numbers})
     return next((texts for texts in candidates if len({*texts}) == different), candidates[-1])

@@ -200,7 +200,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
 def _displaced_guess(
     form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
 ) -> dict[str, Any]:
-    """Return the plan displaced by a visible amount along the variation that lowers its cost.
+    """Return a guess: the plan, displaced visibly along the variation that lowers its cost.
 
     If the variation is unknown, all controls are displaced by seeded random amounts.
     """

@@ -186,7 +186,7 @@ def _refine_mesh(
 def _shortfall(
     stopped: str, late: bool, idles: bool, beyond: list[_Row], audit: Audit, form: Formulation
 ) -> RefinementWarning | None:
-    """Return the warning about the worst remaining row; None if the last plan passes its audit."""
+    """Return a warning about the worst row that is still too large; None if the last plan passes its audit."""
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
         hint = "the time limit is reached: raise time_limit" if late else "raise max_intervals"
@@ -276,7 +276,7 @@ class _Parts(NamedTuple):
 def _rows(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit, tolerance: float, method: DirectMethod
 ) -> list[_Row]:
-    """Return the rows of the audit of a plan, each with the contributions of the intervals."""
+    """Return the rows of a plan's audit, each with the contributions of the intervals."""
     # over the whole horizon an unstable motion diverges; the sum is what feedback would have to correct
     deviation = min(audit.integration_error, float(audit.local_errors.sum()))
     requested = Finding(f"integration error, {tolerance:.0e} requested", deviation, tolerance)

@@ -214,8 +214,7 @@ class Solution:
         return entry_named("parameter", name, self.cost_gradients)
 
     def at(self, time: Any) -> Sample:
-        """Return states and controls at a time (each (n,)) or at times (M,) (each (M, n)), by the method's own
-        interpolant.
+        """Return states and controls at a time, each (n,), or at times (M,), each (M, n), by the method's interpolant.
 
         Raises:
             ProblemError: A time outside 0 to the horizon, or not finite.
@@ -471,7 +470,7 @@ class Solution:
         self.__dict__.update({**state, "problem": None if problem is None else Problem.from_record(problem)})
 
     def __copy__(self) -> Solution:
-        """Return a solution that shares the arrays and the problem."""
+        """Return a solution that shares arrays and problem with this one."""
         return replace(self)
 
     def __deepcopy__(self, memo: Any) -> Solution:

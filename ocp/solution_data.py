@@ -72,7 +72,7 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """First-order change of a plan with a parameter of k entries.
+    """First-order change of a plan with a parameter that has k entries.
 
     Attributes:
         name, value: Of the parameter, (k,).
@@ -100,7 +100,7 @@ class Sensitivity:
         return entry_named("state or control", name, {**self.states, **self.controls})
 
     def __str__(self) -> str:
-        """Return the valid range of each entry, one a line."""
+        """Return the range in which the change is valid for each entry of the parameter, one per line."""
         lines = []
         for k, (below, above) in enumerate(self.limits):
             entry = self.name if len(self.value) == 1 else f"{self.name}[{k}]"
@@ -209,7 +209,7 @@ def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray
 
 
 def check_structure(solution: Any) -> None:
-    """Raise ProblemError, naming the part, unless the arrays of a plan are consistent.
+    """Raise ProblemError, naming the part, if the arrays of a plan are inconsistent.
 
     Times increase from 0 and breaks from 0 to 1. Every array has a row for each time. Every interpolant has one
     polynomial between two breaks, nodes within 0..1, and as many columns as the interpolated pool.

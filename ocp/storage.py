@@ -183,7 +183,7 @@ def check_regular(path: Any, status: os.stat_result) -> None:
 
 
 def check_contents(path: Any, stream: IO[bytes], size: int) -> None:
-    """Raise an error if an archive's table of contents is too large or its end is missing."""
+    """Raise an error if an archive's table of contents is too large, or if the end of the archive is missing."""
     stream.seek(max(0, size - 42))
     tail = stream.read(42)
     if tail[-22:-18] != END_RECORD or tail.startswith(ZIP64_LOCATOR):

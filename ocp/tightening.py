@@ -282,7 +282,7 @@ WARM_START_OPTIONS = {"mu_init": 1e-4}
 
 
 def switches(problem: Problem, solution: Solution) -> np.ndarray:
-    """Return fractions of the horizon at which a control or path constraint reaches or leaves a limit. Shape (k,).
+    """Return the horizon fractions at which a control or path constraint reaches or leaves a limit. Shape (k,).
 
     Args:
         problem: The problem that was solved, by collocation with controls at the points.

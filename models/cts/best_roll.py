@@ -346,7 +346,7 @@ class Search:
         return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
-        """Return bounds on how far sin q4 and cos q2 can change if the roll changes by ROOTS.root_tolerance."""
+        """Return bounds of the changes of sin q4 and cos q2 for a change of the roll by ROOTS.root_tolerance."""
         rig = self.rig
         sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4
@@ -442,7 +442,7 @@ class Search:
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))
 
     def _solution(self, target: Expression, previous: Expression, best: Incumbent, status: Expression) -> Expression:
-        """Return the RigSolution of the incumbent. Shape (9, 1)."""
+        """Return the RigSolution of the best roll so far as a column. Shape (9, 1)."""
         roll = unwrap_roll(self.rig, best.c, best.s, previous)
         joints = joints_of(self.rig, target, roll, self._configuration(target, best.c, best.s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)

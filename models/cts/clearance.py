@@ -53,7 +53,7 @@ def _half_size(box: Box) -> Expression:
 
 
 def box_distance(point: Expression, box: Box) -> Expression:
-    """Return the signed distance of a point to a box, which is convex. Shape (1, 1), m."""
+    """Return the signed distance of a point to a box, as a convex function. Shape (1, 1), m."""
     over = ca.fabs(_finite_axes(point, box)) - _half_size(box)
     outside = ca.fmax(over, 0)
     deepest = reduce(ca.fmax, ca.vertsplit(over))
@@ -183,7 +183,7 @@ class CollisionScene:
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
-    """Return the links of the rig as capsules, by name, from joint 2 to the store."""
+    """Return the links of the rig as capsules, by name, from that of joint 2 to the store."""
     require.instance("rig: rig", rig, Rig)
     radii = Radii() if radii is None else require.instance("rig: radii", radii, Radii)
     frames = dh_frames(rig, checked_vector("q", q, 6, "one entry for each joint of the rig"))
@@ -236,7 +236,7 @@ def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
 
 
 def checked_clearance(clearance: float) -> float:
-    """Return `clearance` itself, m; raise a ModelError unless it is a finite distance or -inf for none."""
+    """Return `clearance`, m; raise a ModelError unless it is a finite distance, or -inf for no clearance."""
     if require.number("rig: clearance", clearance, finite=False) == np.inf:
         message = f"clearance {clearance} m must be a finite distance or -inf for none"
         raise ModelError(message, name="clearance", value=clearance)
@@ -335,7 +335,7 @@ def collision_free_inverse(
 
 
 def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the function (merits on a grid) -> lowest minima, columns (angle, merit, step)."""
+    """Return inputs and outputs of the function (grid merits) -> (angle, merit, step) of each of the lowest minima."""
     merits = ca.SX.sym("merits", 1, samples)
     angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
     remaining = []
@@ -353,7 +353,7 @@ def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
 
 
 def _least_value(count: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of (angles, values) -> (angle of the minimum, minimum, whether it is the first)."""
+    """Return inputs and outputs of the function (angles, values) -> (best angle, minimum, whether it is the first)."""
     angles, values = ca.SX.sym("angles", 1, count), ca.SX.sym("values", 1, count)
     best, least, is_first = angles[0], values[0], ca.SX(1)
     for k in range(1, count):

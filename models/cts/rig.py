@@ -136,7 +136,7 @@ def checked_branch(branch: Branch) -> Branch:
 
 
 class RigConfiguration(NamedTuple):
-    """Configuration of the rig for a target, a roll and a branch; scalar expressions unless noted.
+    """Joint angles of the rig for a target, a roll and a branch, with intermediate scalar expressions.
 
     Attributes:
         corner: P_G in world. Shape (3, 1), m.

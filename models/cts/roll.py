@@ -265,7 +265,7 @@ def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Exp
 
 
 def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
-    """Return a position of a joint just inside one of its limits, m or rad."""
+    """Return a position of a joint slightly inside one of its limits, m or rad."""
     return rig.limit(joint, upper) + (-1 if upper else 1) * ANGLE_INSET
 
 
@@ -387,7 +387,7 @@ def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) ->
 
 
 def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]:
-    """Return the interval of rolls within limits, at most one turn long, that are nearest to the previous roll."""
+    """Return the interval of rolls within limits that are nearest to the previous roll, at most one turn long."""
     start, low, high = previous - np.pi, rig.limit(6, False), rig.limit(6, True)
     if not np.isfinite(low):
         return start, start + FULL_TURN

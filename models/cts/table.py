@@ -74,7 +74,7 @@ def solve_table(
     rate_weight: float = 0.0,
     avoidance: Avoidance | None = None,
 ) -> Table:
-    """Return the joints of least index for every target; rows without a solution do not affect the others.
+    """Return the joints with the least index for every target; targets without a solution do not affect others.
 
     Args:
         targets: Shape (samples, 5), m and rad; rows may hold nan.
@@ -122,7 +122,7 @@ def solve_table(
 
 
 def _best_branch(results: list[Any]) -> Array:
-    """Return the best of the branches' results: joints, cost, branch number, active, status. Shape (samples, 10)."""
+    """Return the result of the best branch: joints, cost, branch number, active, status. Shape (samples, 10)."""
     best: Array | None = None
     for number, (joints, cost, active, status, *_) in enumerate(results):
         columns = [np.array(part, dtype=float) for part in (joints, cost, active, status)]
@@ -142,7 +142,7 @@ def _best_branch(results: list[Any]) -> Array:
 
 @dataclass(frozen=True)
 class RollInterval:
-    """An interval of rolls within reach and all limits.
+    """An interval of rolls that are within reach and within all limits.
 
     Attributes:
         start, end: rad, end >= start; a full turn is -pi .. pi.
@@ -229,7 +229,7 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
 
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
-    """Return targets (x, y, z, yaw, pitch), shape (samples, 5); raise a ModelError for the first wrong row."""
+    """Return targets (x, y, z, yaw, pitch), shape (samples, 5); raise a ModelError about the first invalid row."""
     rows = require.array("table: targets", targets, ("samples", 5), entries="finite" if finite else "any")
     warn_of_degrees("table: yaw or pitch", rows[:, 3:], "targets")
     return rows

@@ -28,7 +28,7 @@ SMALLEST_DIVISOR = 1e-300
 
 @dataclass(frozen=True)
 class RootSettings:
-    """Settings of the root finding, which bound its number of operations.
+    """Settings of the root finding, which limit its number of operations.
 
     Attributes:
         min_second_harmonic: Smallest relative second harmonic in the pencil of conics; a smaller one is raised, and the

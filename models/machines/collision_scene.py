@@ -233,7 +233,7 @@ class CollisionScene:
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Reason by pair of links, "A and B", for pairs that are excluded by assumption, without proof."""
+        """Reason for each pair of links, "A and B", that is excluded by assumption, without proof."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value

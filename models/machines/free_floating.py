@@ -110,7 +110,7 @@ class FreeFloating:
         return PLANAR_ROWS if self.base == "planar" else list(range(6))
 
     def base_home(self) -> Array:
-        """Return the base configuration at the world's origin, axes parallel. Shape (base_size,)."""
+        """Return the base configuration at the world's origin, with parallel axes. Shape (base_size,)."""
         return np.zeros(3) if self.base == "planar" else np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
     def world_from_base(self, base: Expression) -> Frame:
@@ -189,7 +189,7 @@ class FreeFloating:
 
     @on_scalars
     def momentum(self, base: Expression, q: Expression, base_twist: Expression, joint_rates: Expression) -> Expression:
-        """Return the total (moment of momentum about the world's origin, linear momentum); (Lz, Px, Py) if planar.
+        """Return total angular momentum about the world's origin and linear momentum; (Lz, Px, Py) if planar.
 
         Shape (6, 1) or (3, 1).
         """

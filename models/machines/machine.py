@@ -166,7 +166,7 @@ class FixedBase:
 def with_tip(
     machine: Machine, link: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Machine:
-    """Return the same machine with its tip at a frame fixed in any link, the root included.
+    """Return the same machine with its tip at a frame fixed in any link, including the root.
 
     Args:
         machine: A FixedBase, a FreeFloating, or any frozen dataclass with a field `robot`.
@@ -181,7 +181,7 @@ def with_tip(
 
 
 def hold_joints(machine: Machine, positions: Mapping[str, float]) -> Machine:
-    """Return the same machine with joints, and those that follow them, locked at positions (rad or m), by name.
+    """Return the same machine with joints, and their followers, locked at positions (rad or m) given by name.
 
     Raises:
         ModelError: As `models.robot.rebuild.lock_joints`; or as `with_tip` for the machine.
@@ -260,7 +260,7 @@ def with_wheels(
 
 
 def find_wheels(robot: Robot) -> dict[str, float]:
-    """Find the joints whose angle is irrelevant, such as reaction wheels; return their inertia (kg m^2) by name.
+    """Find the joints whose angle has no effect, such as reaction wheels; return their inertia (kg m^2) by name.
 
     Such a joint is unbounded and moves a single body, symmetric about the joint axis with its centre of mass on it,
     that carries neither the tip nor a collision shape.

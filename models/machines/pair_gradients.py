@@ -141,7 +141,7 @@ def _leader_columns(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
 
 
 def _base_twists(world_from_base: Frame, base: Expression) -> Expression:
-    """Return the twists of a base per coordinate, (angular, linear at the world's origin), world axes.
+    """Return the base twist for a unit rate of each base coordinate, angular and linear, in world axes.
 
     Shape (6, size).
     """

@@ -214,7 +214,7 @@ class JointsAlong(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScaraPath:
-    """Joints of a SCARA arm whose tool follows a path, from `scara_along`.
+    """Joints of a SCARA arm whose tool follows a path, as `scara_along` computes them.
 
     Attributes:
         scara: The arm.

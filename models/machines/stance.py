@@ -100,7 +100,7 @@ class Foothold:
 
     @classmethod
     def level(cls, x: float, y: float, heading: float = 0.0, height: float = 0.0) -> Self:
-        """Return a foothold on level ground: x, y (m), turned left by a heading (rad), a height (m) above z = 0."""
+        """Return a foothold on level ground at x, y and a height (m), turned left by a heading (rad)."""
         numbers = {"x": x, "y": y, "heading": heading, "height": height}
         x, y, heading, height = (require.number(f"foothold: {name}", value) for name, value in numbers.items())
         turn = [[np.cos(heading), -np.sin(heading), 0.0], [np.sin(heading), np.cos(heading), 0.0], [0.0, 0.0, 1.0]]
@@ -169,7 +169,7 @@ class Stance(FixedBase):
 
     @cached_property
     def bodies(self) -> Robot:
-        """The robot with links merged between moving joints and feet: the same dynamics, faster."""
+        """The robot with fixed links merged, which has the same dynamics and is faster to evaluate."""
         return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:
@@ -202,7 +202,7 @@ class Stance(FixedBase):
     def loads(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> dict[str, Expression]:
-        """Return the loads of all standing feet in a motion from those of the other feet; the first bears the rest."""
+        """Return the loads of all standing feet during a motion, given those of all but the first foot."""
         reaction = base_reaction(
             self.bodies,
             q,
@@ -295,7 +295,7 @@ class Stance(FixedBase):
         return self.load_in_sole(name, load)[1][2]
 
     def edge_moments(self, name: str, load: Expression, margin: float = 0.0) -> Expression:
-        """Return the moments of a load about the edges of its sole, none negative if the foot does not tip.
+        """Return the moments of a load about the edges of its sole; they are nonnegative if the foot does not tip.
 
         Each is the distance of the center of pressure from an edge, less a margin, times the pressure, N m. Only edges
         from which motion can change that distance count. Shape (k, 1); none for a grip.

@@ -71,7 +71,7 @@ MIDDLE_FACTORS: dict[str, float] = {"cubic": 1 / 4, "quintic": 5 / 16}
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
-    """Return the shape factors of vertices, from one for all or one for each. Shape (count,).
+    """Return the shape factors of vertices, from one for all or one for each, after checks. Shape (count,).
 
     Raises:
         ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
@@ -88,7 +88,7 @@ def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
 
 
 def rest_to_rest(s: Expression) -> Expression:
-    """Return the minimum-jerk time scaling 10 s^3 - 15 s^4 + 6 s^5 of the share s of the duration, s in [0, 1].
+    """Return the minimum-jerk time scaling 10 s^3 - 15 s^4 + 6 s^5 at the fraction s, 0 to 1, of the duration.
 
     It is the polynomial of least degree whose velocity and acceleration are zero at both ends. Accepts numbers, arrays
     and expressions.
@@ -99,7 +99,7 @@ def rest_to_rest(s: Expression) -> Expression:
 
 
 def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array:
-    """Return the cubic with given ends and derivatives by u, eqs (1)-(7). Shapes (..., 3) to (..., 6, 3)."""
+    """Return the cubic with given end points and end derivatives by u, eqs (1)-(7). Shapes (..., 3) to (..., 6, 3)."""
     chord = end - start
     zero = np.zeros_like(chord)
     second = 3 * chord - 2 * start_rate - end_rate
@@ -163,7 +163,7 @@ def curvature(coefficients: Array, u: Array) -> Array:
 
 
 def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:
-    """Return position and three derivatives by the distance, by the chain rule with d/ds = (1/|F'|) d/du."""
+    """Return position and its first three derivatives by arc length, from polynomials of u by the chain rule."""
     position, first, second, third = (polynomial(coefficients, u, order) for order in range(4))
     rate = np.linalg.norm(first, axis=-1, keepdims=True)
     rate_u = (first * second).sum(axis=-1, keepdims=True) / rate
@@ -227,7 +227,7 @@ def _table() -> tuple[Array, Array]:
 
 
 def best_shape(ends: Ends, remaining: Array, samples: int = SEARCH.samples) -> Array:
-    """Return the shape factors of least peak curvature of quintic blends between given ends.
+    """Return the shape factors for which quintic blends between given ends have the least peak curvature.
 
     Args:
         ends: Point (m), unit tangent and curvature vector (1/m) at the start, and the same at the end. Shape (V, 3)

@@ -70,7 +70,7 @@ def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
 
 
 def _clamp(distance: Any, length: float) -> Any:
-    """Return the distance clamped to the path, with the derivative 1 at both ends too."""
+    """Return the distance clamped to the path; the derivative stays 1 at both ends."""
     return ca.if_else(distance > length, length, ca.if_else(distance < 0, 0.0, distance))
 
 

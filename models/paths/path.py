@@ -197,7 +197,7 @@ class Path:
 
 
 def checked_segments(segments: Any) -> tuple[Segment, ...]:
-    """Return `segments` as a tuple; raise a ModelError unless they are Lines, Arcs and Helices, at least one."""
+    """Return `segments` as a tuple; raise a ModelError unless it holds Lines, Arcs or Helices, and at least one."""
     try:
         check_entries(segments)
         checked = tuple(segments)
@@ -271,7 +271,7 @@ def split_at_reversals(
 
 
 def bulb_turn(segment: Segment, width: float) -> tuple[Arc, Arc, Arc]:
-    """Return the arcs of a bulb turn at the end of a segment, in a horizontal plane unless the segment is vertical."""
+    """Return the arcs of a bulb-shaped turn at the end of a segment, horizontal unless the segment is vertical."""
     frame = np.asarray(segment.start), segment.tangent, segment.normal
     bends: Any = {"curvature": segment.curvature, "torsion": segment.torsion}
     _, ahead, bend, _ = screw(*frame, **bends, distance=segment.length)

@@ -203,7 +203,7 @@ class SmoothPath:
         return np.append(inside, self.length)
 
     def by_piece(self, of_segments: ArrayInput) -> Array:
-        """Return the speed on each piece from the speed of each segment; a blend takes the lower one of its neighbours.
+        """Return the speed on each piece from that of each segment; a blend has the lower speed of its neighbours.
 
         Shape (P,).
 

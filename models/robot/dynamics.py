@@ -119,7 +119,7 @@ def base_reaction(
 
 @on_scalars
 def mass_matrix(robot: Robot, q: Expression) -> Expression:
-    """Return the joint-space inertia M of T = q'^T M q' / 2, the base at rest. Shape (dof, dof), kg m^2, kg m or kg.
+    """Return the joint-space mass matrix with the base at rest. Shape (dof, dof), kg m^2, kg m or kg.
 
     Composite rigid bodies (Featherstone 2008, 6.2): M_ij is the momentum of all that joint j carries, per rate of j,
     along the axis of each joint i that carries j.
@@ -173,7 +173,7 @@ def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Ex
 
 
 def _twist_and_rate(base_motion: tuple[Expression, Expression] | None) -> tuple[Expression | None, Expression | None]:
-    """Return the two parts of a motion of the base; raise ModelError if they are not two."""
+    """Return twist and twist rate of a base motion; raise ModelError unless it has these two parts."""
     if base_motion is None:
         return None, None
     if not isinstance(base_motion, tuple | list) or len(base_motion) != 2:
@@ -275,7 +275,7 @@ def _motions_in_links(
 
 
 def _mass_sums(link: Link) -> tuple[Expression, Expression]:
-    """Return the sums of m x and of m x x' over a link, in its frame. Shapes (3, 1), kg m, and (3, 3), kg m^2."""
+    """Return the first and second mass moments of a link in its frame. Shapes (3, 1), kg m, and (3, 3), kg m^2."""
     center, inertia = link.center_of_mass, link.inertia
     about_center = np.trace(inertia) / 2 * np.eye(3) - inertia
     return constant(link.mass * center), constant(about_center + link.mass * np.outer(center, center))
@@ -288,7 +288,7 @@ def _field(spin: Expression, turning: Expression) -> Expression:
 
 
 class MassMoments(NamedTuple):
-    """Mass, first and second moments of a set of bodies about the world's origin: their spatial inertia in ten numbers.
+    """Mass, first and second moments of bodies about the world's origin, which contain their spatial inertia.
 
     Attributes:
         mass: kg.
@@ -305,7 +305,7 @@ class MassMoments(NamedTuple):
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """Return (moment of momentum about the origin, linear momentum) for a common motion vector."""
+        """Return (angular momentum about the origin, linear momentum) of bodies that share a motion vector."""
         angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
         return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
@@ -324,7 +324,7 @@ def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placem
 
 
 def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the map from joint rates to (moment of momentum about the world's origin, linear momentum).
+    """Return the matrix from joint rates to (angular momentum about the world's origin, linear momentum).
 
     The base is at rest. Shape (6, dof).
     """
@@ -340,7 +340,7 @@ def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None
 
 
 def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
-    """Return the moments of each link with all links that it carries, by link name, about the world's origin."""
+    """Return the mass moments about the world's origin of each link with all links that it carries, by link name."""
     moments: dict[str, MassMoments] = {}
     for link in robot.links:
         turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)

@@ -64,7 +64,7 @@ def checked_vector(label: str, value: Expression, size: int, meaning: str) -> Ex
 
 
 def checked_placement(placement: Placement | None) -> Frame:
-    """Return the pose of the root link as a frame, the identity if None; raise ModelError if it is invalid."""
+    """Return the pose of the root link as a frame (the identity if None); raise ModelError if it is invalid."""
     if placement is None:
         return Frame(ca.DM.eye(3), ca.DM(3, 1))
     try:
@@ -390,7 +390,7 @@ def manipulability_of(task: Expression) -> Expression:
 
 
 def checked_rows(rows: Sequence[int]) -> list[int]:
-    """Return `rows` as a list; raise ModelError unless they are distinct indices 0..5 of a twist, and not empty."""
+    """Return `rows` as a nonempty list; raise ModelError unless they are distinct twist indices from 0 to 5."""
     try:
         check_entries(rows)
         numbers = floats(list(rows))

@@ -117,7 +117,7 @@ class Robot:
         mimic: MimicRule = "couple",
         inertia: InertiaRule = "warn",
     ) -> Robot:
-        """Read a robot from a URDF description; see `models.robot.urdf.read_urdf` for what is read and the defaults.
+        """Read a robot from a URDF description; `models.robot.urdf.read_urdf` documents contents and defaults.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
@@ -251,13 +251,13 @@ class Robot:
         return {joint.child: joint for joint in self.joints}
 
     def link(self, name: str) -> Link:
-        """Return the link of that name; raise ModelError, with similar names, if there is none."""
+        """Return the link with a name; raise ModelError, with similar names, if there is none."""
         if not isinstance(name, str) or name not in self._links_by_name:
             raise require.unknown("link", name, self._links_by_name)
         return self._links_by_name[name]
 
     def joint(self, name: str) -> Joint:
-        """Return the moving or fixed joint of that name; raise ModelError, with similar names, if there is none."""
+        """Return the moving or fixed joint with a name; raise ModelError, with similar names, if there is none."""
         if not isinstance(name, str) or name not in self._joints_by_name:
             raise require.unknown("joint", name, self._joints_by_name)
         return self._joints_by_name[name]

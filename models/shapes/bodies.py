@@ -223,7 +223,7 @@ class JointStep(NamedTuple):
 
 @dataclass(frozen=True)
 class RigidParts:
-    """Sets of links without a moving joint between them, each named by its link nearest to the root.
+    """Sets of links that no moving joint separates, each named after its link nearest to the root.
 
     Attributes:
         of_link: The part of each link.

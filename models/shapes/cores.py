@@ -121,7 +121,7 @@ def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopG
 def distance_of_segments(
     first: SegmentCore, second: SegmentCore, rounding: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the distance of points and segments; zero, which is minus the depth, for crossing segments."""
+    """Return the distance of points and segments; it is zero for crossing segments."""
     if len(first.points) < len(second.points):
         first, second = second, first
     p, q = first.points[0], second.points[0]
@@ -288,7 +288,7 @@ def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
 def _edge_squares(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, stop_gradient: StopGradient
 ) -> list[Expression]:
-    """Return the squared distances of the edges of a box to another box.
+    """Return the squared distances of the edges of one box to another box.
 
     Together with the corners of the other box they suffice: from a closest point inside a face one can slide along the
     face, at constant distance, to a corner or an edge.

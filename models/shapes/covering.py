@@ -151,7 +151,7 @@ def fit_cover(triangles: Array) -> tuple[Cover, ...]:
 
 
 def exceedance(shape: CoverShape, points: Array) -> Array:
-    """Return by how much points lie outside a capsule or box; zero or negative inside. Shape (n,), m."""
+    """Return the amount by which points lie outside a capsule or box; zero or negative inside. Shape (n,), m."""
     if isinstance(shape, Capsule):
         return np.asarray(_segment_distances(points, np.asarray(shape.start), np.asarray(shape.end)) - shape.radius)
     own = np.abs((points - shape.position) @ shape.rotation) - shape.size / 2
@@ -183,7 +183,7 @@ def _fit_capsule(points: Array) -> Capsule:
 
 
 def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, float, float, Array, Array]:
-    """Return volume, radius, both ends along the axis, the axis and a point on it for a capsule with its axis near z.
+    """Return volume, radius, ends along the axis, axis and axis point of a capsule with its axis near z.
 
     The parameters, shape (5,), are two slopes of the axis, its position across, and the root of the excess radius. A
     radius larger than the enclosing cylinder's lets the caps begin earlier.

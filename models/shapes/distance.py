@@ -207,7 +207,7 @@ def _pair_wrenches(kinds: tuple[Any, Any], rounding: float, count: int) -> Any:
 
 
 class StoppedGradients:
-    """Values that differentiation treats as constants: symbols until they are restored.
+    """Values that differentiation treats as constants, because symbols replace them until they are restored.
 
     A distance is a minimum over positions or a maximum over directions, whose motion does not change it to first order
     (envelope theorem).
@@ -315,7 +315,7 @@ def _core_in_frame(shape: Shape, turn: Expression, place: Expression) -> Core:
 
 
 def _core_of_column(kind: type[Shape], entries: Sequence[Expression]) -> Core:
-    """Return the core of a shape of this kind that is given as a column."""
+    """Return the core of a shape of the given kind from its column of numbers."""
     parts = [triple(entries[3 * k : 3 * k + 3]) for k in range(len(entries) // 3)]
     if kind is Box:
         return BoxCore(parts[0], tuple(parts[1:4]), parts[4])
@@ -357,7 +357,7 @@ def _smooth_minimum(values: Sequence[Expression], rounding: float) -> Expression
 
 
 def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
-    """Return the gaps to the second core along the outward normals of the first's faces; none for a segment."""
+    """Return the gaps to the second core along the face normals of the first core; none if that is a segment."""
     if isinstance(first, BoxCore):
         signed = [(axis, side, h) for axis, h in zip(first.axes, first.half, strict=True) for side in (-1.0, 1.0)]
         normals = [(triple(side * part for part in axis), h) for axis, side, h in signed]

@@ -325,7 +325,7 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _least_overlap(first: np.ndarray, second: np.ndarray, boxes: tuple[bool, bool]) -> np.ndarray:
-    """Return the candidate unit vectors (K, 3), from first to second, along which hulls overlap least.
+    """Return the candidate unit vectors (K, 3), from first to second hull, along which hulls overlap least.
 
     Candidates are the line between the centroids, the edges of both hulls and the cross products of their edges. The
     edges of a hull are those from its first point to the next three; of a box, those from its first corner.

@@ -83,7 +83,7 @@ def numbered_lines(file: Path, data: bytes) -> Iterator[tuple[int, str]]:
 
 
 def parse_numbers(file: Path, words: Sequence[str], line: int) -> list[float]:
-    """Return words as numbers; raise a ModelError with the line for one that is no number."""
+    """Return words as numbers; raise a ModelError that names the line if one is no number."""
     values = []
     for word in words:
         try:
@@ -96,7 +96,7 @@ def parse_numbers(file: Path, words: Sequence[str], line: int) -> list[float]:
 def find_mesh(
     file: str, folder: str | os.PathLike[str] | None, folders: Sequence[str | os.PathLike[str]] = ()
 ) -> Path | None:
-    """Return the file that a URDF names, or None if there is none.
+    """Return the path of a mesh file that a URDF names, or None if it is not found.
 
     A name is a relative or absolute path, file://PATH, or package://NAME/REST. A package is searched in `folders`, then
     in the URDF file's folder and its parents, last in installed packages: those of ROS by ROS_PACKAGE_PATH and
@@ -292,7 +292,7 @@ def _read_obj(file: Path, data: bytes) -> Triangles:
 
 
 def _material_colors(file: Path, name: str) -> Iterator[tuple[str, Array]]:
-    """Yield names and diffuse colours of a material library beside an OBJ file; none if it cannot be read."""
+    """Yield the names and diffuse colours in the material library of an OBJ file; none if it cannot be read."""
     try:
         data = read_regular(file.parent / name, INPUT_LIMITS.mesh_text_bytes)
     except (OSError, ValueError):
@@ -372,7 +372,7 @@ def read_collada(file: Path, data: bytes) -> Triangles:
 
 
 def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
-    """Return the document reduced to what pycollada shall read, and its unit, m.
+    """Return the document reduced to the elements that pycollada may read, and its unit, m.
 
     Instances of nodes are replaced by the nodes, and effects are reduced to a colour. Elements that pycollada would
     misinterpret are refused.
@@ -454,7 +454,7 @@ def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
 
 
 def _materials_document(document: ElementTree.Element) -> ElementTree.Element:
-    """Return a document with the materials alone and their diffuse colours, if these are no images.
+    """Return a document that contains only the materials and their diffuse colours, except images.
 
     All materials are opaque, because programs disagree on what an opacity means.
     """

@@ -70,7 +70,7 @@ SETTINGS = ProofSettings()
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of bodies that are checked and pairs of links that are not.
+    """Pairs of bodies that are checked for collision, and pairs of links that are not.
 
     Attributes:
         checked: Checked pairs as indices of the bodies, the lower first.
@@ -255,7 +255,7 @@ class _Lever(NamedTuple):
 
 @dataclass(frozen=True)
 class _PairClassifier:
-    """Classification of pairs of bodies within joint limits, by random configurations first and proofs afterwards."""
+    """Classifier of pairs of bodies within joint limits, by random configurations and then by proofs."""
 
     robot: Robot
     parts: RigidParts
@@ -328,7 +328,7 @@ class _PlacedBody:
 
 @dataclass(frozen=True)
 class _BodyPair:
-    """Two bodies, the joints between their rigid parts, and their relative poses at the first configurations."""
+    """Two bodies, the joints between their rigid parts, and their relative poses at random configurations."""
 
     robot: Robot
     first: _PlacedBody
@@ -400,7 +400,7 @@ class _BodyPair:
         return gap_along(direction, first, second) - (shapes[0].swept_radius + shapes[1].swept_radius)
 
     def _relative(self, q: Array) -> Poses:
-        """Return the pose of the second body's rigid part in the first body's."""
+        """Return the poses of the second body's rigid part in the first body's."""
         first = second = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
         for step in self.up[::-1]:
             first = _moved(self.robot, first, step, q)
@@ -409,7 +409,7 @@ class _BodyPair:
         return _relative_poses(first, second)
 
     def _proves_apart(self, low: Array, high: Array, margin: float) -> bool:
-        """Return whether the distance is proven to stay above `margin`, m, by bisection of the joint space."""
+        """Return whether bisection of the joint space proves that the distance stays above `margin`, m."""
         columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         budget = SETTINGS.boxes // 4 ** max(0, len(columns) - 3)  # bisection of many joints rarely succeeds
         if not budget:

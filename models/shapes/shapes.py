@@ -30,7 +30,7 @@ CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in
 
 
 class _SweptCore:
-    """A convex solid: all points within `swept_radius` of the convex hull of the points `core`."""
+    """A convex solid: all points within `swept_radius` of the convex hull of its core points."""
 
     @property
     def core(self) -> Array:
@@ -208,7 +208,7 @@ class Box(_Posed):
 
     @property
     def core(self) -> Array:
-        """Corners: along the z edge first, then y, then x. Shape (8, 3), m.
+        """Corners of the box, ordered along the z edge first, then y, then x. Shape (8, 3), m.
 
         Raises:
             ModelError: An edge is infinite.

@@ -369,7 +369,7 @@ def check_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _limit(text: str) -> tuple[str, float]:
-    """Parse JOINT=NUMBER or NUMBER: return the joint, or "", and the number."""
+    """Parse JOINT=NUMBER or NUMBER; return the joint, "" if there is none, and the number."""
     name, _, value = text.rpartition("=")
     try:
         return name, float(value)

@@ -60,7 +60,7 @@ class AccessoryProblem:
         self._switches()
 
     def _units(self) -> None:
-        """Choose the scales that make the backward sweep well conditioned; they do not affect any verdict.
+        """Choose scales that make the backward sweep well conditioned; they affect no verdict.
 
         Horizon and states have their sizes; states that hardly move take those of others of their unit. Controls are
         scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature take their
@@ -220,7 +220,7 @@ class AccessoryProblem:
 
 
 def obstacle(form: Formulation) -> str:
-    """Return the reason why the second variation is unknown for all plans of a problem, or ""."""
+    """Return why the second variation is unknown for all plans of a problem; "" if it can be computed."""
     last = ca.vertcat(form.end.expression, form.terminal)
     if ca.depends_on(last, form.u0):
         return "the control at the start enters the conditions at the end"

@@ -181,7 +181,7 @@ def clearance_along(apart: Separation, track: Track | None, settings: ProofSetti
 def closest_pairs_along(
     problem: Problem, solution: Solution, times: Iterable[float], suffix: str = ""
 ) -> list[ClosestPair]:
-    """Return the closest pair of bodies of a plan at each of the times (s); empty if the problem separates no bodies.
+    """Return the closest pair of bodies of a plan at each time (s); empty if the problem has no separations.
 
     Args:
         suffix: Suffix of the names of the states that move the bodies: selects one part of a plan whose parts are
@@ -214,7 +214,7 @@ def separation_frames(
 
 
 def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Separation, Track]]:
-    """Return the separations that have pairs and whose moving states end with a suffix, each with its track."""
+    """Return each separation that has pairs and whose moving states have names with a suffix, with its track."""
     form = Formulation.of(problem)
     check_variables_match(form, solution)
     solution, p = match_order(form, solution), form.parameter_vector(solution.parameters)
@@ -321,7 +321,7 @@ class _Search:
         ]
 
     def _evaluate_at_closest_balls(self) -> None:
-        """Evaluate each pair at the node or interval middle where the bounding balls of its bodies are closest."""
+        """Evaluate each pair at the node or interval middle where its bounding balls are closest."""
         times = np.union1d(self.breaks, (self.breaks[:-1] + self.breaks[1:]) / 2)
         times = times[:: -(-len(times) // self.settings.first_times)]
         n, frames = len(self.apart), self.track.frames(times)

@@ -305,7 +305,7 @@ class _Stage(NamedTuple):
 
 
 def _reduced(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolerances: RankTolerances) -> list[_Stage]:
-    """Reduce each stage by its own constraints; stages with equal constraints are treated together."""
+    """Reduce each stage by its own constraints; stages with the same active constraints are treated together."""
     n, q = accessory.along.shape
     nz, nu = accessory.nz, accessory.nu
     normals = accessory.normals.reshape(n, q, -1, nz + nu)
@@ -365,7 +365,7 @@ def _eliminated(
 
 
 class _Gain(NamedTuple):
-    """Optimal feedback of a stage: controls as a linear function of (z, 1) and of the free variations."""
+    """Optimal feedback of a stage: controls as a linear function of (z, 1) and of free variations."""
 
     lift: np.ndarray
     response: np.ndarray

@@ -72,7 +72,7 @@ def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, c
 
 
 class _Program:
-    """A sparse program: minimise price . x + weight . x^2 / 2 subject to rows x = right and low <= x."""
+    """A sparse convex program: minimise price . x + weight . x^2 / 2 subject to rows x = right and low <= x."""
 
     def __init__(self) -> None:
         self._variables: list[np.ndarray] = []  # low, price and weight of each, (3, count)
@@ -86,7 +86,7 @@ class _Program:
         return np.arange(first, first + count)
 
     def equations(self, right: np.ndarray) -> np.ndarray:
-        """Add equations and return their indices, in the shape of their right sides."""
+        """Add equations with given right-hand sides; return their indices in the same shape."""
         first = sum(part.size for part in self._right)
         self._right.append(right)
         return np.arange(first, first + right.size).reshape(right.shape)
@@ -310,7 +310,7 @@ class _Dual:
 
 @dataclass(frozen=True)
 class Optimality:
-    """First and second order optimality conditions along a plan.
+    """Result of the first and second order optimality conditions along a plan.
 
     Attributes:
         lost: Cost that the plan could save in each interval, to second order; that of the ends is in the first. Shape

@@ -334,7 +334,7 @@ def _integrated(form: Formulation, kind: str, g: np.ndarray, t: np.ndarray) -> n
 
 
 def excess_over(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return how far values (K, m) exceed their bounds: at least 0, infinite for nan."""
+    """Return the excess of values (K, m) over their bounds: at least 0, infinite for nan."""
     return np.where(np.isnan(values), np.inf, np.maximum(np.maximum(lower - values, values - upper), 0.0))
 
 

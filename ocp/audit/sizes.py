@@ -59,7 +59,7 @@ class FineGrid:
 
 
 def fine_grid(solution: Solution) -> FineGrid:
-    """Sample a plan ten times as finely as its own points."""
+    """Sample a plan at ten times as many points as its own."""
     curve = solution.state_interpolant
     n = len(solution.control_interpolant.breaks) - 1
     points, segments = max(len(curve.nodes) - 1, 1), max((len(curve.breaks) - 1) // n, 1)
@@ -128,7 +128,7 @@ def sizes(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) 
 
 
 def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndarray, bounds: Bounds) -> Sizes:
-    """Return the sizes as `sizes` does, for a plan on its fine grid."""
+    """Return the sizes of states, controls and constraints for a plan on its fine grid, see `sizes`."""
     places = form.bounds.places
     fixed = (_select(bounds, places[kind]) for kind in ("initial", "terminal"))
     ends = [np.where(low == high, low, np.nan) for low, high in fixed]

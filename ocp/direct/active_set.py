@@ -57,7 +57,7 @@ class Conditions:
 
 
 def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Conditions:
-    """Return the first-order conditions at the result of a solver under these arguments (p and bounds)."""
+    """Return the first-order conditions at a solver's result, for the given parameters and bounds."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     a, b, c = scales.variables, scales.rows, scales.cost
     slope, jacobian = program.numbers.first(v, p)
@@ -228,7 +228,7 @@ class Newton:
     def _root(
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, max_steps: int
     ) -> Outcome | None:
-        """Take at most ``max_steps`` Newton steps with a fixed active set; return None if they do not converge."""
+        """Take at most ``max_steps`` Newton steps with a fixed active set; return None without convergence."""
         a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
         fixed, held = _held(sides, arguments)
         target = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
@@ -439,7 +439,7 @@ class Cholesky:
     corner: np.ndarray
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Solve for a right-hand side (n,), in the order of :class:`Bordered`."""
+        """Solve the linear system for a right-hand side (n,), in the order of :class:`Bordered`."""
         n = self.below.shape[1]
         inner = scipy.linalg.cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
         if not len(self.below):

@@ -53,7 +53,7 @@ class Stages:
 
 @dataclass(frozen=True)
 class Interpolants:
-    """Construction of the curves of states and controls from the variables of a phase.
+    """Rule by which the curves of states and controls are built from the variables of a phase.
 
     Attributes:
         breaks: Ends of the segments of the states, as fractions of the horizon; every interval has the same number of
@@ -265,7 +265,7 @@ class NumericDerivatives:
         return np.asarray(self._running(x, p)[0])
 
     def parametric(self, x: np.ndarray, p: np.ndarray, lam: np.ndarray) -> np.ndarray:
-        """Return the gradient of f + lam . g in the parameters. Shape (n_p,)."""
+        """Return the gradient of f + lam . g by the parameters. Shape (n_p,)."""
         return np.asarray(self._parametric(x, p, lam)[0])
 
 
@@ -332,7 +332,7 @@ class Derivatives(NamedTuple):
 
 
 def assemble(transcription: Transcription, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
-    """Assemble the program of a transcription, from given derivatives of its blocks or by deriving them.
+    """Assemble the program of a transcription; derivatives of its blocks are given or derived here.
 
     Raises:
         TimeLimitReached: The time limit is over.
@@ -413,7 +413,7 @@ def derivatives(function: Any) -> Derivatives:
 
 
 def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return row, column and factor in the program's upper triangle for each nonzero of a block Hessian."""
+    """Return row, column and factor in the upper triangle of the program's Hessian for each block Hessian nonzero."""
     first, second = places_of(pattern)
     where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")
@@ -473,7 +473,7 @@ def _scatter_matrix(
     shape: tuple[int, int],
     factors: list[np.ndarray] | None = None,
 ) -> Any:
-    """Return a sparse matrix with the nonzeros of ``matrices``, times their factors, and constant entries added."""
+    """Return a sparse matrix of the nonzeros of ``matrices`` times factors, plus constant entries."""
     rows = np.concatenate([constant[0], *[at[0] for at in places]]).astype(int)
     columns = np.concatenate([constant[1], *[at[1] for at in places]]).astype(int)
     entries, number = np.unique(columns * shape[0] + rows, return_inverse=True)

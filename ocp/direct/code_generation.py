@@ -67,7 +67,7 @@ exec "$@" </dev/null 3<&-
 
 
 class CompilerError(RuntimeError):
-    """C code that cannot be generated, compiled or loaded, with the reason."""
+    """Error that C code cannot be generated, compiled or loaded, with the reason."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ CODE_SIZES = CodeSizes()
 
 
 def generate_c(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
-    """Return the texts of NAME.c and NAME.h of casadi Functions.
+    """Return C code and header (NAME.c and NAME.h) of casadi Functions as texts.
 
     Raises:
         CompilerError: One of them has no C code.
@@ -191,7 +191,7 @@ def _version(command: str, path: str) -> str:
 
 
 def _compile(text: str) -> bytes:
-    """Return the shared library that the compiler makes of C code; raise as :func:`build_library`."""
+    """Compile C code and return the shared library; raises the errors of :func:`build_library`."""
     if len(text) > CODE_SIZES.accepted:
         raise CompilerError(f"{len(text)} characters of C are more than {CODE_SIZES.accepted}")
     speed = "-O1" if len(text) <= CODE_SIZES.optimized else "-O0"
@@ -306,7 +306,7 @@ def write_controller(form: Formulation, transcription: Transcription, guess: np.
 
 
 def problem_header(form: Formulation, transcription: Transcription) -> str:
-    """Return problem.h: sizes, names, and breaks and nodes of the curves."""
+    """Return the text of problem.h: sizes, names, and breaks and nodes of the curves."""
     curves = transcription.interpolants
     sizes = {
         "VARIABLES": transcription.size,

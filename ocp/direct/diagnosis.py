@@ -32,7 +32,7 @@ REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or 
 
 @dataclass(frozen=True)
 class ElasticSettings:
-    """Cost of an elastic plan, and length of the report.
+    """Settings of the elastic plan: the cost of violations, and the length of the report.
 
     Attributes:
         cost: Weight of the problem's own cost, which makes the plan unique.
@@ -123,7 +123,7 @@ def diagnosis(
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
-    """Describe which states and controls are at their bounds, and for which share of the plan, one a line."""
+    """Describe which states and controls are at their bounds, and for what share of the plan, one per line."""
     form, transcription = built.formulation, built.transcription
     lines = []
     for role, labels in (("state", form.state_labels), ("control", form.control_labels)):
@@ -223,7 +223,7 @@ class Elastic:
 def elastic_plan(
     built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, *, horizon: float
 ) -> Elastic | None:
-    """Return the plan that satisfies dynamics and fixed ends and violates the other constraints least.
+    """Return the plan that satisfies dynamics and fixed ends, and violates the other constraints least.
 
     None if the last iterate violates nothing or is not finite, so that the constraints are not the reason for the
     failure, and if no plan is found in the remaining time.

@@ -195,7 +195,7 @@ def finite(expression: Any) -> Any:
 
 
 def call_solver(solver: Any, progress: IterationMonitor | FatropMonitor, arguments: dict[str, np.ndarray]) -> Outcome:
-    """Run a solver; Ctrl-C and a time limit stop it between two iterations, at its last iterate."""
+    """Run a solver; Ctrl-C or a time limit stops it between iterations, and its last iterate is returned."""
     began = time.monotonic()
     name = KINDS[solver.class_name()]
     progress.open(arguments["lbg"], arguments["ubg"])
@@ -282,7 +282,7 @@ def largest_violation(values: dict[str, np.ndarray], arguments: dict[str, np.nda
 
 
 def tighten_for_fatrop(arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Tighten bounds by as much as fatrop relaxes them, so that plans keep the declared bounds."""
+    """Tighten bounds by the amount by which fatrop relaxes them, so that plans keep the declared bounds."""
     relaxation, result = 1e-8, dict(arguments)  # fatrop's own; its casadi interface has no option for it
     for low, high in (("lbx", "ubx"), ("lbg", "ubg")):
         lower, upper = arguments[low], arguments[high]

@@ -77,7 +77,7 @@ class DirectMethod(MeshedMethod):
 
 
 class Prepared:
-    """A problem prepared for a method and a solver, to be solved many times, by one thread at a time.
+    """A problem prepared by a direct method for repeated solves; only one thread solves at a time.
 
     Attributes:
         problem, method: What was prepared.
@@ -123,7 +123,7 @@ class Prepared:
         return scaled_program(self.program)
 
     def _built_solver(self, options: dict[str, Any]) -> tuple[Any, Any]:
-        """Build the solver with options, and the callback that stops it."""
+        """Build the solver with given options, and its callback, by which it can be stopped."""
         return build_solver(
             self.scaled, self.solver_name, options, stages=self.transcription.stages, title=self.problem.name
         )
@@ -238,7 +238,7 @@ class Prepared:
         ) from decisive.error
 
     def _alternative_attempts(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
-        """Run the solver from each start other than the guess until one succeeds or the time is over.
+        """Run the solver from each alternative start until one succeeds or the time limit is reached.
 
         Together they take at most the iterations of the first attempt. If no function is ever finite, the start does
         not matter.
@@ -405,7 +405,7 @@ class Attempt:
 
 
 def tighten_bounds(arguments: dict[str, np.ndarray], amounts: Mapping[str, np.ndarray]) -> None:
-    """Move lower bounds up and upper bounds down, at most to their middle; equalities stay."""
+    """Move lower bounds up and upper bounds down, at most to the middle between them; equalities stay."""
     for kind in ("x", "g"):
         low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
         is_range = low < high

@@ -96,7 +96,7 @@ class Scales:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of the entries of the states (nx,) and controls (nu,), and of the horizon, s."""
+    """Typical sizes of the states (nx,), the controls (nu,) and the horizon (s)."""
 
     states: np.ndarray
     controls: np.ndarray
@@ -112,7 +112,7 @@ class Sizes:
 
 
 class Pattern:
-    """Structure of a program from which sizes are computed, for repeated scaling.
+    """Structure of a program from which its scaling is computed repeatedly.
 
     Attributes:
         rows, columns: Row and column of each nonzero of the Jacobian.
@@ -299,7 +299,7 @@ def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
 
 
 def _powers(sizes: np.ndarray) -> np.ndarray:
-    """Round sizes outside the usual range to powers of two; return 1 for the others."""
+    """Return the nearest power of two for unusually large or small sizes, and 1 for the others."""
     unusual = (sizes < 1 / SCALING.usual) | (sizes > SCALING.usual)
     return np.where(unusual, np.exp2(np.round(np.log2(np.where(unusual, sizes, 1.0)))), 1.0)
 

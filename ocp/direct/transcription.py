@@ -358,7 +358,7 @@ class MeshedMethod(ABC):
     @property
     @abstractmethod
     def order(self) -> int:
-        """Order of the integration error of one interval in its width."""
+        """Order of the integration error of one interval with respect to its width."""
 
     @property
     @abstractmethod
@@ -371,7 +371,7 @@ class MeshedMethod(ABC):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The method as stored in a solution: its type, and its attributes other than None."""
+        """The method as stored in a solution: its type, and its attributes that are not None."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if v is not None}  # type: ignore[call-overload]
         return {"type": type(self).__name__, **values}
 

@@ -106,7 +106,7 @@ class BoundaryProblem:
         return nodes, y
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
-        """Return the integrator data q of all segments, side by side."""
+        """Return the integrator data q of all segments, one column per segment."""
         of, total = self._data(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
         begins, lengths = [], []
@@ -216,7 +216,7 @@ class BoundaryProblem:
 
 
 def side_by_side(sizes: dict[str, int]) -> dict[str, slice]:
-    """Return the slice of each part in a stacked vector, in order."""
+    """Return the slices of consecutive parts in a stacked vector, by name."""
     cuts = np.cumsum([0, *sizes.values()]).tolist()
     return {name: slice(a, b) for name, (a, b) in zip(sizes, itertools.pairwise(cuts), strict=True)}
 
@@ -309,7 +309,7 @@ def newton(
     tolerance: float,
     settings: NewtonSettings = NewtonSettings(),
 ) -> NewtonResult:
-    """Solve a sparse system by damped Newton steps; each step is halved until the residual falls."""
+    """Solve a sparse nonlinear system by damped Newton steps, each halved until the residual decreases."""
     residual, jacobian = system
 
     def evaluate(z: np.ndarray) -> np.ndarray:

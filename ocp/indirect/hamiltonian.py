@@ -161,7 +161,7 @@ class Hamiltonian:
         return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
 
     def _residual(self, w: Any, bang: Any) -> Any:
-        """Return the gradient of H in the smooth controls, and the path equalities. Shape (n + m, 1)."""
+        """Return the gradient of H by the smooth controls, and the path equalities. Shape (n + m, 1)."""
         n = len(self.smooth)
         gradient = ca.gradient(self.value, self.form.u)[list(self.smooth)] if n else self.form.problem.symbols(0, 1)
         stacked = ca.densify(ca.vertcat(gradient, self.rows))
@@ -267,7 +267,7 @@ def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def numbers(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
-    """Evaluate an expression at a random point, with entries between 0.1 and 1."""
+    """Evaluate an expression at a random point with coordinates between 0.1 and 1."""
     function = ca.Function("matrix", symbols, [ca.densify(matrix)])
     return np.asarray(function.call([ca.DM(rng.uniform(0.1, 1.0, s.numel())) for s in symbols])[0].full())
 
@@ -319,7 +319,7 @@ class Extremal:
     nu_end: np.ndarray
 
     def sampled(self, ham: Hamiltonian, outputs: list[Any], p: np.ndarray) -> list[np.ndarray]:
-        """Return expressions of x, u, lam, mu, t, T, p at all K m samples in order; each output (K m, its size)."""
+        """Evaluate expressions of x, u, lam, mu, t, T, p at all K m samples. Shape (K m, size) each."""
         count = self.t.size
         x, u, lam, mu = (v.reshape(count, -1) for v in (self.states, self.controls, self.costates, self.multipliers))
         return ham.form.sampled(outputs, x, u, self.t.ravel(), self.horizon, p, (ham.lam, lam), (ham.mu, mu))

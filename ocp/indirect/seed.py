@@ -70,7 +70,7 @@ class ControlArcs:
 def read_arcs(
     ham: Hamiltonian, outputs: Any, seed: Solution, p: np.ndarray, *, bounds: Bounds, segments: int
 ) -> ControlArcs:
-    """Return the arcs from the signs of dH/du along a seed: a positive slope means the lower bound.
+    """Return the arcs that the signs of dH/du along a seed define; where dH/du > 0, the lower bound is active.
 
     Raises:
         SolveError: A control in which H is linear stays inside its bounds (a singular arc) or chatters.
@@ -112,7 +112,7 @@ def read_arcs(
 
 
 def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
-    """Return the control bounds under which the seed was solved, which may differ. Shape (nu,) each."""
+    """Return the control bounds under which the seed was solved; they may differ from ``bounds``. Shape (nu,) each."""
     source = form if seed.problem is None else Formulation(seed.problem)
     try:
         low, high = source.bound_values(source.parameter_vector(seed.parameters))
@@ -139,7 +139,7 @@ def signs(slope: np.ndarray) -> np.ndarray:
 
 
 def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.ndarray) -> None:
-    """Raise SolveError if a linear control of the seed stays inside its bounds too long."""
+    """Raise SolveError if a control that enters linearly stays inside its bounds for too long."""
     samples = seed.control_interpolant
     widths = np.diff(samples.breaks)
     at = (samples.breaks[:-1, None] + widths[:, None] * samples.nodes).ravel()

@@ -183,7 +183,7 @@ class PhaseTimes:
 
 @dataclass
 class Declarations:
-    """All declarations by kind and name, in order of declaration."""
+    """All declarations of a problem by kind and name, in the order in which they were made."""
 
     states: dict[str, Variable] = field(default_factory=dict)
     controls: dict[str, Variable] = field(default_factory=dict)
@@ -318,7 +318,7 @@ def column_text(value: Any) -> str:
 
 
 def shorten(expression: Any) -> str:
-    """Return an expression as text on one line of bounded length.
+    """Return an expression as a text on one line of limited length.
 
     SX prints shared subexpressions first, so a large expression is described by its symbols instead.
     """
@@ -452,7 +452,7 @@ def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> 
 
 
 def read_scale(what: str, value: Value, size: int) -> Any:
-    """Return the scales of the entries, nan for unknown ones. Shape (size,), or None."""
+    """Return the typical sizes of the entries, nan if unknown, shape (size,); None if no size is given."""
     if value is None:
         return None
     array = numeric(f"{what}: scale", value)
@@ -474,7 +474,7 @@ def check_guess(what: str, guess: Any, size: int) -> None:
 
 
 def read_tolerance(what: str, value: Value, size: int) -> list[float] | None:
-    """Return the tolerances of the rows of a constraint, (size,), or None."""
+    """Return the tolerances of the rows of a constraint, shape (size,); None if none is given."""
     if value is None:
         return None
     array = numeric(f"{what}: tolerance", value)

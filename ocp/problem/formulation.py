@@ -69,7 +69,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class BoundTable:
-    """All bounds of a problem in two vectors; the variables and rows of an NLP refer to their entries.
+    """All bounds of a problem in two vectors; variables and rows of a nonlinear program refer to their entries.
 
     Attributes:
         function: Parameters -> (lower, upper), each of shape (n, 1).
@@ -98,7 +98,7 @@ class BoundTable:
 
 
 class Formulation:
-    """Vectors and functions of a checked problem. Later changes of the problem do not affect it.
+    """The vectors and functions of a checked problem, which later changes of the problem do not affect.
 
     Attributes:
         x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon. sym: Creates
@@ -210,7 +210,7 @@ class Formulation:
         return np.vstack([np.reshape(fractions, (1, -1)), self.signals_at(np.ravel(fractions) * self.duration).T])
 
     def signals_at(self, times: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the signals, or their time derivatives of an order, at times (M,), s. Shape (M, nw)."""
+        """Return the signals, or their time derivatives of a given order, at times (M,), s. Shape (M, nw)."""
         times = np.ravel(times).astype(float)
         return self._signals_at(order, times.tobytes()) if self.signals else np.zeros((len(times), 0))
 
@@ -309,7 +309,7 @@ class Formulation:
         return vector
 
     def bound_values(self, p: np.ndarray) -> Bounds:
-        """Return the bound table for these parameters, after checks: (lower, upper), each (n,)."""
+        """Return lower and upper bounds for the given parameters, after checks. Shape (n,) each."""
         lower, upper = (np.asarray(v.full()).reshape(-1) for v in self.bounds.function(p))
         places = self.bounds.places
         what = f"problem {self.name!r} at these parameters"

@@ -35,7 +35,7 @@ __all__ = ["Separation", "index_rows", "stack_motion_bounds"]
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A body: the convex hull of points of a frame, inflated by a radius; or a half-space.
+    """A body: the convex hull of points that are fixed in a frame, inflated by a radius; or a half-space.
 
     Attributes:
         frame: Index of the frame with which it moves; -1: the world.
@@ -84,7 +84,7 @@ class Hull:
 
     @cached_property
     def size(self) -> float:
-        """Radius of the ball about the middle that contains the points, m."""
+        """Radius of the ball around the middle that contains all points, m."""
         return float(np.linalg.norm(self.core - self.middle, axis=1).max())
 
 

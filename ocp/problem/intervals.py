@@ -62,7 +62,7 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
 
 
 def check_instructions(what: str, function: Any) -> None:
-    """Raise ProblemError, naming the instruction, if an SX function has an instruction without a rule."""
+    """Raise ProblemError if an SX function has an instruction without an interval rule, naming it."""
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
         if code not in RULES and code not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
@@ -84,7 +84,7 @@ def _out(low: Any, high: Any) -> Interval:
 
 
 def constant(value: float, like: Array) -> Interval:
-    """Return a number as an interval for as many intervals as an array has entries."""
+    """Return a number as an interval, repeated for each entry of an array."""
     return Interval(np.full(like.shape, value), np.full(like.shape, value))
 
 

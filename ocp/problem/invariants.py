@@ -103,21 +103,21 @@ def coupled_parts(form: Formulation) -> list[np.ndarray]:
 
 
 def monomials(part: np.ndarray) -> np.ndarray:
-    """Return all monomials of some states up to the highest degree allowed; see `FirstIntegrals`. Shape (m, 3)."""
+    """Return all monomials of some states up to the highest allowed degree, see `FirstIntegrals`. Shape (m, 3)."""
     degree = max(d for d in range(MAX_DEGREE + 1) if comb(len(part) + d, d) <= SETTINGS.monomials + 1)
     rows = combinations_with_replacement([0, *(part + 1)], degree)
     return np.array([(0,) * (MAX_DEGREE - degree) + row for row in rows if any(row)], int).reshape(-1, MAX_DEGREE)
 
 
 def factor_derivatives(monomials: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return derivatives of monomials (m, 3) in each of their factors at states (K, nx). Shape (K, m, 3)."""
+    """Return derivatives of monomials (m, 3) by each of their factors at states (K, nx). Shape (K, m, 3)."""
     factors = np.pad(x, ((0, 0), (1, 0)), constant_values=1.0)[:, monomials]
     return np.stack([factors[..., 1] * factors[..., 2], factors[..., 0] * factors[..., 2],
                      factors[..., 0] * factors[..., 1]], axis=-1)  # fmt: skip
 
 
 def sample_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return random states and their derivatives if finite. Shapes (K, nx), K at most ``count``."""
+    """Return at most ``count`` random states with finite derivatives, and these derivatives. Shapes (K, nx)."""
     rng = np.random.default_rng(0)
     x, u, t = (rng.normal(size=(count, n)) for n in (form.nx, form.nu, 1))
     horizon, p = 1.0, np.exp(0.3 * rng.normal(size=form.np))

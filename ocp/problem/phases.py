@@ -67,7 +67,7 @@ class Phase:
 
 
 class Phases(Problem):
-    """Several consecutive problems, joined to one problem.
+    """Several consecutive problems, joined into one problem.
 
     ``phases["carry"]`` has the symbols of a phase. :meth:`join` connects phases; ``end`` and ``start`` declare further
     conditions on their ends and starts. The horizon of the whole is 1, the fraction of every phase;

@@ -117,7 +117,7 @@ class Problem:
 
     @classmethod
     def from_record(cls, state: dict[str, Any]) -> Problem:
-        """Return the problem whose :meth:`__getstate__` returned this data."""
+        """Return the problem from data that :meth:`__getstate__` has returned."""
         problem = cls.__new__(cls)
         problem.__setstate__(state)
         return problem
@@ -457,7 +457,7 @@ class Problem:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
 
     def _inner(self) -> list[Any]:
-        """Symbols that constraints inside the horizon may use: states, controls, parameters, signals, time, horizon."""
+        """Symbols for constraints inside the horizon: states, controls, parameters, signals, time, horizon."""
         d = self.declared
         pools = (d.states, d.controls, d.parameters, d.signals)
         return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]
@@ -490,7 +490,7 @@ class Problem:
         tolerance: Value = None,
         known: Sequence[Any] = (),
     ) -> Constraint:
-        """Return a new constraint on the symbols inside the horizon and on the ``known`` ones."""
+        """Return a new constraint on symbols inside the horizon and on the ``known`` symbols."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
         return self._reader.constraint(
             kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance

@@ -419,7 +419,7 @@ def symbol_name(symbol: Any) -> str:
 
 
 def pack_record(record: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """Return the structure of a record, which JSON can hold, and its arrays, concatenated by type."""
+    """Split a record into its structure, which JSON can represent, and its arrays, concatenated by type."""
     chunks: dict[str, list[np.ndarray]] = {name: [] for name in ARRAY_NAMES}
     lengths = dict.fromkeys(chunks, 0)
 

@@ -34,7 +34,7 @@ def symbols_of(*functions: Any) -> Any:
 
 
 def identity(symbol: Any) -> int:
-    """Return a number that identifies a symbol: equal only for equal scalar SX or equal MX symbols."""
+    """Return a number that identifies a symbol; only equal scalar SX or equal MX symbols have the same number."""
     return int(symbol.element_hash() if isinstance(symbol, ca.SX) else symbol.__hash__())
 
 
@@ -102,7 +102,7 @@ BLOCK_SIZES = (512, 32, 8, 1)  # samples per call: one map of all samples takes 
 
 
 class Sampler:
-    """A function of columns that is evaluated at many samples at once, in blocks.
+    """A function of columns that is evaluated at many samples together, in blocks.
 
     Args:
         symbols: Arguments of the function, one column each.

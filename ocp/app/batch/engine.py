@@ -103,7 +103,7 @@ def attempt(function: Function, task: str, with_guess: bool, guess: Payload | No
 
 
 def failed(status: str, error: str, message: str) -> Payload:
-    """Return the payload of a task that ended without a result."""
+    """Return the payload of a task that ended without a result, with the reason."""
     empty: dict[str, Any] = {"value": None, "files": [], "cost": None, "verdict": None, "seconds": 0.0}
     empty["inputs"] = {"kept": {}}
     return Payload({"status": status, "error": error, "message": message, **empty})
@@ -189,7 +189,7 @@ class EngineSettings:
 
 
 class Job(NamedTuple):
-    """A task to run: its key, its text, and a neighbour's result."""
+    """A task to run: its key, its text, and the result of its neighbour."""
 
     key: str
     task: str
@@ -411,7 +411,7 @@ class Engine:
 
 
 def checked_cluster(cluster: Any) -> Any:
-    """Return a cluster: the address of a scheduler, or a `distributed.Client`, which stays open.
+    """Return a cluster after checks: the address of a scheduler, or a `distributed.Client`, which stays open.
 
     Raises:
         ProblemError: It is neither.

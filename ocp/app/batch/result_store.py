@@ -56,7 +56,7 @@ DATA = "numbers, texts, True, False, None, and lists and dictionaries by name of
 
 
 class Payload(NamedTuple):
-    """A result as transferred: the record and the bytes of its files."""
+    """A result in the form in which workers send it: the record and the bytes of its files."""
 
     record: dict[str, Any]
     files: tuple[bytes, ...] = ()

@@ -266,7 +266,7 @@ def names_of(argument: str, names: Any) -> tuple[str, ...]:
 
 
 def name_of(function: Any) -> str:
-    """Return the name of a function for its store: ``module:name``; the module of a script is the name of its file.
+    """Return the name of a function for its store, ``module:name``; a script's module is named after its file.
 
     Raises:
         ProblemError: A worker cannot find the function by name, as for a lambda, a nested function, a method, or a

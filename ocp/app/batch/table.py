@@ -79,8 +79,7 @@ class Result:
         return self._store.value(record)
 
     def row(self) -> dict[str, Any]:
-        """Return the result as a row of a table: ``COLUMNS``, then numbers and texts as ``task.NAME`` and
-        ``result.NAME``.
+        """Return the result as a table row: ``COLUMNS``, then numbers and texts as ``task.NAME``, ``result.NAME``.
 
         Longer entries of a task are given as JSON.
         """
@@ -220,7 +219,7 @@ class Batch:
 
 
 def read_batch(folder: str | os.PathLike[str]) -> Batch:
-    """Return all results in a folder, in the order of their keys, without computing any.
+    """Return all results in a folder, in the order of their keys, without computing anything.
 
     Raises:
         ProblemError: The folder is not that of a batch.

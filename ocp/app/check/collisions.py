@@ -222,7 +222,7 @@ def path_rows(
 
 
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
-    """Return a row of the table for a value and its limit, which may be infinite."""
+    """Return the table row for a value and its limit, which may be infinite."""
     bounded = bool(np.isfinite(limit))
     verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.INFO
     return Row(name, value, limit if bounded else None, unit, time, verdict)

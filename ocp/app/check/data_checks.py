@@ -185,7 +185,7 @@ def clean_trajectory(
 def _columns(
     raw: RawTrajectory, robot: Robot, base: Sequence[str], faults: list[Fault], notes: list[str]
 ) -> tuple[list[int], Indices]:
-    """Match the columns of a file with joints; return the columns and the indices of their joints."""
+    """Match the columns of a file to joints; return the used columns and the indices of their joints."""
     names = robot.joint_names
     joints = [k for k, name in enumerate(names) if name in raw.names]
     missing = [name for name in names if name not in raw.names]
@@ -431,7 +431,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
 def _jumps(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], velocity: Array, faults: list[Fault]
 ) -> None:
-    """Add a fault for each joint that jumps: a step far longer than those around it."""
+    """Add a fault for each joint that jumps, which means a step far longer than neighbouring steps."""
     h = np.diff(t)
     steps = np.diff(q, axis=0)
     speeds = steps / h[:, None]

@@ -151,7 +151,7 @@ def limit_rows(
 
 
 def audit_rows(audit: Audit) -> list[Row]:
-    """Return the findings of an audit as rows of a table."""
+    """Return the findings of an audit as table rows."""
     verdicts = [RowVerdict.INFO if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
     return [
         Row(f.name, f.value, f.limit, f.unit, f.time, verdict, f.note)
@@ -196,7 +196,7 @@ class _Side(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """Largest value minus the limit; -inf without a limit."""
+        """Largest value minus the limit; -inf if there is no limit."""
         return float(self.values.max() - self.limit)
 
     @property
@@ -243,7 +243,7 @@ def _check_limits(
 def effort_rows(
     cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Check the torques that the file contains, at its samples."""
+    """Check the torques in the file against the torque limits, at the samples."""
     rows: list[Row] = []
     faults: list[Fault] = []
     if cleaned.efforts is None:

@@ -132,7 +132,7 @@ class Check:
         return "\n".join([*lines, f"The trajectory {self.sentence}."])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result without the samples, as JSON can represent it."""
+        """Return the result as a dictionary for JSON, without the samples."""
         data = {name: getattr(self, name) for name in ("file", "robot", "joints", "samples", "duration", "rule")}
         data |= {"passed": self.passed, "verdict": self.sentence}
         data |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "suspicions", "rows")}
@@ -342,7 +342,7 @@ def check_trajectory(
 
 
 def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
-    """Return a sentence about the links whose meshes are missing, if there are any."""
+    """Return a sentence about links with missing meshes; empty if there are none."""
     shapes = [(link.name, shape) for link in robot.links for shape in link.collisions if shape.kind == "mesh"]
     names = [name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, folders) is None]
     return [f"clearance of {', '.join(dict.fromkeys(names))}, whose meshes are missing"] if names else []
@@ -416,7 +416,7 @@ def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
 
 
 def _check_segment(piece: Piece, times: Array, name: str) -> Check:
-    """Return the check of one segment of a motion at its ends and at the given times that lie inside it."""
+    """Check one segment of a motion at its ends and at those of the given times that lie inside it."""
     plan, local = piece.plan, times - piece.begin
     inside = local[(local > 0) & (local < plan.horizon)]
     sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))

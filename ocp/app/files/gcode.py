@@ -410,7 +410,7 @@ class _Reader:
             self._end_path()
 
     def _stop(self, words: dict[str, float]) -> bool:
-        """Execute the M words, reject unused words, and return whether the program ends."""
+        """Execute the M words and reject unused words; return whether the program ends."""
         is_end = False
         for code in (code for letter, code in self.block.codes if letter == "M"):
             kind, name = M_WORDS.get(code, ""), f"M{code // 10}"

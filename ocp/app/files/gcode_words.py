@@ -144,7 +144,7 @@ def _moved(center: Array, first: Array, last: Array) -> Array:
 def _turned(
     start: Array, end: Array, center: Array, clockwise: bool, sweep: float, plane: tuple[int, int, int]
 ) -> Arc | Helix:
-    """Return the arc, or the helix if it rises or exceeds a full turn, that begins at `start` and turns by `sweep`."""
+    """Return the arc from `start` that turns by `sweep`; it is a helix if it rises or exceeds a full turn."""
     axis, middle = np.zeros(3), start.copy()
     axis[plane[2]] = -1.0 if clockwise else 1.0
     middle[list(plane[:2])] = center
@@ -243,7 +243,7 @@ class Block(NamedTuple):
 
 
 def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
-    """Yield the blocks that have words, up to the second `%`.
+    """Yield the blocks that contain words, up to the second `%`.
 
     Raises:
         ProblemError: With the line: an invalid word, an unclosed comment, an expression, or a repeated letter.

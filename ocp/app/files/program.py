@@ -34,7 +34,7 @@ DEFAULT_TOLERANCE_M = 5e-5
 
 
 class Note(NamedTuple):
-    """Words of a file that were ignored or interpreted in one of several ways.
+    """Remark about words of a file that were ignored or could be interpreted in several ways.
 
     Attributes:
         text: The words and their interpretation.
@@ -199,7 +199,7 @@ class Program:
     def schedule(
         self, limits: LineLimits, *, rapid: float | None = None, tolerance: float | None = None, **options: Any
     ) -> TimedProgram:
-        """Return the trajectory of the program: each section from rest to rest, cuts at their feeds, rapids straight.
+        """Return the trajectory of the program, in which each section runs from rest to rest.
 
         Args:
             limits: Limits of all sections; the speed, one number, also limits the feeds.
@@ -314,7 +314,7 @@ class TimedProgram:
         return tuple(each.name for each in self.program.sections)
 
     def at(self, time: ArrayLike) -> ProgramMotion:
-        """Return the motion at times (M,) of [0, duration], s. At a boundary it is that of the section that begins.
+        """Return the motion at times (M,) in [0, duration], s; a boundary belongs to the section that begins there.
 
         Raises:
             ProblemError: A time is not a number, or is outside by more than rounding.

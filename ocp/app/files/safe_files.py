@@ -88,7 +88,7 @@ def read_lines(
 
 
 def line_error(file: Any, number: int, text: str, why: str, *, limit: Any = None) -> ProblemError:
-    """Return the error of a numbered line: its text, what is wrong and what to do."""
+    """Return the error about a numbered line: its text, what is wrong, and what to do."""
     quoted = text.strip()
     quoted = quoted if len(quoted) <= QUOTED_CHARACTERS else quoted[:QUOTED_CHARACTERS] + " ..."
     return ProblemError(f"{file}, line {number}, {quoted!r}: {why}", name=f"line {number}", value=quoted, limit=limit)
@@ -101,7 +101,7 @@ def missing_package(task: str, package: str, extra: str) -> ProblemError:
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a table's line without quotes; with semicolons as delimiters, a comma is a decimal point."""
+    """Split a line of a table into cells; if the delimiter is a semicolon, a comma is a decimal point."""
     if delimiter == " ":
         return [cell.strip("\"'") for cell in BEFORE_UNIT.sub("", line).split()]
     cells = [cell.strip().strip("\"'") for cell in line.split(delimiter)]
@@ -244,7 +244,7 @@ def _check_count(count: int) -> None:
 
 
 def checked_depth(tree: Any) -> Any:
-    """Return a tree of values; raise ValueError if it is nested more than INPUT_LIMITS.nesting deep."""
+    """Return a tree of values; raise ValueError if it is nested deeper than INPUT_LIMITS.nesting."""
     level = [tree]
     for _ in range(INPUT_LIMITS.nesting + 1):
         level = [child for node in level for child in children_of(node)]

@@ -306,7 +306,7 @@ def _task(entries: TomlTable, folder: Path) -> TipTask:
 
 
 def _path_limit(entries: TomlTable, name: str, unit: str, default: Any = None) -> Any:
-    """Read a limit of the schedule along the path; reject a size that no machine has."""
+    """Read a speed, acceleration or other limit along the path; reject values that no machine has."""
     return entries.number(name, f"a number above 0, {unit}, of 1e-6 to 1e6", default, least=0.999e-6, most=1e6)
 
 

@@ -278,7 +278,7 @@ def _unit(cell: str) -> str | None:
 
 
 def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[list[str], list[float], tuple[str, ...]]:
-    """Return each column's standard name ("" if it is ignored), its unit in SI, and the ignored columns."""
+    """Return for each column the standard name ("" if ignored) and the factor to SI units, and the ignored columns."""
     names: list[str] = []
     scales: list[float] = []
     ignored: list[str] = []
@@ -367,13 +367,13 @@ def _from_vectors(vectors: Array) -> Array:
 
 
 def _aligned(quaternions: Array) -> Array:
-    """Choose the sign of each quaternion so that it is the one nearer to its predecessor."""
+    """Choose the sign of each quaternion that makes it nearer to its predecessor."""
     signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(quaternions * np.cumprod(np.concatenate([[1.0], signs]))[:, None])
 
 
 def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
-    """Return orientations with a given tool axis as z axis, by parallel transport from row to row."""
+    """Return orientations whose z axes are the given tool axes, with least roll from row to row."""
     previous = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
     steps = np.column_stack([1 + (previous * axes).sum(axis=1), np.cross(previous, axes)])
     opposite = steps[:, 0] < 1e-7  # 1 + cosine; half of the digits of double precision

@@ -223,7 +223,7 @@ PAGE_SETTINGS = PageSettings()
 
 
 class ClosestPairs(NamedTuple):
-    """The two bodies with the smallest clearance margin at K times.
+    """The pair of bodies with the smallest clearance margin at each of K times.
 
     Attributes:
         t: s. Shape (K,).
@@ -470,7 +470,7 @@ def _margins(rows: Sequence[Curve]) -> list[Curve]:
 
 
 def _closest_pairs(parts: Sequence[tuple[Solution, str, Array]], horizon: float) -> ClosestPairs | None:
-    """Return the closest bodies at uniform times of a motion, or None if they are unknown.
+    """Return the closest pair of bodies at uniform times of a motion, or None if it is unknown.
 
     Args:
         parts: As returned by `Plan.solved_parts` for these times.

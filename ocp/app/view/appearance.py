@@ -273,7 +273,7 @@ def _parts(surfaces: list[tuple[str, Triangles]]) -> list[Part]:
 
 
 def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> Part:
-    """Return a part with normals: area-weighted means over the faces at a corner that do not meet at a crease."""
+    """Return a part with vertex normals, which are averaged over adjacent faces except across creases."""
     places, where = np.unique(np.round(vertices, 6) + 0.0, axis=0, return_inverse=True)
     faces = where.ravel()[faces]
     one, two, three = (places[faces[:, k]] for k in range(3))

@@ -122,7 +122,7 @@ def _fill_template(title: str, first: Animation, data: str) -> str:
 
 
 def _alike(a: Robot, b: Robot) -> bool:
-    """Return whether two robots look the same, so that one set of surfaces serves both."""
+    """Return whether two robots look the same, so that they can share one set of surfaces."""
     if a is b:
         return True
     names = [[part.name for part in robot.links] for robot in (a, b)]
@@ -136,7 +136,7 @@ def _alike(a: Robot, b: Robot) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
-    """Return for each link the moving link (or root) that it is fixed to, and its pose there."""
+    """Return for each link the moving link, or root, to which it is fixed, and its pose there."""
     carriers = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
     for joint in robot.joints:
         if joint.moves:
@@ -292,7 +292,7 @@ class PageServer:
     """
 
     def __init__(self, text: str, port: int = 0) -> None:
-        """Listen on a port or the next free one; 0: any port.
+        """Listen on the given port or the next free one; port 0 selects any.
 
         Raises:
             ProblemError: No port is free, or the number is invalid.
@@ -320,7 +320,7 @@ class PageServer:
 
 
 def _listening(page: bytes, port: int) -> ThreadingHTTPServer:
-    """Return a server of a page on the first free port."""
+    """Return a server for a page on the first free port."""
 
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self) -> None:

@@ -112,7 +112,7 @@ def draw_joints(
 
 
 def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
-    """Draw the limits of the curves in an axes: dashed if they are close, as text if they are far.
+    """Draw the limits of curves: as dashed lines if they are near the curves, else as text.
 
     Curves with a range smaller than `min_range` are drawn as constant.
     """
@@ -135,7 +135,7 @@ def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
 
 
 def line_style(number: int) -> dict[str, Any]:
-    """Return the line style of a plan, number 0, or of a motion compared with it."""
+    """Return the line style of a plan (number 0), or of a motion that it is compared with."""
     return {"color": PLAN, "lw": 1.4} if number == 0 else {"color": COMPARED, "lw": 1.1, "ls": DASHES[number % 3]}
 
 
@@ -375,7 +375,7 @@ def _named(against: Any) -> dict[str, Any]:
 
 
 def _figure(figure: Any, size: tuple[float, float]) -> Any:
-    """Return a new figure, or the given one if it is empty; raise ProblemError if it is invalid."""
+    """Return a new figure, or the given figure if it is empty; raise ProblemError if it is invalid."""
     if figure is None:
         return Picture(figsize=size, layout="constrained")
     require.instance("plot: figure", figure, Figure)

@@ -215,7 +215,7 @@ def render(
     floor: Floor | None = None,
     side_samples: int = PICTURE_STYLE.side_samples,
 ) -> NDArray[np.uint8]:
-    """Return the picture on white, each pixel the mean of `side_samples` squared. Shape (height, width, 3)."""
+    """Render layers on white; each pixel is the mean of `side_samples` squared samples. Shape (height, width, 3)."""
     width, height = camera.size
     fine = camera._replace(size=(side_samples * width, side_samples * height))
     solid = _Mesh.of([part for layer in layers if layer.opacity >= 1 for part in layer.parts if part.color[3] >= 1])

@@ -139,7 +139,7 @@ def _table(rows: Sequence[Row]) -> str:
 
 
 def report_of_check(check: Check, machine: Machine, limits: Limits, scene: Scene) -> Report:
-    """Return the report of a check with these limits and this scene."""
+    """Return the report of a check, with the limits and the scene that it used."""
     motion, robot = check.cleaned.motion, machine.robot
     complete = len(check.joints) == robot.dof
     base_path = check.cleaned.base if machine.base_size else None

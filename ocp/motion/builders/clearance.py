@@ -173,7 +173,7 @@ class Separating(Protocol):
 def widened(
     margins: Mapping[int, float], labels: Sequence[tuple[str, str]], proofs: Sequence[Clearance]
 ) -> dict[int, float]:
-    """Return margins of pairs, m, increased by their violations.
+    """Return the margins of pairs, m, each increased by the violation of the pair.
 
     Args:
         margins: Margins by the index of the pair among the labels.

@@ -264,7 +264,7 @@ class TorqueLimits:
 
 
 def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> ConstantJerkMotion:
-    """Return a fastest motion from rest to rest within velocity, acceleration and jerk limits.
+    """Return a time-optimal motion from rest to rest within velocity, acceleration and jerk limits.
 
     It is straight if a straight motion attains the least time.
 
@@ -294,7 +294,7 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:
-    """Return the durations of straight motions by changes (K, n) from rest to rest, s, without torque limits."""
+    """Return the durations of straight rest-to-rest motions by changes (K, n), s, without torque limits."""
     return np.asarray(_straight_profile(changes, bounds).duration)
 
 
@@ -318,7 +318,7 @@ def _profiles(distances: Array, bounds: JointBounds) -> _Ramps:
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the profiles of the path fraction of straight motions by changes (K, n). Shape (K,) each."""
+    """Return the profiles of the path fraction for straight motions by changes (K, n). Shape (K,) each."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [

@@ -71,7 +71,7 @@ SEARCH = RollGuessSettings()
 
 @interruptible
 def spline_targets(times: Any, targets: Any) -> Targets:
-    """Return a cubic spline through a table of targets, a function of time for problems with MX symbols.
+    """Return the cubic spline through a table of targets as a function of time, for problems with MX symbols.
 
     Args:
         times: At least 4 increasing times. Shape (samples,), s.
@@ -282,7 +282,7 @@ def roll_problem(
 
 
 def _column(targets: Targets, time: Any) -> Any:
-    """Return the target at a symbol of time, shape (5, 1); raise ProblemError if it is invalid."""
+    """Evaluate the targets at a symbol of time, shape (5, 1); raise ProblemError if the result is invalid."""
     try:
         target = expression(targets(time))
     except RuntimeError:  # interpolants do not take SX symbols

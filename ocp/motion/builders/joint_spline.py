@@ -149,7 +149,7 @@ def joint_path(
     samples: int = 400,
     names: Sequence[str] | None = None,
 ) -> PlannedJoints:
-    """Return joints along a path, from a plan at constant speed or from samples over the distance.
+    """Return the joints along a path as a spline, from a plan at constant speed or from samples.
 
     Args:
         machine: Machine of the joints.
@@ -235,7 +235,7 @@ def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple
 
 
 class _PiecewisePolynomial:
-    """A spline as one polynomial per interval, about the middle of the interval.
+    """A spline, stored as one polynomial per interval about the middle of the interval.
 
     Args:
         breaks: Ends of the intervals. Shape (K + 1,), m.

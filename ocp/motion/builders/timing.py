@@ -200,7 +200,7 @@ def minimum_time_problem(
     guess: Schedule | None = None,
     intervals: int = 200,
 ) -> TimingProblem:
-    """Declare the problem of `solve_minimum_time`, for any method to solve.
+    """Declare the problem that `solve_minimum_time` solves, for solution by any method.
 
     The path constraints are "asked speed" (the line speed's limit), "centripetal acceleration", "joint velocity",
     "joint acceleration" and "joint jerk", each over its limit and only if limited. The boundary constraints are "start

@@ -122,7 +122,7 @@ def speed_limit(path: PathLike, limits: LineLimits, s: Array) -> Array:
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:
-    """Return speed limit, curvature, and three derivatives of the joints by the distance, at distances (M,).
+    """Return speed limit, curvature, and three joint derivatives by distance, at distances (M,).
 
     The curvature is zero if the centripetal acceleration is not limited. Shape (M, m).
 
@@ -138,7 +138,7 @@ def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s
 
 
 def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: LineMotion) -> Array:
-    """Return the largest ratio of speed, acceleration, jerk, centripetal and joint demands to their limits. Shape (M,).
+    """Return the largest ratio of all limited quantities of a motion to their limits. Shape (M,).
 
     Where the path's derivatives jump, the values after the jump count.
     """

@@ -43,7 +43,7 @@ ERRORS, START_ERRORS = "task errors", "start errors"
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """Settings of the pose-error feedback and of relaxed tasks.
+    """Settings of the feedback of pose errors and of relaxed tasks.
 
     Attributes:
         decay: Largest decay of a pose error over an interval of the mesh, as a power of e. Faster feedback would need a

@@ -141,7 +141,7 @@ def declare_actuators(
     pace: Any,
     suffix: str = "",
 ) -> tuple[Any, Any, Any]:
-    """Declare velocities and accelerations within the limits; return both and the running cost (per second).
+    """Declare velocities and accelerations within their limits; return them and the running cost (per second).
 
     The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
     "power" where these are limited or weighted.
@@ -193,7 +193,7 @@ def weights_torques(cost: Cost) -> bool:
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
-    """Return the running cost of a motion (per second), without its time and positive power.
+    """Return the running cost of a motion (per second), without the costs of time and positive power.
 
     Args:
         machine: The machine.
@@ -222,7 +222,7 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
 
 
 def positive_power(problem: Problem, powers: Any, bounds: JointBounds, suffix: str = "") -> Any:
-    """Declare the positive power of each actuator as a control within its limit, W, and return the sum."""
+    """Declare each actuator's positive power as a control within its limit, W; return the sum."""
     power = problem.control(f"power{suffix}", powers.numel(), lower=0.0, upper=bounds.power, unit="W")
     problem.path(f"power{suffix}", power - powers, lower=0.0, unit="W")
     return ca.sum1(power)

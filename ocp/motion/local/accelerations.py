@@ -163,7 +163,7 @@ class _TaskHierarchy:
 
 
 def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
-    """Raise ProblemError if a law is unknown or needs more joints than the machine has.
+    """Raise ProblemError if a law is unknown, or needs more joints than the machine has.
 
     Args:
         machine: The machine.
@@ -191,7 +191,7 @@ def accelerations(
     external: External | None = None,
     options: AccelerationOptions | None = None,
 ) -> Any:
-    """Return the joint accelerations of a law. Shape (n, 1).
+    """Return the joint accelerations that a law commands. Shape (n, 1).
 
     Args:
         machine: The machine.
@@ -392,7 +392,7 @@ def resolve_accelerations(
 
 
 class _Simulation:
-    """Integration of the state (q, q') over fixed steps, many steps in one call."""
+    """Integrator of the state (q, q') with fixed steps, many steps in one call."""
 
     def __init__(self, law: Any, n: int, step: float, options: AccelerationOptions) -> None:
         self.step, self._law, self._n = step, law, n

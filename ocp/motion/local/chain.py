@@ -177,7 +177,7 @@ class Chain:
 
     @classmethod
     def of(cls, machine: Machine) -> Chain | None:
-        """Return the chain to the tip of a machine; None if its base moves or a joint of the chain follows another."""
+        """Return the chain to a machine's tip; None if its base moves, or if a joint of the chain is a follower."""
         robot = machine.robot
         path = () if robot.tip is None else [joint for joint in robot.path_to(robot.tip_link) if joint.moves]
         if machine.base_size or any(joint.mimic is not None for joint in path):
@@ -194,7 +194,7 @@ class Chain:
         return cls(axes, points, revolute, position, np.array(ca.DM(pose.rotation)), order, size)
 
     def extended(self, axes: Array, points: Array) -> Chain:
-        """Return the chain with further revolute joints between the last joint and the tip. Shapes (k, 3), (k, 3)."""
+        """Return the chain with added revolute joints between the last joint and the tip. Shapes (k, 3), (k, 3)."""
         n, count = len(self.axes), len(axes)
         return replace(
             self,

@@ -39,7 +39,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class NearbySettings:
-    """Settings of the search at poses near those whose solutions may be incomplete.
+    """Settings of the search at poses near those for which solutions may be missing.
 
     Attributes:
         pairs: Number of pairs of poses.

@@ -98,7 +98,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def axial(turn: Array) -> Array:
-    """Return the axial vectors of rotations, 2 sin(angle) times their axes. Shapes (M, 3, 3) to (M, 3)."""
+    """Return the vectors 2 sin(angle) axis of rotations. Shapes (M, 3, 3) to (M, 3)."""
     return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
 
 

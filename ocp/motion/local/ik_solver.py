@@ -117,7 +117,8 @@ class IkSolver:
         limits: bool = True,
         samples: int = 36,
     ) -> None:
-        """
+        """Prepare the solver of an arm.
+
         Args:
             machine: Machine on a fixed base.
             link, point: Link of the tip, and its origin in the frame of the link, (3,), m; None: the tip of the robot.
@@ -180,7 +181,7 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class PreparedArm:
-    """Arm prepared for repeated inverse kinematics, see `IkSolver`.
+    """Arm prepared for repeated inverse kinematics by an `IkSolver`.
 
     Attributes:
         arm: Solver of the arm.
@@ -224,7 +225,7 @@ class PreparedArm:
         return not (self.sampled_angles or self.arm.solvers[0].redundant)
 
     def parameters(self, solver: PoseSolver) -> tuple[str, ...]:
-        """Return the names of the parameters that are sampled with a solver."""
+        """Return the names of the parameters that are sampled if this solver is used."""
         return (*(self.names[j] for j in solver.redundant), *("roll", "azimuth", "tilt")[: self.sampled_angles])
 
     def solve(
@@ -393,7 +394,7 @@ def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranc
 def ik_configurations(
     machine: Machine, task: TipTask, *, time: float = 0.0, limits: bool = True, samples: int = 36
 ) -> IkConfigurations:
-    """Return the IK configurations of an arm on all branches of a pose task, and whether the set is complete.
+    """Return IK configurations of an arm on all branches of a pose task, and whether they are all.
 
     For many poses of one arm, prepare an `IkSolver`.
 

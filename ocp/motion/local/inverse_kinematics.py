@@ -39,7 +39,7 @@ LARGEST_SEED = 2**64
 
 @dataclass(frozen=True)
 class IkSettings:
-    """Settings of the Levenberg-Marquardt iterations and of the selection of their solutions.
+    """Settings of the Levenberg-Marquardt iterations, and of the choice among their solutions.
 
     Attributes:
         slide_spread: Range of the starts of prismatic joints without limits, m.
@@ -355,7 +355,7 @@ def gauss_newton(
     iterations: int,
     fixed: Sequence[Any] = (),
 ) -> tuple[Array, Array]:
-    """Return joints (K, n) and largest residuals (K,) after damped Gauss-Newton iterations from starts.
+    """Run damped Gauss-Newton iterations from starts; return joints (K, n) and largest residuals (K,).
 
     Args:
         function: CasADi Function of the joints and `fixed` -> (residual, its Jacobian).
@@ -487,6 +487,6 @@ def unreachable_error(
 
 
 def describe_miss(distance: float, angle: float) -> str:
-    """Describe a pose error by its distance, m, and angle, rad; a part at rounding level is left out."""
+    """Describe a pose error by its distance, m, and angle, rad, without a part at rounding level."""
     parts = [(distance, "m"), (angle, "rad")]
     return " and ".join(f"{value:.3g} {unit}" for value, unit in parts if value > 1e-9 * (distance + angle)) or "0 m"

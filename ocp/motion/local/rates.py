@@ -97,7 +97,7 @@ class LocalSolution:
 
 @dataclass(frozen=True, eq=False)
 class RateOptions:
-    """Options of the least joint rates and of their integration.
+    """Options of the computation of least joint rates, and of their integration.
 
     Attributes:
         weights: Positive weights of the squared joint rates that are minimised. Shape (joint_size,); all 1 if None.
@@ -192,7 +192,7 @@ def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any
 
 
 def _sample_times(samples: Any, horizon: float) -> Array:
-    """Return the sample times of a count or an array of times; raise ProblemError unless they cover the horizon."""
+    """Return sample times from their number or from an array; raise ProblemError unless they cover the horizon."""
     if not isinstance(samples, list | tuple | np.ndarray):
         count = real(samples)
         if not (2 <= count <= INPUT_LIMITS.count and count == int(count)):
@@ -425,7 +425,7 @@ def track_tasks(
         return matrix, right, error, np.where(np.isfinite(errors_along), errors_along, np.inf)
 
     def move_base(step: Array, duration: float) -> Array:
-        """Return the base (K, base_size) after joint steps and a duration of drift."""
+        """Return the base (K, base_size) after steps of the joints and a duration of drift."""
         if motion is None:
             return base_now
         drift = np.array(motion(base_now.T, joints_now.T, np.zeros_like(joints_now).T)).T
@@ -466,7 +466,7 @@ def track_tasks(
 
 
 def _cone_function(equations: TaskEquations) -> Any:
-    """Return the CasADi function (base, joints, targets) -> cone cosines and their gradients by the joints."""
+    """Return the CasADi function (base, joints, targets) -> cosines in cones, and their gradients by the joints."""
     machine = equations.machine
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
     targets = ca.SX.sym("targets", equations.target_function().numel_out())

@@ -47,7 +47,7 @@ class Solver:
         return None
 
     def same_path(self, solution: Solution, reference: Solution) -> bool:
-        """Return whether two solutions are the same motion."""
+        """Return whether two solutions have the same path and so are the same motion."""
         return False
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
@@ -91,7 +91,8 @@ class CandidateQueue:
     """
 
     def __init__(self, solver: Solver, settings: PlannerSettings, *, include_costlier: bool = False) -> None:
-        """
+        """Create an empty queue for a solver.
+
         Args:
             solver: Solver of the candidates.
             settings: Settings of the planner.

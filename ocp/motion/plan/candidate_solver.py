@@ -59,7 +59,8 @@ class CandidateSolver(Solver):
     """
 
     def __init__(self, request: PlanRequest, start: Array, reference: Array) -> None:
-        """
+        """Prepare the solver for the candidates of a request.
+
         Args:
             request: The request.
             start, reference: As in `tool_motion_problem`.
@@ -197,7 +198,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.REFINED, cost=solution.cost, solution=solution)
 
     def _audit(self, candidate: Candidate) -> Candidate:
-        """Audit a candidate; on failure refine its mesh or widen separations, if that may help.
+        """Audit a candidate; if it fails, refine its mesh or increase separation margins where that may help.
 
         If many starts are equally good, the optimality of one of them is undetermined. The motion is then solved and
         audited with its start fixed.
@@ -241,7 +242,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return a new candidate with a free start, from one that passed with a fixed start."""
+        """Return a new candidate with a free start from a candidate that passed with a fixed start."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints
@@ -448,7 +449,7 @@ class CandidateSolver(Solver):
 
     @property
     def no_clear_configuration(self) -> bool:
-        """Whether at some time every configuration that satisfies the tasks is in collision."""
+        """Whether all configurations that satisfy the tasks at some checked time are in collision."""
         return any(isinstance(value, Unreachable) for value in self._clear_counts.values())
 
     def _count_clear_at(self, time: float) -> int | Unreachable | None:

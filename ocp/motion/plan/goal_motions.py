@@ -143,7 +143,7 @@ class GoalTask:
 
     @property
     def is_dynamic(self) -> bool:
-        """Whether the motion is smooth: actuators are limited, or more than velocity or length is the cost."""
+        """Whether the motion is smooth, because actuators are limited or more than velocity or length is weighted."""
         return limits_actuators(self.limits) or not set(self.request.cost.terms) <= {"velocity", "length"} or self.moves
 
     @property
@@ -158,7 +158,7 @@ class GoalTask:
 
     @property
     def is_fastest(self) -> bool:
-        """Whether the motion is time-optimal: only a free time is the cost, and no power is limited."""
+        """Whether the motion is time-optimal: the cost is a free time alone, and no power is limited."""
         is_free = self.request.horizon is None and self.request.cost.terms == ("time",)
         return is_free and not np.isfinite(self.bounds.power).any()
 
@@ -279,7 +279,7 @@ def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _PathProblem:
-    """Problem of moving along one path within actuator limits.
+    """Problem of a motion near one path, within actuator limits.
 
     Attributes:
         task: Checked request.
@@ -329,7 +329,7 @@ class _PathProblem:
         return replace(self, motion=self.motion.slower(factor)).candidate("stops at the corners of a path")
 
     def candidate(self, method: str) -> Candidate:
-        """Audit the motion and return it as a candidate; `method` describes how it was found."""
+        """Audit the motion and return it as a candidate; `method` says how it was computed."""
         problem = self.declare(self.task.request.clearance_constraints)
         return _audited(self.task, self.motion.solution(problem, method), self.path)
 

@@ -412,7 +412,7 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
-    """Check the weights of the cost of tip tasks and return the cost.
+    """Return the cost of tip tasks after a check of its weights.
 
     Args:
         free: Whether the horizon is free.

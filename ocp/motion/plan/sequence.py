@@ -95,7 +95,7 @@ def _velocity(rates: Array, smooth: bool) -> Any:
 
 
 def plan_consecutive(request: SequenceRequest, parts: Sequence[Goal | TipTask | Sequence[TipTask]]) -> SequencePlan:
-    """Plan motions to goals and along tasks one after the other.
+    """Plan motions to goals and motions along tasks, one after the other.
 
     Args:
         request: The options.
@@ -110,7 +110,7 @@ def plan_consecutive(request: SequenceRequest, parts: Sequence[Goal | TipTask | 
 
 @dataclass(eq=False)
 class _Sequence:
-    """Motions of a sequence that have been planned so far, with the state at their end."""
+    """The motions of a sequence that are already planned, and the state at their end."""
 
     request: SequenceRequest
     parts: tuple[Any, ...]

@@ -121,7 +121,7 @@ class _StandingSolver(Solver):
 
 
 def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
-    """Return "rest" if the tasks are at rest at a time, else "free"."""
+    """Return "rest" if the tips are at rest at a time, else "free"."""
     try:
         check_rest(equations, time)
     except ProblemError:

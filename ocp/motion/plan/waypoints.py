@@ -463,7 +463,7 @@ def _path_weights(weights: Any, size: int) -> Array:
 
 
 def _step(step: Any, size: int) -> Array:
-    """Check the largest displacement between waypoints and return it for each joint. Shape (n,)."""
+    """Return the largest displacement of each joint between waypoints, after checks. Shape (n,)."""
     try:
         steps = floats(step)
         if steps.shape in ((), (1,), (size,)) and (steps > 0).all():

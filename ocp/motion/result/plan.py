@@ -116,7 +116,7 @@ class Plan(ABC):
 
     @abstractmethod
     def _values_at(self, name: str, times: Array) -> Array:
-        """Return "joints", "rates", "accelerations" or "base" at checked times (M,). Shape (M, n)."""
+        """Return "joints", "rates", "accelerations" or "base" at times (M,) that have been checked. Shape (M, n)."""
 
     def __getitem__(self, name: str) -> Array:
         """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
@@ -213,7 +213,7 @@ class Plan(ABC):
         return f"<Plan of {self.horizon:.6g} s: {len(self.names)} joints, {self._costs}, {self._counts}>"
 
     def __str__(self) -> str:
-        """Return the cost, the joints that stand still, and the rejected motions by reason, in at most 15 lines."""
+        """Return cost, held joints, and rejected motions with their reasons, in at most 15 lines."""
         moving = [name for name in self.names if name not in self.held]
         lines = [f"plan of {self.horizon:.6g} s for {', '.join(moving)}: {self._costs}; {self._counts}"]
         if self.held:
@@ -262,7 +262,7 @@ class Plan(ABC):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the plan to one `.npz` file, atomically. The file is data: reading it runs nothing.
+        """Write the plan to one `.npz` file atomically. It contains only data: reading it executes nothing.
 
         Raises:
             ProblemError, OSError: As in `Solution.save`; or a machine of an unknown kind.
@@ -279,7 +279,7 @@ class Plan(ABC):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
-        """Read a file that `save` wrote. Of the candidates, only the plan has its solution.
+        """Read a file that `save` has written; only the plan itself has its solution, other candidates have none.
 
         The problem is declared again from the request by the planner's own code, so that the audit checks the motion
         against the machine, limits, tasks and obstacles of the request. The bound and the other candidates are read as
@@ -339,7 +339,7 @@ class Plan(ABC):
         return np.asarray(np.clip(times, 0.0, self.horizon))
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
-        """Return the poses of the tip at checked times (M,). Shape (M, 7)."""
+        """Return the poses of the tip at times (M,) that have been checked. Shape (M, 7)."""
         return tip_poses(self.machine, bases, joints)
 
 

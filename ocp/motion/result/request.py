@@ -304,7 +304,7 @@ def _traced(name: str, track: Callable[[Any], Any]) -> Any:
 
 
 def restored_request(record: Any) -> MotionRequest:
-    """Rebuild a request from a record of `stored_request`, whose contents are checked because files are not trusted.
+    """Rebuild a request from a record of `stored_request`, after checks because files are not trusted.
 
     Raises:
         ProblemError: The record is damaged.

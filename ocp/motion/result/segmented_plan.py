@@ -194,7 +194,7 @@ class ConsecutivePlans(Plan):
         return [self._jump_finding(name) for name in names] if len(self.pieces) > 1 else []
 
     def _jump_finding(self, name: str) -> Finding:
-        """Return the largest difference of "joints", "rates" or "base" from the end of a motion to the next one."""
+        """Return the finding about the largest jump of "joints", "rates" or "base" between consecutive motions."""
         jumps = [
             np.abs(after.plan.at(0.0)[name] - before.plan.at(before.plan.horizon)[name])
             for before, after in pairwise(self.pieces)

@@ -218,7 +218,7 @@ class SolvedPlan(Plan):
     # ---- time of the motion and time of the solution -----------------------------------------------------------------
 
     def _check_parts(self) -> None:
-        """Raise ValueError if the parts do not match the solution, or its joints not the machine."""
+        """Raise ValueError unless the parts match the solution, and its joints match the machine."""
         ends = [0.0, *(part.end for part in self.parts)]
         contiguous = all(part.begin == end < part.end for part, end in zip(self.parts, ends, strict=False))
         clock = self.solution.states.get(CLOCK)
@@ -318,7 +318,7 @@ class PhasedPlan(SolvedPlan):
 
     @cached_property
     def _joint_indices(self) -> dict[str, NDArray[np.intp]]:
-        """Indices of the joints of the first machine in the joint vector of each phase, by phase. Shape (n,)."""
+        """For each phase, the indices of the first machine's joints in the phase's joint vector. Shape (n,)."""
         orders = {}
         for name, machine in zip(self.phases, self.machines, strict=True):
             joints = list(machine.robot.joint_names)

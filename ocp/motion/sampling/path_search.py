@@ -50,7 +50,7 @@ class RandomTreeSettings:
 
 @dataclass(frozen=True, eq=False)
 class TreeSearch:
-    """Request for a path between a start and goals by random trees.
+    """Settings and bounds of a search for a path from a start to goals by random trees.
 
     Attributes:
         motions: Proofs of clearance.

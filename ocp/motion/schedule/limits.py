@@ -183,7 +183,7 @@ class LineLimits:
 
 
 def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, zero: bool = False) -> None:
-    """Raise ProblemError unless a limit is positive, of at most these dimensions, and finite if `finite`.
+    """Raise ProblemError unless a limit is positive, of at most `dimensions` dimensions, and finite if required.
 
     With `zero` it may also be 0.
     """
@@ -285,7 +285,7 @@ def rates_along(joints: JointPath, distance: Array) -> JointRates:
 
 
 def curvature_along(path: PathLike, distance: Array) -> Array:
-    """Return the curvature at distances (M,), 1/m; ProblemError for a wrong shape or a value that is not finite."""
+    """Return the curvature at distances (M,), 1/m; raise ProblemError if it has a wrong shape or is not finite."""
     value = np.asarray(path.curvature(distance), dtype=float)
     if value.shape != np.shape(distance):
         message = f"the path's curvature has shape {value.shape}, expected {np.shape(distance)}"
@@ -327,7 +327,7 @@ def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Ar
 
 
 def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -> None:
-    """Raise ProblemError for jerk limits of joints or tool on a path whose curvature jumps, where it jumps most."""
+    """Raise ProblemError if joint or tool jerks are limited although the path's curvature jumps."""
     joints_limited = joints is not None and np.isfinite(limits.of_joints(len(joints.names))[2]).any()
     tool_limited = limits.tool is not None and np.isfinite(limits.tool.jerk).any()
     jumps = path.curvature_jumps() if joints_limited or tool_limited else np.zeros(0)
@@ -421,7 +421,7 @@ def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[s
 
 
 def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
-    """Return the number of acceleration rows that are torques; they come last."""
+    """Return the number of torque rows, which are the last of the acceleration rows."""
     if joints is None or not np.isfinite(limits.torques(len(joints.names))).any():
         return 0
     return len(joints.names)
@@ -449,7 +449,7 @@ def limit_rows(
 
 
 def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
-    """Return the limit coefficients at the distances of one block."""
+    """Return the limit coefficients at distances of at most one block."""
     speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _names_by_kind(limits, joints))
     if not s.size:
         return Rows(speed[:, :, 0], acceleration, jerk)

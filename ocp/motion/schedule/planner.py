@@ -246,7 +246,7 @@ class Schedule:
         return self.profile.at_distance(distance).t
 
     def sample(self, period: float) -> LineMotion:
-        """Return the motion every `period` s from the start; the last sample, at the end, may come earlier.
+        """Return the motion every `period` s from the start, and at the end.
 
         Raises:
             ProblemError: The period is not positive, or too short.

@@ -35,7 +35,7 @@ class LineMotion(NamedTuple):
 
 
 def integrate_jerk(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple[Any, Any, Any]:
-    """Return distance, speed and acceleration after a time of constant jerk; numbers, arrays or CasADi."""
+    """Return distance, speed and acceleration after a time at constant jerk, for numbers, arrays or CasADi."""
     s = time * (speed + time * (acceleration / 2 + time * jerk / 6))
     return s, speed + time * (acceleration + time * jerk / 2), acceleration + time * jerk
 

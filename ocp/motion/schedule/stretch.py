@@ -186,7 +186,7 @@ def _seam_shares(window: Window, seam: int) -> Array:
 
 
 def _without_jerk(window: Window, margins: Margins) -> Array:
-    """Return the highest squared speeds at the nodes without jerk limits, by a forward and a backward pass."""
+    """Return the highest squared speeds at nodes if jerks are unlimited, by a forward and a backward pass."""
     grid = window.grid
     left, right = window.rows[0], window.rows[-1]
     h = np.diff(window.nodes)[:, None]

@@ -137,7 +137,7 @@ def _numbers(what: str, value: Any) -> Array:
 
 
 def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, Array, Array]:
-    """Return joints, velocities, accelerations and jerks in a motion along the path. Shape (M, n) each.
+    """Return joints, velocities, accelerations and jerks for a motion along the path. Shape (M, n) each.
 
     q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
     """

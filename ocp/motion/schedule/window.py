@@ -151,7 +151,7 @@ class Margins(NamedTuple):
 
 @dataclass(eq=False)
 class EnforcedRows:
-    """Limit rows that are enforced in a window, with their margins.
+    """Limit rows that are enforced in a window, and the margins of the limits.
 
     Attributes:
         margins: Shares of the bounds, lowered where bounds are violated although their rows are enforced there.

@@ -115,7 +115,8 @@ class CellSearch:
     """Cell search for motions of a floating machine, from start configurations through all stretches of a request."""
 
     def __init__(self, request: PlanRequest, configurations: Array, settings: CellSettings = CellSettings()) -> None:
-        """
+        """Run the search passes, from few states to many.
+
         Args:
             request: The request.
             configurations: Joints at the start. Shape (K, n).
@@ -282,7 +283,7 @@ class _CellPass:
         return expanded.select(best), limit_counts
 
     def _sample_self_motions(self, count: int, r: int) -> Array:
-        """Sample self-motions of each state, as coordinates in its null space. Shape (count, C, r)."""
+        """Return random self-motions of each state as coordinates in its null space. Shape (count, C, r)."""
         levels = self._settings.levels
         share = np.linspace(-1.0, 1.0, levels)
         rates = self._max_rate * np.sign(share) * share**2  # finer near zero, where most motions are

@@ -178,7 +178,8 @@ class SelfMotionManifolds:
     def __init__(
         self, space: JointSpace, equations: TaskEquations, targets: Array, settings: ChartSettings = ChartSettings()
     ) -> None:
-        """
+        """Prepare the equations of the manifolds at all time samples.
+
         Args:
             space: Joint space of a machine on a fixed base.
             equations: Equations of pose tasks.
@@ -224,7 +225,7 @@ class SelfMotionManifolds:
         return np.vstack([listed, *(solution.joints for solution in random)])
 
     def linearize(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
-        """Return the task errors (M, m) and their Jacobians in the scaled joints (M, m, n)."""
+        """Return the task errors (M, m) and their Jacobians by the scaled joints (M, m, n)."""
         error, jacobian = self._sampler(joints, self.targets[layer])
         m, n = error.shape[1], joints.shape[1]
         return error, jacobian.reshape(-1, n, m).transpose(0, 2, 1) / self.space.scale
@@ -379,7 +380,7 @@ class SelfMotionManifolds:
         return charts
 
     def split(self, charts: Charts) -> SplitCharts:
-        """Replace charts by charts of half the radius; a chart stays if its halves cannot be projected."""
+        """Replace charts by charts of half the radius; a chart is kept if its halves cannot be projected."""
         r = charts.tangents.shape[2]
         signs = np.array(list(product((-0.5, 0.5), repeat=r))).reshape(2**r, r)
         offsets = charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)

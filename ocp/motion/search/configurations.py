@@ -183,7 +183,7 @@ class PlanRequest:
 
     @cached_property
     def turning_joints(self) -> NDArray[np.intp]:
-        """Indices of the joints that may start in several full turns; none if the start is given."""
+        """Indices of the joints that may start in different full turns; none if the start is given."""
         if self.start is not None:
             return np.zeros(0, dtype=np.intp)
         return turning_joints(self.machine.robot, self.bounds.lower, self.bounds.upper)

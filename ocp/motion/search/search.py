@@ -100,7 +100,8 @@ class AtlasSearch:
         scene: CollisionScene | None = None,
         settings: SearchSettings = SearchSettings(),
     ) -> None:
-        """
+        """Build the atlas at all time samples.
+
         Args:
             space: Joint space.
             samples: Manifolds of the time samples, by rising time.
@@ -151,7 +152,7 @@ class AtlasSearch:
         return atlas
 
     def without_collisions(self, charts: Charts, k: int) -> Charts:
-        """Return the charts of a time sample without those on which every configuration is in collision."""
+        """Return the charts of a time sample except those whose configurations are all in collision."""
         return charts.select(self._collision_free(charts, k))
 
     def _collision_free(self, charts: Charts, k: int) -> NDArray[np.bool_]:
@@ -383,7 +384,7 @@ class AtlasSearch:
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 
     def _can_split(self, layers: list[Charts], max_charts: int) -> bool:
-        """Return whether the charts may be halved: their number stays within `max_charts`, and none gets too small."""
+        """Return whether the charts may be halved without exceeding `max_charts` or becoming too small."""
         count = sum(2 ** charts.tangents.shape[2] * len(charts) for charts in layers)
         return count <= max_charts and max(float(charts.radii.max()) for charts in layers) >= self.settings.finest
 

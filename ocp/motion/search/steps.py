@@ -47,7 +47,7 @@ class QuadraticBounds(NamedTuple):
 
     @classmethod
     def constant(cls, least: Array, free: int) -> QuadraticBounds:
-        """Return constant bounds on charts with `free` directions."""
+        """Return constant bounds on charts that have `free` dimensions."""
         return cls(least, np.zeros((len(least), free)), np.zeros((len(least), free, free)))
 
     def minimum(self, low: Array, high: Array) -> tuple[Array, Array]:
@@ -101,9 +101,7 @@ class StepCost(ABC):
     def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
     ) -> tuple[Array, Array]:
-        """Return cost (P,) and chart coordinates (P, r) of the cheapest steps into P charts at distances `delta` (P,
-        n).
-        """
+        """Return cost (P,) and chart coordinates (P, r) of the lowest-cost steps into charts at distances (P, n)."""
 
     @abstractmethod
     def lower_bounds(
@@ -475,7 +473,7 @@ def _lowest_eigenvalue(square: Array) -> Array:
 
 
 def _raise_eigenvalues(square: Array, floor: float) -> tuple[Array, Array]:
-    """Raise the eigenvalues of symmetric matrices (r, r, P) to a floor; also return the largest increases (P,)."""
+    """Raise the eigenvalues of symmetric matrices (r, r, P) to a minimum; also return the largest increases (P,)."""
     excess = np.maximum(floor - _lowest_eigenvalue(np.moveaxis(square, -1, 0)), 0.0)
     rows = np.flatnonzero(excess > 0)
     if rows.size:

@@ -72,7 +72,8 @@ class TaskSearch:
     def __init__(
         self, request: PlanRequest, motions: list[LocalMotion], settings: SampleSettings = SampleSettings()
     ) -> None:
-        """
+        """Choose the time samples and search at them.
+
         Args:
             request: The request.
             motions: Local motions through its stretches; the best one determines where samples are needed.

@@ -72,7 +72,8 @@ class ChartGraph:
         *,
         settings: GraphSettings = GraphSettings(),
     ) -> None:
-        """
+        """Build the graph of charts and possible steps.
+
         Args:
             space: Joint space.
             layers: Charts of each time sample.
@@ -92,7 +93,7 @@ class ChartGraph:
     def cost_to_go(
         self, cost_to_come: list[QuadraticBounds] | None = None, max_cost: float = np.inf
     ) -> list[QuadraticBounds]:
-        """Return lower bounds of the cost-to-go on the charts of each sample.
+        """Return lower bounds of the remaining cost (cost-to-go) on the charts of each sample.
 
         Motions that cost at least `max_cost` in all, by bounds of the `cost_to_come`, are left out.
         """
@@ -101,7 +102,7 @@ class ChartGraph:
     def cost_to_come(
         self, cost_to_go: list[QuadraticBounds] | None = None, max_cost: float = np.inf
     ) -> list[QuadraticBounds]:
-        """Return lower bounds of the cost-to-come on the charts of each sample."""
+        """Return lower bounds of the previous cost (cost-to-come) on the charts of each sample."""
         return self._sweep(range(len(self.layers)), 1, cost_to_go, max_cost)
 
     def reachable(self) -> list[NDArray[np.bool_]]:

@@ -226,7 +226,7 @@ def _frame(part: BoundTask) -> str:
 
 
 def _sampled(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
-    """Return equidistant times (count,) and the targets there, one column each."""
+    """Return `count` equidistant times, and the targets at these times, one column each."""
     times = np.linspace(0.0, horizon, count)
     return times, np.array(equations.target_function().map(count)(times[None, :]))
 
@@ -354,7 +354,7 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
 
 
 def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array) -> tuple[float, float]:
-    """Return the largest speed, m/s, and angular speed, rad/s, of the tip with joints at their rate limits (n,)."""
+    """Return the largest speed, m/s, and angular speed, rad/s, of the tip within joint rate limits (n,)."""
     linear, angular = 0.0, 0.0
     whole = machine.robot.path_to(machine.robot.tip_link)
     after = {joint.name: whole[i + 1 :] for i, joint in enumerate(whole)}
@@ -366,7 +366,7 @@ def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array
 
 
 def _task_speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
-    """Return the speed and angular speed of a task in its rows, m/s and rad/s. Shape (M,) each."""
+    """Return the speed, m/s, and angular speed, rad/s, that the rows of a task prescribe. Shape (M,) each."""
     angular_rows = [row for row in task.chosen if row in ANGULAR]
     if task.is_pose:
         angular = targets[-3:] if task.tilts else targets[-3:][angular_rows]

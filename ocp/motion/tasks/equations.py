@@ -169,7 +169,7 @@ class TaskEquations:
 
     @on_scalars
     def twist(self, base: Any, joints: Any, rates: Any) -> Any:
-        """Return the velocities of the tips in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
+        """Return the tip velocities in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
         rows = []
         for part in self.bound:
             twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
@@ -366,13 +366,13 @@ class TaskEquations:
         return np.array(self.function.map(count)(bases.T, positions.T, targets)[2]).reshape(-1, count).T
 
     def _along(self, t: Any, base: Any, joints: Any) -> tuple[Array, Array, Any]:
-        """Return base (M, base_size), joints (M, joint_size) and targets as columns, at samples of a motion."""
+        """Return base (M, base_size), joints (M, joint_size) and targets (one column each) along a motion."""
         times, positions = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
         bases = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
         return bases, positions, self.target_function().map(len(times))(times[None, :])
 
     def cone_violations(self, t: Any, base: Any, joints: Any) -> Array:
-        """Return by how much tool axes leave their cones, rad; arguments as for `errors`. Shape (M, k)."""
+        """Return the angles by which tool axes leave their cones, rad. Shape (M, k)."""
         bases, positions, targets = self._along(t, base, joints)
         if not self.cone_angles.size:
             return np.zeros((len(positions), 0))
@@ -441,7 +441,7 @@ class TaskEquations:
 
 
 def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
-    """Return a position track with all three coordinates, zero where the task leaves them out. Shape (3, 1)."""
+    """Return a position target with all three coordinates; those that the task lacks are zero. Shape (3, 1)."""
     short = task.along_reference and len(task.linear) < 3
     shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
     value = track_expression(track, time, shapes, what=name, begin=task.begin)

@@ -50,7 +50,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Return a start, its checked joints (n,) and its base (base_size,).
+        """Return a start whose joints are given, its checked joints (n,), and its base (base_size,).
 
         Args:
             value: A start with joints, or joints.
@@ -64,7 +64,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Goal:
-    """End of a motion, or of one part of it: joints, or a pose of the tip.
+    """End of a motion or of a part of it, given by joints or by a pose of the tip.
 
     Attributes:
         joints: Joints, nan where free. Shape (n,), rad or m.

@@ -224,7 +224,7 @@ LIMITED = ("velocity", "acceleration", "jerk", "torque", "power")
 
 
 class JointBounds(NamedTuple):
-    """Limits of every joint, infinite where there is none. Shape (n,) each; rad or m, s, N m or N, W.
+    """Limits of every joint, infinite where there is none, in rad or m, s, N m or N, W. Shape (n,) each.
 
     Attributes:
         lower, upper: Position limits.

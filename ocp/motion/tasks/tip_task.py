@@ -230,7 +230,7 @@ class TipTask:
 
 
 def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
-    """Return a task over a path parameter as a task over time.
+    """Convert a task over a path parameter to a task over time.
 
     Args:
         task: Task whose tracks are functions of the parameter and whose velocity is per unit of it.
@@ -278,7 +278,7 @@ def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
 
 
 def reference_pose(part: BoundTask, base: Any, joints: Any) -> Frame | None:
-    """Return the pose of the reference frame in the world, None if the reference is the world."""
+    """Return the pose of the reference frame in the world; None if the reference is the world."""
     return None if part.reference is None else part.reference.tip_pose(base, joints)
 
 
@@ -346,9 +346,7 @@ def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
 
 
 def target_twist(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the twist of the target relative to the reference plus the fed-back pose error, in world axes. Shape (6,
-    1).
-    """
+    """Return the target's twist relative to the reference plus pose feedback, in world axes. Shape (6, 1)."""
     position_target, rotation_target = split_targets(part.task, targets)
     reference = reference_pose(part, base, joints)
     angular = ca.DM(3, 1) if rotation_target is None else rotation_target[1]

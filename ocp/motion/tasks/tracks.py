@@ -193,7 +193,7 @@ def reparametrized(track: Track, clock: Callable[[Any], Any]) -> Track:
 
 
 def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]:
-    """Return rotation (3, 3) and position (3,) of a numeric pose, checked."""
+    """Return rotation (3, 3) and position (3,) of a numeric pose after checks."""
     try:
         orientation, position = (np.array(ca.DM(expression(part))) for part in pose)
     except NOT_NUMBERS as error:

@@ -173,7 +173,7 @@ def capture_problem(
     cost: Cost | None = None,
     clearance_constraints: ClearanceConstraints | None = None,
 ) -> Phases:
-    """Declare approach, grasp and detumbling of least total cost.
+    """Declare approach, grasp and detumbling with the least total cost.
 
     The phases "approach" and "detumble" have the states and controls of `dynamics_problem`. The configuration of the
     target is the state "target" of the first, and follows from that of the chaser in the second. Wheel angles count
@@ -222,7 +222,7 @@ def solve_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> Solution:
-    """Solve `capture_problem` and audit the solution; the limits hold between the nodes, too.
+    """Solve `capture_problem` and audit the solution, whose limits also hold between the nodes.
 
     Args:
         chaser, capture, start, limits, cost, clearance_constraints: As for `capture_problem`.
@@ -260,7 +260,7 @@ def chained_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> tuple[Solution, Solution]:
-    """Solve the approach alone, then the detumbling from its end; the joint solution of `solve_capture` costs less.
+    """Solve the approach alone, then the detumbling from its end, which costs more than `solve_capture`.
 
     Args, Raises: As for `solve_capture`.
 

@@ -112,7 +112,7 @@ def motion_of(problem: Problem) -> tuple[Any, Any, Any]:
 
 
 def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> tuple[Any, Any]:
-    """Return force and moment about the tip that the hand applies to the target, in world axes. Shape (3, 1) each.
+    """Return the force and the moment about the tip that the hand exerts on the target, world axes. Shape (3, 1).
 
     They are the rates of the target's momentum, m c'' and (I w)' about its centre of mass.
     """
@@ -159,7 +159,7 @@ GUESS = GuessSettings()
 
 
 def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
-    """Return the configurations of a free body at evenly spaced times, by Runge-Kutta of order four.
+    """Return the configurations of a freely floating body at evenly spaced times, by Runge-Kutta of order four.
 
     Shape (M, base_size) at times (M,), s.
     """
@@ -365,7 +365,7 @@ ROUNDING = 1e-9
 
 
 class State(NamedTuple):
-    """Initial state of a capture, and its longest durations.
+    """Initial state of a capture, and the longest durations of its phases.
 
     Attributes:
         base, joints, velocities: State of the chaser; nan for free velocities.
@@ -432,7 +432,7 @@ def require_capacity(machine: FreeFloating, momentum: Array, capacity: float) ->
 
 
 def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earliest: float) -> None:
-    """Raise ProblemError if the grasp is out of reach of the arm at all times.
+    """Raise ProblemError if the arm cannot reach the grasp at any time.
 
     Both centres of mass drift uniformly. The tip is never farther from the chaser's centre of mass than with the arm
     stretched.

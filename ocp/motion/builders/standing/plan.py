@@ -78,7 +78,7 @@ PACE = PaceSettings()
 def guess_in_time(
     steps: Steps, start: Any, step_options: Mapping[str, Any], options: Mapping[str, Any]
 ) -> dict[str, Any] | None:
-    """Return a guess for `steps_problem` in the requested durations from a coarse mesh; None if there is none.
+    """Return a guess for `steps_problem` with the requested durations, from a coarse mesh; None without one.
 
     Args:
         step_options: Cost and limits of steps_problem.
@@ -177,7 +177,7 @@ def _too_fast(
 
 
 def _active_limits(problem: Phases, coarse: Solution, phase: str) -> str:
-    """Describe which limits are active in a phase, and for which share of it."""
+    """Describe which limits are active in a phase, and for what share of it."""
     form = Formulation.of(problem)
     at = np.linspace(0.0, 1.0, PACE.samples)
     x, u = coarse.state_interpolant(at), coarse.control_interpolant(at)

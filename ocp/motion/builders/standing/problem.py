@@ -73,7 +73,7 @@ __all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_co
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the cost, an integral over the motion plus `time` times a free final time.
+    """Weights of the cost, an integral over the motion plus `time` times the free final time.
 
     Attributes:
         acceleration, velocity, jerk: Weights of the sums of squares over the joints.
@@ -310,7 +310,7 @@ def _motion(
     guess: Mapping[str, Any],
     setup: StandingSetup,
 ) -> tuple[tuple[Any, Any, Any], Any]:
-    """Declare joint positions, velocities and accelerations; also jerks, empty if these are no controls."""
+    """Declare joint positions, velocities and accelerations, and jerks if these are controls, else an empty column."""
     n = len(begin)
     joints = problem.state(
         "joints", n, initial=begin, terminal=setup.end, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"],

@@ -32,7 +32,7 @@ __all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Settings of the check of a start at rest, and of the guess.
+    """Settings of the check whether a motion can start from rest, and of the first guess.
 
     Attributes:
         violation: Relative violation of a limit that is tolerated.

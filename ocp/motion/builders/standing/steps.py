@@ -235,7 +235,7 @@ def _load(problem: Problem, stance: Stance, name: str) -> Any:
 
 
 def _limit_load(problem: Problem, stance: Stance, name: str, load: Any, options: _Options) -> None:
-    """Constrain a foot's load to what its sole can bear; a grip bears any load."""
+    """Constrain a foot's load to what its sole can bear; the load of a grip is not limited."""
     if stance.feet[name].sole is None:
         return
     least = 0.0 if options.limits.vertical_force is None else float(options.limits.vertical_force)
