@@ -226,8 +226,9 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """Solve the cubic of a pencil of conics: return t = l / r in [-1, 1] with 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) +
-    q^2 (t + 1) = 0.
+    """Return the root t = l / r in [-1, 1] of the cubic of a pencil of conics.
+
+    The cubic is 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0.
     """
     b2 = -a0 / r
     b1 = (p * p + q * q) / (4 * r * r) - 1

@@ -229,7 +229,7 @@ def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Traje
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Alternative starts of a solver.
+    """Settings of the alternative starts of a solver.
 
     Attributes:
         horizon: Factor on the guess of a free horizon when starting from zeros: a long horizon contains a feasible

@@ -151,9 +151,7 @@ class BoundaryProblem:
         return side_by_side(parts)
 
     def _integrator(self, places: np.ndarray) -> Any:
-        """Return the function (y, q) -> (y at ``places``, integrals of L and dH/dT); q = [t0, duration, T, p, bang,
-        guess].
-        """
+        """Return the integrator of a segment, a function (y, q) -> (y at ``places``, integrals of L and dH/dT)."""
         ham = self.ham
         sizes = ham.sizes
         flow = ham.flow()

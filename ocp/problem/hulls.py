@@ -77,9 +77,7 @@ class Hull:
 
     @cached_property
     def kind(self) -> int:
-        """Group of hulls that are evaluated together: 0 for boxes, else the number of points, rounded up to a power of
-        two.
-        """
+        """Group of hulls that are evaluated together: 0 for boxes, else the number of points as a power of two."""
         return 0 if is_box(self.core) else 1 << (len(self.core) - 1).bit_length()
 
     @cached_property
@@ -259,8 +257,9 @@ class BodyPairs:
         return self._ball_distance(second - first, pair)
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return distances of all pairs at all samples, shape (M, n), m; those above `near` may be lower bounds above
-        `near`. With `pairs`, the indices of the only pairs that count, the others are infinite.
+        """Return the distances of all pairs at all samples; above `near` they may be lower bounds. Shape (M, n), m.
+
+        With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
         distances = self.all_balls(frames)
         count = distances.shape[1]

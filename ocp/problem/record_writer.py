@@ -98,9 +98,7 @@ class FunctionWriter:
         return number
 
     def _leaf(self, record: dict[str, Any]) -> Any:
-        """Store a function as one record, without splitting it into operations, and return the function rebuilt from
-        the record.
-        """
+        """Store a function as a single record, without its operations; return the function rebuilt from it."""
         function = BUILDERS[record["kind"]](record, ())
         self._alive.append(function)
         self._append(function.__hash__(), record, function)

@@ -374,9 +374,7 @@ def least_cost_roll(
 
 
 def _lowest_cost_path(stage: Array, away: Any, spans: Array, rate_weight: float, rate_limit: float, step: float) -> Any:
-    """Return the roll index at each time on the lowest-cost path through the grid, with a penalty beyond the rate
-    limit.
-    """
+    """Return the roll index at each time on the lowest-cost path, with a penalty beyond the rate limit."""
     weights = np.convolve(np.append(spans, 0), [0.5, 0.5])[: len(stage)]
     weights[[0, -1]] = np.maximum(weights[[0, -1]], spans[[0, -1]] / 2)
     penalty = 1e3 * (np.ptp(stage[np.isfinite(stage)]) + rate_weight + 1e-9)

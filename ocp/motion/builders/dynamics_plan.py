@@ -453,9 +453,7 @@ def _attempts(
 def _tightened(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
-    """Tighten the limits so that a plan satisfies them between the nodes; return it if it costs hardly more, or the
-    error.
-    """
+    """Tighten the limits so that they hold between the nodes; return the plan if it costs hardly more, or an error."""
     if largest_excess(problem, plan) <= HOLDING.excess:
         return plan
     own, largest = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.cost_increase * abs(plan.cost)

@@ -278,7 +278,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class AccelerationSolution:
-    """Motion of an acceleration-level law.
+    """Motion that results from an acceleration-level control law.
 
     Attributes:
         law: The law.

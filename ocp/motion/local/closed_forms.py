@@ -243,9 +243,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function of a pose and angles of x and z -> two solutions, their excess over the reach, and the lever arm of
-        y.
-        """
+        """Function of a pose and angles of x and z -> two solutions, excess over the reach, lever arm of y."""
         symbols, (x, y, z, *triple), order, goal = self._loop()
         angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"
         before, after = z.frame(angles[1]), compose(inverse(x.frame(angles[0])), goal)

@@ -54,7 +54,7 @@ PRODUCTS = _half_angle_products()
 
 @dataclass(frozen=True)
 class EliminationSettings:
-    """Settings of the elimination.
+    """Settings of inverse kinematics by elimination.
 
     Attributes:
         rank: Singular values of the eliminated products below this share of the largest count as zero.

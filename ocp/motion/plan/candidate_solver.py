@@ -320,8 +320,7 @@ class CandidateSolver(Solver):
 
         An interior-point method with barrier parameter mu leads to a point whose cost exceeds the least one by mu for
         each limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier
-        alone determines where
-        it leads: far away from the bodies, into another homotopy class.
+        alone determines the result: a motion far away from the bodies, in another homotopy class.
         """
         declared = motion.problem.declared
         min_barrier = self.settings.negligible_rate * motion.horizon

@@ -284,9 +284,7 @@ class _Search:
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
     def guess(self, path: Array) -> tuple[Array, float]:
-        """Return initial control points along a path, and a duration with which a motion from rest to rest keeps its
-        rate limits.
-        """
+        """Return control points along a path, and a duration that keeps the rate limits from rest to rest."""
         p, ramp = self.degree, self.settings.ramp
         at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
         top = 1 / (1 - ramp)

@@ -5,9 +5,8 @@ If a task leaves r of n joint directions free, the configurations that do it at 
 there (the self-motions), and a box in the tangent space near the manifold.
 
 The atlas grows from the solutions of inverse kinematics at all time samples. Wherever the edge of a chart lies in no
-other chart, the next chart is put there, until the union of the charts has no edge except at the joint limits
-(Henderson 2002, Multiple parameter continuation, Int. J. Bifurcation and Chaos 12). Connected components are covered
-completely, also at folds and bifurcations.
+other chart, the next chart is put there, until the charts have no edge except at the joint limits (Henderson 2002, Int.
+J. Bifurcation and Chaos 12). Components are covered completely, also at folds and bifurcations.
 """
 
 from __future__ import annotations
@@ -425,7 +424,7 @@ class SelfMotionManifolds:
     def is_covered(
         self, charts: Charts, layer: Indices, joints: Array, excluded: Indices | None = None
     ) -> NDArray[np.bool_]:
-        """Return which configurations lie in any chart, or in any except the one that `excluded` names. Shape (M,)."""
+        """Return which configurations lie in any chart, or in any except that in `excluded`. Shape (M,)."""
         if not len(layer) or not len(charts):
             return np.zeros(len(layer), dtype=bool)
         r = charts.tangents.shape[2]
