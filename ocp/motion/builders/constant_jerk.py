@@ -108,8 +108,7 @@ def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) 
 
 
 def least_durations(distances: Array, bounds: JointBounds) -> Array:
-    """Return the least duration of each joint alone, from rest to rest within its velocity, acceleration and jerk
-    limits.
+    """Return the least duration of each joint alone, from rest to rest within velocity, acceleration and jerk limits.
 
     Args:
         distances: Absolute distances, rad or m. Shape (..., n).

@@ -264,8 +264,7 @@ class _MultiStart:
     options: IkOptions = IK_OPTIONS
 
     def solve(self, first: Array, random: int) -> list[IkSolution]:
-        """Return the solutions from starts (K, n), the best first; unlimited angles of the last `random` ones are
-        wrapped.
+        """Return the solutions from starts (K, n), best first; unlimited angles of the last `random` are wrapped.
 
         Raises:
             Unreachable: There is no solution.

@@ -142,8 +142,7 @@ class SpeedProfile:
         return self.at(np.concatenate([self.t, self.t[:-1][inside] + zero[inside]]))
 
     def function(self) -> Any:
-        """Return the CasADi function time (s) -> (distance, speed, acceleration, jerk), with MX tables for code
-        generation.
+        """Return the CasADi function time (s) -> (distance, speed, acceleration, jerk), with its tables as MX.
 
         Times outside are clipped to the ends.
         """

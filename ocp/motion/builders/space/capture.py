@@ -428,8 +428,7 @@ class _Capture:
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base at a time from its attitude and the joints; no force acts, so the centre of mass moves
-        evenly.
+        """Return the base at a time from its attitude and the joints, since the centre of mass moves uniformly.
 
         The position of the centre of mass and the norm of the quaternion are conserved by the dynamics. Continuity of
         them would be a condition that no control influences, and would leave the second-order conditions undetermined.
