@@ -260,7 +260,7 @@ class Comparison:
 
     @property
     def worst(self) -> float:
-        """The largest difference."""
+        """The largest of all differences."""
         differences = (self.cost_difference, self.horizon_difference, self.state, self.control, self.costate)
         return max(*differences, self.hamiltonian)
 

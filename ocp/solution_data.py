@@ -142,7 +142,7 @@ def plain(value: Any) -> Any:
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """Stack arrays (M, n) side by side; with no arrays, return an empty array with as many rows as ``like``."""
+    """Stack arrays (M, n) side by side; without any arrays, return an empty array with ``like`` rows."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 

@@ -251,7 +251,7 @@ def _declared(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the problem over a span of the reference time theta, in scaled units."""
+    """Declare the problem over a span of theta, in scaled units; `along` returns reference speed and path columns."""
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
     speeds = np.asarray(path.by_piece(limits.speed))
@@ -292,7 +292,7 @@ def _declared(
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Return the ratios of limited quantities to their limits, by name."""
+    """Return the ratios of quantities to their limits by name; `values` are reference speed and path columns."""
     demands: dict[str, Any] = {}
     if np.isfinite(limits.centripetal):
         demands["centripetal acceleration"] = v**2 * values[2] / limits.centripetal

@@ -95,7 +95,7 @@ def shorten(
 
 
 def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, *, rungs: int = 32) -> bool:
-    """Return whether straight motions between points at equal fractions of two paths are collision-free (homotopy).
+    """Return whether two paths are homotopic, as shown by collision-free straight motions at equal fractions.
 
     Paths of one homotopy class need not satisfy this; paths that do can replace each other as guesses. They are
     compared at as many places as there are `rungs`.

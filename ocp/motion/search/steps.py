@@ -285,7 +285,7 @@ class SquaredRateBounds:
         return value + _dot(places, products / 2 + self.slope), _rows_first(slope)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return chart coordinates (P, r) where the bounds minus slope . t + t . curve . t / 2 are lower than here."""
+        """Return coordinates (P, r) that lower the bounds minus slope . t + t . curve . t / 2, starting at `places`."""
         end_place = self._minimize_after(_rows_last(places))[2]
         gradient = -_apply_transposed(self.rotation, self.projection + end_place) / self.seconds
         square = _multiply_transposed(self.rotation, self.rotation) / self.seconds + self.level - _rows_last(curve)
