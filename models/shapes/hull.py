@@ -229,7 +229,7 @@ def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _point_beside_box(point: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the same as `_between_segments` for points (K, 1, 3) and boxes (K, 8, 3), or two points."""
+    """Return the closest points of points (K, 1, 3) and boxes (K, 8, 3) or points, as `_between_segments` does."""
     on_point = point[:, 0]
     if box.shape[1] == 1:
         return on_point, box[:, 0], box[:, 0] - on_point

@@ -308,7 +308,7 @@ class _PairClassifier:
         return self._placed[key]
 
     def _pose(self, part: str) -> Poses:
-        """Return the poses of a rigid part relative to the root at the first random configurations."""
+        """Return the poses of a rigid part relative to the root at the first of the random configurations."""
         if part not in self._poses:
             q = self.configurations[: SETTINGS.first_configurations]
             step = self.parts.step.get(part)

@@ -452,7 +452,7 @@ class Cholesky:
 
 
 def _border(row: np.ndarray, column: np.ndarray, distance: np.ndarray, size: int) -> np.ndarray:
-    """Return the variables of the border, with most entries far from the diagonal; their number minimises the work."""
+    """Choose the variables for the border of a banded matrix, so that its factorisation takes little work."""
     degree = np.bincount(row, minlength=size) + np.bincount(column, minlength=size)
     is_border, border, least_work, count = np.zeros(size, dtype=bool), list[int](), np.inf, 0
     for k in np.argsort(-distance, kind="stable"):

@@ -443,7 +443,7 @@ def gather(vector: Any, index: np.ndarray) -> Any:
 
 
 def mapped(function: Any, block: Block, arguments: list[Any]) -> Any:
-    """Evaluate a block function in all its applications; the parameters (argument 2) are shared."""
+    """Evaluate a block function for every column of arguments; all share the parameters (argument 2)."""
     check_time()
     count = block.variables.shape[1]
     if count == 1:

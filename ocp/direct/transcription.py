@@ -392,7 +392,7 @@ class MeshedMethod(ABC):
         return self.with_mesh(np.union1d(nodes, (nodes[1:] + nodes[:-1]) / 2))
 
     def with_nodes_at(self, fractions: Any) -> Self:
-        """Return the method with additional nodes at fractions 0..1 of the horizon, for example where problems jump.
+        """Return the method with additional nodes at fractions 0..1 of the horizon, for example at jumps of a limit.
 
         A given mesh keeps its nodes. Without one the intervals between the fractions are equal and no wider than
         before.

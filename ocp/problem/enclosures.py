@@ -141,7 +141,7 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
 
 
 def _number(x: Interval) -> float | None:
-    """Return the number that an interval consists of if it is the same in all M intervals, else None."""
+    """Return the value of M intervals if all consist of the same single number, else None."""
     first = float(x.low[0])
     return first if bool((x.low == first).all() and (x.high == first).all()) else None
 

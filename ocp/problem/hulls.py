@@ -193,7 +193,7 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return, for the rows of K pairs and their covers, the pair and the index of each row. Shape (R,) each.
+        """List the rows of K pairs and of their covers: positions of their pairs in `pair`, and row indices, (R,) each.
 
         The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow.
         """

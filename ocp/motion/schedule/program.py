@@ -334,7 +334,7 @@ class _Constraints:
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
     def _spread(self, values: Iterable[Array]) -> Array:
-        """Sum values over the rows of each interval, and add the sums to its coefficients, or to pairs of them.
+        """Sum values over the rows of each interval, and add the k-th sums to the k-th coefficient of the interval.
 
         Shapes (M - `alone`,) each to (N + number of values - 1,).
         """

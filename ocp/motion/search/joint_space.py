@@ -62,7 +62,7 @@ class JointSpace:
         return np.asarray(delta)
 
     def length(self, displacement: Array) -> Array:
-        """Return the lengths of displacements (..., n) in the metric."""
+        """Return the lengths of joint displacements (..., n) in the metric of the space."""
         return np.asarray(np.linalg.norm(displacement * self.scale, axis=-1))
 
     def within(self, joints: Array) -> NDArray[np.bool_]:

@@ -261,7 +261,7 @@ class SectionSearch(AtlasSearch):
     """Search for paths on sections of self-motion manifolds, on each of which one joint has a constant value."""
 
     def __init__(self, *args: Any, joint: int, values: Array, radius: float, charts: int, **options: Any) -> None:
-        """Build the section curves at all time samples.
+        """Build the charts of all sections at all time samples.
 
         Args:
             args, options: As in `AtlasSearch`; all samples must belong to one `SelfMotionManifolds` of dimension two.

@@ -271,7 +271,7 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + _rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Return the step to t' = 0, and the least remaining cost over the end t' in its box."""
+        """Return the step to the end t' = 0, the least cost that the choice of t' in its box adds, and that t'."""
         start = self.projection - _apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 

@@ -359,7 +359,7 @@ def _concavity(values: Array, half: Array, curve: Array) -> Array:
 
 
 def _secant_slopes(values: list[Array], half: Array) -> Array:
-    """Return secant slopes of functions in boxes from values in the middle and at the ends of each axis. (M, r)
+    """Return slopes of functions in boxes, from values in the middle and at both ends of each axis. Shape (M, r).
 
     A concave function gets the slope from end to end, a convex one the flattest slope.
     """

@@ -181,7 +181,7 @@ class Steps:
         return Stance.on(self.robot, self.feet, footholds, self.gravity)
 
     def balanced(self, k: int) -> Array:
-        """Return a balanced position of the center of mass at the start of phase k, over the feet that stay on ground.
+        """Return a balanced position of the center of mass at the start of phase k, over the feet that stay down.
 
         It is the mean of the centers of their soles, or of their footholds if none has a sole. Shape (2,), m.
         """
