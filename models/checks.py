@@ -94,7 +94,7 @@ def frozen(array: Array) -> Array:
 
 
 def argument_of(label: str) -> str:
-    """Return the name of the argument, `scheme`, from a label such as `Collocation: scheme`."""
+    """Return the name of an argument from a label: `scheme` from `Collocation: scheme`."""
     return label.rpartition(" ")[2].strip("'")
 
 
@@ -119,7 +119,7 @@ class Checks:
         return self.error(words, name=argument_of(label), value=value, limit=limit)
 
     def unknown(self, kind: str, name: object, known: Iterable[str]) -> DetailedError:
-        """Return the error for a name that does not exist, with the most similar names, or else all."""
+        """Return the error for a name that does not exist; it lists similar known names, or all if none is similar."""
         names = [str(item) for item in known]
         by_case = {item.casefold(): item for item in reversed(names)}
         similar = [by_case[item] for item in get_close_matches(str(name).casefold(), by_case, n=3, cutoff=0.5)]
@@ -130,14 +130,14 @@ class Checks:
         return self.error(words, name=str(name) or kind, value=name, limit=tuple(names))
 
     def number(self, label: str, value: Any, *, finite: bool = True, unit: str = "") -> float:
-        """Return a number as a float; infinity is accepted unless `finite`."""
+        """Return a value as a float after checking that it is a number; with `finite`, infinity is rejected."""
         number = real(value)
         if isnan(number) or (finite and isinf(number)):
             raise self.invalid(label, ("a finite number" if finite else "a number") + _in(unit), value)
         return number
 
     def positive(self, label: str, value: Any, *, below: float = inf, unit: str = "") -> float:
-        """Return a number as a float that is above zero and less than `below`."""
+        """Return a value as a float after checking that it is a number above zero and less than `below`."""
         number = real(value)
         if not 0 < number < below:
             kind = "positive and finite" if below == inf else f"between 0 and {below:g}"
@@ -145,39 +145,39 @@ class Checks:
         return number
 
     def nonnegative(self, label: str, value: Any, *, unit: str = "") -> float:
-        """Return a number as a float that is finite, zero or above."""
+        """Return a value as a float after checking that it is a finite number, zero or above."""
         number = real(value)
         if not 0 <= number < inf:
             raise self.invalid(label, "a finite number, zero or above" + _in(unit), value, 0.0)
         return number
 
     def count(self, label: str, value: Any, least: int = 1, most: int = INPUT_LIMITS.count) -> int:
-        """Return an integer from `least` to `most`."""
+        """Return the value after checking that it is an integer from `least` to `most`."""
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or not least <= value <= most:
             raise self.invalid(label, f"a whole number, {least} to {most}", value, (least, most))
         return int(value)
 
     def choice(self, label: str, value: _Choice, choices: Iterable[Any]) -> _Choice:
-        """Return a value that is one of the choices, and of its type."""
+        """Return the value after checking that it is one of the choices and has the same type."""
         allowed = tuple(choices)
         if not any(isinstance(value, type(item)) and value == item for item in allowed):
             raise self.invalid(label, " or ".join(map(repr, allowed)), value, allowed)
         return value
 
     def flag(self, label: str, value: Any) -> bool:
-        """Return True or False."""
+        """Return the value after checking that it is True or False."""
         if not isinstance(value, bool | np.bool_):
             raise self.invalid(label, "True or False", value, (True, False))
         return bool(value)
 
     def text(self, label: str, value: Any) -> str:
-        """Return a string, which may be empty."""
+        """Return the value after checking that it is a string; it may be empty."""
         if not isinstance(value, str):
             raise self.invalid(label, "a string", value, "str")
         return value
 
     def name(self, label: str, value: Any) -> str:
-        """Return a string of printable characters, at least one, as terminals and shells act on others."""
+        """Return the value after checking that it is a non-empty string of printable characters."""
         limit = INPUT_LIMITS.name_characters
         if not isinstance(value, str) or not value:
             raise self.invalid(label, "a name, a string that is not empty", value)
@@ -186,7 +186,7 @@ class Checks:
         return value
 
     def instance(self, label: str, value: Any, kind: type[_Kind]) -> _Kind:
-        """Return an instance of a class."""
+        """Return the value after checking that it is an instance of a class."""
         if not isinstance(value, kind):
             raise self.invalid(label, f"a {kind.__name__}", value, kind.__name__)
         return value
@@ -201,7 +201,7 @@ class Checks:
         return tuple(self.instance(label, item, kind) for item in items)
 
     def mapping(self, label: str, values: Any, keys: type = str) -> dict[Any, Any]:
-        """Return a copy of a dictionary with keys of one class, empty for None."""
+        """Return a copy of a dictionary after checking the class of its keys; an empty one for None."""
         if not isinstance(values, Mapping | None) or not all(isinstance(key, keys) for key in values or ()):
             raise self.invalid(label, "a dictionary by name", values)
         return dict(values or {})
@@ -257,7 +257,7 @@ class Checks:
         sign: Sign = "any",
         unit: str = "",
     ) -> Array:
-        """Return one float for each of `count` items, from one number or from one each. Shape (count,).
+        """Return one float for each of `count` items, from one number for all or one for each. Shape (count,).
 
         Args:
             items: Plural noun for messages.
@@ -270,7 +270,7 @@ class Checks:
         return frozen(np.array(np.broadcast_to(array, (count,))))
 
     def indices(self, label: str, value: Any, count: int) -> NDArray[np.intp]:
-        """Return an array of integers from 0, below `count`."""
+        """Return an array of indices after checking that each is an integer from 0 to `count` - 1."""
         try:
             check_entries(value)
             indices = np.asarray(value)
@@ -281,7 +281,7 @@ class Checks:
         return indices.astype(np.intp)
 
     def rotation(self, label: str, value: ArrayInput) -> Array:
-        """Return a read-only rotation matrix. One printed with few digits is projected onto the nearest rotation."""
+        """Return a read-only rotation matrix; a matrix with rounded digits is projected onto the nearest rotation."""
         matrix = self.array(label, value, (3, 3))
         error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost
@@ -320,9 +320,7 @@ def _in(unit: str) -> str:
 
 
 def _shown(array: Array, wrong: Any) -> str:
-    """Return the text by which an error message describes an invalid array: all of it if short, else its first invalid
-    part.
-    """
+    """Return the text that describes an invalid array in an error message: all of it if short, else its first fault."""
     if array.ndim < 2 and array.size <= MAX_LISTED:
         return f"{array.tolist()}"
     if array.ndim == 1:
@@ -354,7 +352,7 @@ def warn_of_millimetres(label: str, lengths: ArrayInput, name: str | None = None
 
 
 def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tuple[float, float], words: str) -> None:
-    """Warn of the first entry whose magnitude lies in a range."""
+    """Warn about the first entry whose magnitude suggests another unit."""
     low, high = range_
     for value in np.ravel(values).tolist():  # faster than array operations on few entries
         if low < abs(value) < high:

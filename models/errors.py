@@ -28,11 +28,11 @@ class DetailedError(Exception):
 
 
 class ModelError(DetailedError, ValueError):
-    """An impossible machine, or an argument that does not fit it."""
+    """Error about an impossible machine, or about an argument that does not fit it."""
 
 
 class ModelWarning(DetailedError, UserWarning):
-    """A suspicious but usable description of a machine; the message says where."""
+    """Warning about a suspicious but usable description of a machine; the message says where."""
 
 
 def _pickled(value: Any) -> Any:

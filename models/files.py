@@ -86,7 +86,7 @@ INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
-    """A file that is not read: it is not a regular file, is too large, or is not owned by the user.
+    """Error about a file that is not read: it is not a regular file, is too large, or is not owned by the user.
 
     Attributes:
         value: Size of a file that is too large, bytes; else None.
@@ -241,7 +241,7 @@ def private_folder(make: bool = False) -> Path:
 
 
 def _unsafe(place: Path) -> str:
-    """Return why other users could change files in a folder, or an empty string."""
+    """Return the reason why other users could change files in a folder, or an empty string if they cannot."""
     status, me = place.lstat(), os.geteuid()
     if not stat.S_ISDIR(status.st_mode):
         return "it is a link or not a folder; set XDG_CACHE_HOME to another folder"
@@ -381,7 +381,7 @@ def _evict(newest: Path) -> None:
 
 
 def _write(name: str, content: bytes) -> Path:
-    """Write a file of the folder atomically."""
+    """Write a file into the cache folder atomically."""
     place = private_folder(make=True)
     part = None
     try:

@@ -85,7 +85,7 @@ def _is_sequence(value: Any) -> bool:
 
 
 def on_scalars(function: _Callable) -> _Callable:
-    """Evaluate a function written element by element on SX, also for MX arguments.
+    """Evaluate a function on SX symbols even for MX arguments, because element-wise MX graphs are slow.
 
     Element-wise MX graphs are slow to build and to run. If an argument is MX, the decorated function is evaluated once
     with SX symbols of the same sparsity, and the resulting Function is called. Other arguments pass through unchanged.
@@ -123,7 +123,7 @@ def skew(vector: Expression) -> Expression:
 
 
 def cross(a: Expression, b: Expression) -> Expression:
-    """Return the vector product; unlike CasADi's, it keeps structural zeros. Shape (3, 1)."""
+    """Return the vector product; unlike that of CasADi, it keeps structural zeros. Shape (3, 1)."""
     a, b = expression(a), expression(b)
     return ca.vertcat(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
@@ -256,7 +256,7 @@ def motion_cross(velocity: Expression) -> Expression:
 
 
 def force_cross(velocity: Expression) -> Expression:
-    """Return the operator v x* on force vectors, minus the transpose of motion_cross. Shape (6, 6)."""
+    """Return the operator v x* on force vectors, which is minus the transpose of motion_cross. Shape (6, 6)."""
     return -motion_cross(velocity).T
 
 
@@ -363,7 +363,7 @@ def expand_tables(values: Any) -> Any:
 
 
 def _table(function: Any, inputs: list[Any]) -> list[Any]:
-    """Return a look-up table of one argument as polynomials; its data are read from C code that CasADi generates."""
+    """Replace a look-up table by polynomials, whose data are read from the C code that CasADi generates for it."""
     code = ca.CodeGenerator("table")
     code.add(function)
     text = code.dump()
@@ -393,7 +393,7 @@ def _table(function: Any, inputs: list[Any]) -> list[Any]:
 
 
 def _polynomials(breaks: Array, coefficients: Array, x: Any, *, beyond: bool) -> Any:
-    """Return a piecewise polynomial as an expression without branches: the sum of its increments over the segments.
+    """Return a piecewise polynomial as an expression without branches.
 
     Outside all breakpoints the end segments continue if `beyond`, else the value is zero.
     """

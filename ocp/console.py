@@ -75,7 +75,7 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Stop the call: ask its loop if that polls, else raise KeyboardInterrupt at its next Python step."""
+        """Stop the call: set the flag that its loop polls, or else raise KeyboardInterrupt at its next Python step."""
         self.stop = True
         began = time.monotonic()
         try:
@@ -97,7 +97,7 @@ _DEADLINE: contextvars.ContextVar[float] = contextvars.ContextVar("deadline", de
 
 
 def interruptible(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a public function that Ctrl-C ends within a second.
+    """Decorate a public function so that Ctrl-C ends it within a second.
 
     KeyboardInterrupt is raised, or whatever another signal handler raises. It carries as ``solution`` the last iterate
     of the call, if any (see :class:`ocp.errors.Interrupted`). Outside the main thread, which alone receives signals,
@@ -131,7 +131,7 @@ def interruptible(function: Callable[P, T]) -> Callable[P, T]:
 
 @contextmanager
 def stop_requests_polled() -> Iterator[None]:
-    """Declare that a loop inside checks :func:`reason_to_stop` regularly and ends by itself."""
+    """Declare that the code in this block polls :func:`reason_to_stop` regularly and ends by itself."""
     call = _CALL.get()
     if call is None:
         yield
@@ -157,7 +157,7 @@ def reason_to_stop() -> SolverStatus | None:
 
 @contextmanager
 def time_limited(seconds: float | None) -> Iterator[None]:
-    """Limit the time of all solves inside, s, in addition to an outer limit; None for no limit."""
+    """Limit the time of all solves in this block to some seconds; None adds no limit to that of an outer block."""
     outer = _DEADLINE.get()
     token = _DEADLINE.set(outer if seconds is None else min(outer, time.monotonic() + seconds))
     try:
@@ -167,16 +167,16 @@ def time_limited(seconds: float | None) -> Iterator[None]:
 
 
 def time_left() -> float:
-    """Return the time until the time limit, s; infinite without one, negative after it."""
+    """Return the time until the time limit, s; infinite without a limit, negative after it."""
     return _DEADLINE.get() - time.monotonic()
 
 
 class TimeLimitReached(Exception):
-    """The time limit has passed in a computation without its own status; the function that set the limit reports it."""
+    """Error that the time limit has passed; the function that set the limit catches and reports it."""
 
 
 def check_time() -> None:
-    """Raise TimeLimitReached after the time limit."""
+    """Raise TimeLimitReached if the time limit has passed."""
     if time_left() <= 0:
         raise TimeLimitReached(str(SolverStatus.TIME_LIMIT))
 
@@ -185,7 +185,7 @@ def check_time() -> None:
 
 
 class _FilteredStream(io.TextIOBase):
-    """``sys.stderr`` without the output of silenced threads."""
+    """Replacement of ``sys.stderr`` that drops the output of silenced threads."""
 
     def __init__(self, real: Any) -> None:
         self.real = real
@@ -209,7 +209,7 @@ _FILTER_LOCK = threading.Lock()
 
 @contextmanager
 def casadi_silenced() -> Iterator[None]:
-    """Suppress what CasADi writes to ``sys.stderr`` from this thread when an expected evaluation fails.
+    """Suppress CasADi's messages on ``sys.stderr`` from this thread, for evaluations that are expected to fail.
 
     It would print the function's inputs, and no option of its functions prevents that.
     """
@@ -252,7 +252,7 @@ def report(stage: str) -> None:
 
 @contextmanager
 def shown_progress(title: str, progress: Any) -> Iterator[None]:
-    """Show the stages that are reported inside this block.
+    """Show the stages that are reported in this block as progress.
 
     Args:
         title: Name of the call.
@@ -289,7 +289,7 @@ def _is_interactive() -> bool:
 
 
 class Progress:
-    """Progress line of a command or call; in a log, lines at the start, every 30 s, and at the end.
+    """Progress display of a command or call; in a log, a line at the start, every 30 s, and at the end.
 
     The line appears on a terminal or in a notebook after `delay` seconds.
     """
@@ -301,7 +301,7 @@ class Progress:
         self._lock = threading.Lock()
 
     def __call__(self, stage: str) -> None:
-        """Set the name of the next stage."""
+        """Set the name of the current stage, and redraw the progress line."""
         self.stage = stage
         if self.terminal and self.seconds > self.delay:
             self._draw()
@@ -312,7 +312,7 @@ class Progress:
         return time.monotonic() - self.began
 
     def say(self, text: str) -> None:
-        """Print a line of its own, for example a warning."""
+        """Print a text on a line of its own, for example a warning."""
         with self._lock:
             self._wipe()
             print(f"{self.title}: {text}", file=sys.stderr, flush=True)
@@ -357,7 +357,7 @@ class Progress:
 
 
 class _Monitor(ca.Callback):  # type: ignore[misc]
-    """Callback of a solver: it stores the iterate, and stops the solver on Ctrl-C or at the time limit."""
+    """Solver callback that stores the iterate, and stops the solver on Ctrl-C or at the time limit."""
 
     def __init__(self, n: int, title: str, name: str) -> None:
         ca.Callback.__init__(self)
@@ -366,7 +366,7 @@ class _Monitor(ca.Callback):  # type: ignore[misc]
         self.construct(name, {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Begin a solve with these bounds of the rows."""
+        """Begin a solve, with these bounds of the constraint rows."""
         self.lower, self.upper = lower, upper
         self.stopped, self.iterations = None, 0
 
@@ -377,7 +377,7 @@ class _Monitor(ca.Callback):  # type: ignore[misc]
         return 1
 
     def _store(self, iterate: Any) -> None:
-        """Store an iterate, and decide whether the solver is to stop."""
+        """Store an iterate, and decide whether the solver shall stop."""
         try:
             self.stopped = self.stopped or reason_to_stop()
         except KeyboardInterrupt:  # CasADi would turn it into another error
@@ -386,7 +386,7 @@ class _Monitor(ca.Callback):  # type: ignore[misc]
 
 
 class IterationMonitor(_Monitor):
-    """Iteration callback, which also shows a line on a terminal after a second, unless a listener shows the call."""
+    """Iteration callback that also shows a progress line on a terminal, unless the call has its own display."""
 
     def __init__(self, n: int, m: int, np_: int, *, title: str, show: bool) -> None:
         self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
@@ -422,7 +422,7 @@ class IterationMonitor(_Monitor):
 
 
 class FatropMonitor(_Monitor):
-    """Function of an iterate that is 1 to continue and 0 to stop the solver: fatrop has no iteration callback."""
+    """Function of an iterate that returns 1 to continue or 0 to stop fatrop, which has no iteration callback."""
 
     def __init__(self, n: int, title: str) -> None:
         self.size = n

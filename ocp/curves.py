@@ -57,12 +57,12 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(self.breaks, self.nodes, slopes / np.diff(self.breaks)[:, None, None])
 
     def within(self, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Return values at positions ``place`` (M,) in 0..1 of intervals ``interval`` (M,): either side of a break."""
+        """Return values at positions ``place`` (M,), 0..1, of given intervals (M,), which select a side at a break."""
         return np.asarray(np.einsum("md,mdn->mn", lagrange(self.nodes, place), self.values[interval]))
 
 
 def barycentric_weights(nodes: np.ndarray) -> np.ndarray:
-    """Return the weights of the barycentric formula (Berrut, Trefethen 2004, eq 3.2). Shape (d,)."""
+    """Return the weights of barycentric Lagrange interpolation (Berrut, Trefethen 2004, eq 3.2). Shape (d,)."""
     difference = nodes[:, None] - nodes[None, :]
     np.fill_diagonal(difference, 1.0)
     return np.asarray(1.0 / difference.prod(axis=1))
@@ -82,7 +82,7 @@ def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
-    """Return derivatives of the Lagrange basis at its nodes: row j, column i is l_i'(node_j). Shape (d, d)."""
+    """Return derivatives of the Lagrange basis at its nodes; row j, column i is l_i'(node_j). Shape (d, d)."""
     weights = barycentric_weights(nodes)
     difference = nodes[:, None] - nodes[None, :]
     np.fill_diagonal(difference, 1.0)
@@ -93,13 +93,13 @@ def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
 
 
 def quadrature_weights(points: np.ndarray) -> np.ndarray:
-    """Return the weights of the interpolatory quadrature on 0..1 at ``points`` (d,). Shape (d,)."""
+    """Return the interpolatory quadrature weights of ``points`` (d,) for integrals over 0..1. Shape (d,)."""
     gauss, weight = np.polynomial.legendre.leggauss(len(points))
     return np.asarray(0.5 * weight @ lagrange(points, 0.5 * (gauss + 1.0)))
 
 
 def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return divided differences c of values (K, d, n) at nodes (d,). Shape (K, d, n).
+    """Return Newton's divided differences of values (K, d, n) at nodes (d,). Shape (K, d, n).
 
     The polynomial is c0 + (s - node 0) (c1 + (s - node 1) (c2 + ...)), which takes the fewest operations.
     """
@@ -148,7 +148,7 @@ def integrator(
     smooth: bool = True,
     start: float = 0.0,
 ) -> Any:
-    """Return a casadi integrator (cvodes: variable step and order) of ``dae`` from ``start`` to each of ``places``.
+    """Return a casadi integrator (CVODES, variable step and order) of ``dae`` from ``start`` to all ``places``.
 
     Args:
         dae: casadi's dictionary: x, t, p, ode and, if any, quad, which is under error control too.

@@ -24,11 +24,11 @@ __all__ = [
 
 
 class ProblemError(DetailedError, ValueError):
-    """An invalid problem, method or argument, detected before anything is solved."""
+    """Error about an invalid problem, method or argument, detected before anything is solved."""
 
 
 class SolveError(DetailedError, RuntimeError):
-    """A solve that ended without an optimum.
+    """Error that a solve ended without an optimum.
 
     Attributes:
         solution: The last iterate as an unsuccessful solution, or None.
@@ -45,7 +45,7 @@ class SolveError(DetailedError, RuntimeError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during a solve that already has an iterate.
+    """Error that Ctrl-C ended a solve that already had an iterate.
 
     Attributes:
         solution: The last iterate as an unsuccessful solution.
@@ -57,23 +57,23 @@ class Interrupted(KeyboardInterrupt):
 
 
 class AuditError(DetailedError, RuntimeError):
-    """An audit that is impossible, for example of a loaded solution without its problem."""
+    """Error that an audit is impossible, for example of a loaded solution without its problem."""
 
 
 class RefinementWarning(DetailedError, UserWarning):
-    """A refinement that stopped before the audit passed; ``value`` is the worst row's value divided by its limit."""
+    """Warning that a refinement stopped before the audit passed; ``value`` is that of the worst row over its limit."""
 
 
 class StorageWarning(DetailedError, UserWarning):
-    """A part that cannot be saved as data, such as a problem that calls a Python function."""
+    """Warning about a part that cannot be saved as data, such as a problem that calls a Python function."""
 
 
 class BoundWarning(DetailedError, UserWarning):
-    """A motion whose cost, ``value``, is below the proven lower bound, ``limit``: a bug of this package."""
+    """Warning about a bug of this package: a motion costs less, ``value``, than its proven lower bound, ``limit``."""
 
 
 class SolverStatus(Enum):
-    """The end of a solve. The value is IPOPT's word if IPOPT has one; files store it."""
+    """Status with which a solver ended. Its value is IPOPT's name of the status where IPOPT has one."""
 
     SOLVED = "Solve_Succeeded"
     ACCEPTABLE = "Solved_To_Acceptable_Level"
@@ -94,7 +94,7 @@ class SolverStatus(Enum):
 
     @classmethod
     def of_word(cls, word: str) -> SolverStatus:
-        """Return the status whose value is a solver's word, FAILED for any other word."""
+        """Return the status whose value is a solver's own name of it; FAILED for any other name."""
         return cls(word) if word in cls._value2member_map_ else cls.FAILED
 
     @property
@@ -104,7 +104,7 @@ class SolverStatus(Enum):
 
     @property
     def message(self) -> str:
-        """The status with advice on what to try next; "" for a success."""
+        """Text of the status with advice on what to try next; "" for a success."""
         if self.is_success:
             return ""
         return f"{self.value}: {ADVICE[self]}" if self in ADVICE else self.value
@@ -131,7 +131,7 @@ ADVICE = {
 
 @contextmanager
 def error_names(name: str) -> Iterator[None]:
-    """Name the exceptions raised inside that have no name yet."""
+    """Set the name of exceptions that are raised in this block without one."""
     try:
         yield
     except DetailedError as error:
@@ -143,7 +143,7 @@ require = Checks(ProblemError)
 
 
 def format_distinct(*numbers: float) -> list[str]:
-    """Format numbers with six digits, or with as many more as it takes to distinguish unequal numbers."""
+    """Format numbers with six digits, or with more if unequal numbers would look equal."""
     candidates = [[f"{number:.{digits}g}" for number in numbers] for digits in range(6, 18)]
     different = len({repr(number) for number in numbers})
     return next((texts for texts in candidates if len({*texts}) == different), candidates[-1])

@@ -32,7 +32,7 @@ __all__ = ["Certificate", "Comparison", "Method", "PreparedProblem", "certificat
 
 @dataclass(frozen=True)
 class DescentSettings:
-    """Settings of the descent from a stationary plan that is not a minimum.
+    """Settings of the descent from a stationary plan that is not a minimum to a better plan.
 
     Attributes:
         descents: Maximum number of consecutive descents.
@@ -160,7 +160,7 @@ def solve(
 
 
 def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
-    """Return the plan, or a better one if a feasible variation lowers its cost.
+    """Return the plan itself, or a better one if a feasible variation lowers its cost.
 
     Raises:
         SolveError: There is such a variation, but the solver finds no plan along it: the cost may be unbounded below.
@@ -200,7 +200,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
 def _displaced_guess(
     form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
 ) -> dict[str, Any]:
-    """Return the plan displaced by a visible amount along the variation that lowers its cost.
+    """Return a guess: the plan, displaced visibly along the variation that lowers its cost.
 
     If the variation is unknown, all controls are displaced by seeded random amounts.
     """
@@ -231,7 +231,7 @@ def _displaced_guess(
 
 @dataclass(frozen=True)
 class Comparison:
-    """Differences of a solution from the reference, relative to the size of the reference.
+    """Differences between a solution and the reference solution, relative to the size of the reference.
 
     The Hamiltonian is judged by the size of its parts, and the cost also by that of the running cost, since both may
     vanish.
@@ -260,7 +260,7 @@ class Comparison:
 
     @property
     def worst(self) -> float:
-        """The largest difference."""
+        """The largest of all differences."""
         differences = (self.cost_difference, self.horizon_difference, self.state, self.control, self.costate)
         return max(*differences, self.hamiltonian)
 
@@ -397,7 +397,7 @@ def certificate(
 
 
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
-    """Return solutions by name, those of a sequence by their methods; raise ProblemError for anything else."""
+    """Return solutions by name, named by their methods if none are given; raise ProblemError for anything else."""
     if not isinstance(solutions, Mapping):
         return name_by_method(require.each("certificate: solutions", solutions, Solution))
     named = require.mapping("certificate: solutions", solutions)
@@ -406,7 +406,7 @@ def checked_solutions(solutions: Any) -> dict[str, Solution]:
 
 
 def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
-    """Return names such as ``Collocation legendre-3, 50``, numbered if they repeat."""
+    """Return names of solutions such as ``Collocation legendre-3, 50``, numbered if they repeat."""
     named: dict[str, Solution] = {}
     for solution in solutions:
         method = solution.method
@@ -427,7 +427,7 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
 def _sample(
     form: Formulation, solution: Solution, p: np.ndarray, fractions: np.ndarray, reported: np.ndarray
 ) -> tuple[list[np.ndarray], float, float]:
-    """Sample a solution: states and controls at ``fractions``, costates and Hamiltonian at ``reported``, two sizes.
+    """Sample a solution: states and controls at ``fractions``, costates and Hamiltonian at ``reported``.
 
     The sizes are the largest sum of the absolute parts of the Hamiltonian, which itself vanishes for a free horizon,
     and the mean absolute running cost.
@@ -444,6 +444,6 @@ def _sample(
 
 
 def difference(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return differences relative to the largest entry of the reference."""
+    """Return the differences of values from a reference, relative to its largest entry."""
     size = float(np.max(np.abs(reference), initial=0.0))
     return np.asarray(np.abs(values - reference) / (size if size > 0 else 1.0))

@@ -31,7 +31,7 @@ KINDS = ("integration", "equalities", "limits", "cost", "other")
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Settings of the refinement.
+    """Settings of the mesh refinement.
 
     Attributes:
         limits: Limits of the rows of the audit other than the integration error, as keywords of
@@ -77,7 +77,7 @@ def refine(
     settings: RefinementSettings = RefinementSettings(),
     time_limit: float | None = None,
 ) -> Solution:
-    """Solve, and split intervals until every row of the audit is within its limit.
+    """Solve a problem, and refine the mesh until every row of the audit is within its limit.
 
     In every interval it evaluates the deviation of the plan from its re-integration, the violations of path equalities,
     bounds and inequalities between the points, and the cost that the controls lose. Each falls with a power of the
@@ -128,7 +128,7 @@ def refine(
 def refine_from(
     problem: Problem, method: DirectMethod, plan: tuple[Solution, Audit], *, options: ByName = None, check: bool = True
 ) -> tuple[Solution, Audit]:
-    """Refine a plan, solved on the method's mesh, with its audit; return the last plan with its audit.
+    """Refine the mesh of a solved and audited plan; return the last plan with its audit.
 
     Without `check`, a round that fails from the previous plan is neither restarted nor diagnosed: see
     :func:`ocp.methods.solve`.
@@ -145,7 +145,7 @@ def _refine_mesh(
     arguments: dict[str, Any],
     settings: RefinementSettings,
 ) -> tuple[Solution, Audit]:
-    """Refine the mesh until a plan is accurate enough; return the last plan and its audit, or warn."""
+    """Refine the mesh until a plan is accurate enough, or warn that it is not; return the last plan and its audit."""
     solution, audit = first
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
@@ -186,7 +186,7 @@ def _refine_mesh(
 def _shortfall(
     stopped: str, late: bool, idles: bool, beyond: list[_Row], audit: Audit, form: Formulation
 ) -> RefinementWarning | None:
-    """Return the warning about the worst remaining row; None if the last plan passes its audit."""
+    """Return a warning about the worst row that is still too large; None if the last plan passes its audit."""
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
         hint = "the time limit is reached: raise time_limit" if late else "raise max_intervals"
@@ -244,7 +244,7 @@ def _next(
 
 
 class _Row(NamedTuple):
-    """A row of the audit: its value and the contribution of each interval (N,), both divided by its limit.
+    """Row of the audit: its value and the contribution of each interval (N,), divided by the limit of the row.
 
     ``order`` is the power of the width with which it falls; ``errors`` is None if it cannot be attributed to intervals.
     """
@@ -257,7 +257,7 @@ class _Row(NamedTuple):
 
 
 class _Parts(NamedTuple):
-    """Contributions of the intervals to an audit row (N,), in any unit; the row is their sum or their maximum."""
+    """Contributions of the intervals to an audit row (N,) in any unit; the row is their sum or maximum."""
 
     kind: str
     values: np.ndarray
@@ -265,7 +265,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Scale the contributions so that they are comparable with the value of their row. Shape (N,)."""
+        """Return the contributions, scaled to be comparable with the value of their row. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))
@@ -276,7 +276,7 @@ class _Parts(NamedTuple):
 def _rows(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit, tolerance: float, method: DirectMethod
 ) -> list[_Row]:
-    """Return the rows of the audit of a plan, each with the contributions of the intervals."""
+    """Return the rows of a plan's audit, each with the contributions of the intervals."""
     # over the whole horizon an unstable motion diverges; the sum is what feedback would have to correct
     deviation = min(audit.integration_error, float(audit.local_errors.sum()))
     requested = Finding(f"integration error, {tolerance:.0e} requested", deviation, tolerance)
@@ -308,7 +308,7 @@ def _rows(
 def _violations(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit
 ) -> dict[str, tuple[bool, np.ndarray]]:
-    """Return by name whether each bounded quantity is an equality, and its violation in every interval (N,)."""
+    """Return by name the violation of each bounded quantity in each interval (N,), and whether it is an equality."""
     n = len(audit.local_errors)
     x, u = stack(audit.states), stack(audit.controls, len(audit.t))
     g = form.sampled([form.path.expression], x, u, audit.t, solution.horizon, p)[0]
@@ -330,7 +330,7 @@ def _violations(
 def _parts_per_interval(
     beyond: list[_Row], rows: list[_Row], mesh: np.ndarray, settings: RefinementSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of parts into which each interval is split, and its largest error. Shape (N,) each."""
+    """Return the number of parts into which to split each interval, and its largest error. Shape (N,) each."""
     n = len(mesh) - 1
     parts, error = np.ones(n, int), np.zeros(n)
     for row in beyond:
@@ -349,7 +349,7 @@ def _parts_per_interval(
 
 
 def split(mesh: np.ndarray, parts: np.ndarray, error: np.ndarray, max_intervals: int) -> np.ndarray:
-    """Return the mesh (N + 1,) with each interval split into its number of parts, at most ``max_intervals`` in all.
+    """Split each interval of a mesh (N + 1,) into parts, with at most ``max_intervals`` intervals in total.
 
     If these are too few, the intervals of least ``error`` (N,) are split less.
     """

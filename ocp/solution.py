@@ -73,7 +73,7 @@ MAX_LINES = 15  # of a printed solution
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The result of a solve.
+    """The result of a solve: states, controls, costates and multipliers of a plan.
 
     Attributes:
         name: Name of the problem.
@@ -181,7 +181,7 @@ class Solution:
         return str(call_registered("html_of_solution", self))
 
     def table(self) -> dict[str, np.ndarray]:
-        """Return columns by name, a row for every reported time, for pandas.DataFrame, polars.DataFrame, pyarrow.table.
+        """Return columns by name, with a row for every reported time, for pandas, polars or pyarrow.
 
         ``time`` (s), states and controls; the entries of a vector are called ``NAME[k]``. Shape (M,) each.
         """
@@ -197,7 +197,7 @@ class Solution:
 
     @interruptible
     def sensitivity(self, name: str) -> Sensitivity:
-        """Return the first-order change of this plan with a parameter, and the range in which it is valid.
+        """Return the derivatives of this plan by a parameter, and the range in which they are valid.
 
         It solves one linear system in the derivatives of variables and multipliers, with the active limits fixed, for
         plans of direct methods. See :mod:`ocp.direct.sensitivity`.
@@ -210,12 +210,11 @@ class Solution:
         return computed
 
     def cost_gradient(self, name: str) -> np.ndarray:
-        """Return the derivative of the optimal cost in a parameter, from the multipliers. Shape (n,)."""
+        """Return the derivative of the optimal cost by a parameter, from the multipliers. Shape (n,)."""
         return entry_named("parameter", name, self.cost_gradients)
 
     def at(self, time: Any) -> Sample:
-        """Return states and controls at a time (each (n,)) or at times (M,) (each (M, n)), by the method's own
-        interpolant.
+        """Return states and controls at a time, each (n,), or at times (M,), each (M, n), by the method's interpolant.
 
         Raises:
             ProblemError: A time outside 0 to the horizon, or not finite.
@@ -233,7 +232,7 @@ class Solution:
         return self.at_fraction(times / self.horizon)
 
     def at_fraction(self, fraction: Any) -> Sample:
-        """Return states and controls as :meth:`at`, at fractions 0..1 of the horizon."""
+        """Return states and controls at fractions 0..1 of the horizon, as :meth:`at` does at times."""
         try:
             at = floats(fraction)
             inside = bool(((at >= -NODE_TOLERANCE) & (at <= 1 + NODE_TOLERANCE)).all())
@@ -250,7 +249,7 @@ class Solution:
 
     @property
     def phases(self) -> dict[str, tuple[float, float]]:
-        """Start and end times of the phases by name, s; empty without phases (:mod:`ocp.problem.phases`)."""
+        """Start and end times of the phases, s, by name; empty if there are none (:mod:`ocp.problem.phases`)."""
         declared = {} if self.problem is None else self.problem.declared.phases
         if not declared:
             return {}
@@ -303,7 +302,7 @@ class Solution:
         )
 
     def _sampled(self, expressions: list[Any], fractions: np.ndarray) -> list[np.ndarray]:
-        """Return expressions of the declared symbols at fractions (M,) of the plan; each (M, n)."""
+        """Return expressions of the declared symbols at fractions (M,) of the horizon. Shape (M, n) each."""
         form = Formulation.of(self.problem)
         plan = match_order(form, self)
         x, u = plan.state_interpolant(fractions), plan.control_interpolant(fractions)
@@ -395,7 +394,7 @@ class Solution:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Solution:
-        """Read a file written by :meth:`save`, with its problem, without guesses that were functions.
+        """Read a file that :meth:`save` has written, with its problem, but without guesses that were functions.
 
         The file is pure data. Its problem is rebuilt from checked operations, and none of it is executed.
 
@@ -408,7 +407,7 @@ class Solution:
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> Solution:
-        """Return the solution from the arrays of a file, which are removed from ``arrays``; raise as :meth:`load`."""
+        """Return the solution from the arrays of a file, which are consumed; raises the errors of :meth:`load`."""
         try:
             head = read_head(path, arrays.pop("head"))
             version = head.pop("version")
@@ -452,7 +451,7 @@ class Solution:
     # ---- with and without its problem ------------------------------------------------------------------------
 
     def _written_problem(self) -> tuple[dict[str, Any] | None, str]:
-        """Return the problem as numbers and text, and ""; if that is impossible, None and the reason."""
+        """Return the problem as data and ""; if it cannot be saved, None and the reason."""
         if self.problem is None:
             return None, self.problem_lost
         try:
@@ -461,17 +460,17 @@ class Solution:
             return None, str(error)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle with the problem if it can be saved, else without it, with the reason."""
+        """Return the data for pickling, with the problem if it can be saved, else with the reason."""
         written, why = self._written_problem()
         return {**self.__dict__, "problem": written, "problem_lost": why}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state of :meth:`__getstate__`."""
+        """Restore the solution from the data of :meth:`__getstate__`."""
         problem = state["problem"]
         self.__dict__.update({**state, "problem": None if problem is None else Problem.from_record(problem)})
 
     def __copy__(self) -> Solution:
-        """Return a solution that shares the arrays and the problem."""
+        """Return a solution that shares arrays and problem with this one."""
         return replace(self)
 
     def __deepcopy__(self, memo: Any) -> Solution:

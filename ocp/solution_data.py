@@ -72,7 +72,7 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """First-order change of a plan with a parameter of k entries.
+    """First-order change of a plan with a parameter that has k entries.
 
     Attributes:
         name, value: Of the parameter, (k,).
@@ -100,7 +100,7 @@ class Sensitivity:
         return entry_named("state or control", name, {**self.states, **self.controls})
 
     def __str__(self) -> str:
-        """Return the valid range of each entry, one a line."""
+        """Return the range in which the change is valid for each entry of the parameter, one per line."""
         lines = []
         for k, (below, above) in enumerate(self.limits):
             entry = self.name if len(self.value) == 1 else f"{self.name}[{k}]"
@@ -113,9 +113,7 @@ class Sensitivity:
 
 
 def read_head(path: Any, text: np.ndarray) -> Any:
-    """Return the head of a file; raise ProblemError if it is too long, as reading JSON takes up to thirty times its
-    length.
-    """
+    """Return the header of a file; raise ProblemError if it is long, as JSON takes thirty times its length."""
     if text.nbytes > MAX_HEAD_BYTES:
         words = f"{path} is not a saved solution: its head has {text.nbytes:.3g} bytes, {MAX_HEAD_BYTES:.3g} at most"
         raise ProblemError(words, name="head", value=text.nbytes, limit=MAX_HEAD_BYTES)
@@ -123,14 +121,14 @@ def read_head(path: Any, text: np.ndarray) -> Any:
 
 
 def read_status(path: Any, word: Any) -> SolverStatus:
-    """Return the status in the head of a file, or raise ProblemError."""
+    """Return the status that the header of a file contains, or raise ProblemError."""
     if word not in [status.value for status in SolverStatus]:
         raise ProblemError(f"{path}: {word!r} is not a solver status", name="status", value=word)
     return SolverStatus(word)
 
 
 def entry_named(kind: str, name: Any, pool: Mapping[str, T]) -> T:
-    """Return the entry with a name; raise ProblemError, which lists similar names, if there is none."""
+    """Return the entry of a given name; if there is none, raise ProblemError with similar names."""
     if not isinstance(name, str) or name not in pool:
         raise require.unknown(kind, name, pool)
     return pool[name]
@@ -144,7 +142,7 @@ def plain(value: Any) -> Any:
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """Stack arrays (M, n) side by side; without any, return an array (``like``, 0)."""
+    """Stack arrays (M, n) side by side; without any arrays, return an empty array with ``like`` rows."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 
@@ -176,7 +174,7 @@ def check_variables_match(form: VariableSlices, solution: Any) -> None:
 
 
 def match_order(form: VariableSlices, solution: Any) -> Any:
-    """Reorder states and controls of a plan as in a problem, because interpolants have no names."""
+    """Reorder states and controls of a plan to the order in a problem, because interpolants have no names."""
     orders = {"states": list(form.states), "costates": list(form.states), "controls": list(form.controls)}
     changes: dict[str, Any] = {}
     for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
@@ -200,7 +198,7 @@ def match_order(form: VariableSlices, solution: Any) -> Any:
 
 
 def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the bound tightening (2, N, m) of a mesh (N + 1,) at fractions ``at`` (M,). Shape (2, M, m).
+    """Return the tightening (2, N, m) of bounds in mesh intervals at fractions ``at`` (M,). Shape (2, M, m).
 
     At a node between two intervals it is the larger of both.
     """
@@ -211,7 +209,7 @@ def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray
 
 
 def check_structure(solution: Any) -> None:
-    """Raise ProblemError, naming the part, unless the arrays of a plan are consistent.
+    """Raise ProblemError, naming the part, if the arrays of a plan are inconsistent.
 
     Times increase from 0 and breaks from 0 to 1. Every array has a row for each time. Every interpolant has one
     polynomial between two breaks, nodes within 0..1, and as many columns as the interpolated pool.
@@ -241,7 +239,7 @@ def _invalid(solution: Any, name: str, words: str) -> ProblemError:
 
 
 def _real(solution: Any, name: str, value: Any, dimensions: int) -> np.ndarray:
-    """Return a part of a plan; raise ProblemError unless it is a real array of this number of dimensions."""
+    """Return a part of a plan; raise ProblemError unless it is a real array with `dimensions` dimensions."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.ndim != dimensions:
         words = f"is not a real array of {dimensions} dimensions, but {array.dtype} of shape {array.shape}"
@@ -250,7 +248,7 @@ def _real(solution: Any, name: str, value: Any, dimensions: int) -> np.ndarray:
 
 
 def _check_head(solution: Any) -> None:
-    """Raise ProblemError unless the fields that are not arrays have the right types."""
+    """Raise ProblemError if fields of a plan that are not arrays have wrong types."""
     for pool in POOLS:
         if not isinstance(getattr(solution, pool), dict):
             words = f"must be a dictionary by name, not {type(getattr(solution, pool)).__name__}"
@@ -271,7 +269,7 @@ def _check_head(solution: Any) -> None:
 
 
 def _check_interpolant(solution: Any, name: str, columns: int) -> None:
-    """Raise ProblemError unless an interpolant of this number of columns is consistent."""
+    """Raise ProblemError if an interpolant is inconsistent, or has a wrong number of columns."""
     curve = getattr(solution, name)
     breaks, nodes = (_real(solution, f"{name}.{part}", getattr(curve, part), 1) for part in ("breaks", "nodes"))
     values = _real(solution, f"{name}.values", curve.values, 3)
@@ -287,7 +285,7 @@ def _check_interpolant(solution: Any, name: str, columns: int) -> None:
 
 
 def _check_tightening(solution: Any) -> None:
-    """Raise ProblemError unless the tightening has a finite entry, zero or above, for each bound."""
+    """Raise ProblemError unless the tightening has a finite, nonnegative entry for each bound."""
     amounts = _real(solution, "bound_tightening", solution.bound_tightening, 3)
     entries = sum(values.shape[1] for pool in (solution.states, solution.controls) for values in pool.values())
     shape = (2, len(solution.control_interpolant.breaks) - 1, entries)
@@ -302,7 +300,7 @@ def _check_tightening(solution: Any) -> None:
 
 
 def check_finite(solution: Any) -> None:
-    """Raise ProblemError, naming the part, if a successful plan contains a number that is not finite."""
+    """Raise ProblemError, naming the part, if a plan that counts as solved contains nan or infinity."""
     if not solution.success:
         return
     parts: dict[str, Any] = {
@@ -322,12 +320,12 @@ _FUNCTIONS: dict[str, str] = {}
 
 
 def register(operation: str, module: str) -> None:
-    """Register the function called `operation` of a module under its own name."""
+    """Make a function of a module available to `call_registered` under its name, without importing it here."""
     _FUNCTIONS[operation] = module
 
 
 def call_registered(operation: str, *args: Any, **options: Any) -> Any:
-    """Call a registered function.
+    """Call a function that `register` has made available.
 
     Raises:
         LookupError: No package has registered a function of that name.

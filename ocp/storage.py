@@ -32,7 +32,7 @@ ZIP64_LOCATOR = b"PK\x06\x07"  # precedes it in a larger archive
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write one compressed ``.npz`` file, atomically as :func:`write_whole` does.
+    """Write one compressed ``.npz`` file atomically, see :func:`write_whole`.
 
     Raises:
         ProblemError: path is not the path of a file, or the arrays are larger than :func:`read_arrays` accepts.
@@ -47,12 +47,12 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file in UTF-8, atomically as :func:`write_whole` does."""
+    """Write a text file in UTF-8 atomically, see :func:`write_whole`."""
     write_whole(path, lambda stream: stream.write(text.encode()))
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any], synced: bool = True) -> None:
-    """Write a file atomically; with ``synced``, return only when it is on the disk.
+    """Write a file atomically; with ``synced``, return only after it is on the disk.
 
     Without ``synced`` the file appears some ms earlier, and may be empty after a loss of power; use it for files whose
     readers detect incompleteness.
@@ -108,7 +108,7 @@ def open_part(target: Path) -> IO[bytes]:
 
 
 def remove_abandoned(target: Path) -> None:
-    """Remove the files that killed writers of the target left behind."""
+    """Remove partial files of a target that interrupted writers have left behind."""
     prefix = f"{target.name}."
     with suppress(OSError):
         for name in os.listdir(target.parent):
@@ -123,7 +123,7 @@ def remove_abandoned(target: Path) -> None:
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file by name, real numbers only.
+    """Return the arrays of an ``.npz`` file by name; only real numbers are accepted.
 
     Sizes are checked before anything is unpacked, so memory is bounded by twice ``MAX_FILE_BYTES``.
 
@@ -170,20 +170,20 @@ def open_unlinked(path: str | os.PathLike[str]) -> io.BufferedReader:
 
 
 def checked_path(path: Any) -> str | os.PathLike[str]:
-    """Return ``path``, or raise ProblemError unless it is a path; a number would be a file descriptor."""
+    """Return ``path``; raise ProblemError unless it is a path, since a number would be a file descriptor."""
     if not isinstance(path, str | os.PathLike):
         raise ProblemError(f"a path is expected, not {path!r}", name="path", value=path)
     return path
 
 
 def check_regular(path: Any, status: os.stat_result) -> None:
-    """Raise ProblemError unless a file is regular, not a folder, a pipe or a device."""
+    """Raise ProblemError if a path is not a regular file but, for example, a folder, a pipe or a device."""
     if not stat.S_ISREG(status.st_mode):
         raise ProblemError(f"{path} is not a file, but a folder, a pipe or a device", name="path", value=str(path))
 
 
 def check_contents(path: Any, stream: IO[bytes], size: int) -> None:
-    """Raise an error if an archive's table of contents is too large or its end is missing."""
+    """Raise an error if an archive's table of contents is too large, or if the end of the archive is missing."""
     stream.seek(max(0, size - 42))
     tail = stream.read(42)
     if tail[-22:-18] != END_RECORD or tail.startswith(ZIP64_LOCATOR):
@@ -200,7 +200,7 @@ def name_of(member: zipfile.ZipInfo) -> str:
 
 
 def array_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Return an array of real numbers, whose size is checked before it is allocated."""
+    """Return an array of real numbers from an archive; its size is checked before memory is allocated."""
     if member.compress_type not in COMPRESSIONS:
         raise ValueError(f"{member.filename!r} has an unknown compression")
     with archive.open(member) as packed:
@@ -231,12 +231,12 @@ FORMULA = re.compile(r"^[=+\-@\t\r%]")
 
 
 def column_name(name: str) -> str:
-    """Return a joint name for the header of a table, with special characters encoded as %XX of their UTF-8 bytes."""
+    """Encode a joint name for a table header; special characters become %XX of their UTF-8 bytes."""
     return ESCAPED.sub(_quoted, name)
 
 
 def cell(value: Any) -> Any:
-    """Return a value as the text of a CSV cell; text that looks like a formula starts with %XX instead."""
+    """Return the text of a CSV cell; the first character of text that looks like a formula becomes %XX."""
     return FORMULA.sub(_quoted, value) if isinstance(value, str) else value
 
 
@@ -245,7 +245,7 @@ def _quoted(match: re.Match[str]) -> str:
 
 
 def joint_name(column: str) -> str:
-    """Return the name that :func:`column_name` encoded."""
+    """Decode a joint name that :func:`column_name` has encoded."""
     return unquote(column, errors="surrogatepass")
 
 
@@ -255,7 +255,7 @@ def table_head(names: Sequence[str]) -> list[str]:
 
 
 def table_joints(head: Sequence[str]) -> tuple[str, ...]:
-    """Return the joints of a header made by :func:`table_head`; empty for any other header."""
+    """Return the joint names in a header of :func:`table_head`; empty for any other header."""
     try:
         names = tuple(map(joint_name, head[1 : 1 + len(head) // 3]))
     except UnicodeDecodeError:

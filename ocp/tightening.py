@@ -35,7 +35,7 @@ __all__ = ["WARM_START_OPTIONS", "largest_excess", "solve_at_switches", "switche
 
 @dataclass(frozen=True)
 class TighteningSettings:
-    """Settings of the tightening.
+    """Settings of the tightening of limits.
 
     Attributes:
         places: Evaluation points per interval and polynomial degree of the plan.
@@ -65,7 +65,7 @@ def tighten(
     time_limit: float | None = None,
     max_cost: float = np.inf,
 ) -> Solution:
-    """Solve with IPOPT so that every inequality holds between the points of the grid as well.
+    """Solve with IPOPT, with limits tightened so that every inequality also holds between grid points.
 
     The plan is the optimum under bounds that are tightened where it would exceed them, so its cost is slightly above
     that of :func:`ocp.methods.solve`, by ``Solution.tightening_cost``; finer grids close the gap. Equalities are not
@@ -146,7 +146,7 @@ def tighten(
 
 
 def largest_excess(problem: Problem, solution: Solution) -> float:
-    """Return the largest excess of a plan over bounds and inequalities between grid points, in their own units."""
+    """Return the largest excess of a plan over bounds and inequalities between its grid points, in own units."""
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
@@ -155,7 +155,7 @@ def largest_excess(problem: Problem, solution: Solution) -> float:
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """Describe the largest excess over a bound as a sentence and as the attributes of an error; see :func:`_excess`."""
+    """Describe the largest excess over a bound: a sentence, and fields for an error; see :func:`_excess`."""
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
@@ -167,7 +167,7 @@ def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[st
 def _places(
     form: Formulation, transcription: Transcription, shared: bool
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Map variables ("x") and rows ("g") to the state, control or path row (else -1) and the interval they belong to.
+    """Return which state, control or path row (or -1), and which interval, variables ("x") and rows ("g") belong to.
 
     Args:
         shared: Whether a control at a node belongs to both intervals; otherwise it, and rows with it, may jump there.
@@ -202,7 +202,7 @@ def _slack(
     high: np.ndarray,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Return the smallest distance from points to bounds in each interval, (2, N, m); inf without points."""
+    """Return the smallest distance of points to their bounds in each interval, (2, N, m); inf without points."""
     slack = np.full(shape, np.inf)
     for kind, (entry, left, right) in places.items():
         bounded = entry >= 0
@@ -216,7 +216,7 @@ def _slack(
 def _excess(
     form: Formulation, solution: Solution, p: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far values lie below and above their bounds in each interval, (2, N, m), and the interval ends, s."""
+    """Return by how much values exceed lower and upper bounds in each interval, (2, N, m), and its ends, s."""
     breaks = solution.control_interpolant.breaks
     n = len(breaks) - 1
     per_interval = (len(solution.state_interpolant.breaks) - 1) // n
@@ -238,7 +238,7 @@ def _excess(
 
 
 def _peaks(values: np.ndarray) -> np.ndarray:
-    """Return the largest values of sampled curves (N, K, m), by parabolas also between samples. Shape (N, m)."""
+    """Return the maxima of sampled curves (N, K, m), with parabolas between the samples. Shape (N, m)."""
     left, middle, right = values[:, :-2], values[:, 1:-1], values[:, 2:]
     with np.errstate(invalid="ignore", divide="ignore"):
         rise = (right - left) ** 2 / (8 * (2 * middle - left - right))
@@ -252,7 +252,7 @@ def _peaks(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SwitchingSettings:
-    """Settings of the location of switches.
+    """Settings by which the switches of a plan are located.
 
     Attributes:
         at_limit: Distance from a limit, relative to the range of both limits, below which a value is at it: the audit's
@@ -282,7 +282,7 @@ WARM_START_OPTIONS = {"mu_init": 1e-4}
 
 
 def switches(problem: Problem, solution: Solution) -> np.ndarray:
-    """Return fractions of the horizon at which a control or path constraint reaches or leaves a limit. Shape (k,).
+    """Return the horizon fractions at which a control or path constraint reaches or leaves a limit. Shape (k,).
 
     Args:
         problem: The problem that was solved, by collocation with controls at the points.
@@ -325,7 +325,7 @@ def switches(problem: Problem, solution: Solution) -> np.ndarray:
 def _limited_values(
     form: Formulation, solution: Solution, at: np.ndarray, owner: np.ndarray, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the values (M, m) and limits (m,) of controls, and of path constraints with controls, at M places."""
+    """Return values (M, m) and limits (m,) of controls and of path constraints with controls, at M fractions."""
     p = form.parameter_vector(solution.parameters)
     lower, upper = form.bound_values(p)
     x, u = solution.state_interpolant(at), solution.control_interpolant.within(owner, place)
@@ -341,7 +341,7 @@ def _limited_values(
 def solve_at_switches(
     problem: Problem, method: Collocation, plan: Solution, *, parameters: ByName = None, options: ByName = None
 ) -> Solution:
-    """Solve a plan again with nodes at its switches, whose locations improve in each round.
+    """Solve a plan again with mesh nodes at its switches, which are located more accurately in each round.
 
     Args:
         problem, parameters, options: As for :func:`ocp.methods.solve`.
@@ -369,13 +369,13 @@ def solve_at_switches(
 
 
 def _distinct(fractions: np.ndarray) -> np.ndarray:
-    """Return the switches inside the horizon; of several close ones only the first."""
+    """Return the switches inside the horizon, with only the first of several close ones."""
     inside = fractions[(fractions > SWITCHING.same) & (fractions < 1 - SWITCHING.same)]
     return np.asarray(inside[np.diff(inside, prepend=-1.0) > SWITCHING.same])
 
 
 def _mesh(mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return a mesh with nodes at the switches and without the old nodes close to them."""
+    """Return a mesh with nodes at the switches, without those old nodes that are close to them."""
     inner, width = mesh[1:-1], np.diff(mesh)
     interval = np.clip(np.searchsorted(mesh, at, side="right") - 1, 0, len(width) - 1)
     close = (np.abs(inner[:, None] - at) < SWITCHING.too_near * width[interval]).any(axis=1)

@@ -51,7 +51,7 @@ _Record = TypeVar("_Record")
 
 
 class Incumbent(NamedTuple):
-    """The best feasible roll so far.
+    """The best feasible roll that the search has found so far.
 
     Attributes:
         cost: Its index, inf if there is none yet.
@@ -69,7 +69,7 @@ class Incumbent(NamedTuple):
 
 
 class RoughRoll(NamedTuple):
-    """An approximate point of a roll that may be optimal.
+    """An approximate roll that may be optimal, given by its cosine and sine.
 
     Attributes:
         bound: Lower bound of the cost near the point; inf if the roll is infeasible.
@@ -88,14 +88,14 @@ class RoughRoll(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """An evaluated roll: its cost, inf if joints 4 to 6 do not allow it, and cos q2."""
+    """Cost of a roll, infinite if it violates limits of joints 4 to 6, and the value of cos q2."""
 
     cost: Expression
     cos2: Expression
 
 
 class LevelBound(NamedTuple):
-    """An `ArcEndLevel` with a lower bound of the cost of all rolls on it; `side` as in RoughRoll."""
+    """A limiting value of cos q2, with a lower bound of the cost of all rolls that have it; `side` as in RoughRoll."""
 
     bound: Expression
     cosine: Expression
@@ -119,12 +119,12 @@ class RigSolution(NamedTuple):
 
 
 def stack(kind: Any, records: Sequence[Any]) -> Expression:
-    """Return records of one kind as the columns of a matrix. Shape (fields, records)."""
+    """Return named tuples of one class as the columns of a matrix. Shape (fields, records)."""
     return ca.horzcat(*[ca.vertcat(*record) for record in records]) if records else ca.SX(len(kind._fields), 0)
 
 
 def unstack(kind: Callable[..., _Record], matrix: Expression) -> list[_Record]:
-    """Return the records of one kind from the columns of a matrix."""
+    """Return the columns of a matrix as named tuples of one class, the inverse of `stack`."""
     return [kind(*ca.vertsplit(column)) for column in ca.horzsplit(matrix)]
 
 
@@ -184,7 +184,7 @@ def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits
 
 @dataclass(frozen=True)
 class Search:
-    """The steps of the search as casadi Functions.
+    """The steps of the search for the best roll, each a casadi Function.
 
     Their argument `best` is an Incumbent, `evaluations` a row of Evaluation, `rough` columns of RoughRoll.
 
@@ -198,7 +198,7 @@ class Search:
     gain: float
 
     def direct(self) -> Any:
-        """Return the Function (target, previous) -> (answer, done, best, evaluations) of the best stationary point.
+        """Return the Function (target, previous) -> (answer, done, best, evaluations) for the best stationary roll.
 
         `done` says that the answer is final: it is within reach and limits, or the input is not finite.
         """
@@ -235,7 +235,7 @@ class Search:
         return ca.Function("direct", [x, before], list(settled))
 
     def search_ends(self, count: int) -> Any:
-        """Return the Function (target, previous, best, `count` evaluations) -> answer from the arc ends."""
+        """Return the Function (target, previous, best, `count` evaluations) -> answer that searches all roll limits."""
         target, previous = _inputs(ca.MX)
         first, evaluations = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("seen", len(Evaluation._fields), count)
         best, more = self._cheap_ends()(target, previous, first)
@@ -260,7 +260,7 @@ class Search:
     # ---- candidates ------------------------------------------------------------------------------------------
 
     def _cheap_ends(self) -> Any:
-        """Return the Function (target, previous, best) -> (best, evaluations), with the arc ends in closed form."""
+        """Return the Function (target, previous, best) -> (best, evaluations) for roll limits with a closed form."""
         target, previous = _inputs(ca.SX)
         first = ca.SX.sym("best", INCUMBENT_SIZE)
         ends = closed_form_ends(self.rig, target, self.branch)
@@ -270,7 +270,7 @@ class Search:
         )
 
     def _rough_stationary(self) -> Any:
-        """Return the Function (target) -> points near the minima of I1; NO_ROLL if it certainly has only one minimum.
+        """Return the Function (target) -> rolls near the minima of the index I1; NO_ROLL if there is only one minimum.
 
         In the axes of trigonometric.least_point there are only two stationary points outside the astroid
         |p|^(2/3) + |q|^(2/3) = (4 r)^(2/3), which the circle hypot(p, q) = 4 r encloses.
@@ -286,7 +286,7 @@ class Search:
         return ca.Function("rough_stationary", [x], [answer])
 
     def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the Function (target, previous, evaluations, best) -> best, which adds the ends by yaw joints.
+        """Return the Function (target, previous, evaluations, best) -> best for roll limits due to yaw joints.
 
         A level is searched if an evaluated roll better than the incumbent is on its infeasible side. All levels are
         searched if one violates a limit of joint 1 alone, since its arc may end before that limit is satisfied.
@@ -330,7 +330,7 @@ class Search:
         return ca.Function("levels", [x, before, evaluations, first], [best])
 
     def _slide_ends(self, chart: Any, upper: bool) -> Any:
-        """Return the Function (target, previous, best) -> best, which adds the arc ends by limits of joint 1."""
+        """Return the Function (target, previous, best) -> best for roll limits due to joint 1 (the slide)."""
         target, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
         rough, reach = self._approximation(target), (0, 1 + self._slack()[1])
         datum = inside_limit(self.rig, 1, upper), limit_code(1, upper)
@@ -346,14 +346,14 @@ class Search:
         return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
-        """Return bounds on how far sin q4 and cos q2 can change if the roll changes by ROOTS.root_tolerance."""
+        """Return bounds of the changes of sin q4 and cos q2 for a change of the roll by ROOTS.root_tolerance."""
         rig = self.rig
         sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4
         return sin4, (ROOTS.root_tolerance * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
 
     def _approximation(self, target: Expression) -> Callable[..., RoughRoll]:
-        """Return a function that makes a RoughRoll; cos q2 must be within about = (middle, half width)."""
+        """Return a function that creates a RoughRoll; `about` = (middle, half width) restricts its cos q2."""
         f, (slack4, _) = self._index(target), self._slack()
         slack = ROOTS.root_tolerance * (ca.fabs(f.a1) + ca.fabs(f.b1) + 2 * (ca.fabs(f.a2) + ca.fabs(f.b2)))
 
@@ -370,7 +370,7 @@ class Search:
         return rough
 
     def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
-        """Return the Function (target, previous, rough, best) -> best, which polishes and compares `count` points.
+        """Return the Function (target, previous, rough, best) -> best that polishes and compares `count` rough rolls.
 
         Points whose bound is not below the cost of the incumbent are skipped.
         """
@@ -390,7 +390,7 @@ class Search:
         return ca.Function("gates", [target, previous, rough, first], [column])
 
     def _stationary(self, target: Expression, rough: RoughRoll) -> Point:
-        """Return the stationary point of the index I1 near a point."""
+        """Return the stationary point of the index I1 near a rough roll, by Newton's method."""
         slope = self._index(target).derivative()
         bend = slope.derivative()
         return polish((rough.c, rough.s), lambda c, s: (slope.value(c, s), bend.value(c, s)))
@@ -398,7 +398,7 @@ class Search:
     def _compare(
         self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Incumbent
     ) -> tuple[Incumbent, list[Evaluation], Expression]:
-        """Compare further rolls with the incumbent; return the best one, their evaluations, and their least cost."""
+        """Compare rolls with the incumbent; return the best of all, the evaluations, and the least cost of rolls."""
         f = self._index(target)
         cost, c, s, code, below, above = best
         least, evaluations = ca.SX(ca.inf), []
@@ -429,20 +429,20 @@ class Search:
     # ---- answers ---------------------------------------------------------------------------------------------
 
     def _finish(self) -> Any:
-        """Return the Function (target, previous, best) -> answer, with joints and status of the incumbent."""
+        """Return the Function (target, previous, best) -> answer that computes joints and status of the incumbent."""
         target, previous = _inputs(ca.SX)
         best = ca.SX.sym("best", INCUMBENT_SIZE)
         answer = self._solution(target, previous, _record(Incumbent, best), 0)
         return ca.Function("finish", [target, previous, best], ca.cse([answer]))
 
     def _infeasible(self) -> Any:
-        """Return the Function (target) -> answer without joints, with the status of an infeasible target."""
+        """Return the Function (target) -> answer for an infeasible target: no joints, and a status with the reason."""
         target = ca.SX.sym("target", 5)
         result = RigSolution(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))
 
     def _solution(self, target: Expression, previous: Expression, best: Incumbent, status: Expression) -> Expression:
-        """Return the RigSolution of the incumbent. Shape (9, 1)."""
+        """Return the RigSolution of the best roll so far as a column. Shape (9, 1)."""
         roll = unwrap_roll(self.rig, best.c, best.s, previous)
         joints = joints_of(self.rig, target, roll, self._configuration(target, best.c, best.s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)
@@ -450,13 +450,13 @@ class Search:
 
 
 def _is_finite(target: Expression, previous: Expression) -> Expression:
-    """Return whether the input is finite."""
+    """Return whether target and previous roll are finite."""
     total = ca.sum1(target) + previous
     return ca.fabs(total) < ca.inf
 
 
 def evaluate_unless(alternative: Any, shape: tuple[int, int] = (INCUMBENT_SIZE, 1)) -> Any:
-    """Return the Function (settled, known, arguments) -> `known`, of a shape, if settled, else alternative(arguments).
+    """Return the Function (settled, known, arguments) -> `known` if `settled` is true, else alternative(arguments).
 
     The alternative is only evaluated if needed. casadi.if_else would also evaluate what its arguments depend on.
     """

@@ -34,7 +34,7 @@ KINK = 1e-12
 
 
 class LinkCapsule(NamedTuple):
-    """A capsule of a link; radius in m, ends of the segment as expressions in world. Shape (3, 1), m."""
+    """A link of the rig as a capsule. Its ends are expressions in world, shape (3, 1), m; its radius is in m."""
 
     radius: float
     start: Expression
@@ -48,12 +48,12 @@ def _finite_axes(point: Expression, box: Box) -> Expression:
 
 
 def _half_size(box: Box) -> Expression:
-    """Return half of the finite edges of a box, m."""
+    """Return half the edge lengths of a box along its finite axes, m."""
     return ca.DM(box.size[np.isfinite(box.size)] / 2)
 
 
 def box_distance(point: Expression, box: Box) -> Expression:
-    """Return the signed distance of a point to a box, which is convex. Shape (1, 1), m."""
+    """Return the signed distance of a point to a box, as a convex function. Shape (1, 1), m."""
     over = ca.fabs(_finite_axes(point, box)) - _half_size(box)
     outside = ca.fmax(over, 0)
     deepest = reduce(ca.fmax, ca.vertsplit(over))
@@ -163,7 +163,7 @@ class Radii:
 
 @dataclass(frozen=True)
 class CollisionScene:
-    """Obstacles of the rig.
+    """Obstacles around the rig.
 
     Attributes:
         walls: The hollow tunnel; its floor is a wall. None for no walls.
@@ -183,7 +183,7 @@ class CollisionScene:
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
-    """Return the links of the rig as capsules, by name, from joint 2 to the store."""
+    """Return the links of the rig as capsules, by name, from that of joint 2 to the store."""
     require.instance("rig: rig", rig, Rig)
     radii = Radii() if radii is None else require.instance("rig: radii", radii, Radii)
     frames = dh_frames(rig, checked_vector("q", q, 6, "one entry for each joint of the rig"))
@@ -236,7 +236,7 @@ def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
 
 
 def checked_clearance(clearance: float) -> float:
-    """Return `clearance` itself, m; raise a ModelError unless it is a finite distance or -inf for none."""
+    """Return `clearance`, m; raise a ModelError unless it is a finite distance, or -inf for no clearance."""
     if require.number("rig: clearance", clearance, finite=False) == np.inf:
         message = f"clearance {clearance} m must be a finite distance or -inf for none"
         raise ModelError(message, name="clearance", value=clearance)
@@ -245,7 +245,7 @@ def checked_clearance(clearance: float) -> float:
 
 @dataclass(frozen=True)
 class Avoidance:
-    """How the rig avoids obstacles: clearance as a constraint, as a term of the index, or both.
+    """Settings by which the rig avoids obstacles: clearance as a constraint, as a term of the index, or both.
 
     Attributes:
         scene: Obstacles.
@@ -275,7 +275,7 @@ class Avoidance:
 def collision_free_inverse(
     rig: Rig, tunnel: Tunnel, avoidance: Avoidance, branch: Branch = HOME, *, rate_weight: float = 0.0
 ) -> Any:
-    """Return the Function (target, previous) -> (joints, cost, active, status, gap): `optimal_inverse` among obstacles.
+    """Return `optimal_inverse` among obstacles: the Function (target, previous) -> (joints, cost, active, status, gap).
 
     Args:
         avoidance: Obstacles, clearance and proximity term.
@@ -335,7 +335,7 @@ def collision_free_inverse(
 
 
 def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the function (grid merits) -> columns (angle, merit, step) of the lowest minima."""
+    """Return inputs and outputs of the function (grid merits) -> (angle, merit, step) of each of the lowest minima."""
     merits = ca.SX.sym("merits", 1, samples)
     angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
     remaining = []
@@ -353,7 +353,7 @@ def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
 
 
 def _least_value(count: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of (angles, values) -> (angle of the minimum, minimum, whether it is the first)."""
+    """Return inputs and outputs of the function (angles, values) -> (best angle, minimum, whether it is the first)."""
     angles, values = ca.SX.sym("angles", 1, count), ca.SX.sym("values", 1, count)
     best, least, is_first = angles[0], values[0], ca.SX(1)
     for k in range(1, count):
@@ -364,7 +364,7 @@ def _least_value(count: int) -> tuple[list[Any], list[Any]]:
 
 
 def _pattern_search(merit: Any) -> Any:
-    """Return the Function (states, inputs) -> states after a pattern search about each state (angle, merit, step).
+    """Return the Function (states, inputs) -> states that improves each state (angle, merit, step) by a pattern search.
 
     Inputs are target and previous roll.
     """

@@ -69,11 +69,11 @@ class Rig:
                 warn_of_degrees(f"rig: limit of joint {joint}", (low, high), f"joint {joint}")
 
     def limited(self, joint: int) -> bool:
-        """Return whether the limits of revolute joint 2..6 (counted from 1) are less than a full turn apart."""
+        """Return whether a revolute joint, 2 to 6, has limits less than a full turn apart."""
         return bool(self.upper[joint - 1] - self.lower[joint - 1] < FULL_TURN)
 
     def limit(self, joint: int, upper: bool) -> float:
-        """Return one limit of joint 1..6, m or rad; infinite if there is none."""
+        """Return the lower or upper limit of a joint, 1 to 6, in m or rad; infinite if there is none."""
         return float((self.upper if upper else self.lower)[joint - 1])
 
     def middle_and_half(self, joint: int) -> tuple[float, float]:
@@ -88,7 +88,7 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Tunnel:
-    """Reference of the index I1, which measures the position of the goose-neck's corner, (35).
+    """Reference of the index I1, which measures how far the goose-neck's corner is from the tunnel's centre, (35).
 
     Attributes:
         center: P_C in world. Shape (3,), m.
@@ -110,7 +110,7 @@ class Tunnel:
 
     @property
     def scale(self) -> Array:
-        """Diagonal of D, w / range^2. Shape (3,), 1/m^2."""
+        """Diagonal of the weight matrix D, w / range^2. Shape (3,), 1/m^2."""
         return np.asarray(self.weights / self.ranges**2)
 
 
@@ -136,7 +136,7 @@ def checked_branch(branch: Branch) -> Branch:
 
 
 class RigConfiguration(NamedTuple):
-    """Configuration of the rig for a target, a roll and a branch; scalar expressions unless noted.
+    """Joint angles of the rig for a target, a roll and a branch, with intermediate scalar expressions.
 
     Attributes:
         corner: P_G in world. Shape (3, 1), m.
@@ -157,7 +157,7 @@ class RigConfiguration(NamedTuple):
 
 
 def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
-    """Return frames 0..6 and the tool in world by the D-H product (1)-(4), Table 1 without offsets of q2 and q5.
+    """Return frames 0 to 6 and the tool frame in world as Denavit-Hartenberg products (1)-(4), without joint offsets.
 
     Args:
         q: Joint positions. Shape (6, 1).
@@ -182,7 +182,7 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
 
 
 def forward(rig: Rig, q: Expression) -> Expression:
-    """Return the pose (x, y, z, yaw, pitch, roll) of the tool in world, (16)-(22). Shape (6, 1), m and rad.
+    """Return the tool pose (x, y, z, yaw, pitch, roll) in world, (16)-(22). Shape (6, 1), m and rad.
 
     Yaw and pitch are the sums of the joint angles, not reduced to one turn.
     """
@@ -211,19 +211,19 @@ def task_jacobian(rig: Rig, q: Expression) -> Expression:
 
 
 def goose_neck_corner(rig: Rig, target: Expression, roll: Expression) -> Expression:
-    """Return P_G = p - Lp2 x + Lg z in tool axes, (32)-(34), in world. Shape (3, 1), m."""
+    """Return the goose-neck's corner for a target pose and a roll, (32)-(34), in world. Shape (3, 1), m."""
     roll = expression(roll)
     return corner_of_roll(rig, expression(target), ca.cos(roll), ca.sin(roll))
 
 
 def corner_of_roll(rig: Rig, target: Expression, c: Expression, s: Expression) -> Expression:
-    """Return P_G for a roll given by its cosine and sine. Shape (3, 1), m."""
+    """Return the position of the goose-neck's corner for a roll given by cosine and sine. Shape (3, 1), m."""
     axle, cosine_part, sine_part = corner_circle(rig, target)
     return axle + rig.goose_neck * (c * cosine_part + s * sine_part)
 
 
 def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression, Expression]:
-    """Return the circle on which roll moves P_G: centre (m), axes of cosine and sine. Shape (3, 1), in world."""
+    """Return the circle on which roll moves the goose-neck's corner: centre (m), cosine and sine axis. Shape (3, 1)."""
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     c_pitch, s_pitch = ca.cos(target[4]), ca.sin(target[4])
     axle = target[:3] - rig.sting * ca.vertcat(c_yaw * c_pitch, s_yaw * c_pitch, -s_pitch)
@@ -232,7 +232,7 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
 
 
 def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression, *, branch: Branch) -> RigConfiguration:
-    """Return the configuration for a roll given by its cosine and sine: (23), (25), (27)."""
+    """Return the configuration of the rig for a roll given by its cosine and sine, (23), (25), (27)."""
     corner = corner_of_roll(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     sin4 = -corner[2] / rig.pitch_link
@@ -280,5 +280,5 @@ def nearest_turn(angle: Expression, middle: Expression) -> Expression:
 
 
 def first_turn_after(angle: Expression, start: Expression) -> Expression:
-    """Return the angle plus the fewest full turns that bring it to `start` or beyond, rad."""
+    """Return the smallest angle at or beyond `start` that differs from `angle` by full turns, rad."""
     return angle + FULL_TURN * ca.ceil((start - angle) / FULL_TURN)

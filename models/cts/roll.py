@@ -62,7 +62,7 @@ COSINE_SLACK = 1e-7
 
 
 class Candidate(NamedTuple):
-    """A candidate for the best roll: a point of the circle and the code of the constraint that it lies on."""
+    """A candidate for the best roll: its cosine and sine, and the code of the constraint that it lies on."""
 
     c: Expression
     s: Expression
@@ -70,7 +70,7 @@ class Candidate(NamedTuple):
 
 
 class ConstraintCheck(NamedTuple):
-    """Constraints that a roll satisfies; scalar conditions."""
+    """Constraints that a roll satisfies, as boolean expressions."""
 
     pitch: Expression
     yaw: Expression
@@ -97,7 +97,7 @@ class ConstraintCheck(NamedTuple):
 
 
 class ArcEndLevel(NamedTuple):
-    """A value of cos q2 at which an arc may end.
+    """A value of cos q2 at which an interval of feasible rolls may end.
 
     Attributes:
         cosine: The value.
@@ -113,12 +113,12 @@ class ArcEndLevel(NamedTuple):
 
 
 def limit_code(joint: int, upper: bool) -> int:
-    """Return the number that stands for the lower or upper limit of joint 1..6 in ACTIVE."""
+    """Return the code of a joint limit, for joint 1 to 6, as in the table ACTIVE."""
     return 3 + 2 * (joint - 1) + int(upper)
 
 
 def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
-    """Return I1 of (36) as a function of roll; with D = diag(w / range^2) it has only two harmonics."""
+    """Return the index I1 of (36) as a trigonometric polynomial of the roll, which has only two harmonics."""
     axle, e_c, e_s = corner_circle(rig, target)
     offset = axle - ca.DM(tunnel.center)
     weight = ca.DM(tunnel.scale)
@@ -137,7 +137,7 @@ def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
 def check_constraints(
     rig: Rig, target: Expression, configuration: RigConfiguration, *, c: Expression, s: Expression
 ) -> ConstraintCheck:
-    """Return the constraints that a configuration satisfies. Angles are compared by their cosine from mid-range."""
+    """Return the constraints that a configuration satisfies; angles are compared by their cosine from mid-range."""
     p = configuration
     pair3 = _difference(ca.sin(target[3]), -ca.cos(target[3]), p.sin2, p.cos2)  # yaw - pi/2 - q2
     pair5 = _difference(-ca.sin(target[4]), ca.cos(target[4]), p.sin4, p.cos4)  # pitch + pi/2 - q4
@@ -153,7 +153,7 @@ def check_constraints(
 
 
 def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expression:
-    """Return the code in STATUS of a target without a feasible roll: a link out of reach, or joint limits."""
+    """Return the status code of a target without a feasible roll: a link is out of reach, or joint limits."""
     rig = rig.unlimited()
     axle, e_c, _ = corner_circle(rig, target)
     pitch = ca.fabs(axle[2]) - rig.goose_neck * ca.fabs(e_c[2]) <= rig.pitch_link
@@ -167,7 +167,7 @@ def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expressi
 
 
 def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return points that include all ends of the feasible arcs, except those by the limits of joint 1."""
+    """Return points that include all ends of the intervals of feasible rolls, except those due to limits of joint 1."""
     ends = closed_form_ends(rig, target, branch)
     chart = yaw_chart(rig, branch)
     for level in yaw_levels(rig, target, branch):
@@ -182,7 +182,7 @@ def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
 
 
 def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return the arc ends that have a closed form: limits of joints 4, 5 and 6, and the reach of the pitch link."""
+    """Return ends of feasible roll intervals in closed form: limits of joints 4 to 6, reach of the pitch link."""
     axle, e_c, _ = corner_circle(rig, target)
     ends = []
     for sine, code in _pitch_sines(rig, target, branch):
@@ -198,12 +198,12 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
 
 
 def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel]:
-    """Return the values of cos q2 at which an arc may end: limits of joints 2 and 3, and the reach of the yaw link."""
+    """Return values of cos q2 at ends of feasible roll intervals: limits of joints 2 and 3, reach of the yaw link."""
     levels = []
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
     def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Add a value of q2 at which an arc may end, valid only if joint 3 is within its limits there."""
+        """Add a value of q2 at a possible end of a roll interval, valid only if joint 3 is within its limits there."""
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
@@ -227,7 +227,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
 
 
 def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
-    """Return four approximate rolls, as (cos, sin), at which cos q2 has a value; `polish_to_value` makes them exact.
+    """Return four approximate solutions, as (cos, sin) of the roll, of the equation cos q2 = `cosine`.
 
     They are roots of the squared equation. It is smooth near a stretched pitch link, where cos q2 is not; near yaw 0 it
     has nearly double roots, where cos q2 has simple ones.
@@ -249,7 +249,7 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
-    """Return the values of sin q4 at which an arc of feasible rolls may end, each with the code of the active limit."""
+    """Return the values of sin q4 at which a feasible roll interval may end, each with the code of the active limit."""
     sines: list[tuple[Expression, int]] = []
     for sign in (-1, 1):
         if _allows(rig, 4, sign * np.pi / 2):
@@ -265,12 +265,12 @@ def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Exp
 
 
 def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
-    """Return a position of a joint just inside one of its limits, m or rad."""
+    """Return a position of a joint slightly inside one of its limits, m or rad."""
     return rig.limit(joint, upper) + (-1 if upper else 1) * ANGLE_INSET
 
 
 def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = COSINE_SLACK) -> Expression:
-    """Return whether an angle, given by sine and cosine, is within a joint's limits up to a slack of the cosine."""
+    """Return whether an angle, given by sine and cosine, is within a joint's limits, with a tolerance of the cosine."""
     if not rig.limited(joint):
         return 1
     middle, half = rig.middle_and_half(joint)
@@ -278,7 +278,7 @@ def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: f
 
 
 def _allows(rig: Rig, joint: int, angle: float) -> bool:
-    """Return whether the limits of a joint allow an angle, in any turn."""
+    """Return whether an angle, or the angle plus full turns, is within the limits of a joint."""
     if not rig.limited(joint):
         return True
     middle, half = rig.middle_and_half(joint)
@@ -286,7 +286,7 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return the Function (target, cosine, sine of roll) -> cos q2, its slope by roll, q1, its slope, cos q4."""
+    """Return the Function (target, cosine, sine of roll) -> cos q2, its derivative, q1, its derivative, cos q4."""
     t, c, s = ca.SX.sym("target", 5), ca.SX.sym("c"), ca.SX.sym("s")
     configuration = configuration_at(rig, t, c, s, branch=branch)
     values = ca.vertcat(configuration.cos2, configuration.q1)
@@ -295,12 +295,12 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 
 def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Return the point moved by Newton steps until cos q2 (output 0 of the chart) or q1 (output 2) has a value."""
+    """Solve cos q2 = value (output 0 of the chart) or q1 = value (output 2) for the roll by Newton steps."""
     return polish(point, chart_residual(chart, target, output, value))
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the point moved by Newton steps until cos q2 has a value, on the feasible side of it despite rounding.
+    """Solve cos q2 = value for the roll by Newton steps, and stay on the feasible side of it despite rounding.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     holds above the value, -1 if below.
@@ -312,7 +312,7 @@ def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expressi
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return the function of the roll, as (cos, sin), that `polish` sets to zero: a chart output minus a value.
+    """Return a chart output minus a value as a function of cosine and sine of the roll, for `polish` to solve.
 
     The output is 0 or 2; the function also returns its derivative by the roll.
     """
@@ -325,7 +325,7 @@ def chart_residual(chart: Any, target: Expression, output: int, value: Expressio
 
 
 def _difference(cos_a: Expression, sin_a: Expression, sin_b: Expression, cos_b: Expression) -> Point:
-    """Return cosine and sine of a - b."""
+    """Return cosine and sine of the difference of two angles, given by cosines and sines."""
     return cos_a * cos_b + sin_a * sin_b, sin_a * cos_b - cos_a * sin_b
 
 
@@ -334,7 +334,7 @@ def _not_zero(x: Expression) -> Expression:
 
 
 def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
-    """Return the Function of the target -> points that include all arc ends by one limit of joint 1.
+    """Return the Function (target) -> rolls that include all ends of feasible intervals due to one limit of joint 1.
 
     Output shape (2, 8): rows cosine and sine of the roll.
     """
@@ -348,7 +348,7 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
 
 
 def slide_points(rig: Rig, upper: bool) -> Any:
-    """Return the Function of the target -> approximate arc ends by one limit of joint 1. Output shape (2, 8)."""
+    """Return the Function (target) -> approximate rolls at one limit of joint 1. Output shape (2, 8)."""
     limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
@@ -374,12 +374,12 @@ def slide_points(rig: Rig, upper: bool) -> Any:
 
 
 def checked_gain(rate_weight: float) -> float:
-    """Return the weight of the roll rate over 2 pi; raise ModelError if it is negative or not finite."""
+    """Return the roll rate's weight divided by 2 pi; raise ModelError if it is negative or not finite."""
     return require.nonnegative("rig: rate_weight", rate_weight) / FULL_TURN
 
 
 def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:
-    """Return the roll angle of a point of the circle, in the turn of the previous roll or in that of the limits."""
+    """Return the angle of a roll given by cosine and sine, in the turn of the previous roll or of the limits."""
     angle = ca.atan2(s, c)
     if rig.limited(6):
         return nearest_turn(angle, rig.middle_and_half(6)[0])
@@ -387,7 +387,7 @@ def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) ->
 
 
 def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]:
-    """Return the interval of rolls within limits, at most one turn long, that are nearest to the previous roll."""
+    """Return the interval of rolls within limits that are nearest to the previous roll, at most one turn long."""
     start, low, high = previous - np.pi, rig.limit(6, False), rig.limit(6, True)
     if not np.isfinite(low):
         return start, start + FULL_TURN
@@ -396,7 +396,7 @@ def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]
 
 
 def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
-    """Return the Function (target, previous) -> rolls, shape (5, 1), rad, including all minima of I1 + gain change^2.
+    """Return the Function (target, previous) -> rolls that include all minima of I1 + gain change^2. Shape (5, 1), rad.
 
     If I2 is convex there is one minimum. Otherwise the window of rolls is split where I1'' = -2 gain, and each convex
     interval has its own minimum.
@@ -435,7 +435,7 @@ def minimize_convex(
 
 
 def _inflections(f: Harmonics, gain: float, start: Expression, end: Expression) -> list[Expression]:
-    """Return the rolls with I1'' = -2 gain in the window, between which I2 is convex or concave."""
+    """Return the rolls of the window at which I2 changes between convex and concave, that is I1'' = -2 gain."""
     bend = f.derivative().derivative()
     points = roots(bend._replace(a0=2 * gain))
     return [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in points]

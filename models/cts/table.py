@@ -59,7 +59,7 @@ class Table:
 
     @property
     def ok(self) -> Any:
-        """Whether each row has joints. Shape (samples,), bool."""
+        """Whether each target has a solution. Shape (samples,), bool."""
         return np.array([status == "ok" for status in self.status])
 
 
@@ -74,7 +74,7 @@ def solve_table(
     rate_weight: float = 0.0,
     avoidance: Avoidance | None = None,
 ) -> Table:
-    """Return the joints of least index for every target; rows without a solution do not affect the others.
+    """Return the joints with the least index for every target; targets without a solution do not affect others.
 
     Args:
         targets: Shape (samples, 5), m and rad; rows may hold nan.
@@ -122,7 +122,7 @@ def solve_table(
 
 
 def _best_branch(results: list[Any]) -> Array:
-    """Return the best of the branches' results: joints, cost, branch number, active, status. Shape (samples, 10)."""
+    """Return the result of the best branch: joints, cost, branch number, active, status. Shape (samples, 10)."""
     best: Array | None = None
     for number, (joints, cost, active, status, *_) in enumerate(results):
         columns = [np.array(part, dtype=float) for part in (joints, cost, active, status)]
@@ -142,7 +142,7 @@ def _best_branch(results: list[Any]) -> Array:
 
 @dataclass(frozen=True)
 class RollInterval:
-    """An interval of rolls within reach and all limits.
+    """An interval of rolls that are within reach and within all limits.
 
     Attributes:
         start, end: rad, end >= start; a full turn is -pi .. pi.
@@ -155,7 +155,7 @@ class RollInterval:
 
 
 def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[RollInterval]:
-    """Return all rolls, modulo a turn, that reach a target within joint limits, with start in [-pi, pi).
+    """Return all intervals of roll, modulo a turn, that reach a target within joint limits, with start in [-pi, pi).
 
     Args:
         target: Shape (5,), m and rad.
@@ -190,7 +190,7 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
 
 @lru_cache(maxsize=16)
 def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
-    """Return Functions (target) -> points with all arc ends, rows cosine, sine, code; (target, roll) -> feasible."""
+    """Return the Functions (target) -> ends of feasible roll intervals and (target, roll) -> whether it is feasible."""
     target, roll = ca.SX.sym("target", 5), ca.SX.sym("roll")
     angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in arc_ends(rig, target, branch)])
     x = ca.MX.sym("target", 5)
@@ -206,7 +206,7 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
 
 
 def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Branch, Array]]:
-    """Return every branch that reaches a target with a given roll, and its joints, shape (6,), without joint limits.
+    """Return the joints, shape (6,), of every branch that reaches a target with a given roll, without joint limits.
 
     Raises:
         ModelError: The target or roll is not finite, or no branch reaches the pose (names the link).
@@ -229,7 +229,7 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
 
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
-    """Return targets (x, y, z, yaw, pitch), shape (samples, 5); raise a ModelError for the first wrong row."""
+    """Return targets (x, y, z, yaw, pitch), shape (samples, 5); raise a ModelError about the first invalid row."""
     rows = require.array("table: targets", targets, ("samples", 5), entries="finite" if finite else "any")
     warn_of_degrees("table: yaw or pitch", rows[:, 3:], "targets")
     return rows

@@ -28,7 +28,7 @@ SMALLEST_DIVISOR = 1e-300
 
 @dataclass(frozen=True)
 class RootSettings:
-    """Settings of the root finding, which bound its number of operations.
+    """Settings of the root finding, which limit its number of operations.
 
     Attributes:
         min_second_harmonic: Smallest relative second harmonic in the pencil of conics; a smaller one is raised, and the
@@ -58,7 +58,7 @@ ROOTS = RootSettings()
 
 
 class Harmonics(NamedTuple):
-    """The function f = a0 + a1 cos + b1 sin + a2 cos 2 + b2 sin 2 of an angle; scalar expressions or numbers."""
+    """A trigonometric polynomial f = a0 + a1 cos x + b1 sin x + a2 cos 2x + b2 sin 2x with scalar coefficients."""
 
     a0: Expression
     a1: Expression
@@ -67,36 +67,36 @@ class Harmonics(NamedTuple):
     b2: Expression
 
     def value(self, c: Expression, s: Expression) -> Expression:
-        """Return f at the angle with cosine c and sine s."""
+        """Return the value of the polynomial at the angle with cosine c and sine s."""
         return self.a0 + self.a1 * c + self.b1 * s + self.a2 * (c * c - s * s) + 2 * self.b2 * c * s
 
     def derivative(self) -> Harmonics:
-        """Return df / d angle."""
+        """Return the derivative of the polynomial by the angle."""
         return Harmonics(0.0, self.b1, -self.a1, 2 * self.b2, -2 * self.a2)
 
     def slope_bound(self) -> Expression:
-        """Return an upper bound of |f''|: hypot(a1, b1) + 4 hypot(a2, b2)."""
+        """Return an upper bound of the second derivative's magnitude: hypot(a1, b1) + 4 hypot(a2, b2)."""
         return ca.sqrt(self.a1**2 + self.b1**2) + 4 * ca.sqrt(self.a2**2 + self.b2**2)
 
 
 def square_of_first_harmonic(a0: Expression, a1: Expression, b1: Expression) -> Harmonics:
-    """Return (a0 + a1 cos + b1 sin)^2."""
+    """Return the square of a0 + a1 cos x + b1 sin x as Harmonics."""
     mean = a0 * a0 + (a1 * a1 + b1 * b1) / 2
     return Harmonics(mean, 2 * a0 * a1, 2 * a0 * b1, (a1 * a1 - b1 * b1) / 2, a1 * b1)
 
 
 def subtract_harmonics(f: Harmonics, g: Harmonics) -> Harmonics:
-    """Return f - g."""
+    """Return the difference f - g of two trigonometric polynomials."""
     return Harmonics(*(a - b for a, b in zip(f, g, strict=True)))
 
 
 def scale_harmonics(f: Harmonics, factor: Expression) -> Harmonics:
-    """Return factor f."""
+    """Return a trigonometric polynomial multiplied by a factor."""
     return Harmonics(*(factor * a for a in f))
 
 
 def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS.polish_steps) -> list[Point]:
-    """Return four points of the circle that include all roots of f; if f has fewer, the others are meaningless.
+    """Return four points of the circle that include all roots of f; if f has fewer, the others have no meaning.
 
     The roots are the intersections of the unit circle with the conic f = 0, in axes with the second harmonic r (x^2 -
     y^2). The pencil f + l (x^2 + y^2 - 1) contains a pair of real lines for a root l in [-r, r] of a cubic, which
@@ -145,7 +145,7 @@ def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
-    """Return cosine and sine of the rotation to axes with f = a0 + p x + q y + r (x^2 - y^2), and p, q and r > 0.
+    """Return cosine and sine of the rotation to axes with f = a0 + p x + q y + r (x^2 - y^2), then p, q and r > 0.
 
     `shift` is added to a2, so that the second harmonic has a direction.
     """
@@ -159,7 +159,7 @@ def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expr
 
 
 def least_point(f: Harmonics) -> Point:
-    """Return the point of the circle where f has its global minimum.
+    """Return the point (cos, sin) of the unit circle at which f has its global minimum.
 
     In axes with f = a0 + p x + q y + r (x^2 - y^2), r > 0, mirroring x or y only changes the terms p x and q y, so the
     minimum is in the quadrant where neither is positive. There f has exactly one stationary point, the root of
@@ -204,7 +204,7 @@ def polish(
     max_polish_step: float = ROOTS.max_polish_step,
     floor: float = SMALLEST_DIVISOR,
 ) -> Point:
-    """Return a point after Newton steps of limited size (rad) on the circle.
+    """Refine a root on the unit circle by Newton steps of limited size (rad).
 
     `function` returns value and derivative by the angle. If the square of the derivative is below `floor` the steps
     vanish.
@@ -226,8 +226,9 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """Solve the cubic of a pencil of conics: return t = l / r in [-1, 1] with 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) +
-    q^2 (t + 1) = 0.
+    """Return the root t = l / r in [-1, 1] of the cubic of a pencil of conics.
+
+    The cubic is 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0.
     """
     b2 = -a0 / r
     b1 = (p * p + q * q) / (4 * r * r) - 1
@@ -257,7 +258,7 @@ Series = list[tuple[Expression, Expression]]
 
 
 def multiply_series(f: Series, g: Series) -> Series:
-    """Return the product f g of two series."""
+    """Return the product of two trigonometric series."""
     total = [[0.0, 0.0] for _ in range(len(f) + len(g) - 1)]
     for i, (a, b) in enumerate(f):
         for k, (c, d) in enumerate(g):
@@ -270,7 +271,7 @@ def multiply_series(f: Series, g: Series) -> Series:
 
 
 def add_series(f: Series, g: Series, factor: float = 1) -> Series:
-    """Return f + factor g for two series."""
+    """Return the sum f + factor g of two trigonometric series."""
     zero: Series = [(0.0, 0.0)]
     size = max(len(f), len(g))
     longer = [f + zero * (size - len(f)), g + zero * (size - len(g))]
@@ -278,7 +279,7 @@ def add_series(f: Series, g: Series, factor: float = 1) -> Series:
 
 
 def series_roots(degree: int) -> Any:
-    """Return the Function of the coefficients of a Series -> points of the circle that include its simple roots.
+    """Return the Function (coefficients of a trigonometric series) -> points of the circle at its simple roots.
 
     Input (2, degree + 1), rows a and b; output (2, 2 degree), rows cosine and sine. The roots z = exp(i angle) of the
     polynomial z^degree f are points simultaneously (Aberth 1973) in at most sum(ROOTS.stages) steps. Roots off the

@@ -33,7 +33,7 @@ MIN_SOFTNESS_M = 1e-6
 
 
 class Levers(NamedTuple):
-    """Bounds on the relative motion of the two bodies of each of n pairs per unit rate of the configuration.
+    """Bounds on the relative velocity of the two bodies of each of n pairs per unit rate of base and joint coordinates.
 
     A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
     turn times |r|.
@@ -133,7 +133,7 @@ class CollisionScene:
         self._place(own, checked, with_obstacles)
 
     def with_locked(self, machine: Machine) -> CollisionScene:
-        """Return the scene of the same machine with some joints locked, with those of its pairs that still move.
+        """Return the scene of the same machine with some joints locked; pairs that no longer move are left out.
 
         A scene of its own would take links as adjacent that only the locked joints connect.
         """
@@ -211,7 +211,7 @@ class CollisionScene:
         object.__setattr__(self, "cover_pairs", cover_pairs)
 
     def _reference_link(self, first: Body, second: Body) -> str:
-        """Return the last link that carries both bodies."""
+        """Return the link farthest from the root that carries both bodies."""
         return self._parts.common_part(*(self._parts.of_link[body.link] for body in (first, second)))
 
     @property
@@ -220,7 +220,7 @@ class CollisionScene:
         return tuple((self.bodies[i].name, self.bodies[j].name) for i, j, _ in self.pairs)
 
     def pair_names(self, pair: int) -> tuple[str, str]:
-        """Return the names of a pair as in `ignored`: those of its links, or of a link and an obstacle."""
+        """Return the names of a pair in the form of `ignored`: two links, or a link and an obstacle."""
         bodies = [self.bodies[body] for body in self.pairs[pair, :2]]
         own = range(len(self._carriers))
         first, second = (self._carriers[body.frame] if body.frame in own else body.name for body in bodies)
@@ -233,7 +233,7 @@ class CollisionScene:
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Reason by pair of links, "A and B", for pairs that are excluded by assumption, without proof."""
+        """Reason for each pair of links, "A and B", that is excluded by assumption, without proof."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value
@@ -325,7 +325,7 @@ class CollisionScene:
 
     @cached_property
     def levers(self) -> Levers:
-        """Bounds on the relative motion of each pair.
+        """Bounds on the relative motion of each pair per unit rate of base and joint coordinates, see `Levers`.
 
         Raises:
             ModelError: A prismatic joint without limits.
@@ -362,7 +362,7 @@ class CollisionScene:
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
-        """Return pairs of bodies by what they cover or are, for links with at most three joints between them.
+        """Return the pairs of bodies, one of them a mesh, that are close on the robot and are checked by convex hulls.
 
         Such links may be only millimetres apart by design, closer than the covers of their meshes allow. So the hulls
         of meshes are checked, as are those of meshes whose covers always collide.
@@ -381,7 +381,7 @@ class CollisionScene:
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
     def _levers_of(self, placed: PlacedShape, reference: int) -> Levers:
-        """Return the levers of one body in a reference frame: the frame of a link, or the world (-1)."""
+        """Return the velocity bounds of one body in a reference frame: the frame of a link, or the world (-1)."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
         joints, turns, base, base_turns = np.zeros(robot.dof), np.zeros(robot.dof), np.zeros(size), np.zeros(size)
         levers = Levers(base, base_turns, joints, turns)

@@ -106,11 +106,11 @@ class FreeFloating:
 
     @property
     def twist_rows(self) -> list[int]:
-        """Rows of a spatial twist or momentum that the base has: (rotation z, x, y) if planar, else all six."""
+        """Indices of the twist components that the base has: (rotation about z, x, y) if planar, else all six."""
         return PLANAR_ROWS if self.base == "planar" else list(range(6))
 
     def base_home(self) -> Array:
-        """Return the base configuration at the world's origin, axes parallel. Shape (base_size,)."""
+        """Return the base configuration at the world's origin, with parallel axes. Shape (base_size,)."""
         return np.zeros(3) if self.base == "planar" else np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
     def world_from_base(self, base: Expression) -> Frame:
@@ -189,7 +189,7 @@ class FreeFloating:
 
     @on_scalars
     def momentum(self, base: Expression, q: Expression, base_twist: Expression, joint_rates: Expression) -> Expression:
-        """Return the total (moment of momentum about the world's origin, linear momentum); (Lz, Px, Py) if planar.
+        """Return total angular momentum about the world's origin and linear momentum; (Lz, Px, Py) if planar.
 
         Shape (6, 1) or (3, 1).
         """
@@ -293,7 +293,7 @@ class FreeFloating:
     def _reaction(
         self, q: Expression, joint_rates: Expression | None, base: Expression = None, tip: bool = False
     ) -> _Reaction:
-        """Return the base reaction, including the momentum if joint rates are given."""
+        """Return the base motion that joint rates cause; with joint rates given, include the conserved momentum."""
         carried = None
         if joint_rates is not None and (momentum := self._spatial_momentum()) is not None:
             turn = self.world_from_base(base).rotation

@@ -78,7 +78,7 @@ class Machine(Protocol):
         """Return the time derivative of the base configuration, including the drift. Shape (base_size, 1)."""
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Return the manipulability of the task that fixes these rows of the tip's twist, see jacobian_manipulability.
+        """Return the manipulability of a task that fixes some rows of the tip's twist, see jacobian_manipulability.
 
         Shape (1, 1).
         """
@@ -138,9 +138,7 @@ class FixedBase:
 
     @cached_property
     def _pose_function(self) -> Any:
-        """Cached CasADi Function from joints to the pose of the tip; inlining it is faster than building its
-        expressions.
-        """
+        """Cached CasADi Function from joints to the tip's pose; inlining it is faster than building its expressions."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_pose", [q], [*map(ca.densify, tip_pose(self.robot, q, self.world_from_base()))])
 
@@ -161,14 +159,14 @@ class FixedBase:
         return type(joint_vector(self.robot, joint_rates, "joint_rates"))(0, 1)
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Return the manipulability, see jacobian_manipulability. Shape (1, 1)."""
+        """Return Yoshikawa's manipulability of the tip Jacobian, see jacobian_manipulability. Shape (1, 1)."""
         return jacobian_manipulability(self.tip_jacobian(base, q), rows)
 
 
 def with_tip(
     machine: Machine, link: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Machine:
-    """Return the same machine with its tip at a frame fixed in any link, the root included.
+    """Return the same machine with its tip at a frame fixed in any link, including the root.
 
     Args:
         machine: A FixedBase, a FreeFloating, or any frozen dataclass with a field `robot`.
@@ -183,7 +181,7 @@ def with_tip(
 
 
 def hold_joints(machine: Machine, positions: Mapping[str, float]) -> Machine:
-    """Return the same machine with joints, and those that follow them, locked at positions (rad or m), by name.
+    """Return the same machine with joints, and their followers, locked at positions (rad or m) given by name.
 
     Raises:
         ModelError: As `models.robot.rebuild.lock_joints`; or as `with_tip` for the machine.
@@ -262,7 +260,7 @@ def with_wheels(
 
 
 def find_wheels(robot: Robot) -> dict[str, float]:
-    """Find the joints whose angle is irrelevant, such as reaction wheels; return their inertia (kg m^2) by name.
+    """Find the joints whose angle has no effect, such as reaction wheels; return their inertia (kg m^2) by name.
 
     Such a joint is unbounded and moves a single body, symmetric about the joint axis with its centre of mass on it,
     that carries neither the tip nor a collision shape.

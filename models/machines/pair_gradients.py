@@ -130,7 +130,7 @@ def _motion_signs(
 
 
 def _leader_columns(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
-    """Return the matrix that adds the columns of followers to those of their leaders, or None without followers."""
+    """Return the matrix that adds the columns of followers to those of their leaders; None without followers."""
     robot, size = machine.robot, machine.base_size
     matrix = np.zeros((size + len(joints), size + robot.dof))
     matrix[:size, :size] = np.eye(size)
@@ -141,7 +141,7 @@ def _leader_columns(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
 
 
 def _base_twists(world_from_base: Frame, base: Expression) -> Expression:
-    """Return the twists of a base per coordinate, (angular, linear at the world's origin), world axes.
+    """Return the base twist for a unit rate of each base coordinate, angular and linear, in world axes.
 
     Shape (6, size).
     """

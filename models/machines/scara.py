@@ -139,7 +139,7 @@ class Scara:
         return q
 
     def whole_turn(self, joint: int, least: float, most: float) -> float | None:
-        """Return the smallest multiple of 2 pi that moves a joint's range within its limits (to 1e-9), or None.
+        """Return the multiple of 2 pi that moves the range of a joint into its limits (to 1e-9), or None.
 
         It is always 0 for the quill.
 
@@ -204,7 +204,7 @@ ANGLES = [0, 1, 3]
 
 
 class JointsAlong(NamedTuple):
-    """Joints along a path and their derivatives by arc length. Shape (M, 4) each, rad and m, per m, m^2, m^3."""
+    """Joints along a path and three derivatives by arc length. Shape (M, 4) each, rad and m, per m, m^2, m^3."""
 
     position: Array
     first: Array
@@ -214,7 +214,7 @@ class JointsAlong(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScaraPath:
-    """Joints of a SCARA arm whose tool follows a path, from `scara_along`.
+    """Joints of a SCARA arm whose tool follows a path, as `scara_along` computes them.
 
     Attributes:
         scara: The arm.
@@ -292,7 +292,7 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
 
 
 def _poses(path: SmoothPath, s: Array) -> list[Any]:
-    """Return (x, y, z, yaw) and three derivatives at arc lengths of shape (M,). Shape (4, M) each."""
+    """Return tool poses (x, y, z, yaw) of a path and three derivatives at arc lengths (M,). Shape (4, M) each."""
     position, orientation = path.at(s), path.turn(s)
     yaw = 2 * np.arctan2(orientation.quaternion[:, 3], orientation.quaternion[:, 0])
     angular = (yaw, orientation.rate[:, 2], orientation.acceleration[:, 2], orientation.jerk[:, 2])
@@ -300,7 +300,7 @@ def _poses(path: SmoothPath, s: Array) -> list[Any]:
 
 
 def _turns(joints_along: ScaraPath) -> Array:
-    """Return the whole turns to add to the joints so that they keep their limits. Shape (4,), rad."""
+    """Return the multiples of 2 pi to add to the joints so that they stay within their limits. Shape (4,), rad."""
     turns, scara, (s, q) = np.zeros(4), joints_along.scara, joints_along.table
     for joint, (name, low, high) in enumerate(zip(scara.names, scara.lower, scara.upper, strict=True)):
         if np.isneginf(low) and np.isposinf(high):
@@ -345,7 +345,7 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
 
 
 def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:
-    """Return place and value of the maximum (sign 1) or minimum (-1) of a function of arc length, also between samples.
+    """Return arc length and value of a function's maximum (sign 1) or minimum (-1), found between samples too.
 
     Args:
         function: Of arc lengths, shape (M,) to (M,).

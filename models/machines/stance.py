@@ -100,7 +100,7 @@ class Foothold:
 
     @classmethod
     def level(cls, x: float, y: float, heading: float = 0.0, height: float = 0.0) -> Self:
-        """Return a foothold on level ground: x, y (m), turned left by a heading (rad), a height (m) above z = 0."""
+        """Return a foothold on level ground at x, y and a height (m), turned left by a heading (rad)."""
         numbers = {"x": x, "y": y, "heading": heading, "height": height}
         x, y, heading, height = (require.number(f"foothold: {name}", value) for name, value in numbers.items())
         turn = [[np.cos(heading), -np.sin(heading), 0.0], [np.sin(heading), np.cos(heading), 0.0], [0.0, 0.0, 1.0]]
@@ -169,7 +169,7 @@ class Stance(FixedBase):
 
     @cached_property
     def bodies(self) -> Robot:
-        """The robot with links merged between moving joints and feet: the same dynamics, faster."""
+        """The robot with fixed links merged, which has the same dynamics and is faster to evaluate."""
         return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:
@@ -202,7 +202,7 @@ class Stance(FixedBase):
     def loads(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> dict[str, Expression]:
-        """Return the loads of all standing feet in a motion from those of the other feet; the first bears the rest."""
+        """Return the loads of all standing feet during a motion, given those of all but the first foot."""
         reaction = base_reaction(
             self.bodies,
             q,
@@ -249,7 +249,7 @@ class Stance(FixedBase):
 
     @cached_property
     def load_rows(self) -> dict[str, tuple[int, ...]]:
-        """Rows of the twist of each foot but the first, world axes, that the joints can move.
+        """Twist components of each foot but the first, in world axes, that the joints can change.
 
         They are all six, or three in a plane, also for feet in the air. The load of a foot has the same rows: nothing
         resists the others.
@@ -282,7 +282,7 @@ class Stance(FixedBase):
         return rows_of_feet
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """Return the full load (6, 1) of a foot from its free rows `load_rows`; the other rows are zero."""
+        """Return the full load (6, 1) of a foot from its components in `load_rows`; the other components are zero."""
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
@@ -295,7 +295,7 @@ class Stance(FixedBase):
         return self.load_in_sole(name, load)[1][2]
 
     def edge_moments(self, name: str, load: Expression, margin: float = 0.0) -> Expression:
-        """Return the moments of a load about the edges of its sole, none negative if the foot does not tip.
+        """Return the moments of a load about the edges of its sole; they are nonnegative if the foot does not tip.
 
         Each is the distance of the center of pressure from an edge, less a margin, times the pressure, N m. Only edges
         from which motion can change that distance count. Shape (k, 1); none for a grip.
@@ -317,7 +317,7 @@ class Stance(FixedBase):
         return rows[self._edges(name, margin)]
 
     def _edges(self, name: str, margin: float) -> list[int]:
-        """Return the edges of a sole relative to which motion can shift the center of pressure."""
+        """Return the indices of the sole's edges towards which motion can shift the center of pressure."""
         sole = self.feet[name].sole
         assert sole is not None
         distances = self._sampled_pressures[name] @ sole.normals.T - (sole.normals * sole.vertices).sum(axis=1)

@@ -38,7 +38,7 @@ External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
 
 
 def wrenches_at(external: External | None, time: Expression, tip: Expression) -> tuple[Wrench, ...]:
-    """Return the wrenches that `external` returns, () if None; raise ModelError for anything else."""
+    """Return the wrenches that the function `external` returns, () if it is None; raise ModelError for others."""
     if external is None:
         return ()
     if not callable(external):
@@ -118,7 +118,7 @@ class Standing(FixedBase):
         return np.array([0.0, 0.0, -self.gravity])
 
     def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
-        """Return the robot with links merged between moving joints and wrenches: the same dynamics, faster."""
+        """Return the robot with fixed links merged, which has the same dynamics and is faster to evaluate."""
         keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
         if keep not in self._bodies:
             self._bodies[keep] = simplify(self.robot, keep)
@@ -182,7 +182,7 @@ class Standing(FixedBase):
         x, y = ca.vertsplit(point)
 
         def moments(velocity: Expression, acceleration: Expression) -> Expression:
-            """Return the moments about the point, in the order and with the signs of (11)-(12). Shape (2, 1)."""
+            """Return the moments about the prescribed point, in order and with signs of (11)-(12). Shape (2, 1)."""
             reaction = self.ground_reaction(q, velocity, acceleration) - external
             return ca.vertcat(-reaction[1] - x * reaction[5], reaction[0] - y * reaction[5])
 
@@ -313,7 +313,7 @@ class StandingMotion:
 
     @property
     def stands(self) -> bool:
-        """Whether the machine neither lifts off nor tips, which a stability index of 1 does not imply."""
+        """Whether the machine neither lifts off nor tips; a stability index of 1 does not imply that."""
         return self.stays_on_ground and self.stays_in_foot
 
     def summary(self) -> dict[str, float | bool]:
@@ -361,7 +361,7 @@ class StandingMotion:
 
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
-    """Return the CasADi Function (time, q, qd, qdd) -> attributes of a StandingMotion from `joint_torques` on.
+    """Return the CasADi function (time, q, qd, qdd) -> the computed attributes of a `StandingMotion`, torques first.
 
     Its symbols are SX, or MX if `external` requires it.
     """
@@ -402,7 +402,7 @@ def standing_motion(
 
 
 def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, *, qdd: Array) -> dict[str, Array]:
-    """Return the outputs of a motion function at M times, by name: (M, k), or (M,) for scalars."""
+    """Return the outputs of a motion function at M times, by name. Shape (M, k), or (M,) for scalars."""
     outputs = function.map(len(t))(t[None, :], q.T, qd.T, qdd.T)
     names = [function.name_out(i) for i in range(function.n_out())]
     values = {name: np.array(ca.DM(value)).T for name, value in zip(names, outputs, strict=True)}

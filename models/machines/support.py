@@ -107,7 +107,7 @@ class Support:
         return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM(offsets)
 
     def margin(self, point: Expression) -> Expression:
-        """Return the least of :meth:`distances`: how far a point may move before it leaves the polygon.
+        """Return the least of :meth:`distances`, by which a point may move before it leaves the polygon.
 
         Outside it is negative; its size is the distance from the farthest line, which is at most that from the polygon.
         Shape (1, 1), m.
@@ -142,7 +142,7 @@ RIM = 32
 
 
 class Footprint(NamedTuple):
-    """Contact of a robot with the ground, and its pose on it.
+    """Contact polygon of a robot with the ground, and the pose of the robot on it.
 
     With this pose the robot stands on z = 0 of the world: `Standing(robot, support=result.support,
     translation=result.translation, rotation=result.rotation)`.

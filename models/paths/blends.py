@@ -71,7 +71,7 @@ MIDDLE_FACTORS: dict[str, float] = {"cubic": 1 / 4, "quintic": 5 / 16}
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
-    """Return the shape factors of vertices, from one for all or one for each. Shape (count,).
+    """Return the shape factors of vertices, from one for all or one for each, after checks. Shape (count,).
 
     Raises:
         ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
@@ -88,7 +88,7 @@ def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
 
 
 def rest_to_rest(s: Expression) -> Expression:
-    """Return the minimum-jerk time scaling 10 s^3 - 15 s^4 + 6 s^5 of the share s of the duration, s in [0, 1].
+    """Return the minimum-jerk time scaling 10 s^3 - 15 s^4 + 6 s^5 at the fraction s, 0 to 1, of the duration.
 
     It is the polynomial of least degree whose velocity and acceleration are zero at both ends. Accepts numbers, arrays
     and expressions.
@@ -99,7 +99,7 @@ def rest_to_rest(s: Expression) -> Expression:
 
 
 def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array:
-    """Return the cubic with given ends and derivatives by u, eqs (1)-(7). Shapes (..., 3) to (..., 6, 3)."""
+    """Return the cubic with given end points and end derivatives by u, eqs (1)-(7). Shapes (..., 3) to (..., 6, 3)."""
     chord = end - start
     zero = np.zeros_like(chord)
     second = 3 * chord - 2 * start_rate - end_rate
@@ -127,7 +127,7 @@ def quintic(start: End, end: End) -> Array:
 
 
 def polynomial(coefficients: Array, u: Array, order: int = 0) -> Array:
-    """Return a derivative of polynomials at u. Shapes (..., 6, 3), (...) to (..., 3)."""
+    """Evaluate polynomials or their derivatives at u. Shapes (..., 6, 3), (...) to (..., 3)."""
     factors = _falling_factorials(order)
     value = coefficients[..., 5, :] * factors[5]
     u = np.asarray(u, dtype=float)[..., None]
@@ -142,7 +142,7 @@ def _falling_factorials(order: int) -> list[float]:
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
-    """Return the distance of the blend from the vertex over the remaining distance, eq. (8), between two lines.
+    """Return the ratio of the blend's distance from the vertex to the remaining distance, eq. (8), between two lines.
 
     |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic: the distance at u = 1/2,
     which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
@@ -163,7 +163,7 @@ def curvature(coefficients: Array, u: Array) -> Array:
 
 
 def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:
-    """Return position and three derivatives by the distance, by the chain rule with d/ds = (1/|F'|) d/du."""
+    """Return position and its first three derivatives by arc length, from polynomials of u by the chain rule."""
     position, first, second, third = (polynomial(coefficients, u, order) for order in range(4))
     rate = np.linalg.norm(first, axis=-1, keepdims=True)
     rate_u = (first * second).sum(axis=-1, keepdims=True) / rate
@@ -213,9 +213,7 @@ def corner_shape(angle: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Return interior angles, rad, and the optimal shape factor over the chord, for blends from distance 1 of the
-    corner.
-    """
+    """Return a table of interior angles (rad) and optimal shape factors over the chord, at unit remaining distance."""
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])
@@ -229,7 +227,7 @@ def _table() -> tuple[Array, Array]:
 
 
 def best_shape(ends: Ends, remaining: Array, samples: int = SEARCH.samples) -> Array:
-    """Return the shape factors of least peak curvature of quintic blends between given ends.
+    """Return the shape factors for which quintic blends between given ends have the least peak curvature.
 
     Args:
         ends: Point (m), unit tangent and curvature vector (1/m) at the start, and the same at the end. Shape (V, 3)
@@ -292,7 +290,7 @@ MAX_STEPS = 4
 
 
 class Cells(NamedTuple):
-    """Cells of polynomial curves, sorted by curve and u.
+    """Cells of polynomial curves, sorted by curve and parameter u; each has its own table of arc length.
 
     Attributes:
         curve: Index of the curve. Shape (C,).
@@ -332,7 +330,7 @@ def _speed(derivative: Array, u: Array) -> Array:
 
 
 def _half_square_slope(derivative: Array, u: Array) -> Array:
-    """Return half the derivative of the squared speed by u. Shapes (3, 5, M), (M,) to (M,)."""
+    """Return half the derivative of the squared speed with respect to u. Shapes (3, 5, M), (M,) to (M,)."""
     total: Array = np.zeros(np.shape(u))
     for terms in derivative:
         value, slope = terms[4] * u + terms[3], terms[4].copy()
@@ -349,7 +347,7 @@ def _lengths(derivative: Array, start: Array, width: Array) -> Array:
 
 
 def cells(coefficients: Array) -> Cells:
-    """Split curves into cells. `coefficients` as in models.paths.blends, shape (B, 6, 3).
+    """Split polynomial curves, shape (B, 6, 3), into cells in which the arc length can be inverted reliably.
 
     Raises:
         ModelError: A curve has a cusp, which no finite number of cells resolves.
@@ -386,7 +384,7 @@ def cells(coefficients: Array) -> Cells:
 
 
 def parameter(coefficients: Array, start: Array, width: Array, *, length: Array, distance: Array) -> Array:
-    """Return the u at which the arc length from the cell's start is `distance`.
+    """Return the parameter u at which the arc length from the start of a cell equals `distance`.
 
     Shapes: coefficients (M, 6, 3), all others (M,). A cubic Hermite guess from the cell's ends is refined by Chebyshev
     iterations, which converge cubically, with the 10-point rule. The result is accurate to rounding for distances from

@@ -70,7 +70,7 @@ def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
 
 
 def _clamp(distance: Any, length: float) -> Any:
-    """Return the distance clamped to the path, with the derivative 1 at both ends too."""
+    """Return the distance clamped to the path; the derivative stays 1 at both ends."""
     return ca.if_else(distance > length, length, ca.if_else(distance < 0, 0.0, distance))
 
 
@@ -120,7 +120,7 @@ def _cell_function() -> Any:
 
 
 def _derivative(columns: Any) -> Any:
-    """Return the coefficients of the derivative, one column less."""
+    """Return the coefficients of a polynomial's derivative, which has one column less."""
     return ca.horzcat(*[power * columns[:, power] for power in range(1, columns.shape[1])])
 
 
@@ -132,7 +132,7 @@ def _horner(columns: Any, u: Any) -> Any:
 
 
 def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
-    """Return the start distances of the cells, then the length, and a column of data per cell (see `_cell_function`).
+    """Return the start distance of each cell, then the path's length, and one column of data per cell.
 
     For a segment: its start point, the axial, tangential and inward vectors of its screw, and its rotation rate. For a
     blend: the coefficients, three a power. For both: distance, length, whether it is a blend; u at the start, width in
@@ -161,7 +161,7 @@ def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
 
 
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
-    """Return the paper's map of distance to parameter: predictor (15), `corrections` times corrector (13).
+    """Return the map of distance to path parameter from the paper: predictor (15), then `corrections` correctors (13).
 
     It does not control its error: with the trapezoid rule (12) the sample drifts from its distance.
 
@@ -269,8 +269,7 @@ def exponential(vector: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def orientation_function() -> Any:
-    """Return the casadi Function of tool orientation and its rates on one segment, for any number of samples as
-    columns.
+    """Return the casadi Function of tool orientation and its rates on one segment; the samples are columns.
 
     Inputs: reference (4); theta (3, 6) as 18 entries column by column, ascending powers of distance over length; length
     (m); distance over length. Outputs: unit quaternion (4); in world axes the angular rate per metre (3, rad/m), its

@@ -123,7 +123,7 @@ class Path:
         return _angles(self.at(index, self.lengths[:-1])[1], self.tangent[1:])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = (1.0, 0.0, 0.0, 0.0)) -> Path:
-        """Return the path in a world in which its own axes have a given pose; the tool turns with it.
+        """Return the path moved to a given pose in the world; tool orientations rotate with it.
 
         Args:
             position: Origin of the path's axes in that world. Shape (3,), m.
@@ -197,7 +197,7 @@ class Path:
 
 
 def checked_segments(segments: Any) -> tuple[Segment, ...]:
-    """Return `segments` as a tuple; raise a ModelError unless they are Lines, Arcs and Helices, at least one."""
+    """Return `segments` as a tuple; raise a ModelError unless it holds Lines, Arcs or Helices, and at least one."""
     try:
         check_entries(segments)
         checked = tuple(segments)
@@ -271,7 +271,7 @@ def split_at_reversals(
 
 
 def bulb_turn(segment: Segment, width: float) -> tuple[Arc, Arc, Arc]:
-    """Return the arcs of a bulb turn at the end of a segment, in a horizontal plane unless the segment is vertical."""
+    """Return the arcs of a bulb-shaped turn at the end of a segment, horizontal unless the segment is vertical."""
     frame = np.asarray(segment.start), segment.tangent, segment.normal
     bends: Any = {"curvature": segment.curvature, "torsion": segment.torsion}
     _, ahead, bend, _ = screw(*frame, **bends, distance=segment.length)

@@ -77,7 +77,7 @@ class _Corners(NamedTuple):
     vertices: NDArray[np.intp]
 
     def subset(self, chosen: NDArray[np.intp] | slice) -> _Corners:
-        """Return the corners of some indices."""
+        """Return the corners with the given indices."""
         return self._replace(shape=self.shape[chosen], vertices=self.vertices[chosen])
 
     @property
@@ -102,7 +102,7 @@ class _Corners(NamedTuple):
         return quintic((p0, rate * n0, rate**2 * k0), (p1, rate * n1, rate**2 * k1))
 
     def with_best_shape(self, remaining: Array) -> _Corners:
-        """Return the corners with the shape factor that is best for each."""
+        """Return the same corners with the shape factor of each optimised."""
         shape, curved = corner_shape(self.path.corner_angles()[self.vertices]), self.curved
         subset = self.subset(curved)
         shape[curved] = best_shape(subset.ends(remaining[curved]), remaining[curved])
@@ -112,7 +112,7 @@ class _Corners(NamedTuple):
 def _remaining_distances(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """Return the corners, with optimised shapes if these are free, and their remaining distances, (n - 1,), m.
+    """Return the corners, with optimised shapes if `free`, and the remaining distances of their blends, (n - 1,), m.
 
     Arguments as for `smooth`.
     """
@@ -209,7 +209,7 @@ def _initial_distances(corners: _Corners, tolerance: Array, longest: Array) -> A
 
 
 def _solve_distances(corners: _Corners, tolerance: Array, longest: Array) -> Array:
-    """Return remaining distances, at most `longest`, whose deviation is the tolerance, or less at the longest."""
+    """Return remaining distances, up to `longest`, at which the deviation reaches the tolerance or stays below it."""
     low, high, trial = np.zeros_like(longest), longest.copy(), longest.copy()
     todo = np.arange(len(longest))
     for number in range(SETTINGS.iterations):
@@ -292,7 +292,7 @@ def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remain
 
 
 def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distance of points (V, S, 3) from the stretch first..last of one segment each."""
+    """Return the distance of points (V, S, 3) from the part first..last of one path segment each."""
     helices = np.flatnonzero(path.torsion[index] != 0)
     if helices.size:
         result, others = np.empty(points.shape[:2]), np.flatnonzero(path.torsion[index] == 0)
@@ -319,7 +319,7 @@ def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, fir
 
 
 def _distance_to_helix(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the same as `_distance_to_segment` for helices, by Newton iterations from the closest sample."""
+    """Return the same distances as `_distance_to_segment` for helices, by Newton's method from the closest sample."""
     if len(index) > SETTINGS.block:
         parts = [slice(k, k + SETTINGS.block) for k in range(0, len(index), SETTINGS.block)]
         return np.concatenate([_distance_to_helix(path, index[p], points[p], first[p], last[p]) for p in parts])

@@ -147,7 +147,7 @@ class Arc(_Circular):
         start_orientation: ArrayInput | None = None,
         end_orientation: ArrayInput | None = None,
     ) -> Arc:
-        """Return the arc from `start` around `center`, turning by `sweep` rad about `axis`; negative: the other way."""
+        """Return the arc from `start` around `center` by `sweep` rad about `axis`; a negative sweep turns backwards."""
         turn = require.number("arc: sweep", sweep)
         vector = require.array("arc: axis", axis, (3,))
         return cls(start, center, vector if turn >= 0 else -vector, abs(turn), start_orientation, end_orientation)

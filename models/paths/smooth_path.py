@@ -120,7 +120,7 @@ class SmoothPath:
 
     @property
     def piece_lengths(self) -> Array:
-        """Lengths of the pieces. Shape (P,), m."""
+        """Lengths of the pieces, which are segments and blends in order. Shape (P,), m."""
         return np.diff(self.bounds)
 
     @cached_property
@@ -203,7 +203,7 @@ class SmoothPath:
         return np.append(inside, self.length)
 
     def by_piece(self, of_segments: ArrayInput) -> Array:
-        """Return the speed on each piece from the speed of each segment; a blend takes the lower one of its neighbours.
+        """Return the speed on each piece from that of each segment; a blend has the lower speed of its neighbours.
 
         Shape (P,).
 
@@ -216,7 +216,7 @@ class SmoothPath:
         return np.where(self.piece_blend >= 0, blends, values[self.piece_segment])
 
     def curvature_jumps(self) -> Array:
-        """Return the jump of the curvature vector at each bound between pieces. Shape (P - 1,), 1/m."""
+        """Return the jump of the curvature vector between consecutive pieces. Shape (P - 1,), 1/m."""
         left, right = self._end_curvatures(1.0)[:-1], self._end_curvatures(0.0)[1:]
         return np.asarray(np.linalg.norm(right - left, axis=1))
 
@@ -271,7 +271,7 @@ class SmoothPath:
         return along_piece(reference[piece], theta[piece], length, (s - self.bounds[piece]) / length)
 
     def _on_segment(self, segment: NDArray[np.intp], distance: Array) -> tuple[Array, ...]:
-        """Return position and derivatives at distances from the end of the blend before each segment."""
+        """Return position and derivatives on segments at distances from the end of the blend before each."""
         start_offset = np.concatenate([[0.0], self.remaining])[segment]
         return self.path.at(segment, start_offset + distance)
 
@@ -286,7 +286,7 @@ class SmoothPath:
 
     @cached_property
     def charts(self) -> tuple[Array, Array]:
-        """Reference quaternion (P, 4) and rotation vector polynomials (P, 6, 3) of the pieces, by distance/length."""
+        """Reference quaternion (P, 4) and rotation vector polynomial (P, 6, 3) of each piece; u is distance/length."""
         path, lengths = self.path, self.piece_lengths
         rate = path.turn / path.lengths[:, None]
         start_offset = np.concatenate([[0.0], self.remaining])
@@ -307,7 +307,7 @@ class SmoothPath:
 
 
 def _in_blocks(function: Callable[[Array], tuple[Array, ...]], s: Array, widths: tuple[int, ...]) -> list[Array]:
-    """Return the rows of a function of distances, evaluated in blocks. Shapes (M,) to (M, width) each."""
+    """Evaluate a function of distances in blocks to bound its memory. Shapes (M,) to (M, width) each."""
     results = [np.empty((len(s), width)) for width in widths]
     for first in range(0, len(s), BLOCK_SIZE):
         part = slice(first, first + BLOCK_SIZE)
@@ -320,7 +320,7 @@ SERIES_TERMS = 18
 
 
 def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the same as `orientation_function`, in numpy, for M samples.
+    """Return orientation and its rates for M samples, computed in numpy as `orientation_function` does in casadi.
 
     omega = theta' + B theta x theta' + C theta x (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and
     a = |theta|, in the axes of the reference. B and C are entire functions of a^2.
@@ -365,7 +365,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    """Return the power series with terms (-x)^k / (2 k + start)! and its first two derivatives."""
+    """Return sum of (-x)^k / (2 k + start)! at x = `square`, and its first two derivatives."""
     value, first, second = (np.zeros_like(square) for _ in range(3))
     for k in reversed(range(SERIES_TERMS)):
         second = second * square + 2 * first

@@ -119,7 +119,7 @@ def base_reaction(
 
 @on_scalars
 def mass_matrix(robot: Robot, q: Expression) -> Expression:
-    """Return the joint-space inertia M of T = q'^T M q' / 2, the base at rest. Shape (dof, dof), kg m^2, kg m or kg.
+    """Return the joint-space mass matrix with the base at rest. Shape (dof, dof), kg m^2, kg m or kg.
 
     Composite rigid bodies (Featherstone 2008, 6.2): M_ij is the momentum of all that joint j carries, per rate of j,
     along the axis of each joint i that carries j.
@@ -173,7 +173,7 @@ def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Ex
 
 
 def _twist_and_rate(base_motion: tuple[Expression, Expression] | None) -> tuple[Expression | None, Expression | None]:
-    """Return the two parts of a motion of the base; raise ModelError if they are not two."""
+    """Return twist and twist rate of a base motion; raise ModelError unless it has these two parts."""
     if base_motion is None:
         return None, None
     if not isinstance(base_motion, tuple | list) or len(base_motion) != 2:
@@ -243,7 +243,7 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Return a less gravity, shape (3, 1), and U, shape (3, 3), of each link in its own axes, by name; see _efforts."""
+    """Return acceleration less gravity (3, 1) and acceleration field (3, 3) of each link in its own axes, by name."""
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
@@ -275,7 +275,7 @@ def _motions_in_links(
 
 
 def _mass_sums(link: Link) -> tuple[Expression, Expression]:
-    """Return the sums of m x and of m x x' over a link, in its frame. Shapes (3, 1), kg m, and (3, 3), kg m^2."""
+    """Return the first and second mass moments of a link in its frame. Shapes (3, 1), kg m, and (3, 3), kg m^2."""
     center, inertia = link.center_of_mass, link.inertia
     about_center = np.trace(inertia) / 2 * np.eye(3) - inertia
     return constant(link.mass * center), constant(about_center + link.mass * np.outer(center, center))
@@ -288,7 +288,7 @@ def _field(spin: Expression, turning: Expression) -> Expression:
 
 
 class MassMoments(NamedTuple):
-    """Mass, first and second moments of a set of bodies about the world's origin: their spatial inertia in ten numbers.
+    """Mass, first and second moments of bodies about the world's origin, which contain their spatial inertia.
 
     Attributes:
         mass: kg.
@@ -305,7 +305,7 @@ class MassMoments(NamedTuple):
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """Return (moment of momentum about the origin, linear momentum) for a common motion vector."""
+        """Return (angular momentum about the origin, linear momentum) of bodies that share a motion vector."""
         angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
         return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
@@ -324,7 +324,7 @@ def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placem
 
 
 def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the map from joint rates to (moment of momentum about the world's origin, linear momentum).
+    """Return the matrix from joint rates to (angular momentum about the world's origin, linear momentum).
 
     The base is at rest. Shape (6, dof).
     """
@@ -340,7 +340,7 @@ def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None
 
 
 def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
-    """Return the moments of each link with all links that it carries, by link name, about the world's origin."""
+    """Return the mass moments about the world's origin of each link with all links that it carries, by link name."""
     moments: dict[str, MassMoments] = {}
     for link in robot.links:
         turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)
@@ -357,7 +357,7 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
 def joint_momenta(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
 ) -> Expression:
-    """Return momentum_matrix from the axes of frames_and_axes and the moments of subtree_moments."""
+    """Return the momentum matrix from the axes of frames_and_axes and the moments of subtree_moments."""
     children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
     momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
     return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, momenta))
@@ -372,7 +372,7 @@ def momentum(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return (moment of momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
+    """Return (angular momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     motions = propagate_motions(robot, frames, axes, qd=qd, qdd=ca.DM(robot.dof, 1))
     place = checked_vector("about", about, 3, "a point of the world")

@@ -26,7 +26,7 @@ Placement = tuple[Expression, Expression]
 
 
 class _Turn(NamedTuple):
-    """Rotation about consecutive parallel axes: orientation before the first, common axis, sum of angles."""
+    """Rotation about consecutive parallel axes: orientation before the first axis, common axis, sum of the angles."""
 
     before: Expression
     axis: Array
@@ -34,7 +34,7 @@ class _Turn(NamedTuple):
 
 
 def joint_vector(robot: Robot, q: Expression, name: str = "q") -> Expression:
-    """Return `q` as a column; raise ModelError unless it has one entry for each moving joint."""
+    """Return `q` as a column; raise ModelError unless it has one entry for each entry of the joint vector."""
     require.instance("kinematics: robot", robot, Robot)
     return checked_vector(name, q, robot.dof, f"one entry for each of the joints {list(robot.joint_names)}")
 
@@ -64,7 +64,7 @@ def checked_vector(label: str, value: Expression, size: int, meaning: str) -> Ex
 
 
 def checked_placement(placement: Placement | None) -> Frame:
-    """Return the pose of the root link as a frame, the identity if None; raise ModelError if it is invalid."""
+    """Return the pose of the root link as a frame (the identity if None); raise ModelError if it is invalid."""
     if placement is None:
         return Frame(ca.DM.eye(3), ca.DM(3, 1))
     try:
@@ -106,7 +106,7 @@ def by_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> list[Ex
 
 
 def link_frames(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Frame]:
-    """Return the frames of all links in the world, by link name, root first."""
+    """Return the frames of all links in the world by link name, the root first."""
     return frames_and_axes(robot, q, world_from_base)[0]
 
 
@@ -390,7 +390,7 @@ def manipulability_of(task: Expression) -> Expression:
 
 
 def checked_rows(rows: Sequence[int]) -> list[int]:
-    """Return `rows` as a list; raise ModelError unless they are distinct indices 0..5 of a twist, and not empty."""
+    """Return `rows` as a nonempty list; raise ModelError unless they are distinct twist indices from 0 to 5."""
     try:
         check_entries(rows)
         numbers = floats(list(rows))

@@ -69,7 +69,7 @@ class CollisionShape:
         warn_of_millimetres(f"{owner}: size", size)
 
     def placed(self, rotation: Array, translation: Array) -> Self:
-        """Return the same shape in a frame, given the pose of its link in it. Shape (3, 3) and (3,)."""
+        """Return the shape in another frame, given the pose of its link there, shapes (3, 3) and (3,)."""
         turn = require.rotation("placed shape: rotation", rotation)
         shift = require.array("placed shape: translation", translation, (3,)) + turn @ self.translation
         return replace(self, translation=shift, rotation=turn @ self.rotation)
@@ -100,7 +100,7 @@ class VisualShape(CollisionShape):
         object.__setattr__(self, "color", color)
 
     def _check_size(self, size: Array, owner: str) -> None:
-        """Accept every size."""
+        """Accept shapes of any size, because they are for display only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +285,7 @@ class Joint:
 
 
 def massless_error(consequence: str) -> ModelError:
-    """Return the error for a robot without mass; `consequence` names what that makes impossible."""
+    """Return the error for a robot without mass; `consequence` says what is impossible therefore."""
     message = f"the robot has no mass, {consequence}: give its links masses; in URDF none has an <inertial>"
     return ModelError(message, name="mass", value=0.0, limit=0.0)
 

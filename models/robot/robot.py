@@ -117,7 +117,7 @@ class Robot:
         mimic: MimicRule = "couple",
         inertia: InertiaRule = "warn",
     ) -> Robot:
-        """Read a robot from a URDF description; see `models.robot.urdf.read_urdf` for what is read and the defaults.
+        """Read a robot from a URDF description; `models.robot.urdf.read_urdf` documents contents and defaults.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
@@ -196,12 +196,12 @@ class Robot:
         return tuple(joint.name for joint in self.moving_joints)
 
     def unit(self, per: str = "") -> str:
-        """Return the unit of the joint vector, or of its rates with `per` "/s": "rad", "m" or "rad, m" in its order."""
+        """Return the units of the joint vector, "rad", "m" or both in order of appearance, each with `per` appended."""
         return ", ".join(dict.fromkeys(joint.unit + require.text("unit: per", per) for joint in self.moving_joints))
 
     @property
     def effort_unit(self) -> str:
-        """Unit of the efforts of the joint vector: "N m", "N" or "N m, N" in its order."""
+        """Unit of the efforts of the joint vector: "N m", "N", or both in order of appearance."""
         return ", ".join(dict.fromkeys(joint.effort_unit for joint in self.moving_joints))
 
     @property
@@ -225,12 +225,12 @@ class Robot:
 
     @property
     def upper(self) -> Array:
-        """Upper position limits, likewise. Shape (dof,), rad or m."""
+        """Upper position limits of the joint vector, including those of followers. Shape (dof,), rad or m."""
         return self._limits["upper"].copy()
 
     @property
     def velocity(self) -> Array:
-        """Speed limits, likewise; infinite if unknown. Shape (dof,), rad/s or m/s."""
+        """Speed limits of the joint vector and of its followers; infinite if unknown. Shape (dof,), rad/s or m/s."""
         return self._limits["velocity"].copy()
 
     @property
@@ -251,13 +251,13 @@ class Robot:
         return {joint.child: joint for joint in self.joints}
 
     def link(self, name: str) -> Link:
-        """Return the link of that name; raise ModelError, with similar names, if there is none."""
+        """Return the link with a name; raise ModelError, with similar names, if there is none."""
         if not isinstance(name, str) or name not in self._links_by_name:
             raise require.unknown("link", name, self._links_by_name)
         return self._links_by_name[name]
 
     def joint(self, name: str) -> Joint:
-        """Return the moving or fixed joint of that name; raise ModelError, with similar names, if there is none."""
+        """Return the moving or fixed joint with a name; raise ModelError, with similar names, if there is none."""
         if not isinstance(name, str) or name not in self._joints_by_name:
             raise require.unknown("joint", name, self._joints_by_name)
         return self._joints_by_name[name]

@@ -69,7 +69,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
 
 
 def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
-    """Return the indices of the joints in an order in which every joint comes before those of its descendants.
+    """Return the indices of the joints in an order in which every joint precedes its descendants.
 
     The order of declaration is kept where possible.
 
@@ -180,7 +180,7 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
 
 
 def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
-    """Return the joints with some locked at given positions (rad or m, by name), and their followers with them.
+    """Return the joints after locking some, and their followers, at given positions (rad or m, by name).
 
     Joints that cannot move are locked too: followers of a locked joint, followers of a fixed joint (which counts as
     being at 0), and followers with multiplier 0. A follower that is locked itself follows no longer.
@@ -222,7 +222,7 @@ def prune_joints(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, 
 
 
 def joint_couplings(joints: Sequence[Joint]) -> dict[str, JointCoupling]:
-    """Return the coupling of each moving joint to the joint vector, whose entries are the leaders in order, by name."""
+    """Return the coupling of each moving joint, by name, to the joint vector of the leaders in order."""
     leaders = [joint.name for joint in joints if joint.moves and joint.mimic is None]
     columns = {name: column for column, name in enumerate(leaders)}
     couplings = {joint.name: Mimic(joint.name) for joint in joints if joint.moves} | ties_to_leaders(joints)

@@ -126,7 +126,7 @@ def _is_virtual(floating: Joint, links: Sequence[Link], joints: Sequence[Joint])
 
 
 def _without_world(floating: Joint, links: tuple[Link, ...]) -> tuple[Link, ...]:
-    """Return the links without the massless root to which a floating joint connects the robot."""
+    """Return the links other than the massless root to which a floating joint connects the robot."""
     base = next(link for link in links if link.name == floating.parent)
     if base.collisions:
         message = (
@@ -213,7 +213,7 @@ def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> 
 
 
 def _write_origin(element: ElementTree.Element, translation: Array, rotation: Array) -> None:
-    """Write an <origin>; without rotation there is no rpy, so that zeros stay exact."""
+    """Write an <origin> element, without rpy if there is no rotation, so that zeros stay exact."""
     rpy = {} if np.array_equal(rotation, np.eye(3)) else {"rpy": _text(_rpy(rotation))}
     ElementTree.SubElement(element, "origin", {"xyz": _text(translation)} | rpy)
 
@@ -395,7 +395,7 @@ def _axis(element: ElementTree.Element) -> Array | None:
 
 
 def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
-    """Return descriptions of unknown attributes of a link's or a joint's child elements that lack a known attribute.
+    """Describe the unknown attributes of those child elements of a link or joint that lack a known attribute.
 
     Unknown attributes in addition to all known ones are an extension and are skipped, like unknown elements.
 
@@ -450,7 +450,7 @@ def name_of(element: ElementTree.Element) -> str:
 
 
 def child_of(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element:
-    """Return the only child with a tag; raise ModelError naming `owner` if there is none, or several."""
+    """Return the only child with a tag; raise ModelError naming `owner` if there is none or more than one."""
     child = _only(element, tag, owner)
     if child is None:
         raise ModelError(f"{owner}: <{element.tag}> has no <{tag}>", name=tag, value=0, limit=1)

@@ -47,7 +47,7 @@ class LinkMesh:
 
     @cached_property
     def hull(self) -> Mesh:
-        """Convex hull in the frame of the link; of coplanar points, the hull of cubes of half-edge 1 um around them."""
+        """Convex hull in the frame of the link; coplanar points are first replaced by cubes of half-edge 1 um."""
         try:
             return Mesh.around(convex_hull(self.points))
         except ModelError:
@@ -223,7 +223,7 @@ class JointStep(NamedTuple):
 
 @dataclass(frozen=True)
 class RigidParts:
-    """Sets of links without a moving joint between them, each named by its link nearest to the root.
+    """Sets of links that no moving joint separates, each named after its link nearest to the root.
 
     Attributes:
         of_link: The part of each link.
@@ -251,14 +251,14 @@ class RigidParts:
         return parts
 
     def path(self, first: str, second: str) -> tuple[list[JointStep], list[JointStep]]:
-        """Return the joints from the first part up to the common part, and from there down to the second part."""
+        """Return the joints on the path between two parts: those up to their common part, then those down from it."""
         up, down = self._above(first), self._above(second)
         while up and down and up[-1] is down[-1]:
             up, down = up[:-1], down[:-1]
         return up, down[::-1]
 
     def common_part(self, first: str, second: str) -> str:
-        """Return the last part of the tree that carries both parts."""
+        """Return the rigid part farthest from the root that carries both parts."""
         up = self.path(first, second)[0]
         return up[-1].above if up else first
 

@@ -43,7 +43,7 @@ class BoxCore(NamedTuple):
 
 
 def no_stop(value: Expression) -> Expression:
-    """Return the value unchanged; the counterpart of functions that stop its derivative."""
+    """Return the value unchanged; used where derivatives are not to be stopped."""
     return value
 
 
@@ -51,7 +51,7 @@ def no_stop(value: Expression) -> Expression:
 
 
 def triple(entries: Iterable[Expression]) -> Triple:
-    """Return three entries as a vector."""
+    """Return three entries as a tuple (x, y, z)."""
     x, y, z = entries
     return x, y, z
 
@@ -89,25 +89,25 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
 
 
 def _root(square: Expression, excess: float = 0.0) -> Expression:
-    """Return a lower bound of d for d^2 <= square <= d^2 + excess; d itself if the excess is zero."""
+    """Return a lower bound of d, where `square` lies between d^2 and d^2 + excess; d itself if the excess is zero."""
     root = ca.sqrt(square + (excess or KINK**2))
     return (square - excess) * (1 / root) if excess else root - KINK
 
 
 def _negative_part(gap: Expression, rounding: float) -> Expression:
-    """Return min(gap, 0), or a smooth lower bound at most rounding/4 below; zero for gaps of at least `rounding`."""
+    """Return min(gap, 0), or a smooth lower bound within rounding/4 of it; zero for gaps of at least `rounding`."""
     if rounding == 0:
         return ca.fmin(gap, 0)
     return ca.fmin(gap + rounding, 0) - _clip(rounding - gap, 0.0, 2 * rounding) ** 2 * (0.25 / rounding)
 
 
 def _positive_part(gap: Expression, rounding: float) -> Expression:
-    """Return a smooth lower bound of max(gap, 0), at most rounding/2 below; zero for negative gaps."""
+    """Return a smooth lower bound of max(gap, 0) within rounding/2 of it; zero for negative gaps."""
     return ca.fmax(gap - rounding, 0) + _clip(gap, 0.0, rounding) ** 2 * (0.5 / rounding)
 
 
 def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopGradient) -> Expression:
-    """Return the largest gap, or a smooth lower bound, at most `rounding` below."""
+    """Return the largest gap, or a smooth lower bound of it within `rounding`."""
     largest = reduce(ca.fmax, gaps)
     if rounding == 0 or len(gaps) == 1:
         return largest
@@ -121,7 +121,7 @@ def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopG
 def distance_of_segments(
     first: SegmentCore, second: SegmentCore, rounding: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the distance of points and segments; zero, which is minus the depth, for crossing segments."""
+    """Return the distance of points and segments; it is zero for crossing segments."""
     if len(first.points) < len(second.points):
         first, second = second, first
     p, q = first.points[0], second.points[0]
@@ -194,7 +194,7 @@ def distance_to_box(
 
 
 def _in_box_axes(core: SegmentCore | BoxCore, box: BoxCore) -> tuple[Triple, list[Triple], Sequence[Expression]]:
-    """Return centre, axes and half extents of a point (no axis), a segment or a box, in the axes of a box."""
+    """Return centre, axes and half extents of a point (without axes), a segment or a box, in the axes of a box."""
     if isinstance(core, BoxCore):
         centre = in_axes(subtract(core.centre, box.centre), box.axes)
         return centre, [in_axes(axis, box.axes) for axis in core.axes], core.half
@@ -232,7 +232,7 @@ def _separating_gaps(
 
 
 def smooth_abs(x: Expression, slack: Expression) -> Expression:
-    """Return |x|, or a smooth upper bound, at most the slack above."""
+    """Return |x|, or a smooth upper bound of it within `slack`."""
     return ca.fabs(x) if isinstance(slack, float) and slack == 0 else ca.sqrt(x * x + slack * slack)
 
 
@@ -288,7 +288,7 @@ def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
 def _edge_squares(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, stop_gradient: StopGradient
 ) -> list[Expression]:
-    """Return the squared distances of the edges of a box to another box.
+    """Return the squared distances of the edges of one box to another box.
 
     Together with the corners of the other box they suffice: from a closest point inside a face one can slide along the
     face, at constant distance, to a corner or an edge.

@@ -151,7 +151,7 @@ def fit_cover(triangles: Array) -> tuple[Cover, ...]:
 
 
 def exceedance(shape: CoverShape, points: Array) -> Array:
-    """Return by how much points lie outside a capsule or box; zero or negative inside. Shape (n,), m."""
+    """Return the amount by which points lie outside a capsule or box; zero or negative inside. Shape (n,), m."""
     if isinstance(shape, Capsule):
         return np.asarray(_segment_distances(points, np.asarray(shape.start), np.asarray(shape.end)) - shape.radius)
     own = np.abs((points - shape.position) @ shape.rotation) - shape.size / 2
@@ -162,7 +162,7 @@ def exceedance(shape: CoverShape, points: Array) -> Array:
 
 
 def _fit_capsule(points: Array) -> Capsule:
-    """Return a capsule of nearly least volume around points, fitted to the extreme ones."""
+    """Return a capsule of nearly least volume around points, optimised for the extreme points among them."""
     frame = _principal_axes(points)
     extreme_points = points[_extreme_indices(points, frame)]
     bases = _bases(np.concatenate([frame.T, _sphere_points(SETTINGS.directions, half=True) @ frame.T]))
@@ -183,7 +183,7 @@ def _fit_capsule(points: Array) -> Capsule:
 
 
 def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, float, float, Array, Array]:
-    """Return volume, radius, both ends along the axis, the axis and a point on it for a capsule with its axis near z.
+    """Return volume, radius, ends along the axis, axis and axis point of a capsule with its axis near z.
 
     The parameters, shape (5,), are two slopes of the axis, its position across, and the root of the excess radius. A
     radius larger than the enclosing cylinder's lets the caps begin earlier.
@@ -205,7 +205,7 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
 
 
 def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Array]:
-    """Return the volumes of capsules about the last axes of bases (k, 3, 3), positions across and excess radii."""
+    """Return approximate volumes, axis positions and relative excess radii of enclosing capsules along k given axes."""
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
     rows = np.arange(len(bases))
@@ -225,7 +225,7 @@ def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Ar
 
 
 def _approximate_capsule(points: Array, bases: Array) -> Capsule:
-    """Return the best capsule about any of the last axes of bases."""
+    """Return the smallest approximate capsule around points along one of the last axes of bases (k, 3, 3)."""
     volumes, centres, excess = _approximate_capsules(points, bases)
     k = int(volumes.argmin())
     return _capsule_from_parameters(points, np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])]), bases[k])
@@ -254,7 +254,7 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
 
 
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
-    """Return the two sides of a plane across an axis for which the covering capsules have the least volume in all.
+    """Return the two parts of a mesh, split by a plane, whose covering capsules have the least total volume.
 
     If no plane splits the part, the part itself is returned.
     """
@@ -290,7 +290,7 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
 
 
 def _grid(points: Array) -> tuple[Array, float]:
-    """Return points that fill a box 1.5 times as large as the extent of some points, and the volume of the box.
+    """Return points that fill a box 1.5 times as large as the extent of the given points, and the volume of the box.
 
     The box contains nearly all of their covers. Shape (k, 3).
     """
@@ -303,14 +303,14 @@ def _grid(points: Array) -> tuple[Array, float]:
 
 
 def _covered_share(shapes: Sequence[CoverShape], grid: Array) -> float:
-    """Return the share of grid points that lie in some shape."""
+    """Return the share of grid points that lie in at least one of the shapes."""
     if not len(grid):
         return 0.0
     return float((np.min([exceedance(each, grid) for each in shapes], axis=0) <= 0).sum() / len(grid))
 
 
 def _representative_triangles(triangles: Array, frame: Array) -> Array:
-    """Return the triangles or, of many, the largest ones and the extreme vertices as degenerate triangles."""
+    """Return the triangles; if there are many, only the largest ones, and extreme vertices as degenerate triangles."""
     if len(triangles) <= SETTINGS.max_triangles:
         return triangles
     length = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
@@ -388,7 +388,7 @@ def _enclosing_box(box: Box, points: Array) -> Box:
 
 
 def _overhang(shape: CoverShape, hull: Array) -> float:
-    """Return how far a shape extends beyond the convex hull of some points, at sampled surface points."""
+    """Return how far a shape extends beyond a convex hull, sampled at points of its surface, m."""
     around = _sphere_points(SETTINGS.samples)
     if isinstance(shape, Capsule):
         along = np.asarray(shape.end) - np.asarray(shape.start)
@@ -401,7 +401,7 @@ def _overhang(shape: CoverShape, hull: Array) -> float:
 
 
 def _hull_vertices(points: Array) -> Array:
-    """Return the hull's vertices; of a large mesh, only those of its extreme points, which overestimates overhangs."""
+    """Return vertices of the convex hull; of a large mesh, only extreme ones, which overestimates overhangs."""
     if len(points) > SETTINGS.max_triangles:
         points = points[_extreme_indices(points, _principal_axes(points), 2 * SETTINGS.extremes)]
     try:
@@ -432,7 +432,7 @@ def _principal_axes(points: Array) -> Array:
 
 
 def _bases(axes: Array) -> Array:
-    """Return rotations whose last columns are given unit axes. Shape (k, 3, 3)."""
+    """Return rotation matrices whose last columns are the given unit axes. Shape (k, 3, 3)."""
     side = np.eye(3)[np.abs(axes).argmin(axis=1)]
     side = side - (side * axes).sum(axis=1, keepdims=True) * axes
     side = side / np.linalg.norm(side, axis=1, keepdims=True)
@@ -450,7 +450,7 @@ def _sphere_points(count: int, half: bool = False) -> Array:
 
 
 def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes) -> Any:
-    """Return the indices of points that are extreme in some of `count` directions, a multiple of 32."""
+    """Return the indices of points that are extreme in one of `count` directions; `count` is a multiple of 32."""
     if len(points) <= count:
         return np.arange(len(points))
     directions = np.split(_sphere_points(count) @ frame.T, count // 32)  # in blocks, which bounds the memory
@@ -458,7 +458,7 @@ def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes
 
 
 def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:
-    """Return the shape in the units of the mesh, enlarged by a bound of the rounding errors."""
+    """Return the shape scaled and moved to the mesh, enlarged by a bound of the rounding errors."""
     margin = 16 * float(np.finfo(float).eps * (np.abs(middle).max() + size))
     if isinstance(shape, Capsule):
         return Capsule(shape.radius * size + margin, middle + size * shape.start, middle + size * shape.end)
@@ -472,7 +472,7 @@ def _to_json(each: Cover) -> dict[str, Any]:
 
 
 def _from_json(value: Any, points: Array) -> tuple[Cover, ...] | None:
-    """Return cached covers, or None if the entry is invalid or does not contain the mesh's points."""
+    """Return covers read from the cache, or None if the entry is invalid or does not contain the mesh's points."""
     if not isinstance(value, list) or not 0 < len(value) <= SETTINGS.parts:
         return None
     try:

@@ -207,7 +207,7 @@ def _pair_wrenches(kinds: tuple[Any, Any], rounding: float, count: int) -> Any:
 
 
 class StoppedGradients:
-    """Values that differentiation treats as constants: symbols until they are restored.
+    """Values that differentiation treats as constants, because symbols replace them until they are restored.
 
     A distance is a minimum over positions or a maximum over directions, whose motion does not change it to first order
     (envelope theorem).
@@ -218,7 +218,7 @@ class StoppedGradients:
         self._values: list[Expression] = []
 
     def __call__(self, value: Expression) -> Expression:
-        """Return a new symbol that replaces an expression, so that derivatives treat it as a constant."""
+        """Return a new symbol for an expression, so that differentiation treats the expression as a constant."""
         if not isinstance(value, ca.MX) or value.is_constant():
             return value
         self._symbols.append(ca.MX.sym("stopped", value.shape))
@@ -276,7 +276,7 @@ def _check_kind(kind: Any, what: str) -> None:
 def _distance_of_columns(
     kinds: tuple[Any, Any], entries: Sequence[Sequence[Expression]], rounding: float, stop_gradient: StopGradient
 ) -> Any:
-    """Return the signed distance of two shapes of these kinds, given as columns."""
+    """Return the signed distance of two shapes of the given kinds, each described by a column of numbers."""
     first, second = map(_core_of_column, kinds, entries)
     swept_radius = sum(own[-1] for kind, own in zip(kinds, entries, strict=True) if kind in (Sphere, Capsule))
     if isinstance(first, PlaneCore):
@@ -315,7 +315,7 @@ def _core_in_frame(shape: Shape, turn: Expression, place: Expression) -> Core:
 
 
 def _core_of_column(kind: type[Shape], entries: Sequence[Expression]) -> Core:
-    """Return the core of a shape of this kind that is given as a column."""
+    """Return the core of a shape of the given kind from its column of numbers."""
     parts = [triple(entries[3 * k : 3 * k + 3]) for k in range(len(entries) // 3)]
     if kind is Box:
         return BoxCore(parts[0], tuple(parts[1:4]), parts[4])
@@ -335,7 +335,7 @@ def _as_number(entry: Expression) -> Expression:
 
 
 def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) -> Expression:
-    """Return the least height of a core above a plane, or a smooth lower bound, at most `rounding` below."""
+    """Return the least height of a core above a plane, or a smooth lower bound of it within `rounding`."""
     if isinstance(core, SegmentCore):
         heights = [dot(normal, subtract(end, point)) for end in core.points]
         middle, reaches = sum(heights) / len(heights), [(heights[-1] - heights[0]) / 2][: len(heights) - 1]
@@ -350,14 +350,14 @@ def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) ->
 
 
 def _smooth_minimum(values: Sequence[Expression], rounding: float) -> Expression:
-    """Return the smallest value, or a smooth lower bound, at most `rounding` below."""
+    """Return the smallest value, or a smooth lower bound of it within `rounding`."""
     if rounding == 0 or len(values) == 1:
         return reduce(ca.fmin, values)
     return soft_minimum(values, rounding / log(len(values)))
 
 
 def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
-    """Return the gaps to the second core along the outward normals of the first's faces; none for a segment."""
+    """Return the gaps to the second core along the face normals of the first core; none if that is a segment."""
     if isinstance(first, BoxCore):
         signed = [(axis, side, h) for axis, h in zip(first.axes, first.half, strict=True) for side in (-1.0, 1.0)]
         normals = [(triple(side * part for part in axis), h) for axis, side, h in signed]
@@ -372,7 +372,7 @@ def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
 
 
 def _edge_directions(hull: Hull) -> Array:
-    """Return bisectors of normals of faces that share an edge or corner, all more than pi/4 apart. Shape (k, 3).
+    """Return bisectors of the normals of faces that meet, where the normals differ by more than pi/4. Shape (k, 3).
 
     Beyond an edge whose faces' normals differ by an angle a, the normals alone see at most cos(a/2) of a distance, 92 %
     at pi/4.
@@ -394,7 +394,7 @@ def _edge_directions(hull: Hull) -> Array:
 
 
 def _in_frame(core: Core, centre: Triple, axes: Sequence[Triple]) -> Core:
-    """Return the core in coordinates of these axes and centre."""
+    """Return the core in the coordinates of a frame with this centre and these axes."""
     if isinstance(core, SegmentCore):
         return SegmentCore(tuple(in_axes(subtract(point, centre), axes) for point in core.points))
     assert not isinstance(core, PlaneCore)

@@ -103,7 +103,7 @@ def _convex_hull(points: Array) -> Hull:
 
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of distinct directions and the position of every direction among these. Shapes (f,), (k,)."""
+    """Return the indices of the distinct normals, and for each normal the position of its equal. Shapes (f,), (k,)."""
     close_pairs = scipy.spatial.cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
     links = scipy.sparse.coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
     _, same = scipy.sparse.csgraph.connected_components(links, directed=False)
@@ -199,7 +199,7 @@ def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray
 
 
 def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the same as `_between_segments` for a segment (K, 2, 3) and the corners of a box (K, 8, 3).
+    """Return closest points as `_between_segments` does, for segments (K, 2, 3) and corners of boxes (K, 8, 3).
 
     Half the derivative of the squared distance by the position s along the segment is increasing and piecewise linear.
     It has its kinks where the segment enters or leaves a slab of the box. It is evaluated at the kinks, between two of
@@ -229,7 +229,7 @@ def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _point_beside_box(point: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the same as `_between_segments` for a point (K, 1, 3) and the corners of a box (K, 8, 3) or a point."""
+    """Return the closest points of points (K, 1, 3) and boxes (K, 8, 3) or points, as `_between_segments` does."""
     on_point = point[:, 0]
     if box.shape[1] == 1:
         return on_point, box[:, 0], box[:, 0] - on_point
@@ -243,7 +243,7 @@ def _point_beside_box(point: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the same as `_between_segments` for hulls of points (K, m, 3), (K, l, 3), by the GJK algorithm."""
+    """Return closest points as `_between_segments` does, for hulls (K, m, 3) and (K, l, 3), by the GJK algorithm."""
     on_first, on_second = first[:, 0].astype(float), second[:, 0].astype(float)
     active = np.arange(len(first))
     a, b = np.repeat(on_first[:, None], 4, axis=1), np.repeat(on_second[:, None], 4, axis=1)
@@ -319,13 +319,13 @@ def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the cross product along the last axis; faster than numpy's own."""
+    """Return the cross product along the last axis, faster than numpy does."""
     i, j = [1, 2, 0], [2, 0, 1]
     return np.asarray(first[..., i] * second[..., j] - first[..., j] * second[..., i])
 
 
 def _least_overlap(first: np.ndarray, second: np.ndarray, boxes: tuple[bool, bool]) -> np.ndarray:
-    """Return the candidate unit vectors (K, 3), from first to second, along which hulls overlap least.
+    """Return the candidate unit vectors (K, 3), from first to second hull, along which hulls overlap least.
 
     Candidates are the line between the centroids, the edges of both hulls and the cross products of their edges. The
     edges of a hull are those from its first point to the next three; of a box, those from its first corner.

@@ -55,7 +55,7 @@ class Triangles(NamedTuple):
 
 
 def without_colors(vertices: Array, faces: Faces) -> Triangles:
-    """Return the triangles of vertices and faces, all without a colour."""
+    """Return the triangles of a mesh without colours from vertices and faces."""
     return Triangles(vertices, faces, np.full((len(faces), 4), np.nan))
 
 
@@ -76,14 +76,14 @@ def mesh_error(file: Path, what: str, value: object = None, limit: object = None
 
 
 def numbered_lines(file: Path, data: bytes) -> Iterator[tuple[int, str]]:
-    """Yield the numbers, from 1, and the texts of the lines; raise a ModelError if the text is too long."""
+    """Yield each line's number, from 1, and its text; raise a ModelError if the text is too long."""
     if len(data) > INPUT_LIMITS.mesh_text_bytes:
         raise mesh_error(file, f"it has {len(data)} bytes of text", len(data), INPUT_LIMITS.mesh_text_bytes)
     return enumerate(TextIOWrapper(BytesIO(data), "utf-8", errors="replace"), start=1)
 
 
 def parse_numbers(file: Path, words: Sequence[str], line: int) -> list[float]:
-    """Return words as numbers; raise a ModelError with the line for one that is no number."""
+    """Return words as numbers; raise a ModelError that names the line if one is no number."""
     values = []
     for word in words:
         try:
@@ -96,7 +96,7 @@ def parse_numbers(file: Path, words: Sequence[str], line: int) -> list[float]:
 def find_mesh(
     file: str, folder: str | os.PathLike[str] | None, folders: Sequence[str | os.PathLike[str]] = ()
 ) -> Path | None:
-    """Return the file that a URDF names, or None if there is none.
+    """Return the path of a mesh file that a URDF names, or None if it is not found.
 
     A name is a relative or absolute path, file://PATH, or package://NAME/REST. A package is searched in `folders`, then
     in the URDF file's folder and its parents, last in installed packages: those of ROS by ROS_PACKAGE_PATH and
@@ -204,7 +204,7 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
 
 
 def _read_stl(file: Path, data: bytes) -> Triangles:
-    """Read an STL file. Some binary files begin with "solid" as texts do, so the number of triangles decides."""
+    """Read a binary or text STL file. The number of triangles decides, as both kinds may begin with "solid"."""
     count = (
         int.from_bytes(data[STL_HEADER_BYTES - 4 : STL_HEADER_BYTES], "little") if len(data) >= STL_HEADER_BYTES else -1
     )
@@ -292,7 +292,7 @@ def _read_obj(file: Path, data: bytes) -> Triangles:
 
 
 def _material_colors(file: Path, name: str) -> Iterator[tuple[str, Array]]:
-    """Yield names and diffuse colours of a material library beside an OBJ file; none if it cannot be read."""
+    """Yield the names and diffuse colours in the material library of an OBJ file; none if it cannot be read."""
     try:
         data = read_regular(file.parent / name, INPUT_LIMITS.mesh_text_bytes)
     except (OSError, ValueError):
@@ -372,7 +372,7 @@ def read_collada(file: Path, data: bytes) -> Triangles:
 
 
 def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
-    """Return the document reduced to what pycollada shall read, and its unit, m.
+    """Return the document reduced to the elements that pycollada may read, and its unit, m.
 
     Instances of nodes are replaced by the nodes, and effects are reduced to a colour. Elements that pycollada would
     misinterpret are refused.
@@ -398,7 +398,7 @@ def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
 
 
 def _check_numbers(file: Path, root: ElementTree.Element) -> None:
-    """Refuse elements that pycollada reads in part or misinterprets; normalise the axes of rotations."""
+    """Reject elements that pycollada reads in part or misinterprets; normalise the axes of rotations."""
     for part in root.iter():
         several = part.tag in ("triangles", "polylist") and len(part.findall("p")) > 1
         if several or part.tag in ("lookat", "skew", "ph"):
@@ -428,7 +428,7 @@ def _check_numbers(file: Path, root: ElementTree.Element) -> None:
 
 
 def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
-    """Replace instances by their nodes; limit the number of nodes, which nested instances make grow exponentially."""
+    """Replace instances by their nodes; limit the number of nodes, because nested instances multiply it."""
     nodes = {each.get("id"): each for each in root.iter("node")}
     counts: dict[ElementTree.Element, int] = {}
 
@@ -454,7 +454,7 @@ def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
 
 
 def _materials_document(document: ElementTree.Element) -> ElementTree.Element:
-    """Return a document with the materials alone and their diffuse colours, if these are no images.
+    """Return a document that contains only the materials and their diffuse colours, except images.
 
     All materials are opaque, because programs disagree on what an opacity means.
     """

@@ -46,7 +46,7 @@ MARGIN_M = 1e-6
 
 @dataclass(frozen=True)
 class ProofSettings:
-    """Effort spent on a pair before it is checked in any case.
+    """Limits of the effort to prove that a pair need not be checked.
 
     Attributes:
         first_configurations: Random configurations that are tried before a proof.
@@ -70,7 +70,7 @@ SETTINGS = ProofSettings()
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of bodies that are checked and pairs of links that are not.
+    """Pairs of bodies that are checked for collision, and pairs of links that are not.
 
     Attributes:
         checked: Checked pairs as indices of the bodies, the lower first.
@@ -174,7 +174,7 @@ def checked_pairs(
 
 
 def _key(robot: Robot, bodies: Sequence[Body], named: Mapping[frozenset[str], Reason], *numbers: Any) -> str:
-    """Return the cache key of all that the pairs depend on."""
+    """Return the cache key, which depends on everything that determines the pairs."""
     parts = list(numbers)
     words = ["pairs", *(f"{sorted(pair)} {why}" for pair, why in named.items())]
     for joint in robot.joints:
@@ -188,7 +188,7 @@ def _key(robot: Robot, bodies: Sequence[Body], named: Mapping[frozenset[str], Re
 
 
 def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:
-    """Return pairs from the cache, or None if the entry is invalid."""
+    """Return the pairs read from the cache, or None if the entry is invalid."""
     try:
         checked = tuple((int(i), int(j)) for i, j in value["checked"])
         left = {(str(first), str(second)): Reason(why) for first, second, why in value["left"]}
@@ -235,7 +235,7 @@ Poses: TypeAlias = tuple[Array, Array]
 
 
 class _Lever(NamedTuple):
-    """A moving joint between two bodies.
+    """A moving joint between two bodies, with its lever arm.
 
     Attributes:
         column: Index in the joint vector.
@@ -248,14 +248,14 @@ class _Lever(NamedTuple):
     arm: float
 
     def moved(self, half: Array) -> Array:
-        """Return the largest change of the distance when the joint moves by at most `half`, rad or m."""
+        """Return the largest change of the distance of two bodies when a joint moves by at most `half`, rad or m."""
         turned = np.minimum(abs(self.ratio) * half, np.pi)
         return np.asarray(2 * self.arm * np.sin(turned / 2) if self.arm else abs(self.ratio) * half)
 
 
 @dataclass(frozen=True)
 class _PairClassifier:
-    """Classification of pairs of bodies within joint limits, by random configurations first and proofs afterwards."""
+    """Classifier of pairs of bodies within joint limits, by random configurations and then by proofs."""
 
     robot: Robot
     parts: RigidParts
@@ -268,7 +268,7 @@ class _PairClassifier:
     _poses: dict[str, Poses] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why a pair need not be checked, or None; also whether its covers are known to collide.
+        """Return why a pair need not be checked, or None if it must; also whether its covers are known to collide.
 
         Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
         therefore classified by the convex hulls of meshes.
@@ -308,7 +308,7 @@ class _PairClassifier:
         return self._placed[key]
 
     def _pose(self, part: str) -> Poses:
-        """Return the poses of a rigid part in the frame of the root at the first configurations."""
+        """Return the poses of a rigid part relative to the root at the first of the random configurations."""
         if part not in self._poses:
             q = self.configurations[: SETTINGS.first_configurations]
             step = self.parts.step.get(part)
@@ -328,7 +328,7 @@ class _PlacedBody:
 
 @dataclass(frozen=True)
 class _BodyPair:
-    """Two bodies, the joints between their rigid parts, and their relative poses at the first configurations."""
+    """Two bodies, the joints between their rigid parts, and their relative poses at random configurations."""
 
     robot: Robot
     first: _PlacedBody
@@ -338,7 +338,7 @@ class _BodyPair:
     start: Poses = (np.eye(3)[None], np.zeros((1, 3)))
 
     def classify(self, low: Array, high: Array, configurations: Array, margin: float, overhang: float) -> Reason | None:
-        """Return ALWAYS, COVERED or NEVER, or None for bodies that are to be checked."""
+        """Return why the bodies need not be checked: ALWAYS, COVERED or NEVER in collision; None if they must be."""
         colliding = self.bounds_at(self.start)[0] <= 0
         if colliding.all():
             largest = float(self.distance_bounds(*self._relative(configurations)).max())
@@ -347,7 +347,7 @@ class _BodyPair:
         return None if colliding.any() or not self._proves_apart(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
-        """Return NEVER if the hulls are apart at all points of a joint grid, refined where they are closest.
+        """Classify two hulls on a joint grid: NEVER in collision if they are apart at all points of all refinements.
 
         Returns ALWAYS for hulls that overlap on the whole first grid, else None.
         """
@@ -373,7 +373,7 @@ class _BodyPair:
         return None if (self.bounds(configurations)[0] > 0).any() else ALWAYS
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds of the distances at joint vectors (k, dof), and where bounding balls were not enough.
+        """Return lower bounds of the distances at joint vectors (k, dof), and where bounding balls did not suffice.
 
         Bounding balls suffice where they prove a distance greater than `above`, m.
         """
@@ -389,7 +389,7 @@ class _BodyPair:
         return bounds, close
 
     def distance_bounds(self, turn: Array, shift: Array) -> Array:
-        """Return lower bounds of the distances for poses of the second body, exact where the search has converged."""
+        """Return lower bounds of the distances for poses of the second body, exact where the search converged."""
         shapes = self.first.shape, self.second.shape
         first, second = (np.repeat(each.core, 2, axis=0) if len(each.core) == 1 else each.core for each in shapes)
         first, second = (
@@ -400,7 +400,7 @@ class _BodyPair:
         return gap_along(direction, first, second) - (shapes[0].swept_radius + shapes[1].swept_radius)
 
     def _relative(self, q: Array) -> Poses:
-        """Return the pose of the second body's rigid part in the first body's."""
+        """Return the poses of the second body's rigid part in the first body's."""
         first = second = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
         for step in self.up[::-1]:
             first = _moved(self.robot, first, step, q)
@@ -409,7 +409,7 @@ class _BodyPair:
         return _relative_poses(first, second)
 
     def _proves_apart(self, low: Array, high: Array, margin: float) -> bool:
-        """Return whether the distance is proven to stay above `margin`, m, by bisection of the joint space."""
+        """Return whether bisection of the joint space proves that the distance stays above `margin`, m."""
         columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         budget = SETTINGS.boxes // 4 ** max(0, len(columns) - 3)  # bisection of many joints rarely succeeds
         if not budget:
@@ -449,7 +449,7 @@ class _BodyPair:
         return False
 
     def _levers(self, low: Array, high: Array) -> list[_Lever]:
-        """Return the levers of the joints between the bodies, each with the shorter arm of both sides."""
+        """Return the levers of the joints between the bodies, each with the shorter arm of the two bodies."""
         chain = [*((step, False) for step in self.up), *((step, True) for step in self.down)]
         reverse = [(step, not down) for step, down in chain[::-1]]
         arms_second, _ = lever_arms(self.robot, chain, self.second.shape, low=low, high=high)
@@ -462,7 +462,7 @@ class _BodyPair:
 
 
 def _grid(values: Array, dimension: int) -> Array:
-    """Return the points of a regular grid with these values along each axis. Shape (k, dimension)."""
+    """Return the points of a regular grid with the given values along each axis. Shape (k, dimension)."""
     return np.stack(np.meshgrid(*[values] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
 
 
@@ -486,6 +486,6 @@ def _moved(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
 
 
 def _relative_poses(first: Poses, second: Poses) -> Poses:
-    """Return the second poses in the frames of the first."""
+    """Return the second poses relative to the first poses."""
     back = first[0].transpose(0, 2, 1)
     return back @ second[0], (back @ (second[1] - first[1])[:, :, None])[:, :, 0]

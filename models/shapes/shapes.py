@@ -30,7 +30,7 @@ CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in
 
 
 class _SweptCore:
-    """A convex solid: all points within `swept_radius` of the convex hull of the points `core`."""
+    """A convex solid: all points within `swept_radius` of the convex hull of its core points."""
 
     @property
     def core(self) -> Array:
@@ -52,7 +52,7 @@ class _Posed(_SweptCore):
     """Base class of shapes with a pose of their own."""
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
-        """Return the shape in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        """Return the shape in another frame, given rotation (3, 3) and position (3,) of its present frame in it, m."""
         turn, shift = _motion(rotation, translation)
         own: Any = copy(self)  # shares the hull, which is costly to compute
         object.__setattr__(own, "position", frozen(turn @ own.position + shift))
@@ -90,7 +90,7 @@ class Sphere(_SweptCore):
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Sphere:
-        """Return the sphere in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        """Return the sphere in another frame, given rotation (3, 3) and position (3,) of its present frame in it, m."""
         turn, shift = _motion(rotation, translation)
         return Sphere(self.radius, turn @ self.position + shift)
 
@@ -130,7 +130,7 @@ class Capsule(_SweptCore):
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Capsule:
-        """Return the capsule in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        """Return the capsule in another frame, given rotation (3, 3) and position (3,), m, of its present frame."""
         turn, shift = _motion(rotation, translation)
         return Capsule(self.radius, turn @ self.start + shift, turn @ self.end + shift)
 
@@ -167,7 +167,7 @@ class Cylinder(_Posed):
 
     @property
     def core(self) -> Array:
-        """Corners of the prism. Shape (2 SIDES, 3), m."""
+        """Corners of the prism that represents the cylinder. Shape (2 SIDES, 3), m."""
         return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
 
     @cached_property
@@ -208,7 +208,7 @@ class Box(_Posed):
 
     @property
     def core(self) -> Array:
-        """Corners: along the z edge first, then y, then x. Shape (8, 3), m.
+        """Corners of the box, ordered along the z edge first, then y, then x. Shape (8, 3), m.
 
         Raises:
             ModelError: An edge is infinite.
@@ -250,12 +250,12 @@ class HalfSpace(_SweptCore):
         return np.array([self.point])
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> HalfSpace:
-        """Return the half-space in another frame, in which its own has this rotation (3, 3) and position (3,), m."""
+        """Return the half-space in another frame, given rotation (3, 3) and position (3,), m, of its present frame."""
         turn, shift = _motion(rotation, translation)
         return HalfSpace(turn @ self.normal, turn @ self.point + shift)
 
     def reach(self, point: ArrayInput) -> float:
-        """Return inf: a half-space is unbounded."""
+        """Return inf, because a half-space is unbounded."""
         require.array("half-space: point", point, (3,))
         return np.inf
 

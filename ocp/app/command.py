@@ -129,7 +129,7 @@ def _printable(text: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON can represent it: null if it is not finite, the text of any other object."""
+    """Convert a value so that JSON can represent it: null if it is not finite, text if it is another object."""
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -312,7 +312,7 @@ def _force(parser: argparse.ArgumentParser) -> None:
 
 
 def robot_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options with which a URDF is read."""
+    """Add the options that say how a URDF is read."""
     group = parser.add_argument_group("the robot")
     group.add_argument("--tip", metavar="LINK", help="link that carries the tip")
     group.add_argument(
@@ -326,7 +326,7 @@ def robot_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `check`."""
+    """Add the options of the subcommand `check`."""
     file = parser.add_argument_group("the file")
     file.add_argument("--columns", metavar="NAMES", help="of a table without a header: time,joint1,...")
     file.add_argument("--period", type=float, metavar="S", help="sampling period of a table without times, s")
@@ -369,7 +369,7 @@ def check_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _limit(text: str) -> tuple[str, float]:
-    """Parse JOINT=NUMBER or NUMBER: return the joint, or "", and the number."""
+    """Parse JOINT=NUMBER or NUMBER; return the joint, "" if there is none, and the number."""
     name, _, value = text.rpartition("=")
     try:
         return name, float(value)

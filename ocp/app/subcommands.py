@@ -94,7 +94,7 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
 
 
 def machine_of(options: argparse.Namespace, robot: Robot, raw: RawTrajectory) -> tuple[Machine, list[str]]:
-    """Return the robot on the base that the options name, and a note on assumptions about its feet."""
+    """Return the robot on the base that the options name, and a note about assumed feet."""
     if options.floating:
         return FreeFloating(robot, "planar" if set(PLANAR_BASE) <= set(raw.names) else "spatial"), []
     translation, rotation = base_pose(options)
@@ -303,7 +303,7 @@ def run_task(
 
 
 def _segments(result: Plan) -> dict[str, Any]:
-    """Describe the segments of a plan and the motions between them, if it has several."""
+    """Describe the segments of a plan and the motions between them; "" if it has only one."""
     if not isinstance(result, SegmentedPlan):
         return {}
     names = ("time", "before", "after", "duration", "failure")

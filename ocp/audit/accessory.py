@@ -60,7 +60,7 @@ class AccessoryProblem:
         self._switches()
 
     def _units(self) -> None:
-        """Choose the scales that make the backward sweep well conditioned; they do not affect any verdict.
+        """Choose scales that make the backward sweep well conditioned; they affect no verdict.
 
         Horizon and states have their sizes; states that hardly move take those of others of their unit. Controls are
         scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature take their
@@ -82,14 +82,14 @@ class AccessoryProblem:
         self.unit = np.concatenate([state, horizon, *([state] if self.with_start else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
-        """Return the indices of the used entries of y = (x, T, u), and where each one is in (z, u)."""
+        """Return the indices of the variables of y = (x, T, u) that are used, and their indices in (z, u)."""
         nx = self.nx
         keep = [*range(nx), *([nx] if self.free else [])]
         inputs = range(nx + 1, nx + 1 + self.nu)
         return [*keep, *inputs], [*range(len(keep)), *range(self.nz, self.nz + self.nu)]
 
     def _second_order(self) -> None:
-        """Set the derivatives of dynamics and Hamiltonian, in scaled variations."""
+        """Compute the first and second derivatives of dynamics and Hamiltonian, in scaled variations."""
         along, form, m = self.along, self.along.form, len(self.along.s)
         lam, mu = form.sym("lam", form.nx), form.sym("mu", len(form.path))
         multipliers = np.zeros((m, len(form.path)))
@@ -125,7 +125,7 @@ class AccessoryProblem:
 
     @cached_property
     def residual_slope(self) -> np.ndarray:
-        """Slope of T H in the controls that no multiplier balances, in scaled controls. Shape (M, nu)."""
+        """Derivative of T H by the scaled controls that no multiplier balances. Shape (M, nu)."""
         along = self.along
         multipliers = self.adjoint.control_multipliers
         gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
@@ -133,20 +133,20 @@ class AccessoryProblem:
 
     @property
     def start_slope(self) -> np.ndarray:
-        """Slope of the cost in start and horizon, in scaled z. Shape (nz,)."""
+        """Derivative of the cost by start and horizon, in scaled variables z. Shape (nz,)."""
         gradient, nx = self.adjoint.ends.slope, self.nx
         slope = np.concatenate([gradient[:nx], gradient[nx:] if self.free else [], np.zeros(nx * self.with_start)])
         return np.asarray(slope * self.unit[: self.nz])
 
     @property
     def hamiltonian_scale(self) -> float:
-        """Second-order change of the Hamiltonian over the sizes of states and controls, in units of cost."""
+        """Second-order change of the Hamiltonian if states and controls change by their sizes, in units of cost."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
 
     @property
     def cost_scale(self) -> float:
-        """Curvature over the sizes, for the states by the running cost alone, because multipliers have no cost size."""
+        """Curvature of the cost for changes by the sizes; for states only that of the running cost counts."""
         sizes, curvature = self.along.sizes, np.abs(self._curves[:, self.nx + 1 :])
         total = self.along.share @ (np.abs(self._cost_curves) @ sizes.state**2 + curvature @ sizes.control**2)
         return float(total) / 2
@@ -157,7 +157,7 @@ class AccessoryProblem:
         return float(self.along.share @ np.sum(np.abs(self._curves[:, self.nx + 1 :]) * self.along.u**2, axis=1)) / 2
 
     def _constraints(self) -> None:
-        """Set the active limits: those with multipliers (strong) and those without (weak)."""
+        """Find the active limits: those with multipliers (strongly active) and those without (weakly active)."""
         along, m = self.along, len(self.along.s)
         used, z_of = self._into_z()
         size = self.nz + self.nu
@@ -198,7 +198,7 @@ class AccessoryProblem:
         self.node_normals, self.node_strong = node * self.unit[: self.nz], on_arc & along.node_limits.near
 
     def _switches(self) -> None:
-        """Find the controls that switch within an interval, and the second variation of the switching time."""
+        """Find the controls that switch within an interval, and the second variation for a shift of the switch."""
         along, nu = self.along, self.nu
         n, q = along.shape
         self.moved, self.switching = np.zeros((n, nu), bool), np.zeros((n, nu))
@@ -220,7 +220,7 @@ class AccessoryProblem:
 
 
 def obstacle(form: Formulation) -> str:
-    """Return the reason why the second variation is unknown for all plans of a problem, or ""."""
+    """Return why the second variation is unknown for all plans of a problem; "" if it can be computed."""
     last = ca.vertcat(form.end.expression, form.terminal)
     if ca.depends_on(last, form.u0):
         return "the control at the start enters the conditions at the end"
@@ -244,7 +244,7 @@ def curved_ends(form: Formulation) -> Any:
 
 
 def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return Hessian and active rows at the end, then at the start, in scaled z.
+    """Return the Hessian and the active rows of the conditions at the end, then at the start, in scaled z.
 
     Inequalities are active if they have multipliers, state bounds if the plan rests on them.
     """

@@ -99,7 +99,7 @@ class Audit:
 
     @property
     def feasible(self) -> bool:
-        """Whether dynamics, bounds, constraints, ends and horizon hold and the reported cost is right."""
+        """Whether dynamics, bounds, constraints, ends, horizon and reported cost are right."""
         return all(finding.passed for finding in self.findings if finding.verdict == "feasible")
 
     @property
@@ -121,7 +121,7 @@ class Audit:
 
     @property
     def lost(self) -> np.ndarray:
-        """Excess cost of each interval over the nearest extremal, in units of cost. Shape (N,)."""
+        """Cost of each interval above that of the nearest extremal, in units of cost. Shape (N,)."""
         return np.zeros(0) if self.optimality is None else self.optimality.lost
 
     def __getitem__(self, name: str) -> Finding:
@@ -298,7 +298,7 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
 def optimality_findings(
     form: Formulation, optimum: Optimality, excess: float, lost: float, *, costates: float | None
 ) -> list[Finding]:
-    """Return the findings of the first and second order conditions.
+    """Return the findings about the first and second order optimality conditions.
 
     The cost is quadratic in errors of the costates: a transcription that loses a share of the cost determines its
     costates to the root of this share. The curvature is judged only at an extremal. ``excess`` is the share of the cost
@@ -335,14 +335,14 @@ def optimality_findings(
 
 
 def clearance_finding(clearance: Clearance, limit: float) -> Finding:
-    """Return the largest shortfall below a required clearance that the proof leaves possible."""
+    """Return the finding about the largest possible shortfall below a required clearance."""
     pair = clearance.worst
     missed, time = (0.0, None) if pair is None else (pair.missed, pair.time)
     return Finding(clearance.name, missed, limit, time, str(clearance), unit="m")
 
 
 def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) -> Finding:
-    """Return the deviation of the plan from its re-integration over the whole horizon, relative."""
+    """Return the finding about the relative deviation of the plan from its re-integration over the horizon."""
     notes = [] if motion.breakdown_time is None else [f"the integration broke down at {motion.breakdown_time:.6g} s"]
     if is_unstable:
         notes.append(f"unstable dynamics amplify {motion.added[-1]:.2g}, the sum of the defects of the intervals")
@@ -351,7 +351,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
-    """Return the largest violation, relative to the size or, with a given tolerance, in its own unit."""
+    """Return the finding about the largest violation, relative to its size, or in its own unit with a `tolerance`."""
     if tolerance is not None:
         return _worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))
@@ -369,7 +369,7 @@ def _worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None
 
 
 def _cost_finding(solution: Solution, running: float, final: float, sizes: Sizes, limit: float) -> Finding:
-    """Compare the cost of the re-integrated plan, along it and at its end, with the reported cost."""
+    """Compare the reported cost with that of the re-integrated plan, along it and at its end."""
     cost = running + final
     size = max(abs(cost), abs(final), abs(solution.cost), sizes.cost)  # parts of the cost may cancel
     error = abs(cost - solution.cost) / size if size > 0 else abs(cost - solution.cost)
@@ -377,7 +377,7 @@ def _cost_finding(solution: Solution, running: float, final: float, sizes: Sizes
 
 
 def reported_finding(solution: Solution, sizes: Sizes, limit: float) -> Finding:
-    """Compare the reported arrays with the interpolants, relative; at a break the value of either side counts."""
+    """Compare the reported arrays with the interpolants, relative to the sizes; at a break either side may fit."""
     errors = np.zeros(len(solution.t))
     costates = float(np.max(np.abs(solution.costate_interpolant.values), initial=0.0)) or 1.0
     at = np.add.outer([-1e-12, 1e-12], solution.t / solution.horizon).ravel()
@@ -395,7 +395,7 @@ def reported_finding(solution: Solution, sizes: Sizes, limit: float) -> Finding:
 def _jump(
     name: str, interpolant: PiecewisePolynomial, horizon: float, sizes: np.ndarray, limit: float | None
 ) -> Finding:
-    """Return the largest jump between two segments of a curve, relative to the sizes of its entries."""
+    """Return the finding about the largest jump between two segments of a curve, relative to its sizes."""
     n = len(interpolant.breaks) - 1
     segments = np.arange(n)
     left = interpolant.within(segments[:-1], np.ones(n - 1))

@@ -45,7 +45,7 @@ MAX_PRINTED = 4
 
 @dataclass(frozen=True)
 class ProofSettings:
-    """Resolution and limits of the interval halving.
+    """Resolution and limits of the search that bounds the distances on halved intervals.
 
     Attributes:
         share: Relative accuracy of the difference between the smallest and the required distance.
@@ -153,7 +153,7 @@ class Clearance:
 
     @property
     def _assumptions(self) -> list[str]:
-        """Describe the pairs that are excluded by assumption, as a list of one text; empty if there are none."""
+        """Describe the pairs that are excluded by assumption, as a list with one text; an empty list without any."""
         first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_PRINTED]]
         more = [f"{len(self.assumed) - MAX_PRINTED} more"] if len(self.assumed) > MAX_PRINTED else []
         return [f"left out by assumption: {', '.join([*first, *more])}"] if first else []
@@ -172,7 +172,7 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
 
 
 def clearance_along(apart: Separation, track: Track | None, settings: ProofSettings = ProofSettings()) -> Clearance:
-    """Bound the distance of each pair of bodies along a track at all times; without pairs the track may be None."""
+    """Bound the distance of each pair of bodies along a track at all times; the track may be None without pairs."""
     if not len(apart) or track is None:
         return Clearance(apart.name, (), True, 0, assumed=apart.assumed)
     return _Search(apart, track, settings).run()
@@ -181,7 +181,7 @@ def clearance_along(apart: Separation, track: Track | None, settings: ProofSetti
 def closest_pairs_along(
     problem: Problem, solution: Solution, times: Iterable[float], suffix: str = ""
 ) -> list[ClosestPair]:
-    """Return the closest pair of bodies of a plan at each of the times (s); empty if the problem separates no bodies.
+    """Return the closest pair of bodies of a plan at each time (s); empty if the problem has no separations.
 
     Args:
         suffix: Suffix of the names of the states that move the bodies: selects one part of a plan whose parts are
@@ -214,7 +214,7 @@ def separation_frames(
 
 
 def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Separation, Track]]:
-    """Return the separations that have pairs and whose moving states end with a suffix, each with its track."""
+    """Return each separation that has pairs and whose moving states have names with a suffix, with its track."""
     form = Formulation.of(problem)
     check_variables_match(form, solution)
     solution, p = match_order(form, solution), form.parameter_vector(solution.parameters)
@@ -237,7 +237,7 @@ def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.nd
 
 
 class _Search:
-    """Bisection of the time intervals of all pairs until each is decided.
+    """Bisection of the time intervals of all pairs, until the distance of each is known accurately enough.
 
     At level l >= 0 an interval is a block of 2^l segments; at level l < 0 it is the share 2^l of one segment. The
     interval ``index`` begins at segment index 2^l and ends at (index + 1) 2^l.
@@ -257,7 +257,7 @@ class _Search:
         self.best, self.when, self.points = np.full(n, np.inf), np.zeros(n), np.zeros((n, 2, 3))
 
     def run(self) -> Clearance:
-        """Halve intervals until every pair is decided, or the limits of the search are reached."""
+        """Halve intervals until the bounds of every pair suffice, or the limits of the search are reached."""
         n, level = len(self.apart), self.top
         self._evaluate_at_closest_balls()
         blocks = np.arange(-(-self.pieces >> level) if level else self.pieces)
@@ -285,7 +285,7 @@ class _Search:
         return Clearance(self.apart.name, tuple(closest), settled, checked, reason, self.apart.assumed)
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
-        """Return why intervals stay undecided if a prescribed motion is the cause; else an empty text."""
+        """Return the reason if a prescribed motion prevents sufficient bounds on intervals; else an empty text."""
         begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         if self.track.prescribed is None:
             return ""
@@ -304,7 +304,7 @@ class _Search:
         return self._closest(self.best)
 
     def _closest(self, bounds: np.ndarray) -> list[ClosestPair]:
-        """Return the closest approach of each pair computed so far, with the given lower bounds (n,), m."""
+        """Return the closest approach found for each pair, with the given lower bounds (n,), m."""
         rotations, positions = self.track.frames(self.when)
         each, frame = np.arange(len(self.apart)), self.apart.pairs[:, 2]
         points = np.einsum("nij,nkj->nki", rotations[each, frame], self.points) + positions[each, frame][:, None]
@@ -321,7 +321,7 @@ class _Search:
         ]
 
     def _evaluate_at_closest_balls(self) -> None:
-        """Evaluate each pair at the node or interval middle where the bounding balls of its bodies are closest."""
+        """Evaluate each pair at the node or interval middle where its bounding balls are closest."""
         times = np.union1d(self.breaks, (self.breaks[:-1] + self.breaks[1:]) / 2)
         times = times[:: -(-len(times) // self.settings.first_times)]
         n, frames = len(self.apart), self.track.frames(times)
@@ -329,13 +329,13 @@ class _Search:
         self._evaluate(times[self.bodies.balls(frames, at, pair).reshape(n, -1).argmin(axis=1)])
 
     def _evaluate(self, when: np.ndarray) -> None:
-        """Evaluate the distance of each pair at one time of its own (n,), as a fraction of the horizon."""
+        """Evaluate the distance of each pair at its own time (n,), as a fraction of the horizon."""
         pair = np.arange(len(self.apart))
         _, gap, points = self.bodies.nearest(self.track.frames(when), pair, pair)
         self._keep(pair, gap, when, points)
 
     def _sufficient_bounds(self) -> np.ndarray:
-        """Return the lower bound of the distance that decides each pair. Shape (n,), m.
+        """Return the lower bound of the distance at which each pair needs no further halving. Shape (n,), m.
 
         The pair with the smallest margin is resolved to a relative accuracy. For the others it suffices that their
         margins are no smaller.
@@ -347,7 +347,7 @@ class _Search:
         return np.where(margin >= 0, self.apart.least + max(smallest - max(share * smallest, finest), 0.0), reduced)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower bounds of the distances of pairs on intervals of a level (K,), and the sufficient bounds (n,).
+        """Return lower bounds of the distances of pairs on intervals of a level (K,), and sufficient bounds (n,).
 
         Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. Smallest distances
         are kept.
@@ -377,7 +377,7 @@ class _Search:
         return bound, self._sufficient_bounds()
 
     def _fraction(self, place: np.ndarray, level: int) -> np.ndarray:
-        """Return the fractions of the horizon at which the intervals ``place`` (K,) of a level begin."""
+        """Return the start of the intervals ``place`` (K,) of a level, as fractions of the horizon."""
         if level >= 0:
             return np.asarray(self.breaks[np.minimum(place << level, self.pieces)])
         segment = place >> -level
@@ -388,7 +388,7 @@ class _Search:
     def _moves(
         self, pair: np.ndarray, block: np.ndarray, level: int, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return by how much the distances of pairs can decrease within intervals of ``width`` s.
+        """Return how much the distances of pairs can decrease within intervals that last ``width`` s.
 
         Below the value at the middle, and below the chord between the ends. Shape (K,) each, m.
         """
@@ -403,7 +403,7 @@ class _Search:
         return moves * width / 2, (bends + 2 * turns * moves) * width**2 / 8
 
     def _keep(self, pair: np.ndarray, distance: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
-        """Store distances that are smaller than all earlier ones."""
+        """Store for each pair a distance that is smaller than all before, with its time and points."""
         order = np.lexsort((distance, pair))
         first = order[np.unique(pair[order], return_index=True)[1]]
         first = first[distance[first] < self.best[pair[first]]]
@@ -412,13 +412,13 @@ class _Search:
 
 
 def _pairwise_maximum(values: np.ndarray) -> np.ndarray:
-    """Return the maximum of each two successive rows; an odd last row stays. (N, k) to (ceil(N / 2), k)."""
+    """Return the maxima of successive pairs of rows; an odd last row stays. Shapes (N, k) to (ceil(N / 2), k)."""
     even = np.concatenate([values, values[-1:]]) if len(values) % 2 else values
     return np.asarray(np.maximum(even[::2], even[1::2]))
 
 
 def _rate_bounds(curve: PiecewisePolynomial, columns: list[int], horizon: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds of the first and second time derivatives of states on each segment of a curve. Shapes (N, k).
+    """Return bounds of the first and second time derivatives of states on each segment. Shapes (N, k).
 
     The Bernstein coefficients of a polynomial bound it on its interval.
     """

@@ -71,7 +71,7 @@ RULE, ROUGH = (quadrature(POINTS, POINTS[1:], degree).T for degree in (LENGTH, L
 
 
 class IntegratedMotion(NamedTuple):
-    """The motion under the controls of a plan at its fine grid.
+    """Motion that the controls of a plan produce, on its fine grid.
 
     Attributes:
         local: Over each interval from the plan's own state at its start. Shape (N, cells + 1, nx).
@@ -86,7 +86,7 @@ class IntegratedMotion(NamedTuple):
 
 
 def corrected_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion | None:
-    """Return the motion under the controls of a plan; None if corrections of the plan do not converge to it."""
+    """Return the motion that the controls of a plan produce; None if corrections of the plan do not converge."""
     if not along.finite:
         return None
     newton = _Newton(along, grid)
@@ -108,7 +108,7 @@ class _Converged(NamedTuple):
 
 
 class _Newton:
-    """Newton's method for the motion under the controls of a plan, on its fine grid."""
+    """Newton's method for the motion that the controls of a plan produce, on its fine grid."""
 
     def __init__(self, along: Linearisation, grid: FineGrid) -> None:
         self.along, form = along, along.form
@@ -142,7 +142,7 @@ class _Newton:
         self.own = None if self.first is None else self._own_error(self.first, self.x)
 
     def _integral(self, x: np.ndarray) -> np.ndarray | None:
-        """Return the integral of dynamics and running cost along x, from the start of each interval to every sample.
+        """Integrate dynamics and running cost along states x from the start of each interval to every sample.
 
         Shape (N, 2 cells + 1, nx + 1). None if the quadrature error exceeds the tolerance.
         """
@@ -158,7 +158,7 @@ class _Newton:
         return self._cumulative(panels, flow.shape) if (doubt <= allowed).all() else None
 
     def _cumulative(self, panels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Integrate values in ``_panels`` form from the start of each interval to every sample.
+        """Integrate values, arranged as by ``_panels``, from the start of each interval to every sample.
 
         ``shape`` is that of the values and of the result, (N, 2 cells + 1, m).
         """
@@ -170,7 +170,7 @@ class _Newton:
         return integral
 
     def converged(self, chained: bool, rate: float = 1.0) -> _Converged | None:
-        """Iterate to the motion that starts from the plan's first state, or anew in every interval.
+        """Compute the motion that starts from the plan's first state, or one in every interval, by iteration.
 
         Args:
             chained: Whether the intervals are joined to one motion.
@@ -193,13 +193,13 @@ class _Newton:
         return None
 
     def _cost_change(self, change: np.ndarray) -> float:
-        """Return the change of the running cost, to first order, for a change of the states."""
+        """Return the first-order change of the running cost for a change of the states."""
         along, (n, q) = self.along, self.along.shape
         slope = along.cost_y[:, : along.form.nx].reshape(n, q, -1)
         return float(np.einsum("k,j,kji,kji->", along.width, along.weight, slope, self.at_gauss @ change))
 
     def _own_error(self, integral: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return the integration error that each interval contributes to states x, to first order."""
+        """Return the first-order integration error that each interval contributes to states x."""
         (n, q), nx = self.along.shape, self.along.form.nx
         defect = integral[..., :nx] - (x - x[:, :1])
         at_gauss = self.at_gauss @ defect
@@ -211,7 +211,7 @@ class _Newton:
         return np.asarray(defect + self._cumulative(_panels(fed), fed.shape))
 
     def _propagated(self, ends: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Propagate the errors at the interval ends (N, nx) of states x, including jumps between intervals."""
+        """Propagate errors at the interval ends (N, nx) of states x, and the jumps between intervals, onwards."""
         start = np.zeros(ends.shape)
         jumps = ends[:-1] + x[:-1, -1] - x[1:, 0]
         for k in range(len(jumps)):
@@ -221,7 +221,7 @@ class _Newton:
 
 
 def _panels(values: np.ndarray) -> np.ndarray:
-    """Arrange values (N, 2 cells + 1, m) as panels of five cells each. Shape (N cells / 5 m, 11)."""
+    """Arrange values (N, 2 cells + 1, m) into panels of five cells each. Shape (N cells / 5 m, 11)."""
     windows = np.lib.stride_tricks.sliding_window_view(values, LENGTH + 1, axis=1)
     return windows[:, ::LENGTH].reshape(-1, LENGTH + 1)
 

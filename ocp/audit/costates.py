@@ -136,7 +136,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
 
 
 def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray | None) -> np.ndarray:
-    """Return which part of the forces near a node acts before it, weighted by the node's hat function; see `Adjoint`.
+    """Return the part of the forces near each node that acts before it, weighted by the node's hat function.
 
     Half of the ``atoms`` at the starts of the intervals, if these are not distributed yet.
     """
@@ -156,7 +156,7 @@ def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, 
 
 
 def interval_end_costates(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reported costates at the start and the end of every interval from its own side, (N, nx) each."""
+    """Return the reported costates at start and end of every interval, from inside the interval. Shapes (N, nx)."""
     curve, mesh = along.solution.costate_interpolant, along.mesh
     if len(curve.breaks) == len(mesh) and np.array_equal(curve.breaks, mesh):
         intervals = np.arange(len(mesh) - 1)
@@ -219,7 +219,7 @@ class Backwards:
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
     def chained(self, errors: np.ndarray) -> np.ndarray:
-        """Accumulate the costate errors of the intervals (N, nx), propagated backwards, at the start of each."""
+        """Accumulate the costate errors of the intervals (N, nx) backwards; return the sum at the start of each."""
         (n, q), nx = self.along.shape, self.along.form.nx
         points = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
         weight = self.along.weight[:, None, None]
@@ -233,7 +233,7 @@ class Backwards:
 
 
 def _forces(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the state limits in interval k that best explain its costates: (q, m), atoms (2, m)."""
+    """Return state limit multipliers of interval k that fit its costates: (q, m), and impulses (2, m) at its ends."""
     along = back.along
     q, nx, m = along.shape[1], along.form.nx, along.state_limits.lower.shape[1]
     points = slice(k * q, (k + 1) * q)
@@ -287,7 +287,7 @@ def _forces(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
 
 
 def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return the error of the reported costates inside the intervals, in units of cost. Shape (N,)."""
+    """Return the errors of the reported costates inside the intervals, in units of cost. Shape (N,)."""
     (n, q), nx = along.shape, along.form.nx
     fractions = along.solution.t / along.solution.horizon
     k = np.clip(np.searchsorted(along.mesh, fractions, side="right") - 1, 0, n - 1)
@@ -310,7 +310,7 @@ def _ends(
     cost: float,
     lam1: np.ndarray,
 ) -> Ends:
-    """Return the residuals of the end conditions for multipliers of the right signs that fit best."""
+    """Return the residuals of the end conditions with best-fitting multipliers of the right signs."""
     form, solution, nx = along.form, along.solution, along.form.nx
     low, high = along.bounds
     places = form.bounds.places

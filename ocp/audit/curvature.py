@@ -23,7 +23,7 @@ __all__ = ["Curvature", "curvature"]
 
 
 class RankTolerances(NamedTuple):
-    """Tolerances on the singular values of constraints, with rows of length 1, in the controls of a stage.
+    """Tolerances of singular values, for constraint rows of length 1, in the controls of a stage.
 
     Attributes:
         size: Below this value constraints count as dependent.
@@ -74,7 +74,7 @@ class Curvature:
         return bool(self.least > FLAT_SHARE)
 
     def lost(self, slope: np.ndarray) -> float:
-        """Return how much a change of start and horizon could reduce the cost, to second order, given its slope (nz,).
+        """Return the second-order cost reduction by a change of start and horizon, given the cost's slope (nz,).
 
         Where the cost does not curve, they change by their scales at most.
         """
@@ -87,7 +87,7 @@ class Curvature:
 
 
 def curvature(accessory: AccessoryProblem) -> Curvature:
-    """Sweep the second variation of the cost along a plan with known multipliers."""
+    """Compute the second variation of the cost along a plan with known multipliers by a backward sweep."""
     along = accessory.along
     if along.form.indifferent:
         return Curvature(np.inf, None, "", None, along.t)
@@ -116,7 +116,7 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
 
 
 class _Swept(NamedTuple):
-    """Result of one sweep: the fields of `Curvature` without ``t``.
+    """Result of one backward sweep: the fields of `Curvature` without ``t``.
 
     ``dependent``: Whether it is inconclusive because constraints are nearly dependent.
     """
@@ -134,7 +134,7 @@ class _Swept(NamedTuple):
 def _sweep(
     accessory: AccessoryProblem, stages: _Linearised, weak: bool, tolerances: RankTolerances = FULL_RANK
 ) -> _Swept:
-    """Sweep backwards over all stages: by linear solves if every stage is convex, else by eigenvectors.
+    """Sweep backwards over all stages: by linear solves if all stages are convex, else by eigenvectors.
 
     Args:
         weak: Whether active limits without multipliers are held too.
@@ -227,7 +227,7 @@ def _swept(
 
 
 class _Linearised(NamedTuple):
-    """The accessory problem of all stages: variations at the points from those at the start and of the controls.
+    """The linearised problem of all stages: variations at the points as functions of start and controls.
 
     Attributes:
         whole: Variations of (z, u) at the points. Shape (N, q, nz + nu, nz + q nu).
@@ -250,7 +250,7 @@ class _Linearised(NamedTuple):
 
     @classmethod
     def of(cls, accessory: AccessoryProblem) -> _Linearised:
-        """Condense the accessory problem to variations at the interval starts and of the controls."""
+        """Express the variations at all points by those at the interval starts and those of the controls."""
         along, nz, nu = accessory.along, accessory.nz, accessory.nu
         (n, q), h = along.shape, along.width
         # variations at the Gauss points from those at the start of the interval and those of the controls
@@ -305,7 +305,7 @@ class _Stage(NamedTuple):
 
 
 def _reduced(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolerances: RankTolerances) -> list[_Stage]:
-    """Reduce each stage by its own constraints; stages with equal constraints are treated together."""
+    """Reduce each stage by its own constraints; stages with the same active constraints are treated together."""
     n, q = accessory.along.shape
     nz, nu = accessory.nz, accessory.nu
     normals = accessory.normals.reshape(n, q, -1, nz + nu)
@@ -335,7 +335,7 @@ def _reduced(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolera
 def _eliminated(
     rows: np.ndarray, nz: int, tolerances: RankTolerances
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Eliminate the controls that constraint rows (K, r, nz + m) determine, at K stages of nz states and m controls.
+    """Eliminate the controls that constraint rows (K, r, nz + m) determine, at K stages with m controls each.
 
     Returns:
         For each group of L stages with equal ranks: their indices, (L,); states and controls from the states and the
@@ -365,26 +365,26 @@ def _eliminated(
 
 
 class _Gain(NamedTuple):
-    """Optimal feedback of a stage: controls as a linear function of (z, 1) and of the free variations."""
+    """Optimal feedback of a stage: controls as a linear function of (z, 1) and of free variations."""
 
     lift: np.ndarray
     response: np.ndarray
 
     def of(self, z: np.ndarray) -> np.ndarray:
-        """Return the controls for a variation of the state."""
+        """Return the optimal controls for a variation of the state."""
         inputs = np.append(z, 0.0)
         return np.asarray(self.lift @ np.concatenate([inputs, -self.response @ inputs]))
 
 
 def unit_rows(rows: np.ndarray, rank: float) -> np.ndarray:
-    """Return rows scaled to length 1, without those that vanish."""
+    """Return rows scaled to length 1, without rows that vanish."""
     sizes = np.linalg.norm(rows, axis=1)
     nonzero = sizes > rank * max(1.0, float(sizes.max(initial=0.0)))
     return np.asarray(rows[nonzero] / sizes[nonzero, None])
 
 
 def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
-    """Scale end conditions to rows of length 1, so that small entries of states that hardly move count."""
+    """Scale end conditions to rows of length 1, so that small entries of states that hardly change count."""
     return unit_rows(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 
@@ -410,7 +410,7 @@ def _variation(
     gains: list[_Gain],
     start: np.ndarray | None = None,
 ) -> _Variation:
-    """Return the variation that begins with these controls, or at the start, and follows the optimal feedback."""
+    """Return the variation that follows the optimal feedback after these first controls, or from a start."""
     along, nz, nu = accessory.along, accessory.nz, accessory.nu
     n, q = along.shape
     without_one = np.delete(np.arange(nz + 1 + q * nu), nz)
@@ -438,7 +438,7 @@ def _variation(
 
 
 def _confirmed(least: float, at: float | None, variation: _Variation, scale: float) -> _Swept:
-    """Return a negative curvature only if a variation confirms it: it lowers the cost and keeps the constraints.
+    """Return a negative curvature only if a variation lowers the cost and keeps the constraints.
 
     End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no
     freedom.
@@ -449,7 +449,7 @@ def _confirmed(least: float, at: float | None, variation: _Variation, scale: flo
 
 
 def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
-    """Return why the curvature is inconclusive at a stage: the Hamiltonian is linear along a control direction.
+    """Return the reason why the curvature is inconclusive at a stage where the Hamiltonian is linear in a control.
 
     For a control that enters linearly the remaining curvature is of the order of the interval's width. A minimum on a
     singular arc is decided by the generalised Legendre-Clebsch condition, which is not checked here.

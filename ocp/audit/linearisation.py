@@ -29,7 +29,7 @@ MAX_DERIVATIVES = 3
 
 
 class Limits:
-    """Limits that may be active at some points of a plan: lower and upper limits of quantities, and distances to them.
+    """Limits that may be active at points of a plan: lower and upper limits of quantities, and distances to them.
 
     A limit that was slightly tightened when the plan was solved may be active where the plan rests on it. The price of
     its multiplier is the distance to the declared limit. Multiplier times distance is the excess cost of the plan to
@@ -60,14 +60,14 @@ class Limits:
         self.lower, self.upper = (equal | (gap <= NEAR_LIMIT_SHARE * size) for gap in gaps)
 
     def at(self, points: slice) -> Limits:
-        """Return the limits at some of the points."""
+        """Return the limits at a slice of the points."""
         part = copy(self)
         for name in ("below", "above", "gap", "lower", "upper"):
             setattr(part, name, getattr(self, name)[points])
         return part
 
     def extend(self, count: int) -> None:
-        """Append equalities that the plan satisfies."""
+        """Append `count` equalities that the plan satisfies exactly."""
         m = len(self.below)
         self.equal = np.append(self.equal, np.ones(count, bool))
         zeros = np.zeros((m, count))
@@ -76,11 +76,11 @@ class Limits:
 
     @property
     def near(self) -> np.ndarray:
-        """Whether the lower or the upper limit may be active. Shape (M, m), bool."""
+        """Whether the plan is so near the lower or upper limit that it may be active. Shape (M, m), bool."""
         return np.asarray(self.lower | self.upper)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the complementarity products: multipliers (M, m) times gaps to the limits, at least zero."""
+        """Return the complementarity products: multipliers (M, m) times distances to the limits, never negative."""
         gap = np.where(multipliers > 0, self.above, self.below)
         return np.asarray(np.where(multipliers != 0, gap, 0.0) * np.abs(multipliers))
 
@@ -141,7 +141,7 @@ class Linearisation:
         self._arcs()
 
     def _differentiate(self) -> None:
-        """Set the derivatives of running cost, dynamics and path rows."""
+        """Compute the derivatives of running cost, dynamics and path rows."""
         form, m = self.form, len(self.s)
         self.y = ca.vertcat(form.x, form.T, form.u)
         self.fraction, *self.scaled = form.cached("over the fraction of the horizon", lambda: over_fraction(form))
@@ -156,7 +156,7 @@ class Linearisation:
 
     @property
     def point(self) -> tuple[Any, ...]:
-        """Arguments of :meth:`Formulation.sampled` at the points, the fraction included."""
+        """Arguments of :meth:`Formulation.sampled` at the points, including the fraction of the horizon."""
         fraction = (self.fraction, self.s[:, None])
         return self.x, self.u, self.t, self.solution.horizon, self.p, fraction
 
@@ -174,17 +174,17 @@ class Linearisation:
 
     @property
     def slope_size(self) -> float:
-        """First-order change of the running cost over the sizes of states and controls, in units of cost."""
+        """First-order change of the running cost if states and controls change by their sizes, in units of cost."""
         unit = np.concatenate([self.state_size, [0.0], self.sizes.control])
         return float(self.share @ (np.abs(self.cost_y) @ unit))
 
     @property
     def share(self) -> np.ndarray:
-        """Weight of every point in an integral over s. Shape (M,)."""
+        """Quadrature weight of every point in an integral over the fraction s. Shape (M,)."""
         return np.asarray((self.width[:, None] * self.weight).ravel())
 
     def _at_ends(self) -> None:
-        """Set the rows at the ends and the derivatives of these and of the terminal cost."""
+        """Compute the rows at the ends, and the derivatives of these rows and of the terminal cost."""
         form, solution = self.form, self.solution
         x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
         u0, u1 = stack(solution.controls, 2)[[0, -1]]
@@ -223,7 +223,7 @@ class Linearisation:
         return result
 
     def _control_sizes(self) -> np.ndarray:
-        """Return the sizes of the controls by which distances to their limits are judged. Shape (nu,).
+        """Return the sizes of the controls, to which distances to their limits are compared. Shape (nu,).
 
         An unused control rests on a limit but for the solver's tolerance, so that its spread is no size. It takes the
         size of other controls of its unit; if all of these are unused, the nearest bound, at most one SI unit.
@@ -238,7 +238,7 @@ class Linearisation:
         return np.asarray(np.where(distance <= RESOLVED_SHARE * full, full, own))
 
     def _limits(self) -> None:
-        """Set the limits of controls and states at the points and at the ends of the intervals."""
+        """Determine the limits of controls and states at the points and at the ends of the intervals."""
         form, sizes, (n, q) = self.form, self.sizes, self.shape
         nx, nu = form.nx, form.nu
         self.mixed = np.flatnonzero(form.path.uses_control)
@@ -287,7 +287,7 @@ class Linearisation:
         self.node_limits_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
 
     def _arcs(self) -> None:
-        """Add state equalities as limits of the controls, via their lowest time derivative that contains a control.
+        """Add state equalities as limits of the controls, using their first time derivative that contains a control.
 
         A transcription that imposes such a row at points determines the costates up to multiples of the gradients of
         the row and of its derivatives (Hartl, Sethi, Vickson 1995, section 4). The slope of the Hamiltonian is then
@@ -304,7 +304,7 @@ class Linearisation:
 
 
 def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampler]]:
-    """Group path rows by order: that of the lowest time derivative that contains a control.
+    """Group path rows by their order, that of their first time derivative that contains a control.
 
     Returns:
         For each order the indices of its rows, and a sampler of the derivatives of these in the controls.
@@ -325,14 +325,14 @@ def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampl
 
 
 def over_fraction(form: Formulation) -> list[Any]:
-    """Return the symbol of the horizon fraction, with T L, T f and the path rows as expressions of it."""
+    """Return the symbol s of the horizon fraction, and T L, T f and the path rows as expressions of s."""
     fraction = form.sym("s")
     parts = [form.T * form.running, form.T * form.f, form.path.expression]
     return [fraction, *ca.substitute(parts, [form.t], [fraction * form.T])]
 
 
 def ends_of(form: Formulation) -> Any:
-    """Return a Function (x, x0, u, u0, T, p) of the conditions at the ends.
+    """Return a casadi Function (x, x0, u, u0, T, p) of the conditions at the ends.
 
     Its outputs are the rows, their derivatives, and the gradient and Hessian of the terminal cost.
     """
@@ -352,7 +352,7 @@ def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def quadrature(places: np.ndarray, ends: np.ndarray, degree: int | None = None) -> np.ndarray:
-    """Return the quadrature weights at ``places`` (q,) for integrals from 0 to each of ``ends`` (m,). Shape (m, q).
+    """Return quadrature weights at ``places`` (q,) for integrals from 0 to each of ``ends`` (m,). Shape (m, q).
 
     The integrand is the least-squares polynomial of the given degree; by default the interpolating one.
     """

@@ -43,7 +43,7 @@ SOLVER = {
 
 
 class Fit(NamedTuple):
-    """The multipliers of a plan that minimise its estimated loss.
+    """Multipliers of a plan that minimise its estimated loss of optimality.
 
     Attributes:
         lost: Loss of the plan in each interval without its ends, in units of cost. Shape (N,).
@@ -58,7 +58,7 @@ class Fit(NamedTuple):
 
 
 def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, cost: float) -> Fit | None:
-    """Return the multipliers of a plan with the smallest loss; None if the program has no solution.
+    """Return the multipliers of a plan with the smallest estimated loss; None if their program has no solution.
 
     Args:
         along: Linearisation of the plan.
@@ -72,7 +72,7 @@ def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, c
 
 
 class _Program:
-    """A sparse program: minimise price . x + weight . x^2 / 2 subject to rows x = right and low <= x."""
+    """A sparse convex program: minimise price . x + weight . x^2 / 2 subject to rows x = right and low <= x."""
 
     def __init__(self) -> None:
         self._variables: list[np.ndarray] = []  # low, price and weight of each, (3, count)
@@ -86,7 +86,7 @@ class _Program:
         return np.arange(first, first + count)
 
     def equations(self, right: np.ndarray) -> np.ndarray:
-        """Add equations and return their indices, in the shape of their right sides."""
+        """Add equations with given right-hand sides; return their indices in the same shape."""
         first = sum(part.size for part in self._right)
         self._right.append(right)
         return np.arange(first, first + right.size).reshape(right.shape)
@@ -114,7 +114,7 @@ class _Program:
 
 @dataclass
 class _Multipliers:
-    """Nonnegative multipliers of limits, each priced by the gap to its limit.
+    """Nonnegative multipliers of limits; the price of each is the distance to its limit.
 
     Attributes:
         point, limit: Point and index of each limit. Shape (K,).
@@ -136,7 +136,7 @@ class _Multipliers:
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
            share: Any = 1.0) -> _Multipliers:  # fmt: skip
-        """Add a multiplier for each side of the ``chosen`` limits (M, m), bool, whose derivatives are (M, m, n).
+        """Add a multiplier for each side of the ``chosen`` limits (M, m), bool, with derivatives (M, m, n).
 
         The variables have the sizes (n,).
 
@@ -161,7 +161,7 @@ class _Multipliers:
 
 
 class _Dual:
-    """The linear or quadratic program whose solution is the multipliers of a plan; everything in units of cost."""
+    """The linear or quadratic program whose solution is the multipliers of a plan, in units of cost."""
 
     def __init__(self, along: Linearisation, curved: np.ndarray, cost: float) -> None:
         self.along, self.cost, self.program = along, cost, _Program()
@@ -199,7 +199,7 @@ class _Dual:
         self._ends()
 
     def _costate_equation(self) -> None:
-        """Add lambda' = -dH/dx over every interval, integrated backwards from node to node."""
+        """Add the equation lambda' = -dH/dx for every interval, integrated backwards between nodes."""
         along, program, node = self.along, self.program, self.node
         controls, states = self.control_limits, self.state_limits
         (n, q), nx, size = along.shape, along.form.nx, along.state_size
@@ -221,7 +221,7 @@ class _Dual:
             program.add(rows_of_point[states.point], states.index[:, None], -force)
 
     def _stationarity(self, curved: np.ndarray) -> None:
-        """Add dH/du = 0 with a residual, whose price is quadratic where the Hamiltonian is curved, else linear.
+        """Add dH/du = 0 with a residual; its price is quadratic where H is curved in the controls, else linear.
 
         The step is the size of the control along the plan or, if the control has limits, the range between them.
         """
@@ -242,7 +242,7 @@ class _Dual:
             self.residual.append(part)
 
     def _ends(self) -> None:
-        """Add the end conditions; a residual is priced by how far the controls could move the states."""
+        """Add the end conditions; the price of a residual is the distance that the controls could move the states."""
         along, program, nx = self.along, self.program, self.along.form.nx
         form, (low, high), horizon = along.form, along.bounds, along.solution.horizon
         places, share = form.bounds.places, along.share
@@ -275,7 +275,7 @@ class _Dual:
             program.add(rows[self.free], self.end_residual[-1], sign)
 
     def fit(self, x: np.ndarray, known: Adjoint) -> Fit:
-        """Return the multipliers of a solution of the program, in units of cost."""
+        """Return the multipliers of a plan from a solution of the program, in units of cost."""
         along, (n, q), nx, size = self.along, self.along.shape, self.along.form.nx, self.along.state_size
         lost = np.zeros(n)
         for part in self.residual:
@@ -310,7 +310,7 @@ class _Dual:
 
 @dataclass(frozen=True)
 class Optimality:
-    """First and second order optimality conditions along a plan.
+    """Result of the first and second order optimality conditions along a plan.
 
     Attributes:
         lost: Cost that the plan could save in each interval, to second order; that of the ends is in the first. Shape
@@ -413,12 +413,12 @@ def optimality(
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Return the loss of a plan with these multipliers, except the loss of its start, in units of cost."""
+    """Return the loss of a plan with these multipliers, in units of cost, without that of its start."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
 def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
-    """Return the loss and the costate errors of a plan with these multipliers, in units of cost."""
+    """Return the loss of a plan with these multipliers plus its costate errors, in units of cost."""
     assert curved is not None
     loss = control_loss(along, multipliers.costate, multipliers.control_multipliers, curved).sum()
     return float(
@@ -427,7 +427,7 @@ def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray 
 
 
 def _control_curvature(along: Linearisation) -> np.ndarray | None:
-    """Return T H_uu at the points without path constraints, (M, nu, nu), if limits may be active at single points."""
+    """Return T H_uu at the points without path constraints, (M, nu, nu); None if no limit acts at single points."""
     form = along.form
     near = along.state_limits.near.any() or along.node_limits.near.any()
     single = along.nodal and (along.mixed.size > 0 or near)
@@ -443,7 +443,7 @@ def _control_curvature(along: Linearisation) -> np.ndarray | None:
 
 
 def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
-    """Return the result for a plan along which the problem is not finite: all its checks fail."""
+    """Return the result for a plan on which the problem is not finite; all its checks fail."""
     (n, _), m, form = along.shape, len(along.s), along.form
     infinite, t = np.full(n, np.inf), along.mesh * along.solution.horizon
     rows = np.zeros(len(form.end)), np.zeros(len(form.start))

@@ -65,7 +65,7 @@ def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamilto
 def find_control_multipliers(
     along: Linearisation, costate: np.ndarray, curved: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the limits of the controls for costates (M, nx) at the points.
+    """Return the multipliers of the control limits that belong to costates (M, nx) at the points.
 
     They minimise the slope of T H, with controls in units of their sizes. A limit that a plan reaches only at single
     points of an interval, as for piecewise constant controls, may be active across a gap elsewhere, where that loses
@@ -113,13 +113,13 @@ def find_control_multipliers(
 
 
 def slope(along: Linearisation, costate: np.ndarray) -> np.ndarray:
-    """Return the derivative of T (L + costate . f) in the controls at the points. Shape (M, nu)."""
+    """Return the derivative of T (L + costate . f) by the controls at the points. Shape (M, nu)."""
     first = along.form.nx + 1
     return np.asarray(along.cost_y[:, first:] + np.einsum("kiu,ki->ku", along.rate_y[:, :, first:], costate))
 
 
 def pseudo_inverse_of(along: Linearisation, active: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse of the derivatives of ``active`` limits (M, m), bool, with controls in units of size.
+    """Return the pseudo-inverse of the derivatives of ``active`` limits (M, m), bool, by controls in their sizes.
 
     Shape (M, nu, m). It is cached with the plan, since it does not depend on the costates.
     """
@@ -130,7 +130,7 @@ def pseudo_inverse_of(along: Linearisation, active: np.ndarray) -> np.ndarray:
 
 
 def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Return pseudo-inverses (M, n, m) of the ``active`` (M, m) rows, bool, of (M, m, n); zero for the other rows."""
+    """Return pseudo-inverses (M, n, m) of the ``active`` (M, m), bool, rows of matrices (M, m, n); else zero."""
     m, count, n = rows.shape
     inverses = np.zeros((m, n, count))
     for pattern, members in groups(active):
@@ -159,7 +159,7 @@ def balance(
 
 
 def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return the largest remaining component of the slope of T H, relative to its terms. Shape (M,)."""
+    """Return the largest residual of stationarity of T H in the controls, relative to its terms. Shape (M,)."""
     form = along.form
     if not form.nu:
         return np.zeros(len(along.s))
@@ -172,8 +172,7 @@ def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.nda
 
 
 def nnls(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Solve nonnegative least squares: minimise |matrix y - target|^2 / 2 + price . y; entries in ``free`` may be
-    negative.
+    """Solve nonnegative least squares: minimise |matrix y - target|^2 / 2 + price . y; ``free`` entries have any sign.
 
     Active-set method (Lawson, Hanson 1974, chapter 23). Free entries have minimal norm.
     """
@@ -210,7 +209,7 @@ def nnls(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.nda
 
 
 def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the distinct rows of patterns (M, m), bool, each with the indices of its members."""
+    """Return the distinct rows of boolean patterns (M, m), each with the indices where it occurs."""
     if not patterns.size:
         return [(np.zeros(patterns.shape[1], bool), np.arange(len(patterns)))] if len(patterns) else []
     packed = np.ascontiguousarray(np.packbits(patterns, axis=1))
@@ -224,7 +223,7 @@ def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """Return the cost that the controls could save in each interval within their limits, to second order. Shape (N,).
+    """Return the cost, to second order, that controls could still save in each interval within limits. Shape (N,).
 
     A control moves within its limits, and at most by its size if the Hamiltonian does not curve along it. Rows with
     multipliers stay active.
@@ -271,7 +270,7 @@ def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndar
 
 
 def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """Return the cost that the quadrature misses where the slope of a linear control changes sign. Shape (N,).
+    """Return the cost that the quadrature misses where dH/du of a linear control changes sign. Shape (N,).
 
     The integrand is max(slope, 0) and max(-slope, 0) times the distances to both limits. Args as in `control_loss`.
     """
@@ -303,7 +302,7 @@ def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray
 
 
 def _step(gradient: np.ndarray, curved: np.ndarray, projector: np.ndarray, scale: float) -> np.ndarray:
-    """Minimise a quadratic function of a control step d at each point, with |d| about 1 where it has no curvature.
+    """Minimise a quadratic function of a control step d at each point; where it is not curved, |d| is about 1.
 
     Shapes (k, nu), (k, nu, nu), (k, nu, nu). ``scale`` is the largest curvature.
     """

@@ -32,7 +32,7 @@ __all__ = ["Reintegration", "Violation", "reintegrate", "violations"]
 
 @dataclass(frozen=True)
 class Reintegration:
-    """The motion under the controls of a plan, on its fine grid.
+    """Motion that the controls of a plan produce, re-integrated on its fine grid.
 
     Attributes:
         t: Times, s. Every interval is listed from start to end, so that interior mesh times occur twice. Shape (M,).
@@ -101,7 +101,7 @@ def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
 
 
 def integrated_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion:
-    """Integrate step by step: as :func:`ocp.audit.correction.corrected_motion`, from the starts of the intervals."""
+    """Return the same motion as :func:`ocp.audit.correction.corrected_motion`, integrated step by step."""
     n, cells = int(grid.interval[-1]) + 1, grid.samples - 1
     flow = Flow(along)
     starts = grid.states.reshape(n, cells + 1, -1)[:, 0]
@@ -120,7 +120,7 @@ def _worst(values: np.ndarray) -> np.ndarray:
 
 
 class Steps(NamedTuple):
-    """Integration steps in order.
+    """Integration steps in increasing order of time.
 
     Attributes:
         cell: Grid cell of each step. Shape (S,).
@@ -133,7 +133,7 @@ class Steps(NamedTuple):
 
     @classmethod
     def even(cls, cells: int, each: int) -> Steps:
-        """Return the steps that divide each interval into cells, with ``each`` cells per interval."""
+        """Return one integration step per cell, with ``each`` cells per interval."""
         cell = np.arange(cells)
         return cls(cell, (cell % each) / each, np.full(cells, 1.0 / each))
 
@@ -146,7 +146,7 @@ class Steps(NamedTuple):
 
 
 class Flow:
-    """Dynamics and running cost under the controls of a plan, integrated from given states."""
+    """Integrator of dynamics and running cost under the controls of a plan from given states."""
 
     def __init__(self, along: Linearisation) -> None:
         form, solution, sizes = along.form, along.solution, along.sizes
@@ -159,7 +159,7 @@ class Flow:
         self._intervals = len(curve.values)
 
     def integrate(self, chain: np.ndarray, starts: np.ndarray, steps: Steps | None = None) -> tuple[np.ndarray, Steps]:
-        """Return states and cost at the ends of all cells, which divide the intervals evenly; nan after a breakdown.
+        """Return states and cost at the ends of all cells, which divide intervals evenly; nan after a breakdown.
 
         Args:
             chain: Number of the chain of successive cells that each cell belongs to, increasing. Shape (cells,).
@@ -204,9 +204,7 @@ class Flow:
     def _run(
         self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Run steps in order; each starts from the end of the previous one, or from its own start where ``first`` is
-        set.
-        """
+        """Run steps in order; each starts at the end of the previous one, or at its own start if ``first`` is set."""
         count, size = len(first), starts.shape[1]
         padded = -(-count // SETTINGS.block) * SETTINGS.block
         data = np.zeros((padded, self._step.size1_in(1)))  # the last block is filled with steps of zero width
@@ -221,7 +219,7 @@ class Flow:
 
 
 def step_function(form: Formulation, nodes: np.ndarray) -> Any:
-    """Return one Dormand-Prince step, a Function (x, data) -> (x after the step, its error); x is states and cost.
+    """Return one Dormand-Prince step: a Function (x, data) -> (x after the step, error), x being states and cost.
 
     The data are: whether to restart, the start state, place and width of the step in its interval, the divided
     differences of the control at ``nodes`` of the interval, start and width of the interval as fractions of the
@@ -331,17 +329,17 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
 
 
 def _integrated(form: Formulation, kind: str, g: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return row values (K, m); rows watched as integrals are replaced by their integrals over time."""
+    """Return row values (K, m), with the rows that are watched as integrals replaced by their time integrals."""
     return np.where(form.watch_integral, integral(g, t), g) if kind == "watch" else g
 
 
 def excess_over(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return how far values (K, m) exceed their bounds: at least 0, infinite for nan."""
+    """Return the excess of values (K, m) over their bounds: at least 0, infinite for nan."""
     return np.where(np.isnan(values), np.inf, np.maximum(np.maximum(lower - values, values - upper), 0.0))
 
 
 def _violation_of(label: str, name: str, t: np.ndarray, excess: np.ndarray, sizes: np.ndarray) -> Violation:
-    """Return the violation of a constraint from its excess (K, m), relative to sizes (m,) or (K, m)."""
+    """Return the violation of a constraint from its excess (K, m), relative to given sizes (m,) or (K, m)."""
     shares = excess / sizes
     largest = np.argmax(shares, axis=1)[:, None]
     size = np.take_along_axis(np.broadcast_to(sizes, excess.shape), largest, axis=1)[:, 0]

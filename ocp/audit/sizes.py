@@ -40,7 +40,7 @@ N_SAMPLES = 32  # number of samples at which the dependence of a constraint on i
 
 @dataclass(frozen=True)
 class FineGrid:
-    """A plan on its fine grid. Every interval is listed from start to end, so that interior mesh times occur twice.
+    """A plan on its fine grid, which lists every interval from start to end, so that mesh times occur twice.
 
     Attributes:
         t: Times, s. Shape (M,).
@@ -59,7 +59,7 @@ class FineGrid:
 
 
 def fine_grid(solution: Solution) -> FineGrid:
-    """Sample a plan ten times as finely as its own points."""
+    """Sample a plan at ten times as many points as its own."""
     curve = solution.state_interpolant
     n = len(solution.control_interpolant.breaks) - 1
     points, segments = max(len(curve.nodes) - 1, 1), max((len(curve.breaks) - 1) // n, 1)
@@ -71,8 +71,7 @@ def fine_grid(solution: Solution) -> FineGrid:
 
 @np.errstate(invalid="ignore")  # nan is reported later, with its name
 def plan_at(solution: Solution, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return states (N m, nx), controls (N m, nu) and times (N m,) at positions ``places`` (m,), 0..1, of all
-    intervals.
+    """Return states (N m, nx), controls (N m, nu) and times (N m,) at m positions, 0..1, of each of N intervals.
 
     At a break each value comes from the side of its interval.
     """
@@ -129,7 +128,7 @@ def sizes(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) 
 
 
 def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndarray, bounds: Bounds) -> Sizes:
-    """Return the sizes as `sizes` does, for a plan on its fine grid."""
+    """Return the sizes of states, controls and constraints for a plan on its fine grid, see `sizes`."""
     places = form.bounds.places
     fixed = (_select(bounds, places[kind]) for kind in ("initial", "terminal"))
     ends = [np.where(low == high, low, np.nan) for low, high in fixed]
@@ -166,7 +165,7 @@ def spaced(grid: FineGrid) -> np.ndarray:
 
 
 def share_sizes(size: np.ndarray, places: Mapping[str, slice], declared: Mapping[str, Variable], below: float) -> None:
-    """Replace sizes that are small beside others of the same unit by the largest of these, in place.
+    """Replace sizes that are much smaller than others of the same unit by the largest of these, in place.
 
     Args:
         size: Sizes of all states or controls, changed in place. Shape (n,).
@@ -190,7 +189,7 @@ def _select(bounds: Bounds, index: np.ndarray) -> Bounds:
 def _sizes_of(
     values: np.ndarray, declared: Bounds, ends: list[np.ndarray], free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes (n,) of entries with values (M, n), and which entries move or have a nonzero fixed end.
+    """Return the sizes (n,) of columns of values (M, n), and flags of those that move or have a nonzero fixed end.
 
     Entries that are ``free`` (n,) are constant along a plan: like a horizon they have the size of their value.
     """
@@ -203,7 +202,7 @@ def _sizes_of(
 
 
 def nearest_bound(declared: Bounds) -> np.ndarray:
-    """Return the absolute value of the smaller of two bounds that are neither zero nor infinite. Shape (n,)."""
+    """Return the smaller magnitude of two bounds, among those that are neither zero nor infinite. Shape (n,)."""
     sides = np.abs(np.array(declared))
     return np.asarray(np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0, initial=np.inf))
 
@@ -211,7 +210,7 @@ def nearest_bound(declared: Bounds) -> np.ndarray:
 def _floored(
     size: np.ndarray, nonzero: np.ndarray, least: np.ndarray, still: Any = STANDSTILL
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Raise the sizes of entries that rest at zero to a floor; also return which entries do not rest there."""
+    """Raise the sizes of entries that stay at zero to a floor; also return flags of those that do not."""
     moves = nonzero | (size > np.maximum(ROUNDING_SHARE * size.max(initial=0.0), still))
     floor = SOLVER_SHARE * np.minimum(least, size[moves].max() if moves.any() else 1.0)
     return np.where(moves, size, np.maximum(size, floor)), moves
@@ -260,7 +259,7 @@ def _rows_of(
 
 
 def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes of states and controls, raised where one is small beside others of the same unit.
+    """Return sizes of states and controls; those much smaller than others of the same unit are raised to these.
 
     A held row is judged by the change that its variables could cause. At a singular configuration the joints that move
     may have no effect on it, and those with an effect stand still: their rounding errors are no measure of the row.
@@ -272,7 +271,7 @@ def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[n
 
 
 def _watched(form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray) -> np.ndarray:
-    """Return the sizes of watched rows: the longest path among rows of one name, or their change with the variables.
+    """Return the sizes of watched rows: the longest path of rows of one name, or their change with the variables.
 
     Args:
         by_variables: Change with the variables. Shape (rows,).
@@ -288,7 +287,7 @@ def _watched(form: Formulation, by_variables: np.ndarray, horizon: float, path_l
 
 
 def integral(rates: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the integral of columns (M, n) over times (M,), from the first to each, by the trapezoidal rule."""
+    """Integrate columns (M, n) over times (M,) from the first time to each, by the trapezoidal rule."""
     steps = np.diff(t)[:, None] * (rates[1:] + rates[:-1]) / 2
     return np.vstack([np.zeros((1, rates.shape[1])), np.cumsum(steps, axis=0)])
 
@@ -302,7 +301,7 @@ def _change_by_variables(
     p: np.ndarray,
     entries: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return how strongly the rows of one kind depend on their variables, at some samples.
+    """Return how strongly the rows of one kind depend on states and controls, at some samples.
 
     Returns:
         Of each row, shape (rows,): the sum of its changes when single entries change by their sizes; whether an entry
@@ -328,7 +327,7 @@ def row_changes(
     p: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the constraint rows of one kind at K samples, and their changes with each single state or control.
+    """Return constraint rows of one kind at K samples, and their change with each single state or control.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.

@@ -57,7 +57,7 @@ class Conditions:
 
 
 def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Conditions:
-    """Return the first-order conditions at the result of a solver under these arguments (p and bounds)."""
+    """Return the first-order conditions at a solver's result, for the given parameters and bounds."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     a, b, c = scales.variables, scales.rows, scales.cost
     slope, jacobian = program.numbers.first(v, p)
@@ -90,7 +90,7 @@ def scaled_values(
 
 
 def active_sides(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
-    """Return the active side of each variable (x) and row (g): -1 lower limit, 1 upper limit, 0 none."""
+    """Return the active side of each variable (x) and row (g): -1 lower limit, 1 upper limit, 0 neither."""
     sides = {}
     for kind, (value, low, high, multiplier) in scaled_values(program, outcome, arguments, scales).items():
         active = at_limit(value, low, high, multiplier)
@@ -107,7 +107,7 @@ def next_active_set(
     sides: Sides,
     tolerance: float,
 ) -> Sides | None:
-    """Return the active sides for the next iteration: limits with a multiplier of the right sign, and violated limits.
+    """Return the active sides for the next iteration: violated limits, and those whose multiplier has the right sign.
 
     The active set is right if it does not change. None if the cost still falls along free directions, as when rounding
     ended the solve too early. Primal-dual active set strategy (Hintermueller, Ito, Kunisch 2002).
@@ -127,7 +127,7 @@ def next_active_set(
 
 
 def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return which values are equalities, or at a limit whose multiplier exceeds the distance to it."""
+    """Return which values are equalities, or at a limit with a multiplier that exceeds the distance to it."""
     with np.errstate(invalid="ignore"):
         below = (multipliers < -SOLVER_RESIDUAL) & (value - lower < -multipliers)
         above = (multipliers > SOLVER_RESIDUAL) & (upper - value < multipliers)
@@ -168,7 +168,7 @@ SETTINGS = NewtonSettings()
 
 
 class Newton:
-    """Newton's method for one program, with its matrix in a banded order.
+    """Newton's method for a nonlinear program, with its matrix in an order that makes it banded.
 
     Args:
         program, transcription: The program.
@@ -196,7 +196,7 @@ class Newton:
     def solve_near(
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales
     ) -> Outcome | None:
-        """Return the optimum near a plan for other parameters or bounds; None if the method does not converge.
+        """Return the optimum for other parameters or bounds, from a nearby plan; None without convergence.
 
         The active limits of the plan are held first. The result determines the next active set (Hintermueller, Ito,
         Kunisch 2002).
@@ -228,7 +228,7 @@ class Newton:
     def _root(
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, max_steps: int
     ) -> Outcome | None:
-        """Take at most ``max_steps`` Newton steps with a fixed active set; return None if they do not converge."""
+        """Take at most ``max_steps`` Newton steps with a fixed active set; return None without convergence."""
         a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
         fixed, held = _held(sides, arguments)
         target = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
@@ -314,7 +314,7 @@ class Newton:
 
 @dataclass(frozen=True)
 class _Matrix:
-    """Newton's matrix at a point, factorised, with a penalty on the active constraints.
+    """Factorised Newton matrix at a point, with a penalty on the active constraints.
 
     Attributes:
         factors: Factors of the Hessian plus penalty.
@@ -330,7 +330,7 @@ class _Matrix:
     price: float
 
     def step(self, gradient: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return Newton's step of variables and multipliers, scaled, by passes of the method of multipliers."""
+        """Return Newton's step of scaled variables and multipliers, by passes of the method of multipliers."""
         place, residual = self.factors.place, self.weight * residual
         side = np.empty_like(gradient)
         side[place] = gradient
@@ -348,7 +348,7 @@ class _Matrix:
 
 
 def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which variables (n,) and rows (m,) act as equalities: real ones, and those held at a limit."""
+    """Return which variables (n,) and rows (m,) act as equalities: declared ones, and those at an active limit."""
     fixed, held = ((arguments[f"lb{kind}"] == arguments[f"ub{kind}"]) | (sides[kind] != 0) for kind in "xg")
     return fixed, held
 
@@ -359,7 +359,7 @@ def _same(sides: Sides, other_sides: Sides) -> bool:
 
 
 class Bordered:
-    """An order of variables in which a symmetric matrix is banded, with a border of a few last variables.
+    """An order of variables that makes a symmetric matrix banded, with a border of a few last variables.
 
     Attributes:
         place: Position of each variable. Shape (n,).
@@ -382,7 +382,7 @@ class Bordered:
         self._size = size
 
     def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the indices, for :meth:`cholesky`, of matrix entries at given positions; ``first`` >= ``second``."""
+        """Return the indices of matrix entries in the argument of :meth:`cholesky`; ``first`` >= ``second``."""
         band = second * self.width + first
         below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
         return np.asarray(np.where(first < self.inner, band, below))
@@ -393,7 +393,7 @@ class Bordered:
         return (self.width + 1) * self.inner + (self._size - self.inner) * self._size
 
     def cholesky(self, values: np.ndarray) -> Cholesky | None:
-        """Return the factors of a matrix; None if it is not positive definite or not finite.
+        """Return the Cholesky factors of a matrix; None if it is not positive definite or not finite.
 
         Args:
             values: Lower triangle, each entry at the index of :meth:`at`, and 0 elsewhere. Overwritten.
@@ -422,7 +422,7 @@ class Bordered:
 
 @dataclass(frozen=True)
 class Cholesky:
-    """Factors of a positive definite matrix with a band and a border of k variables.
+    """Cholesky factors of a positive definite matrix with a band and a border of k variables.
 
     Attributes:
         place: Position of each variable.
@@ -439,7 +439,7 @@ class Cholesky:
     corner: np.ndarray
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Solve for a right-hand side (n,), in the order of :class:`Bordered`."""
+        """Solve the linear system for a right-hand side (n,), in the order of :class:`Bordered`."""
         n = self.below.shape[1]
         inner = scipy.linalg.cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
         if not len(self.below):
@@ -452,7 +452,7 @@ class Cholesky:
 
 
 def _border(row: np.ndarray, column: np.ndarray, distance: np.ndarray, size: int) -> np.ndarray:
-    """Return the border variables: those with the most entries far from the diagonal, as many as minimise the work."""
+    """Choose the variables for the border of a banded matrix, so that its factorisation takes little work."""
     degree = np.bincount(row, minlength=size) + np.bincount(column, minlength=size)
     is_border, border, least_work, count = np.zeros(size, dtype=bool), list[int](), np.inf, 0
     for k in np.argsort(-distance, kind="stable"):

@@ -25,7 +25,7 @@ __all__ = ["Block", "Derivatives", "Interpolants", "Program", "Stages", "Transcr
 
 @dataclass(frozen=True)
 class Block:
-    """A small function and its applications.
+    """A small function, applied repeatedly to different variables of a program.
 
     Attributes:
         function: casadi Function (v (n), d (nd), p) -> (cost, g (m)).
@@ -44,7 +44,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Stages:
-    """Sizes of a stage-ordered program, for structure-exploiting solvers. Each has length N + 1."""
+    """Numbers of states, controls and rows in each of N + 1 stages, for structure-exploiting solvers."""
 
     states: tuple[int, ...]
     controls: tuple[int, ...]
@@ -53,7 +53,7 @@ class Stages:
 
 @dataclass(frozen=True)
 class Interpolants:
-    """Construction of the curves of states and controls from the variables of a phase.
+    """Rule by which the curves of states and controls are built from the variables of a phase.
 
     Attributes:
         breaks: Ends of the segments of the states, as fractions of the horizon; every interval has the same number of
@@ -79,7 +79,7 @@ class Interpolants:
     def __call__(
         self, variables: np.ndarray, parameters: np.ndarray, horizon: float
     ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        """Return the curves of states and controls for the variables of a program."""
+        """Return the curves of states and controls for given values of the variables of a program."""
         values = variables[self.variables].T
         if self.values is not None:
             inputs = variables[self.variables], self.data, horizon, parameters
@@ -91,13 +91,13 @@ class Interpolants:
 
     @cached_property
     def mapped(self) -> Any:
-        """Function ``values``, mapped over all intervals."""
+        """The Function ``values``, mapped over all intervals."""
         return self.values.map("curves", "serial", self.variables.shape[1], [2, 3], [])
 
 
 @dataclass(frozen=True)
 class Transcription:
-    """The nonlinear program of a problem.
+    """The nonlinear program that results from the transcription of a problem.
 
     Attributes:
         mesh: Ends of the intervals, as fractions of the horizon. Shape (N + 1,).
@@ -220,7 +220,7 @@ class Program:
 
 
 class NumericDerivatives:
-    """Values and derivatives of a program as NumPy and SciPy arrays; those at the last point are cached.
+    """Evaluator of a program's values and derivatives as NumPy and SciPy arrays; it caches those at the last point.
 
     CasADi converts its matrices to Python entry by entry, which takes longer than their evaluation. Here the functions
     write into arrays, and the sparsity patterns are read once.
@@ -265,12 +265,12 @@ class NumericDerivatives:
         return np.asarray(self._running(x, p)[0])
 
     def parametric(self, x: np.ndarray, p: np.ndarray, lam: np.ndarray) -> np.ndarray:
-        """Return the gradient of f + lam . g in the parameters. Shape (n_p,)."""
+        """Return the gradient of f + lam . g by the parameters. Shape (n_p,)."""
         return np.asarray(self._parametric(x, p, lam)[0])
 
 
 class ArrayFunction:
-    """A casadi Function of dense vectors that writes its outputs into arrays of their nonzeros."""
+    """A casadi Function of dense vectors whose outputs are written directly into NumPy arrays."""
 
     def __init__(self, function: Any) -> None:
         self._function = function
@@ -305,7 +305,7 @@ class ArrayFunction:
 
 
 def dense_column(nonzeros: np.ndarray, rows: np.ndarray, size: int) -> np.ndarray:
-    """Return a column from its nonzeros. Shape (size,)."""
+    """Return a dense column from its nonzero entries. Shape (size,)."""
     if len(nonzeros) == size:
         return nonzeros
     column = np.zeros(size)
@@ -332,7 +332,7 @@ class Derivatives(NamedTuple):
 
 
 def assemble(transcription: Transcription, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
-    """Assemble the program of a transcription, from given derivatives of its blocks or by deriving them.
+    """Assemble the program of a transcription; derivatives of its blocks are given or derived here.
 
     Raises:
         TimeLimitReached: The time limit is over.
@@ -396,7 +396,7 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
 
 
 def derivatives(function: Any) -> Derivatives:
-    """Derive the exact, symbolic derivatives of a block function."""
+    """Derive the exact derivatives of a block function symbolically."""
     symbol = symbols_of(function).sym
     v, d, p = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
     cost, g = function(v, d, p)
@@ -413,7 +413,7 @@ def derivatives(function: Any) -> Derivatives:
 
 
 def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return row, column and factor in the program's upper triangle for each nonzero of a block Hessian."""
+    """Return row, column and factor in the upper triangle of the program's Hessian for each block Hessian nonzero."""
     first, second = places_of(pattern)
     where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")
@@ -424,7 +424,7 @@ def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray
 
 
 def places_of(pattern: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row and column of each nonzero."""
+    """Return the row and column of each nonzero of a sparsity pattern."""
     row, column = pattern.get_triplet()
     return np.array(row, dtype=int), np.array(column, dtype=int)
 
@@ -436,14 +436,14 @@ def build_function(name: str, arguments: list[Any], outputs: list[Any]) -> Any:
 
 
 def gather(vector: Any, index: np.ndarray) -> Any:
-    """Return the entries ``index`` (n, K) of a vector as a matrix (n, K)."""
+    """Return the entries of a vector at indices (n, K) as a matrix (n, K)."""
     if index.size == 0:
         return ca.MX(*index.shape)
     return ca.reshape(vector[index.ravel(order="F").tolist()], *index.shape)
 
 
 def mapped(function: Any, block: Block, arguments: list[Any]) -> Any:
-    """Evaluate a block function for all its applications; the parameters (argument 2) are shared."""
+    """Evaluate a block function for every column of arguments; all share the parameters (argument 2)."""
     check_time()
     count = block.variables.shape[1]
     if count == 1:
@@ -459,7 +459,7 @@ def nonzeros(matrices: list[Any]) -> Any:
 
 
 def scatter(places: list[np.ndarray], matrices: list[Any], size: int) -> Any:
-    """Return a vector in which each nonzero of ``matrices`` is added at its place."""
+    """Return a vector to which each nonzero of ``matrices`` is added at its index in ``places``."""
     where = np.concatenate([np.zeros(0, int), *places])
     values = nonzeros(matrices)
     collect = sparse(where, np.arange(where.size), np.ones(where.size), (size, where.size))
@@ -473,7 +473,7 @@ def _scatter_matrix(
     shape: tuple[int, int],
     factors: list[np.ndarray] | None = None,
 ) -> Any:
-    """Return a sparse matrix with the nonzeros of ``matrices``, times their factors, and constant entries added."""
+    """Return a sparse matrix of the nonzeros of ``matrices`` times factors, plus constant entries."""
     rows = np.concatenate([constant[0], *[at[0] for at in places]]).astype(int)
     columns = np.concatenate([constant[1], *[at[1] for at in places]]).astype(int)
     entries, number = np.unique(columns * shape[0] + rows, return_inverse=True)
@@ -487,7 +487,7 @@ def _scatter_matrix(
 
 
 def sparse(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, shape: tuple[int, int]) -> Any:
-    """Return a constant sparse matrix from triplets; duplicates are summed."""
+    """Return a constant sparse matrix from rows, columns and values; duplicates are summed."""
     check_time()
     entries, number = np.unique(columns.astype(np.int64) * shape[0] + rows, return_inverse=True)
     summed = np.bincount(number, weights=values, minlength=entries.size)

@@ -67,12 +67,12 @@ exec "$@" </dev/null 3<&-
 
 
 class CompilerError(RuntimeError):
-    """C code that cannot be generated, compiled or loaded, with the reason."""
+    """Error that C code cannot be generated, compiled or loaded, with the reason."""
 
 
 @dataclass(frozen=True)
 class CodeSizes:
-    """Limits on the C code, in characters.
+    """Limits of the length of the C code, in characters.
 
     Attributes:
         optimized: Largest code that is optimised, which takes minutes for more and saves a third of the running time.
@@ -90,7 +90,7 @@ CODE_SIZES = CodeSizes()
 
 
 def generate_c(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
-    """Return the texts of NAME.c and NAME.h of casadi Functions.
+    """Return C code and header (NAME.c and NAME.h) of casadi Functions as texts.
 
     Raises:
         CompilerError: One of them has no C code.
@@ -113,7 +113,7 @@ def generate_c(functions: Iterable[Any], name: str, *, header: bool = True) -> l
 
 @dataclass(frozen=True)
 class Library:
-    """A shared library.
+    """A shared library that is compiled from generated C code and cached.
 
     Attributes:
         contents: The data that determine its C code, such as serialised functions.
@@ -125,13 +125,13 @@ class Library:
 
     @property
     def key(self) -> str:
-        """Its name in the cache; raises CompilerError if there is no compiler."""
+        """Name of the library in the cache; raises CompilerError if there is no compiler."""
         machine = (platform.machine(), sys.platform, ca.__version__, str(CODE_SIZES.optimized))
         return cache.cache_key(VERSION, *machine, *compiler(), *FLAGS, LINK, *self.contents)
 
 
 def build_library(library: Library) -> Path:
-    """Return the path of a library, compiled if it is not cached. Ctrl-C and time limits end the wait.
+    """Return the path of a compiled library, from the cache if possible. Ctrl-C and time limits end the compiler.
 
     Raises:
         CompilerError: There is no compiler, or it rejects the code.
@@ -191,7 +191,7 @@ def _version(command: str, path: str) -> str:
 
 
 def _compile(text: str) -> bytes:
-    """Return the shared library that the compiler makes of C code; raise as :func:`build_library`."""
+    """Compile C code and return the shared library; raises the errors of :func:`build_library`."""
     if len(text) > CODE_SIZES.accepted:
         raise CompilerError(f"{len(text)} characters of C are more than {CODE_SIZES.accepted}")
     speed = "-O1" if len(text) <= CODE_SIZES.optimized else "-O0"
@@ -215,7 +215,7 @@ def _compile(text: str) -> bytes:
 
 
 def _start_process(words: list[str], place: Path) -> subprocess.Popen[bytes]:
-    """Start a command in a folder with its output in a file there; the command ends when its input is closed."""
+    """Start a command in a folder, with its output in a file there; the command ends when its input is closed."""
     with open(place / "words", "wb") as output:
         return subprocess.Popen(
             ["sh", "-c", WATCHED, "sh", *words],
@@ -237,7 +237,7 @@ def _exit_status(process: subprocess.Popen[bytes]) -> int:
 
 
 def function_key(function: Any) -> str:
-    """Return the serialised text of a casadi Function; if it has none, a name that is unique in this process."""
+    """Return the serialised text of a casadi Function, or a name that is unique in this process if it has none."""
     try:
         return SERIALISED + str(function.serialize())
     except RuntimeError:  # of a Callback, say
@@ -246,12 +246,12 @@ def function_key(function: Any) -> str:
 
 @lru_cache
 def warn_interpreted(reason: str) -> None:
-    """Log once why functions are interpreted."""
+    """Log once the reason why functions are interpreted instead of compiled."""
     LOG.warning("functions are interpreted, which is slower: %s", reason)
 
 
 def controller_functions(form: Formulation, transcription: Transcription, guess: np.ndarray) -> list[Any]:
-    """Return the exported functions, in the units of the problem.
+    """Return the functions that `to_c` exports, in the units of the problem.
 
     Args:
         guess: Variables that `plan_guess` clips to the bounds at its parameters. Shape (size,).
@@ -286,7 +286,7 @@ def controller_functions(form: Formulation, transcription: Transcription, guess:
 
 
 def write_controller(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
-    """Write the folder described in this module; each file is written completely or not at all.
+    """Write the folder of C files that this module describes; each file is written completely or not at all.
 
     Raises:
         ProblemError: Some part of the problem has no C, such as an integrator of variable step.
@@ -306,7 +306,7 @@ def write_controller(form: Formulation, transcription: Transcription, guess: np.
 
 
 def problem_header(form: Formulation, transcription: Transcription) -> str:
-    """Return problem.h: sizes, names, and breaks and nodes of the curves."""
+    """Return the text of problem.h: sizes, names, and breaks and nodes of the curves."""
     curves = transcription.interpolants
     sizes = {
         "VARIABLES": transcription.size,

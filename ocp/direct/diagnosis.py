@@ -32,7 +32,7 @@ REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or 
 
 @dataclass(frozen=True)
 class ElasticSettings:
-    """Cost of an elastic plan, and length of the report.
+    """Settings of the elastic plan: the cost of violations, and the length of the report.
 
     Attributes:
         cost: Weight of the problem's own cost, which makes the plan unique.
@@ -49,7 +49,7 @@ SETTINGS = ElasticSettings()
 
 
 class Built(Protocol):
-    """Parts of a prepared problem that a diagnosis uses."""
+    """Parts of a prepared problem that its diagnosis uses."""
 
     problem: Problem
     formulation: Formulation
@@ -123,7 +123,7 @@ def diagnosis(
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
-    """Describe which states and controls are at their bounds, and for which share of the plan, one a line."""
+    """Describe which states and controls are at their bounds, and for what share of the plan, one per line."""
     form, transcription = built.formulation, built.transcription
     lines = []
     for role, labels in (("state", form.state_labels), ("control", form.control_labels)):
@@ -147,7 +147,7 @@ def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]
 def residuals(
     built: Built, v: np.ndarray, arguments: dict[str, np.ndarray]
 ) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
-    """Return label, fraction, value and violation of every row and of the bounds of every variable."""
+    """Return labels, fractions, values and violations of all rows, then of all variables with their bounds."""
     form, transcription = built.formulation, built.transcription
     try:
         g = np.asarray(built.program.values(v, arguments["p"])[1].full()).reshape(-1)
@@ -167,7 +167,7 @@ def both_bounds(arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 
 def variable_labels(form: Formulation, transcription: Transcription) -> list[str]:
-    """Return the name of the state, control or horizon of each variable; "" for undeclared variables of stages."""
+    """Return the name of the state, control or horizon of each variable; "" for internal variables of stages."""
     names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
     return [
         names[role][entry] if role else ""
@@ -176,7 +176,7 @@ def variable_labels(form: Formulation, transcription: Transcription) -> list[str
 
 
 def variable_names(form: Formulation, transcription: Transcription) -> list[str]:
-    """Return the labels with their role, such as "state q[2]", or "a stage variable" for an undeclared variable."""
+    """Return a description of each variable, such as "state q[2]", or "a stage variable" for internal ones."""
     return [
         f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
         for role, name in zip(transcription.variable_role, variable_labels(form, transcription), strict=True)
@@ -214,7 +214,7 @@ class Conflict:
 
 @dataclass(frozen=True)
 class Elastic:
-    """The plan with the smallest violation: its variables (n,), and its conflicts, the largest share first."""
+    """The plan with the smallest violation: its variables (n,), and its conflicts, most severe first."""
 
     plan: np.ndarray
     conflicts: tuple[Conflict, ...]
@@ -223,7 +223,7 @@ class Elastic:
 def elastic_plan(
     built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, *, horizon: float
 ) -> Elastic | None:
-    """Return the plan that satisfies dynamics and fixed ends and violates the other constraints least.
+    """Return the plan that satisfies dynamics and fixed ends, and violates the other constraints least.
 
     None if the last iterate violates nothing or is not finite, so that the constraints are not the reason for the
     failure, and if no plan is found in the remaining time.
@@ -303,7 +303,7 @@ def elastic_plan(
 
 
 class _Soft:
-    """Rows and bounds that may be violated at a cost: all but the dynamics, the fixed ends and the smallest horizon.
+    """Rows and bounds that may be violated at a cost: all but dynamics, fixed ends and the smallest horizon.
 
     Rows are numbered before variables. Those with one label share a slack variable.
     """
@@ -334,7 +334,7 @@ class _Soft:
         self.fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
 
     def matrices(self, n: int, m: int, k: int) -> tuple[Any, Any]:
-        """Return constant matrices R, C: the elastic rows are R g(v) + C (v, slack)."""
+        """Return constant matrices R and C such that the elastic rows are R g(v) + C (v, slack)."""
         chosen = np.concatenate([self.hard, self.lower, self.upper])
         number = np.arange(len(chosen))
         of_rows = chosen < m
@@ -346,7 +346,7 @@ class _Soft:
         return rows, sparse(at, columns, signs, (len(chosen), n + k))
 
     def limits(self, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the bounds of the elastic rows."""
+        """Return the lower and upper bounds of the elastic rows."""
         low, high = both_bounds(arguments)
         free = np.full(max(len(self.lower), len(self.upper)), np.inf)
         lower = np.concatenate([low[self.hard], low[self.lower], -free[: len(self.upper)]])
@@ -355,7 +355,7 @@ class _Soft:
     def conflicts(
         self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float, units: np.ndarray
     ) -> list[Conflict]:
-        """Return the violated constraints; the largest violation, in ``units`` of its row or variable, comes first."""
+        """Return the violated constraints, the worst first, measured in ``units`` of its row or variable."""
         low, high = both_bounds(arguments)
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}

@@ -289,7 +289,7 @@ def control_at(form: Formulation, method: MultipleShooting, w: Any, place: Any) 
 
 
 def interval_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Return the block (v = [x; controls; T if free], d = [s, h], p) -> (running cost, -F(x, controls))."""
+    """Return the block function of an interval: (v, d, p) -> (running cost, minus the state at its end)."""
     nw = n_controls_of(form, method)
     step, flat = step_function(form, method)
     sym = (ca.SX if flat else ca.MX).sym
@@ -306,7 +306,7 @@ def interval_function(form: Formulation, method: MultipleShooting) -> Any:
 
 
 def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, bool]:
-    """Return an integration step (x, w, d, step number, T, p) -> (x, cost), and whether to inline all into SX."""
+    """Return an integration step (x, w, d, step number, T, p) -> (x, cost), and whether it is to be inlined as SX."""
     if method.integrator == "cvodes":
         return cvodes(form, method, [1.0]), False
     function = form.function("f", [form.f, form.running], ["f", "running"])
@@ -344,7 +344,7 @@ def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> 
 
 
 def dense_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Return ([x; w], d, T, p) -> states at THIRDS of each step, by cubic Hermite interpolation."""
+    """Return the function ([x; w], d, T, p) -> states at the THIRDS of each step, by cubic Hermite interpolation."""
     v, d = ca.MX.sym("v", form.nx + n_controls_of(form, method)), ca.MX.sym("d", 2)
     x, w = v[: form.nx], v[form.nx :]
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)

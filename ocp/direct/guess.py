@@ -96,7 +96,7 @@ def guessed_names(form: Formulation, guess: Guess) -> set[str]:
 
 
 def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each variable and each row, the index of its counterpart a number of equal intervals later.
+    """Return, for each variable and row, the index of the same quantity a number of equal intervals later.
 
     The index itself where the horizon ends earlier.
     """
@@ -118,7 +118,7 @@ def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.nd
 
 
 def _trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:
-    """Return a guess as a function of the fraction: from a function of time, from samples (M, n) or from a value."""
+    """Return a guess (a function of time, samples (M, n), or a value) as a function of the horizon fraction."""
     if isinstance(value, Samples) and value.values.shape[1] == size:
         return lambda at: value.over(at * horizon)
     if callable(value):
@@ -161,7 +161,7 @@ class Samples:
     values: np.ndarray
 
     def over(self, times: np.ndarray) -> np.ndarray:
-        """Return values at ``times`` (K,): linear between samples, constant beyond them. Shape (K, n)."""
+        """Return values at ``times`` (K,), linear between the samples and constant beyond them. Shape (K, n)."""
         return np.column_stack([np.interp(times, self.t, column) for column in self.values.T])
 
     def __call__(self, time: float) -> np.ndarray:
@@ -207,9 +207,7 @@ def default_horizon(form: Formulation, bounds: Bounds) -> float:
 
 
 def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Trajectory:
-    """Return the default guess: a straight line between fixed ends, else the middle of the bounds or the point nearest
-    zero.
-    """
+    """Return the default guess: a line between fixed ends, else the middle of the bounds or the value nearest zero."""
 
     def middle(kind: str) -> tuple[np.ndarray, np.ndarray]:
         index = form.bounds.places[kind][place]
@@ -231,7 +229,7 @@ def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Traje
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Alternative starts of a solver.
+    """Settings of the alternative starts of a solver.
 
     Attributes:
         horizon: Factor on the guess of a free horizon when starting from zeros: a long horizon contains a feasible

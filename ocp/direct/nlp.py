@@ -107,7 +107,7 @@ class Outcome:
 def build_solver(
     program: Program, solver: str, options: dict[str, Any], *, stages: Stages | None, title: str
 ) -> tuple[Any, IterationMonitor | FatropMonitor]:
-    """Return the casadi solver of a program, and the callback that stops it.
+    """Return the casadi solver of a program, and its callback, by which it can be stopped.
 
     Raises:
         ProblemError: The solver does not accept an option.
@@ -195,7 +195,7 @@ def finite(expression: Any) -> Any:
 
 
 def call_solver(solver: Any, progress: IterationMonitor | FatropMonitor, arguments: dict[str, np.ndarray]) -> Outcome:
-    """Run a solver; Ctrl-C and a time limit stop it between two iterations, at its last iterate."""
+    """Run a solver; Ctrl-C or a time limit stops it between iterations, and its last iterate is returned."""
     began = time.monotonic()
     name = KINDS[solver.class_name()]
     progress.open(arguments["lbg"], arguments["ubg"])
@@ -260,7 +260,7 @@ def regularised(stats: dict[str, Any]) -> bool:
 
 
 def broken_down(solver: Any, arguments: dict[str, np.ndarray], error: RuntimeError) -> Outcome:
-    """Return an unsuccessful outcome at the start, for a solver that an evaluation error ended."""
+    """Return an unsuccessful outcome at the start point for a solver that an evaluation error ended."""
     rows = np.full(arguments["lbg"].shape, np.nan)
     status = SolverStatus.NOT_FINITE
     values = arguments["x0"], np.nan, rows, rows
@@ -268,21 +268,21 @@ def broken_down(solver: Any, arguments: dict[str, np.ndarray], error: RuntimeErr
 
 
 def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) -> bool:
-    """Return whether ipopt stalls at a solution: rounding of large values exceeds its absolute tolerances."""
+    """Return whether ipopt stalls at a solution because rounding of large values exceeds its absolute tolerances."""
     history = stats["iterations"]
     states, forces = (max(1.0, float(ca.norm_inf(result[key]))) for key in ("x", "lam_g"))
     return bool(history["inf_pr"][-1] <= SOLVER_RESIDUAL * states and history["inf_du"][-1] <= SOLVER_RESIDUAL * forces)
 
 
 def largest_violation(values: dict[str, np.ndarray], arguments: dict[str, np.ndarray]) -> float:
-    """Return the largest violation of variable and row bounds, relative to the largest variable, at least 1."""
+    """Return the largest violation of bounds of variables and rows, over the largest variable or 1."""
     gaps = [(arguments[f"lb{k}"] - values[k], values[k] - arguments[f"ub{k}"]) for k in ("x", "g")]
     worst = max(float(np.max(gap, initial=0.0)) for pair in gaps for gap in pair)
     return worst / max(1.0, float(np.max(np.abs(values["x"]), initial=0.0)))
 
 
 def tighten_for_fatrop(arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Tighten bounds by as much as fatrop relaxes them, so that plans keep the declared bounds."""
+    """Tighten bounds by the amount by which fatrop relaxes them, so that plans keep the declared bounds."""
     relaxation, result = 1e-8, dict(arguments)  # fatrop's own; its casadi interface has no option for it
     for low, high in (("lbx", "ubx"), ("lbg", "ubg")):
         lower, upper = arguments[low], arguments[high]
@@ -378,7 +378,7 @@ def costates_of(program: Program, transcription: Transcription, outcome: Outcome
 def _cost_gradient(
     form: Formulation, program: Program, transcription: Transcription, outcome: Outcome, p: np.ndarray
 ) -> np.ndarray:
-    """Return the derivative of the optimal cost in the parameters, also through every active bound."""
+    """Return the derivative of the optimal cost by the parameters, including their effect on active bounds."""
     v, lam = outcome.variables, outcome.multipliers
     direct = program.numbers.parametric(v, p, lam)
     slope, jacobian = program.numbers.first(v, p)
@@ -391,7 +391,7 @@ def _cost_gradient(
 
 
 def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> PiecewisePolynomial:
-    """Return the polynomials through the reported costates of every interval, both ends included."""
+    """Return the polynomials through the reported costates of each interval, including both its ends."""
     interval, place = transcription.report
     n = len(transcription.mesh) - 1
     starts = np.searchsorted(interval + (place == 1.0), np.arange(n))
@@ -402,7 +402,7 @@ def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> P
 
 
 def controls_at(controls: Any, transcription: Transcription, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return the controls at reported points, from the side of the reporting interval."""
+    """Return the controls at the reported points, each from inside its interval."""
     if len(controls.breaks) == len(transcription.mesh):
         return np.asarray(controls.within(interval, place))
     mesh = transcription.mesh

@@ -77,7 +77,7 @@ class DirectMethod(MeshedMethod):
 
 
 class Prepared:
-    """A problem prepared for a method and a solver, to be solved many times, by one thread at a time.
+    """A problem prepared by a direct method for repeated solves; only one thread solves at a time.
 
     Attributes:
         problem, method: What was prepared.
@@ -119,17 +119,17 @@ class Prepared:
 
     @cached_property
     def scaled(self) -> Program:
-        """The scaled program, see :func:`ocp.direct.scaling.scaled_program`."""
+        """The scaled nonlinear program, see :func:`ocp.direct.scaling.scaled_program`."""
         return scaled_program(self.program)
 
     def _built_solver(self, options: dict[str, Any]) -> tuple[Any, Any]:
-        """Build the solver with options, and the callback that stops it."""
+        """Build the solver with given options, and its callback, by which it can be stopped."""
         return build_solver(
             self.scaled, self.solver_name, options, stages=self.transcription.stages, title=self.problem.name
         )
 
     def __reduce__(self) -> Any:
-        """Pickle and copy as the arguments, to be prepared again."""
+        """Pickle and copy the object as its arguments, from which it is prepared again."""
         return partial(type(self), compiled=self._compiled, scaling=self._scaling), self._arguments
 
     @interruptible
@@ -196,7 +196,7 @@ class Prepared:
     def _solve(
         self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, shift: int
     ) -> Solution:
-        """Solve from the plan given as guess, from the guess, from alternative starts, then from the elastic plan."""
+        """Solve from a guess that is a plan, from the guess, from alternative starts, then from the elastic plan."""
         form, transcription = self.formulation, self.transcription
         p = form.parameter_vector(require.mapping("parameters", parameters))
         bounds = form.bound_values(p)
@@ -238,7 +238,7 @@ class Prepared:
         ) from decisive.error
 
     def _alternative_attempts(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
-        """Run the solver from each start other than the guess until one succeeds or the time is over.
+        """Run the solver from each alternative start until one succeeds or the time limit is reached.
 
         Together they take at most the iterations of the first attempt. If no function is ever finite, the start does
         not matter.
@@ -257,7 +257,7 @@ class Prepared:
         return attempts
 
     def _elastic(self, first: Attempt) -> Elastic | None:
-        """Solve for the plan with the smallest violation; Ctrl-C raises with the last iterate of the first attempt."""
+        """Solve for the plan with the smallest violation; Ctrl-C raises an error with the last iterate of `first`."""
         horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
             return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon=horizon)
@@ -265,14 +265,14 @@ class Prepared:
             raise Interrupted(str(error), first.solution) from error
 
     def _is_own_plan(self, guess: Guess) -> bool:
-        """Return whether a guess is a plan of this program, by its method, mesh, sizes and parameters."""
+        """Return whether a guess is a plan of this program: with its method, mesh, sizes and parameters."""
         if not isinstance(guess, Solution) or guess.method != self.method.settings:
             return False
         sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)
         return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
     def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
-        """Return the optimum near a guess that is a plan, shifted by ``shift`` intervals; None if there is none."""
+        """Return the optimum near a guess that is a plan, shifted by ``shift`` intervals; None without one."""
         form = self.formulation
         if not isinstance(guess, Solution) or not self._is_own_plan(guess) or self.solver_name != "ipopt":
             return None
@@ -306,7 +306,7 @@ class Prepared:
 
     @cached_property
     def _short_solver(self) -> tuple[Any, Any]:
-        """The solver with fewer iterations, used for alternative starts, and its progress display."""
+        """The solver for alternative starts, with fewer iterations, and its progress display."""
         return self._built_solver({**self._options, "max_iter": min(STARTS.iterations, self._max_iterations)})
 
     def _attempt(
@@ -318,7 +318,7 @@ class Prepared:
         bounds: Bounds,
         solver: tuple[Any, Any] | None = None,
     ) -> Attempt:
-        """Run a solver, by default the main one, from a start, with scales from the sizes along it."""
+        """Run a solver, by default the main one, from a start, with scales computed along that start."""
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
         scales = self._scales(x0, names, bounds, p)
@@ -343,7 +343,7 @@ class Prepared:
         return Attempt(start, arguments, names, scales, outcome, solution)
 
     def _scales(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
-        """Return the scales for the sizes along a start; see :func:`sizes_along` for ``names``."""
+        """Return the scales computed from the sizes along a start; ``names`` are as in :func:`sizes_along`."""
         if not self._scaling:
             return unit_scales(self.transcription)
         scales = compute_scales(self._pattern, sizes_along(self._pattern, point, names, bounds=bounds, p=p), point, p)
@@ -405,7 +405,7 @@ class Attempt:
 
 
 def tighten_bounds(arguments: dict[str, np.ndarray], amounts: Mapping[str, np.ndarray]) -> None:
-    """Move lower bounds up and upper bounds down, at most to their middle; equalities stay."""
+    """Move lower bounds up and upper bounds down, at most to the middle between them; equalities stay."""
     for kind in ("x", "g"):
         low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
         is_range = low < high

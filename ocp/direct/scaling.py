@@ -61,7 +61,7 @@ class ScalingSettings:
 
     @property
     def bad(self) -> float:
-        """Ratio between sizes, or between a state and its change, above which a program counts as badly scaled."""
+        """Ratio of sizes, or of a state's change to its size, above which a program counts as badly scaled."""
         return self.usual**2
 
 
@@ -96,14 +96,14 @@ class Scales:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of the entries of the states (nx,) and controls (nu,), and of the horizon, s."""
+    """Typical sizes of the states (nx,), the controls (nu,) and the horizon (s)."""
 
     states: np.ndarray
     controls: np.ndarray
     horizon: float
 
     def of_variables(self, transcription: Transcription) -> np.ndarray:
-        """Return the size of each variable of a program; 1 for undeclared variables of stages."""
+        """Return the size of each variable of a program; 1 for internal variables of stages."""
         result = np.ones(transcription.size)
         for role, sizes in (("state", self.states), ("control", self.controls), ("horizon", np.array([self.horizon]))):
             chosen = transcription.variable_role == role
@@ -112,7 +112,7 @@ class Sizes:
 
 
 class Pattern:
-    """Structure of a program from which sizes are computed, for repeated scaling.
+    """Structure of a program from which its scaling is computed repeatedly.
 
     Attributes:
         rows, columns: Row and column of each nonzero of the Jacobian.
@@ -138,7 +138,7 @@ class Pattern:
 
 
 def unit_scales(transcription: Transcription) -> Scales:
-    """Return scales of one."""
+    """Return scales that are all 1."""
     return Scales(np.ones(transcription.size), np.ones(transcription.n_rows), 1.0)
 
 
@@ -230,7 +230,7 @@ def sizes_along(
 
 
 def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return the horizon times the largest derivatives of state rates in other states and controls. (nx, nx + nu)."""
+    """Return horizon times largest |derivative| of state rates by other states and controls. Shape (nx, nx + nu)."""
     result = np.zeros((pattern.form.nx, pattern.form.nx + pattern.form.nu))
     slopes = _evaluate(pattern.program.numbers.first, point, p)
     if slopes is not None:
@@ -243,7 +243,7 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
-    """Return the scales of a program for given sizes of its variables; rows and cost scale with their changes."""
+    """Return the scales of a program for given sizes of its variables; rows and cost get the size of their changes."""
     program, size_of_variable = pattern.program, sizes.of_variables(pattern.transcription)
     # squares of smaller sizes underflow
     size_of_variable = np.where(size_of_variable > np.sqrt(np.finfo(float).tiny), size_of_variable, 1.0)
@@ -269,7 +269,7 @@ def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
 
 
 def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales: Scales, sizes: Sizes) -> str:
-    """Describe bad scaling of a program that was solved; "" if there is none."""
+    """Describe how a solved program is badly scaled; "" if it is not."""
     form, transcription = pattern.form, pattern.transcription
     scaled_size = sizes.of_variables(transcription) / scales.variables
     deviation = np.abs(np.log(scaled_size))
@@ -291,7 +291,7 @@ def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales:
 
 
 def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
-    """Return the scales of variables, replaced by the declared sizes as powers of two."""
+    """Return the scales of variables, with declared sizes rounded to powers of two in place of computed ones."""
     form = pattern.form
     declared = Sizes(form.scales[: form.nx], form.scales[form.nx :], 1.0).of_variables(pattern.transcription)
     declared[~np.isin(pattern.transcription.variable_role, ("state", "control"))] = np.nan
@@ -299,7 +299,7 @@ def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
 
 
 def _powers(sizes: np.ndarray) -> np.ndarray:
-    """Round sizes outside the usual range to powers of two; return 1 for the others."""
+    """Return the nearest power of two for unusually large or small sizes, and 1 for the others."""
     unusual = (sizes < 1 / SCALING.usual) | (sizes > SCALING.usual)
     return np.where(unusual, np.exp2(np.round(np.log2(np.where(unusual, sizes, 1.0)))), 1.0)
 
@@ -313,7 +313,7 @@ def _evaluate(function: Callable[..., Any], point: np.ndarray, p: np.ndarray) ->
 
 
 class Predetermined:
-    """Variables of a program whose values follow from the start alone, and limits on them.
+    """Variables of a program that the start alone determines, and the limits on them.
 
     Variables that are joined to a fixed variable, as the end of the last interval is to a fixed end, are known too.
     """
@@ -336,7 +336,7 @@ class Predetermined:
         self.joins, self.joined = linear[pairs[:, 0]], column[pairs]
 
     def relaxed(self, arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the solver arguments without the limits that involve only predetermined variables."""
+        """Return the solver arguments without limits that involve only predetermined variables."""
         known = arguments["lbx"] == arguments["ubx"]
         equal = arguments["lbg"][self.joins] == arguments["ubg"][self.joins]
         known[self.joined[equal & known[self.joined].any(axis=1)]] = True
@@ -349,7 +349,7 @@ class Predetermined:
         return result
 
     def checked(self, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Outcome:
-        """Check an outcome against the limits that scaling removed; mark it infeasible if one is violated.
+        """Check an outcome against the limits on predetermined variables; mark it infeasible if one is violated.
 
         Args:
             scales: Units in which violations are judged.
@@ -365,7 +365,7 @@ class Predetermined:
 
 
 def uncontrolled_states(form: Formulation) -> np.ndarray:
-    """Return which states follow from the start and the time alone, whatever the controls do. Shape (nx,), bool."""
+    """Return which states depend only on the start and the time, not on the controls. Shape (nx,), bool."""
     if form.horizon_is_free:
         return np.zeros(form.nx, dtype=bool)
 

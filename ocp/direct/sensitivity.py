@@ -34,7 +34,7 @@ REFINEMENTS = 4
 
 
 def sensitivity(solution: Solution, name: str) -> Sensitivity:
-    """Return the derivatives of a plan in the parameter ``name``; see :meth:`ocp.solution.Solution.sensitivity`.
+    """Return the derivatives of a plan by the parameter ``name``; see :meth:`ocp.solution.Solution.sensitivity`.
 
     Raises:
         ProblemError: An unknown parameter; a plan that is not an optimum of a direct method under the bounds of its
@@ -120,7 +120,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
 
 
 def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]:
-    """Return the program that a plan is a solution of."""
+    """Return formulation, transcription and program of a plan; raise ProblemError if it is not their optimum."""
     plan = f"plan {solution.name!r}"
     settings = dict(solution.method)
     method_name = settings.pop("type")
@@ -145,7 +145,7 @@ def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]
 def _by_parameters(
     transcription: Transcription, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return derivatives in some parameters of the gradient of the Lagrangian (n, k) and of the rows (m, k)."""
+    """Return derivatives of the Lagrangian's gradient (n, k) and of the rows (m, k) by some parameters."""
     slope, change = np.zeros((transcription.size, len(columns))), np.zeros((transcription.n_rows, len(columns)))
     for block in transcription.blocks:
         function = block.function
@@ -166,7 +166,7 @@ def _by_parameters(
 def _solve_system(
     at: Conditions, slope: np.ndarray, change: np.ndarray, at_x: np.ndarray, at_g: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return derivatives of the variables (n, k) and of the multipliers of rows (m, k) and bounds (n, k), scaled.
+    """Return scaled derivatives of the variables (n, k) and of the multipliers of rows (m, k) and bounds (n, k).
 
     Args:
         slope, change: Of the gradient of the Lagrangian and of the rows, with fixed variables.
@@ -205,7 +205,7 @@ def _solve_system(
 
 
 def control_rates(transcription: Transcription, solution: Solution, p: np.ndarray, dv: np.ndarray) -> np.ndarray:
-    """Return derivatives of the controls at the reported times (M, nu, k); controls are linear in their variables."""
+    """Return derivatives of the controls at the reported times (M, nu, k), which are linear in their variables."""
     interval, place = transcription.report
     v, columns = solution.variables, []
     for direction in dv.T:

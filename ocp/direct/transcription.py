@@ -55,7 +55,7 @@ class Layout:
 
 
 def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool) -> Layout:
-    """Return the order of variables node 0, interval 0, node 1, ..., node N, horizon."""
+    """Return the layout with variables in the order node 0, interval 0, node 1, ..., node N, horizon."""
     stride = node_size + interval_size
     grid = np.arange(intervals * stride).reshape(intervals, stride).T
     node = np.column_stack([grid[:node_size], intervals * stride + np.arange(node_size)])
@@ -68,7 +68,7 @@ def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizo
 def _staged_layout(
     intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool
 ) -> Layout:
-    """Return the order by stages: node k, copies of horizon and start, interval k, copy of its end."""
+    """Return the layout by stages: node k, copies of horizon and start, interval k, copy of its end."""
     carried = node_size + free_horizon + node_size * keep_initial
     inputs = interval_size + node_size
     stride = carried + inputs
@@ -132,7 +132,7 @@ class TranscriptionBuilder:
     # ---- variables -------------------------------------------------------------------------------------------
 
     def variables(self, role: str, index: np.ndarray, at: np.ndarray, bounds: str | None) -> None:
-        """Declare variables ``index`` (n, K) as entries of ``role`` at fractions ``at`` (K,), with named bounds."""
+        """Declare variables with indices (n, K) as entries of ``role`` at fractions ``at`` (K,), with named bounds."""
         self.variable_role[index] = role
         self.variable_entry[index] = np.arange(index.shape[0])[:, None]
         self.variable_fraction[index] = at[None, :]
@@ -182,7 +182,7 @@ class TranscriptionBuilder:
         joins: bool = False,
         ends: bool = False,
     ) -> np.ndarray:
-        """Allocate rows ``labels`` (m) at K places and return their indices (m, K); bounds None means equal to zero.
+        """Allocate m rows at each of K places and return their indices (m, K); bounds None means equal to zero.
 
         Args:
             joins: Whether the rows tie a stage to the next.
@@ -199,14 +199,14 @@ class TranscriptionBuilder:
         return first + np.arange(m * places).reshape(places, m).T
 
     def linear(self, rows: np.ndarray, columns: np.ndarray, values: np.ndarray | float) -> None:
-        """Add linear terms ``values * variable[columns]`` to ``rows``; the three are broadcast together."""
+        """Add linear terms ``values * variable[columns]`` to ``rows``; the three arrays are broadcast together."""
         targets, variables, entries = np.broadcast_arrays(rows, columns, values)
         self._linear.append((targets.ravel(), variables.ravel(), entries.ravel().astype(float)))
 
     def path_rows(
         self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, *, at: np.ndarray
     ) -> None:
-        """Declare path constraints at K points with fractions ``at``, states (nx, K) and controls (nu, K)."""
+        """Declare path constraints at K points at fractions ``at``, from states (nx, K) and controls (nu, K)."""
         if len(rows) == 0 or len(at) == 0:
             return
         point_data = self.formulation.point_data(at)
@@ -216,7 +216,7 @@ class TranscriptionBuilder:
         self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
-        """Declare constraints at every node; at the first one only those that fixed initial states leave open.
+        """Declare constraints at every node; at the first node only those that fixed initial states do not determine.
 
         ``controls`` (nu, N + 1) are the variables read there; they do not matter for rows without controls.
         """
@@ -257,7 +257,7 @@ class TranscriptionBuilder:
         initial: tuple[np.ndarray, np.ndarray] | None,
         place: int,
     ) -> None:
-        """Add the function of start (place 0) or end (place 1) with v = [x, controls, T, x0, start controls]."""
+        """Add the block of start (place 0) or end (place 1), a function of v = [x, controls, T, x0, start controls]."""
         form, layout = self.formulation, self.layout
         sym, nx, nu = form.sym, form.nx, form.nu
         stage = self.intervals if place else 0
@@ -358,12 +358,12 @@ class MeshedMethod(ABC):
     @property
     @abstractmethod
     def order(self) -> int:
-        """Order of the integration error of one interval in its width."""
+        """Order of the integration error of one interval with respect to its width."""
 
     @property
     @abstractmethod
     def control_order(self) -> int:
-        """Order of the interpolation error of a smooth control in the width."""
+        """Order of the interpolation error of a smooth control in the width of an interval."""
 
     @abstractmethod
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
@@ -371,7 +371,7 @@ class MeshedMethod(ABC):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The method as stored in a solution: its type, and its attributes other than None."""
+        """The method as stored in a solution: its type, and its attributes that are not None."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if v is not None}  # type: ignore[call-overload]
         return {"type": type(self).__name__, **values}
 
@@ -392,8 +392,7 @@ class MeshedMethod(ABC):
         return self.with_mesh(np.union1d(nodes, (nodes[1:] + nodes[:-1]) / 2))
 
     def with_nodes_at(self, fractions: Any) -> Self:
-        """Return the method with additional nodes at fractions 0..1 of the horizon, where the problem has jumps or
-        kinks.
+        """Return the method with additional nodes at fractions 0..1 of the horizon, for example at jumps of a limit.
 
         A given mesh keeps its nodes. Without one the intervals between the fractions are equal and no wider than
         before.

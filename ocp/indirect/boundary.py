@@ -26,7 +26,7 @@ LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nod
 
 
 class BoundaryProblem:
-    """Boundary value problem of states and costates y = [x; lambda] in consecutive segments.
+    """Boundary value problem of states and costates, y = [x; lambda], in consecutive segments.
 
     Each segment is integrated from its own y with data q = [start time, duration, horizon, p, bang values, guess].
 
@@ -47,7 +47,7 @@ class BoundaryProblem:
         self._systems: dict[tuple[int, ...], tuple[Any, ...]] = {}
 
     def system(self, arcs: ControlArcs) -> tuple[Any, ...]:
-        """Return the residual and its Jacobian as functions of (unknowns, data), for given numbers of segments."""
+        """Return residual and Jacobian as functions of (unknowns, data), for the numbers of segments of the arcs."""
         key = tuple(arcs.segments)
         if key not in self._systems:
             build = self._backward if self.backward else self._multiple
@@ -58,7 +58,7 @@ class BoundaryProblem:
         return self._systems[key]
 
     def _multiple(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Return the system of multiple shooting: y at all segment starts and at the end are unknown."""
+        """Return the equations of multiple shooting, with y at all segment starts and at the end as unknowns."""
         form = self.form
         at, of = self.layout(arcs), self._data(arcs)
         z, data = ca.MX.sym("z", at["end"].stop), ca.MX.sym("data", of["guess"].stop)
@@ -82,7 +82,7 @@ class BoundaryProblem:
         return z, data, ca.vertcat(*residuals)
 
     def _backward(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Return the system of backward shooting: the end state is unknown, the given start is the condition."""
+        """Return the equations of backward shooting: the end state is unknown and must lead to the given start."""
         form = self.form
         of = self._data(arcs)
         total = sum(arcs.segments)
@@ -91,7 +91,7 @@ class BoundaryProblem:
         return z, data, y_start[: form.nx, :] - data[of["ends"]][form.nx : 2 * form.nx]
 
     def _chain(self, state: Any, data: Any, arcs: ControlArcs, total: int) -> tuple[list[Any], Any]:
-        """Integrate y = [x; lambda] backwards from an end state; return its values at the nodes, the last one first."""
+        """Integrate y = [x; lambda] backwards from an end state; return its values at the nodes, in reverse order."""
         form, of = self.form, self._data(arcs)
         horizon = data[of["horizon"]]
         gradient = ca.gradient(form.terminal, form.x)
@@ -106,7 +106,7 @@ class BoundaryProblem:
         return nodes, y
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
-        """Return the integrator data q of all segments, side by side."""
+        """Return the integrator data q of all segments, one column per segment."""
         of, total = self._data(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
         begins, lengths = [], []
@@ -124,14 +124,14 @@ class BoundaryProblem:
         )
 
     def arguments(self, y: Any, at: Any, horizon: Any, q: Any) -> list[Any]:
-        """Return the arguments of the Hamiltonian functions from y and q (one column per sample) at times ``at``."""
+        """Return the arguments of Hamiltonian functions at times ``at`` from y and q, one column per sample."""
         sizes = self.ham.sizes
         cuts = np.cumsum([3, *sizes[4:]])
         tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
         return [y[: sizes[0]], y[sizes[0] :], at, horizon, *tail]
 
     def layout(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Return the slices of the vector of unknowns."""
+        """Return the slices of the parts of the vector of unknowns, by name."""
         form = self.form
         total = sum(arcs.segments)
         sizes = {
@@ -144,16 +144,14 @@ class BoundaryProblem:
         return side_by_side(sizes)
 
     def _data(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Return the slices of the data vector: horizon if fixed, p, end values, bang values, guesses."""
+        """Return the slices of the data vector by name: fixed horizon, p, end values, bang values, guesses."""
         sizes = self.ham.sizes
         total = sum(arcs.segments)
         parts = {"horizon": 1, "p": sizes[4], "ends": 4 * sizes[0], "bang": sizes[5] * total, "guess": sizes[6] * total}
         return side_by_side(parts)
 
     def _integrator(self, places: np.ndarray) -> Any:
-        """Return the function (y, q) -> (y at ``places``, integrals of L and dH/dT); q = [t0, duration, T, p, bang,
-        guess].
-        """
+        """Return the integrator of a segment, a function (y, q) -> (y at ``places``, integrals of L and dH/dT)."""
         ham = self.ham
         sizes = ham.sizes
         flow = ham.flow()
@@ -178,7 +176,7 @@ class BoundaryProblem:
             return np.full(segment.size_out(0), np.nan), np.full(2, np.nan)
 
     def end_multipliers(self, z: np.ndarray, arcs: ControlArcs) -> tuple[np.ndarray, np.ndarray]:
-        """Return the multipliers of the start and of the end constraints."""
+        """Return the multipliers of the start constraints and of the end constraints."""
         if self.backward:
             return np.zeros(0), np.zeros(0)
         at = self.layout(arcs)
@@ -193,7 +191,7 @@ class BoundaryProblem:
     def unpack(
         self, z: np.ndarray, arcs: ControlArcs, data: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Split the unknowns: y at the nodes (2 nx, S + 1), q of the segments, switch times, horizon."""
+        """Split the unknowns into y at the nodes (2 nx, S + 1), q of the segments, switch times and horizon."""
         form, total = self.form, sum(arcs.segments)
         horizon, switches = float(data[0]), np.zeros(0)
         if self.backward:
@@ -216,7 +214,7 @@ class BoundaryProblem:
 
 
 def side_by_side(sizes: dict[str, int]) -> dict[str, slice]:
-    """Return the slice of each part in a stacked vector, in order."""
+    """Return the slices of consecutive parts in a stacked vector, by name."""
     cuts = np.cumsum([0, *sizes.values()]).tolist()
     return {name: slice(a, b) for name, (a, b) in zip(sizes, itertools.pairwise(cuts), strict=True)}
 
@@ -246,7 +244,7 @@ def check_backward(ham: Hamiltonian) -> None:
 
 
 def end_conditions(form: Formulation) -> Any:
-    """Return the function (y0, yN, T, p, nu0, nu1, ends) -> (2 nx + n_start + n_end conditions, dPhi/dT).
+    """Return the function (y0, yN, T, p, nu0, nu1, ends) -> (residuals of the end conditions, dPhi/dT).
 
     ``ends`` holds, for initial and then for terminal states, 1 if an entry is fixed and its value. For free entries the
     costate is the gradient of Phi = terminal cost + nu . constraints (with a minus sign at the start).
@@ -286,7 +284,7 @@ class NewtonSettings:
 
 @dataclass(frozen=True)
 class NewtonResult:
-    """The last iterate of Newton's method."""
+    """Last iterate and status of Newton's method."""
 
     unknowns: np.ndarray
     residual: float
@@ -309,7 +307,7 @@ def newton(
     tolerance: float,
     settings: NewtonSettings = NewtonSettings(),
 ) -> NewtonResult:
-    """Solve a sparse system by damped Newton steps; each step is halved until the residual falls."""
+    """Solve a sparse nonlinear system by damped Newton steps, each halved until the residual decreases."""
     residual, jacobian = system
 
     def evaluate(z: np.ndarray) -> np.ndarray:

@@ -48,7 +48,7 @@ class Hamiltonian:
 
     @classmethod
     def of(cls, form: Formulation) -> Hamiltonian:
-        """Derive the Hamiltonian system.
+        """Derive the Hamiltonian system of a problem.
 
         Raises:
             ProblemError: An unsupported constraint, a control without bounds in which H is linear, or a control that H
@@ -71,14 +71,12 @@ class Hamiltonian:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Sizes of x, lam, t, T, p, bang, guess."""
+        """Sizes of the arguments x, lam, t, T, p, bang and guess."""
         form = self.form
         return (form.nx, form.nx, 1, 1, form.np, len(self.linear), len(self.smooth) + len(form.path))
 
     def flow(self) -> Any:
-        """Return the function (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT), with the control that
-        minimises H.
-        """
+        """Return the function (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT) under the optimal control."""
         form = self.form
         # H is stationary in u and mu, so both are constant in its derivatives
         outputs = [form.f, -ca.gradient(self.value, form.x), form.running, ca.gradient(self.value, form.T)]
@@ -93,8 +91,7 @@ class Hamiltonian:
     def multipliers(
         self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, *, t: np.ndarray, horizon: float, p: Any
     ) -> np.ndarray:
-        """Return the multipliers of the path equalities of least-squares stationarity in the free controls. Shape (K,
-        m).
+        """Return the path equality multipliers for which H is most nearly stationary in free controls. Shape (K, m).
 
         Args:
             free: Which controls are off their bounds. Shape (K, nu), bool.
@@ -113,7 +110,7 @@ class Hamiltonian:
         return mu
 
     def _eliminate(self, name: str, outputs: list[Any]) -> Any:
-        """Return a function of given outputs, with the minimiser of H inserted for w."""
+        """Return a function of given expressions in which the controls and multipliers w minimise H."""
         form = self.form
         sym = form.sym
         w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])
@@ -129,7 +126,7 @@ class Hamiltonian:
     # ---- the equations that make H stationary in the smooth controls, and their solution ----------------------
 
     def _solve(self) -> tuple[Any, str]:
-        """Return the function that computes the optimal controls and multipliers w, and how it does so.
+        """Return the function that computes the optimal controls and multipliers w, and the name of its method.
 
         Its arguments are (x, lam, t, T, p, bang, guess).
         """
@@ -164,7 +161,7 @@ class Hamiltonian:
         return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
 
     def _residual(self, w: Any, bang: Any) -> Any:
-        """Return the gradient of H in the smooth controls, and the path equalities. Shape (n + m, 1)."""
+        """Return the gradient of H by the smooth controls, and the path equalities. Shape (n + m, 1)."""
         n = len(self.smooth)
         gradient = ca.gradient(self.value, self.form.u)[list(self.smooth)] if n else self.form.problem.symbols(0, 1)
         stacked = ca.densify(ca.vertcat(gradient, self.rows))
@@ -206,7 +203,7 @@ class Hamiltonian:
 
 
 def _assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
-    """Return all controls from the smooth ones (first entries of ``w``) and those at their bounds."""
+    """Return all controls: smooth ones from the first entries of ``w``, and linear ones at their bounds."""
     order = {index: w[i] for i, index in enumerate(smooth)} | {index: bang[i] for i, index in enumerate(linear)}
     return ca.densify(ca.vertcat(form.problem.symbols(0, 1), *[order[i] for i in range(form.nu)]))
 
@@ -249,7 +246,7 @@ def check_constraints(form: Formulation) -> None:
 
 
 def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
-    """Return the sparsity of the nonzero entries; of an MX expression, nonzero at one of three random points."""
+    """Return the sparsity of nonzero entries; of an MX expression those nonzero at one of three random points."""
     if isinstance(matrix, ca.SX):
         return ca.sparsify(matrix).sparsity()
     rng = np.random.default_rng(0)
@@ -270,13 +267,13 @@ def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def numbers(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
-    """Evaluate an expression at a random point, with entries between 0.1 and 1."""
+    """Evaluate an expression at a random point with coordinates between 0.1 and 1."""
     function = ca.Function("matrix", symbols, [ca.densify(matrix)])
     return np.asarray(function.call([ca.DM(rng.uniform(0.1, 1.0, s.numel())) for s in symbols])[0].full())
 
 
 def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
-    """Solve [[W, A'], [A, 0]] w = rhs with W (n, n) by elimination, or as a whole if W is not positive definite."""
+    """Solve [[W, A'], [A, 0]] w = rhs, by elimination of the block W (n, n) if that is positive definite."""
     if not isinstance(matrix, ca.SX):
         return ca.solve(matrix, rhs)
     curvature, constraint = matrix[:n, :n], matrix[n:, :n]
@@ -301,7 +298,7 @@ def positive(matrix: Any) -> bool:
 
 @dataclass(frozen=True)
 class Extremal:
-    """Samples of an extremal in segments of its horizon.
+    """Samples of an extremal, segment by segment.
 
     Attributes:
         places: Positions of the samples in each segment, 0..1. Shape (m,). widths: of the segments, s. Shape (K,).
@@ -322,14 +319,14 @@ class Extremal:
     nu_end: np.ndarray
 
     def sampled(self, ham: Hamiltonian, outputs: list[Any], p: np.ndarray) -> list[np.ndarray]:
-        """Return expressions of x, u, lam, mu, t, T, p at all K m samples in order; each output (K m, its size)."""
+        """Evaluate expressions of x, u, lam, mu, t, T, p at all K m samples. Shape (K m, size) each."""
         count = self.t.size
         x, u, lam, mu = (v.reshape(count, -1) for v in (self.states, self.controls, self.costates, self.multipliers))
         return ham.form.sampled(outputs, x, u, self.t.ravel(), self.horizon, p, (ham.lam, lam), (ham.mu, mu))
 
 
 def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> np.ndarray:
-    """Return the derivative of the optimal cost in the parameters. Shape (np,)."""
+    """Return the derivative of the optimal cost by the parameters. Shape (np,)."""
     form = ham.form
     slopes = [ca.gradient(ham.value, s) for s in (form.p, form.T, form.u)]
     by_p, by_horizon, by_control, value = path.sampled(ham, [*slopes, ham.value], p)
@@ -357,7 +354,7 @@ def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bound
 def _end_gradients(
     ham: Hamiltonian, path: Extremal, x0: np.ndarray, x1: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """Return gradients of Phi = terminal cost + nu . end constraints in p, T, the first and the last state."""
+    """Return gradients of Phi = terminal cost + nu . end constraints by p, T, the first and the last state."""
     form = ham.form
     begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
     end, terminal = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])

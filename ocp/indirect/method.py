@@ -40,7 +40,7 @@ __all__ = ["Indirect", "PreparedIndirect", "hamiltonian_defect"]
 
 
 def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> str:
-    """Return why the controls of an extremal do not minimise the Hamiltonian, or "".
+    """Return the reason why the controls of an extremal do not minimise the Hamiltonian, or "" if they do.
 
     At each sample H must be stationary in the free controls, must not fall when a control leaves its bound, and must
     not curve downwards (Legendre-Clebsch condition).
@@ -89,7 +89,7 @@ def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: 
 
 
 def control_derivatives(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list[np.ndarray]:
-    """Return derivatives of H in the controls at K samples, and the path equalities.
+    """Return the derivatives of H by the controls at K samples, and the path equalities.
 
     These are dH/du (K, nu), the sum of absolute terms of dH/du (K, nu), d2H/du2 (K, nu, nu), the path equalities (K, m)
     and their Jacobian (K, m, nu).
@@ -192,15 +192,14 @@ class PreparedIndirect:
         self.seconds = time.monotonic() - began
 
     def __reduce__(self) -> Any:
-        """Pickle and copy the arguments, from which it is prepared again."""
+        """Pickle and copy the object as its arguments, from which it is prepared again."""
         return type(self), (self.problem, self.method, self._seeding)
 
     @interruptible
     def solve(
         self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
     ) -> Solution:
-        """Solve with these parameters. A solution as ``guess`` seeds states and costates; another guess starts the
-        direct seed.
+        """Solve with these parameters. A solution as ``guess`` is the seed; another guess serves to compute a seed.
 
         Raises:
             ProblemError: Invalid parameters or guess. SolveError: Newton's method failed, or a control has a singular
@@ -258,7 +257,7 @@ class PreparedIndirect:
         return solution
 
     def _no_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
-        """Handle an unusable seed: raise SolveError, or return an unsuccessful solution."""
+        """Raise SolveError because of an unusable seed, or return an unsuccessful solution."""
         if check or seed is None:
             words = f"problem {self.problem.name!r}: the indirect method failed: {why}{error}"
             details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
@@ -269,7 +268,7 @@ class PreparedIndirect:
     # ---- before and after ------------------------------------------------------------------------------------
 
     def _check_order(self, root: NewtonResult, arcs: ControlArcs, bounds: Bounds) -> NewtonResult:
-        """Reject a root whose switches are out of order, or whose horizon is outside its bounds."""
+        """Reject a result whose switches are out of order, or whose horizon is outside its bounds."""
         if self.method.shooting == "backward" or not root.success:
             return root
         at = self.boundary.layout(arcs)
@@ -365,7 +364,7 @@ class PreparedIndirect:
         )
 
     def _segments(self, y: np.ndarray, inputs: np.ndarray, bounds: Bounds) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return initial y and q of all reported segments: the shooting segments, split where controls reach bounds."""
+        """Return the first y and q of all reported segments: shooting segments, split where controls reach bounds."""
         index = self.formulation.bounds.places["control"]
         low, high = bounds[0][index], bounds[1][index]
 
@@ -393,7 +392,7 @@ class PreparedIndirect:
 
 
 def bisect(marks: Callable[[float], np.ndarray], low: float, high: float, before: np.ndarray) -> float:
-    """Return the position in low..high at which the marks change from ``before`` to another value, by bisection."""
+    """Find by bisection the position in low..high at which the marks cease to equal ``before``."""
     for _ in range(40):
         middle = 0.5 * (low + high)
         if np.array_equal(marks(middle), before):

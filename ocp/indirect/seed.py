@@ -41,7 +41,7 @@ SETTINGS = SeedSettings()
 
 @dataclass(frozen=True)
 class ControlArcs:
-    """Arcs between the switches of the controls in which the Hamiltonian is linear.
+    """Arcs between the switches of those controls in which the Hamiltonian is linear.
 
     Attributes:
         switches: Fractions of the horizon. Shape (A - 1,).
@@ -70,7 +70,7 @@ class ControlArcs:
 def read_arcs(
     ham: Hamiltonian, outputs: Any, seed: Solution, p: np.ndarray, *, bounds: Bounds, segments: int
 ) -> ControlArcs:
-    """Return the arcs from the signs of dH/du along a seed: a positive slope means the lower bound.
+    """Return the arcs that the signs of dH/du along a seed define; where dH/du > 0, the lower bound is active.
 
     Raises:
         SolveError: A control in which H is linear stays inside its bounds (a singular arc) or chatters.
@@ -112,7 +112,7 @@ def read_arcs(
 
 
 def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
-    """Return the control bounds under which the seed was solved, which may differ. Shape (nu,) each."""
+    """Return the control bounds under which the seed was solved; they may differ from ``bounds``. Shape (nu,) each."""
     source = form if seed.problem is None else Formulation(seed.problem)
     try:
         low, high = source.bound_values(source.parameter_vector(seed.parameters))
@@ -124,7 +124,7 @@ def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.n
 
 
 def signs(slope: np.ndarray) -> np.ndarray:
-    """Return signs of sampled switching functions (M, n); a sample close to zero takes the sign that follows.
+    """Return the signs of sampled switching functions (M, n); samples near zero take the next clear sign.
 
     After the last significant sample its sign continues. A switching function that vanishes at an end, for example at a
     free state, would have the sign of the seed's noise there.
@@ -139,7 +139,7 @@ def signs(slope: np.ndarray) -> np.ndarray:
 
 
 def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.ndarray) -> None:
-    """Raise SolveError if a linear control of the seed stays inside its bounds too long."""
+    """Raise SolveError if a control that enters linearly stays inside its bounds for too long."""
     samples = seed.control_interpolant
     widths = np.diff(samples.breaks)
     at = (samples.breaks[:-1, None] + widths[:, None] * samples.nodes).ravel()
@@ -185,7 +185,7 @@ def check_chattering(ham: Hamiltonian, events: list[tuple[float, int]], seed: So
 def read_unknowns(
     ham: Hamiltonian, seed: Solution, arcs: ControlArcs, p: np.ndarray, *, bounds: Bounds, backward: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return unknowns and data from a seed, in the layout of :class:`ocp.indirect.boundary.BoundaryProblem`.
+    """Return the initial unknowns and the data of a :class:`ocp.indirect.boundary.BoundaryProblem` from a seed.
 
     The unknowns are states and costates at all nodes, switch times, the horizon if free, and multipliers of start and
     end constraints (zero); for backward shooting the end state alone. A seed of another horizon is stretched.
@@ -221,7 +221,7 @@ def sampled(form: Formulation, seed: Solution, fractions: np.ndarray) -> tuple[n
 def control_guess(
     ham: Hamiltonian, seed: Solution, fractions: np.ndarray, *, horizon: float, p: np.ndarray, bounds: Bounds
 ) -> np.ndarray:
-    """Return smooth controls and multipliers of the path equalities at fractions of the horizon. Shape (K, n + m).
+    """Return smooth controls and path equality multipliers at fractions of the horizon. Shape (K, n + m).
 
     With bounds, the control equations cannot be solved from distant multipliers: all controls would be at bounds.
     """

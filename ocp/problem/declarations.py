@@ -166,7 +166,7 @@ class Horizon:
 
 @dataclass(frozen=True)
 class PhaseTimes:
-    """Times and cost of one phase of a problem of consecutive phases (:mod:`ocp.problem.phases`).
+    """Start time, duration and cost of one phase of a problem with phases (:mod:`ocp.problem.phases`).
 
     Attributes:
         name: Name of the phase, the prefix, before a dot, of the names of its parts.
@@ -183,7 +183,7 @@ class PhaseTimes:
 
 @dataclass
 class Declarations:
-    """All declarations by kind and name, in order of declaration."""
+    """All declarations of a problem by kind and name, in the order in which they were made."""
 
     states: dict[str, Variable] = field(default_factory=dict)
     controls: dict[str, Variable] = field(default_factory=dict)
@@ -202,7 +202,7 @@ class Declarations:
     terminal: Any = None
 
     def check_new_variable(self, kind: str, name: Any) -> None:
-        """Raise ProblemError unless a new variable may have this name; ``kind`` is for the message."""
+        """Raise ProblemError if a new variable may not have this name; ``kind`` appears in the message."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
         if name in RESERVED:
@@ -212,14 +212,14 @@ class Declarations:
                 raise ProblemError(f"{kind} {name!r}: a {pool[:-1]} of this name exists already")
 
     def check_new_constraint(self, kind: str, name: Any) -> None:
-        """Raise ProblemError unless a new constraint may have this name; ``kind`` is for the message."""
+        """Raise ProblemError if a new constraint may not have this name; ``kind`` appears in the message."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
         if any(name in pool for pool in (self.path, self.start, self.end, self.watch, self.apart)):
             raise ProblemError(f"{kind} {name!r}: a constraint of this name exists already")
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError, naming the part, if declarations that were read from a file are inconsistent.
+        """Raise ProblemError, naming the faulty part, if declarations that were read from a file are inconsistent.
 
         Args:
             symbols: ``casadi.SX`` or ``casadi.MX``, the type of every expression.
@@ -254,7 +254,7 @@ class Declarations:
                 _require(isinstance(variable.unit, str), what)
 
     def _check_equations(self, symbols: Any) -> None:
-        """Check dynamics, symbols at the start, signals and cost."""
+        """Check the dynamics, the symbols at the start, the signals and the cost."""
         for name, rate in self.dynamics.items():
             _require(name in self.states, f"dynamics of {name!r}")
             _require_columns(symbols, self.states[name].size, f"dynamics of {name!r}", rate)
@@ -296,19 +296,19 @@ PART_KINDS: dict[str, Any] = {
 
 
 def _require(condition: bool, what: str) -> None:
-    """Raise ProblemError, naming the part, unless the condition holds."""
+    """Raise ProblemError with the name of the part if a condition does not hold."""
     if not condition:
         raise ProblemError(f"{what} does not fit the rest of its problem", name=what)
 
 
 def _require_columns(symbols: Any, size: int, what: str, *values: Any) -> None:
-    """Require that the values of a part are columns of ``size`` entries in the given symbols."""
+    """Raise ProblemError unless values are columns of ``size`` entries of the given symbols."""
     for value in values:
         _require(isinstance(value, symbols) and value.shape == (size, 1), what)
 
 
 def column_text(value: Any) -> str:
-    """Return a column of numbers or expressions as text; a single number if all entries are equal."""
+    """Return a column of numbers or expressions as text; equal entries are written once."""
     if isinstance(value, ca.MX):
         if ca.symvar(value):
             return shorten(str(value))
@@ -318,7 +318,7 @@ def column_text(value: Any) -> str:
 
 
 def shorten(expression: Any) -> str:
-    """Return an expression as text on one line of bounded length.
+    """Return an expression as a text on one line of limited length.
 
     SX prints shared subexpressions first, so a large expression is described by its symbols instead.
     """
@@ -330,7 +330,7 @@ def shorten(expression: Any) -> str:
 
 @dataclass(frozen=True)
 class ExpressionReader:
-    """Reader of values as expressions of the symbols of one problem.
+    """Reader that converts values to expressions of the symbols of one problem.
 
     Attributes:
         symbols: ``casadi.SX`` or ``casadi.MX``. parameters: The symbols of the parameters declared so far.
@@ -340,7 +340,7 @@ class ExpressionReader:
     parameters: tuple[Any, ...]
 
     def expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
-        """Return a value as a dense column of ``known`` symbols only; with ``finite``, its constants must be finite."""
+        """Return a value as a dense column of ``known`` symbols only; with ``finite``, constants must be finite."""
         if value is None or isinstance(value, str):
             raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
         if is_symbolic(value):
@@ -399,7 +399,7 @@ class ExpressionReader:
         unit: str,
         tolerance: Value,
     ) -> Constraint:
-        """Return a constraint on an expression of the ``known`` symbols; ``kind`` is for messages."""
+        """Return a constraint on an expression of the ``known`` symbols; ``kind`` appears in messages."""
         what = f"{kind} constraint {name!r}"
         require.text(f"{what}: unit", unit)
         vector = self.expression(what, expression, known)
@@ -436,7 +436,7 @@ class ExpressionReader:
 
 
 def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> int:
-    """Return the given size, or the common size of the labelled values; 1 if all of them are scalars."""
+    """Return the given size, or else the common size of the values; 1 if all of them are scalars."""
     if size is not None:
         return require.count(f"{what}: size", size)
     labelled = {f"{what}: {k}": v for k, v in values.items() if v is not None and not callable(v)}
@@ -452,7 +452,7 @@ def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> 
 
 
 def read_scale(what: str, value: Value, size: int) -> Any:
-    """Return the scales of the entries, nan for unknown ones. Shape (size,), or None."""
+    """Return the typical sizes of the entries, nan if unknown, shape (size,); None if no size is given."""
     if value is None:
         return None
     array = numeric(f"{what}: scale", value)
@@ -474,7 +474,7 @@ def check_guess(what: str, guess: Any, size: int) -> None:
 
 
 def read_tolerance(what: str, value: Value, size: int) -> list[float] | None:
-    """Return the tolerances of the rows of a constraint, (size,), or None."""
+    """Return the tolerances of the rows of a constraint, shape (size,); None if none is given."""
     if value is None:
         return None
     array = numeric(f"{what}: tolerance", value)
@@ -485,7 +485,7 @@ def read_tolerance(what: str, value: Value, size: int) -> list[float] | None:
 
 
 def signal_function(what: str, track: Callable[[Any], Any]) -> Any:
-    """Return the casadi Function time -> column of a function of time alone."""
+    """Return the casadi Function from time to a column that depends on time alone."""
     time = ca.MX.sym("time")
     try:
         return ca.Function("signal", [time], [ca.densify(ca.vec(ca.MX(track(time))))])

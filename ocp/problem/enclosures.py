@@ -67,7 +67,7 @@ class Enclosures:
         check_instructions(what, self._function)
 
     def __call__(self, low: np.ndarray, high: np.ndarray) -> Enclosure:
-        """Return the bounds over intervals of the symbol from ``low`` to ``high``, (M,) each, finite and in order."""
+        """Return bounds of the expressions over M intervals of the symbol, from ``low`` to ``high``, (M,) each."""
         jets = self._jets(_Jet(Interval(low, high), constant(1.0, low)))
         return Enclosure(*(np.column_stack([side(jet) for jet in jets]) for side in _SIDES))
 
@@ -92,7 +92,7 @@ class Enclosures:
 
 
 class _Jet(NamedTuple):
-    """Range and slopes of one instruction over M intervals."""
+    """Bounds of an instruction's value and of its derivative over M intervals."""
 
     value: Interval
     slope: Interval
@@ -111,12 +111,12 @@ ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_
 
 
 def _where(valid: Any, slope: Interval) -> Interval:
-    """Return the slopes in the valid intervals, and infinite bounds elsewhere."""
+    """Return the derivative's bounds in the valid intervals, and infinite bounds elsewhere."""
     return Interval(np.where(valid, slope.low, -np.inf), np.where(valid, slope.high, np.inf))
 
 
 def _smooth(code: int, *jets: _Jet) -> _Jet:
-    """Apply the rule of a smooth operation: the mean value theorem."""
+    """Return value and derivative bounds of a smooth operation, by the mean value theorem."""
     value = RULES[code](*(jet.value for jet in jets))
     is_power = code in (ca.OP_POW, ca.OP_CONSTPOW)
     exponent = _number(jets[1].value) if is_power else None
@@ -130,7 +130,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
 
 @lru_cache(maxsize=4096)
 def _partials(code: int, count: int, exponent: float | None) -> Any:
-    """Return the partial derivatives of an operation as an SX function; a fixed exponent counts as a constant."""
+    """Return the partial derivatives of an operation as an SX function; a fixed exponent is a constant."""
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     if count == 1:
         return ca.Function("partials", [x], [ca.densify(ca.gradient(ca.SX.unary(code, x), x))])
@@ -141,13 +141,13 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
 
 
 def _number(x: Interval) -> float | None:
-    """Return the value of an interval that is the same single number everywhere, else None."""
+    """Return the value of M intervals if all consist of the same single number, else None."""
     first = float(x.low[0])
     return first if bool((x.low == first).all() and (x.high == first).all()) else None
 
 
 def _steps(code: int, *jets: _Jet) -> _Jet:
-    """Apply the rule of a piecewise constant operation: floor, ceil, sign, tests."""
+    """Return value and derivative bounds of a piecewise constant operation: floor, ceil, sign, comparisons."""
     value = RULES[code](*(jet.value for jet in jets))
     return _Jet(value, _where(value.low == value.high, constant(0.0, value.low)))
 
@@ -159,7 +159,7 @@ def _absolute(code: int, x: _Jet) -> _Jet:
 
 
 def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
-    """Apply the rule of fmin and fmax: the slopes of the selected argument, or of both."""
+    """Return value and derivative bounds of fmin or fmax; if the selected argument is unknown, both count."""
     low, high = (x, y) if code == ca.OP_FMIN else (y, x)
     first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
     ends = [
@@ -191,7 +191,7 @@ def _copysign(code: int, x: _Jet, y: _Jet) -> _Jet:
 
 
 def _angle(code: int, y: _Jet, x: _Jet) -> _Jet:
-    """Apply the rule of atan2, which is smooth except on the half-line where it jumps by a full turn."""
+    """Return value and derivative bounds of atan2, which jumps by a full turn on a half-line."""
     smooth = _smooth(code, y, x)
     continuous = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
     return _Jet(smooth.value, _where(continuous, smooth.slope))
@@ -219,7 +219,7 @@ FRAME_ENTRIES = 12
 
 
 class PrescribedMotion:
-    """Bodies of separated pairs that move as a function of time alone, such as moving obstacles.
+    """Motion of bodies that depends on time alone, such as that of moving obstacles.
 
     Args:
         separation: The pairs. placements: Their frames, possibly in other symbols. time: The symbol of time.
@@ -257,7 +257,7 @@ class PrescribedMotion:
                 self._bodies.append((frames.index(moving[0].frame), _coordinates(core)))
 
     def bounds(self, pair: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bound the motion of the bodies of pairs within intervals of time.
+        """Bound the motion of the bodies of given pairs during intervals of time.
 
         Args:
             pair, begin, end: Indices of the pairs, and the ends of the intervals in the unit of the time. Shape (K,).
@@ -294,7 +294,7 @@ class PrescribedMotion:
 
 
 def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]) -> Any:
-    """Return a frame as an expression of time with numbers as parameters; raise if it depends on states."""
+    """Return a frame as an expression of time, with numbers for the parameters; raise if it depends on states."""
     known = {identity(symbol) for symbol in ca.symvar(ca.vertcat(time, *parameters))}
     others = [symbol for symbol in ca.symvar(frame) if identity(symbol) not in known]
     if others and ca.depends_on(frame, ca.vertcat(*map(ca.vec, others))):
@@ -305,7 +305,7 @@ def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[
 
 
 def _coordinates(core: np.ndarray) -> np.ndarray:
-    """Return the linear map from a frame to the world coordinates of box corners about points. Shape (3 C, 12)."""
+    """Return the matrix that maps the 12 entries of a frame to bounding box corners in world. Shape (3 C, 12)."""
     ends = np.stack([core.min(axis=0), core.max(axis=0)])
     corners = np.unique(np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3), axis=0)
     with_one = np.column_stack([corners, np.ones(len(corners))])
@@ -313,6 +313,6 @@ def _coordinates(core: np.ndarray) -> np.ndarray:
 
 
 def _longest(coordinates: np.ndarray) -> np.ndarray:
-    """Return the length of the longest of stacked vectors (M, 3 C); inf if one is huge. Shape (M,)."""
+    """Return the length of the longest of C vectors, stacked in rows (M, 3 C); inf if one is huge. Shape (M,)."""
     lengths = np.linalg.norm(coordinates.reshape(len(coordinates), -1, 3), axis=2).max(axis=1)
     return np.where(lengths < 1e100, lengths, np.inf)

@@ -55,11 +55,11 @@ class Rows:
         return tuple(dict.fromkeys(self.owners))
 
     def of(self, name: str) -> np.ndarray:
-        """Return the indices of the rows that belong to a constraint."""
+        """Return the indices of the rows of a constraint, given by its name."""
         return np.array([i for i, owner in enumerate(self.owners) if owner == name])
 
     def select(self, mask: np.ndarray) -> Rows:
-        """Return the rows selected by ``mask`` (m,)."""
+        """Return the rows that a mask (m,) selects."""
         keep = np.flatnonzero(mask)
         expression = self.expression[keep.tolist()] if keep.size else self.expression[:0, :]
         names, owners = (tuple(texts[i] for i in keep) for texts in (self.labels, self.owners))
@@ -69,7 +69,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class BoundTable:
-    """All bounds of a problem in two vectors; the variables and rows of an NLP refer to their entries.
+    """All bounds of a problem in two vectors; variables and rows of a nonlinear program refer to their entries.
 
     Attributes:
         function: Parameters -> (lower, upper), each of shape (n, 1).
@@ -81,12 +81,12 @@ class BoundTable:
     places: dict[str, np.ndarray]
 
     def pullback(self, p: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-        """Multiply multipliers (2, n) of the bounds by the derivatives of the bounds in p. Shape (np,)."""
+        """Return the derivative, by the parameters, of bounds multiplied by multipliers (2, n). Shape (np,)."""
         return np.asarray(self._pullback(p, multipliers.T).full()).reshape(-1)
 
     @cached_property
     def _pullback(self) -> Any:
-        """The function of :meth:`pullback`."""
+        """The casadi function that :meth:`pullback` evaluates."""
         count, n = self.function.numel_in(0), self.function.numel_out(0)
         parameters, multipliers = ca.MX.sym("p", count), ca.MX.sym("multipliers", n, 2)
         bounds = self.function(parameters)
@@ -98,7 +98,7 @@ class BoundTable:
 
 
 class Formulation:
-    """Vectors and functions of a checked problem. Later changes of the problem do not affect it.
+    """The vectors and functions of a checked problem, which later changes of the problem do not affect.
 
     Attributes:
         x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon. sym: Creates
@@ -191,13 +191,13 @@ class Formulation:
         return cached
 
     def cached(self, name: Any, make: Callable[[], Any]) -> Any:
-        """Return the cached value of a name; compute it on the first call."""
+        """Return the value cached under a name; on the first call, compute it by ``make``."""
         if name not in self._cache:
             self._cache[name] = make()
         return self._cache[name]
 
     def function(self, name: str, outputs: list[Any], names: list[str]) -> Any:
-        """Return a casadi Function of (x, u, t, T, p), of MX type if it depends on signals."""
+        """Return a casadi Function of (x, u, t, T, p); it is of MX type if it depends on signals."""
         inputs, labels = [self.x, self.u, self.t, self.T, self.p], ["x", "u", "t", "T", "p"]
         if not (self.signals and ca.depends_on(ca.vertcat(*map(ca.vec, outputs)), self.w)):
             return ca.Function(name, inputs, outputs, labels, names)
@@ -206,16 +206,16 @@ class Formulation:
         return ca.Function(name, symbols, inner.call([*symbols, self._signal(symbols[2])]), labels, names)
 
     def point_data(self, fractions: np.ndarray) -> np.ndarray:
-        """Return the data of point functions at fractions (K,): the fractions and the signals. Shape (1 + nw, K)."""
+        """Return the data of point functions at fractions (K,): fractions, then signals. Shape (1 + nw, K)."""
         return np.vstack([np.reshape(fractions, (1, -1)), self.signals_at(np.ravel(fractions) * self.duration).T])
 
     def signals_at(self, times: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the signals, or their time derivatives of an order, at times (M,), s. Shape (M, nw)."""
+        """Return the signals, or their time derivatives of a given order, at times (M,), s. Shape (M, nw)."""
         times = np.ravel(times).astype(float)
         return self._signals_at(order, times.tobytes()) if self.signals else np.zeros((len(times), 0))
 
     def _evaluate_signals(self, order: int, times: bytes) -> np.ndarray:
-        """Return :meth:`signals_at` for times as bytes, which can be hashed for the cache."""
+        """Compute :meth:`signals_at`; the times are bytes, because the cache requires a hashable argument."""
 
         def make() -> Sampler:
             t = ca.MX.sym("t")
@@ -229,13 +229,13 @@ class Formulation:
 
     @property
     def duration(self) -> float:
-        """The horizon, s, if there are signals; else 1, because the horizon may be unknown."""
+        """Horizon, s, if there are signals; else 1, because the horizon may then be unknown."""
         return float(self.horizon_value) if self.signals else 1.0
 
     def sampled(
         self, outputs: list[Any] | Callable[[], list[Any]], *point: Any, cache_as: Any = None
     ) -> list[np.ndarray]:
-        """Return expressions of (x, u, t, T, p) at M samples. Shape (M, number of entries) each, column by column.
+        """Evaluate expressions of (x, u, t, T, p) at M samples. Shape (M, number of entries) each, column by column.
 
         Args:
             outputs: Expressions of the symbols, or a function that returns them.
@@ -254,19 +254,19 @@ class Formulation:
         return list(function(x, u, times, horizon, p, self.signals_at(times), *values))
 
     def sampler(self, outputs: list[Any], *more: Any) -> Sampler:
-        """Return the function (x, u, t, T, p, w, *more) -> outputs, which evaluates them at many samples."""
+        """Return the function (x, u, t, T, p, w, *more) -> outputs for evaluation at many samples."""
         symbols = self.problem.symbols
         inputs = [self.x, self.u, self.t, self.T, self.p, self.w, *more]
         return Sampler(inputs, [symbols(output) for output in outputs])
 
     def terminal_cost(self, x: np.ndarray, x0: np.ndarray, u0: np.ndarray, *, horizon: float, p: np.ndarray) -> float:
-        """Return the terminal cost of a final state, given the state and controls at the start."""
+        """Return the terminal cost of a final state, given the states and controls at the start."""
         symbols = [self.x, self.x0, self.u0, self.t, self.T, self.p]
         function = self.cached("terminal", lambda: ca.Function("terminal", symbols, [self.terminal]))
         return float(function(x, x0, u0, horizon, horizon, p))
 
     def horizon_at(self, p: Any) -> Any:
-        """Return the fixed horizon for parameters, numbers or symbols."""
+        """Return the value of a fixed horizon for parameters that are numbers or symbols."""
         return self.bounds.function(p)[0][int(self.bounds.places["horizon"][0])]
 
     def point_function(self, name: str, d: Any, cost: Any, g: Any) -> Any:
@@ -284,7 +284,7 @@ class Formulation:
         return ca.Function(name, [v, d, self.p], outputs, {"cse": True})
 
     def parameter_vector(self, values: dict[str, Any] | None) -> np.ndarray:
-        """Return the stacked parameters. Shape (np,).
+        """Return the values of all parameters as one vector. Shape (np,).
 
         Raises:
             ProblemError: A parameter is missing, unknown, of the wrong size or not finite.
@@ -309,7 +309,7 @@ class Formulation:
         return vector
 
     def bound_values(self, p: np.ndarray) -> Bounds:
-        """Return the bound table for these parameters, after checks: (lower, upper), each (n,)."""
+        """Return lower and upper bounds for the given parameters, after checks. Shape (n,) each."""
         lower, upper = (np.asarray(v.full()).reshape(-1) for v in self.bounds.function(p))
         places = self.bounds.places
         what = f"problem {self.name!r} at these parameters"
@@ -337,7 +337,7 @@ class Formulation:
     # ---- flattening ------------------------------------------------------------------------------------------
 
     def flat(self, expression: Any) -> Any:
-        """Return an expression of the declared symbols in terms of the stacked symbols."""
+        """Return an expression with the declared symbols replaced by entries of the stacked symbols."""
         d = self._declared
         old: list[Any] = [self.problem.time]
         new: list[Any] = [self.t]
@@ -358,7 +358,7 @@ class Formulation:
         return ca.densify(ca.substitute([self.problem.symbols(expression)], old, new)[0])
 
     def _signal_function(self) -> Any:
-        """Return the casadi Function time -> all signals; raise ProblemError unless the horizon is a number."""
+        """Return the casadi Function from time to all signals; raise ProblemError unless the horizon is a number."""
         if not self.signals:
             return None
         if self.horizon_is_free or ca.symvar(self.horizon_value):
@@ -370,7 +370,7 @@ class Formulation:
         return ca.Function("signals", [t], [ca.densify(ca.vertcat(*parts))])
 
     def _rows(self, kind: str, pool: dict[str, Constraint], end: float | None = None) -> Rows:
-        """Return the constraint rows of a kind; at an ``end`` of the horizon, 0 or 1, signals become numbers."""
+        """Return the constraint rows of one kind; at an ``end``, 0 or 1, signals are replaced by their values."""
         symbols = self.problem.symbols
         expression = self.flat(ca.vertcat(symbols(0, 1), *[c.expression for c in pool.values()]))
         if self.signals and end is not None:
@@ -432,13 +432,13 @@ class Formulation:
 
 
 def entries_of(declared: Declarations) -> list[Any]:
-    """Return all declared states, controls, parameters, constraints and other parts as one list."""
+    """Return all declared states, controls, parameters, constraints and other parts in one list."""
     pools = [getattr(declared, kind.name) for kind in fields(declared)]
     return [entry for pool in pools for entry in (pool.values() if isinstance(pool, dict) else [pool])]
 
 
 def slices(pool: Mapping[str, Variable | Signal]) -> dict[str, slice]:
-    """Return the slice of each variable in the stacked vector."""
+    """Return the slice of each variable in the stacked vector by name."""
     places, offset = {}, 0
     for name, variable in pool.items():
         places[name] = slice(offset, offset + variable.size)

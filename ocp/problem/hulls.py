@@ -35,7 +35,7 @@ __all__ = ["Separation", "index_rows", "stack_motion_bounds"]
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A body: the convex hull of points of a frame, inflated by a radius; or a half-space.
+    """A body: the convex hull of points that are fixed in a frame, inflated by a radius; or a half-space.
 
     Attributes:
         frame: Index of the frame with which it moves; -1: the world.
@@ -77,14 +77,12 @@ class Hull:
 
     @cached_property
     def kind(self) -> int:
-        """Group of hulls that are evaluated together: 0 for boxes, else the number of points, rounded up to a power of
-        two.
-        """
+        """Group of hulls that are evaluated together: 0 for boxes, else the number of points as a power of two."""
         return 0 if is_box(self.core) else 1 << (len(self.core) - 1).bit_length()
 
     @cached_property
     def size(self) -> float:
-        """Radius of the ball about the middle that contains the points, m."""
+        """Radius of the ball around the middle that contains all points, m."""
         return float(np.linalg.norm(self.core - self.middle, axis=1).max())
 
 
@@ -100,7 +98,7 @@ class Frames(NamedTuple):
 
 
 class HullPairs:
-    """The pairs of bodies of two kinds, see `Hull.kind`.
+    """Pairs of bodies whose hulls are of two given kinds, see `Hull.kind`.
 
     Attributes:
         has: Whether a pair is in this group. row: Its index in the group. Shape (n,) each.
@@ -145,7 +143,7 @@ class HullPairs:
         return points
 
     def nearest(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return unit vectors from first to second body, gaps, and nearest points, in the reference frames.
+        """Return unit vectors from first to second body, gaps and nearest points, in the frame of each pair.
 
         Shapes (K, 3), (K,), m, and (K, 2, 3), m.
         """
@@ -156,7 +154,7 @@ class HullPairs:
         return along, gap, np.stack([nearest_first, nearest_second], axis=1)
 
     def distances(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Return the distances of pairs at samples, shape (K,), m; of a ball and a box or a ball in closed form."""
+        """Return distances of pairs at samples, shape (K,), m; in closed form for a ball and a box or another ball."""
         if self._box_side is None:
             return self.nearest(frames, at, row)[1]
         (rotations, positions), box, ball = frames, self._box_side, 1 - self._box_side
@@ -171,12 +169,12 @@ class HullPairs:
         return np.asarray(np.sqrt(outside.sum(axis=1)) + np.minimum(excess.max(axis=1), 0.0) - self.radii[row])
 
     def gaps(self, along: np.ndarray, frames: Frames, at: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Return the gaps between both bodies along unit vectors (K, 3). Shape (K,), m."""
+        """Return the gaps between the bodies of pairs along unit vectors (K, 3). Shape (K,), m."""
         return np.asarray(gap_along(along, *self.points(frames, at, row)) - self.radii[row])
 
 
 class CoveredPairs:
-    """Pairs of bodies, some of them with pairs of smaller shapes that cover their bodies.
+    """Pairs of bodies, some of which have pairs of smaller shapes that cover the bodies.
 
     Covering pairs contain the two bodies between them, so the smallest of their distances is a lower bound of the
     distance of the pair. The distance of the hulls is another one; the larger bound counts. Unlike a hull, covers of
@@ -195,7 +193,7 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return which of the K pairs each row belongs to, and the indices of the rows. Shape (R,) each.
+        """List the rows of K pairs and of their covers: positions of their pairs in `pair`, and row indices, (R,) each.
 
         The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow.
         """
@@ -206,7 +204,7 @@ class CoveredPairs:
 
     @staticmethod
     def decisive(place: np.ndarray, gap: np.ndarray, count: int) -> np.ndarray:
-        """Return which of R rows determines the distance of each of K pairs. Shape (K,).
+        """Return the row, of R rows, that determines the distance of each of K pairs. Shape (K,).
 
         Args:
             place: As of `of`. gap: Distance of each row. Shape (R,), m. count: K.
@@ -220,7 +218,7 @@ class CoveredPairs:
 
 
 class SeparatingDirections(NamedTuple):
-    """Directions of the shortest distance of the rows of K pairs of bodies, see `CoveredPairs.of`.
+    """Directions of shortest distance, for the rows of K pairs of bodies and of their covers.
 
     Attributes:
         place, row: Shape (R,). along: Unit vectors from the first body to the second, in the frame of observation. (R,
@@ -232,13 +230,13 @@ class SeparatingDirections(NamedTuple):
     along: np.ndarray
 
     def of(self, selected: np.ndarray) -> SeparatingDirections:
-        """Return the directions of a subset of the pairs. ``selected`` has shape (K,), bool."""
+        """Return the directions of those pairs that a mask (K,) selects."""
         keep = selected[self.place]
         return SeparatingDirections((np.cumsum(selected) - 1)[self.place[keep]], self.row[keep], self.along[keep])
 
 
 class BodyPairs:
-    """Pairs of bodies with their covering pairs, and their distances; see `CoveredPairs`."""
+    """Pairs of bodies with the shapes that cover them, and their distances; see `CoveredPairs`."""
 
     def __init__(self, hulls: Sequence[Hull], pairs: np.ndarray, covers: Mapping[int, np.ndarray]) -> None:
         self._covered = CoveredPairs(pairs, covers)
@@ -253,14 +251,15 @@ class BodyPairs:
         self._normals = np.array([_normal(*pair) for pair in bodies]).reshape(-1, 3)
 
     def balls(self, frames: Frames, at: np.ndarray, pair: np.ndarray) -> np.ndarray:
-        """Return the gaps between the bounding balls of the bodies of pairs at samples. Shape (K,) each, m."""
+        """Return the gaps between the bounding balls of given pairs at given samples. Shape (K,), m."""
         bodies = self._first[pair], self._second[pair]
         first, second = (self._in_world(frames, at, self._middles[k], self._frames[k]) for k in bodies)
         return self._ball_distance(second - first, pair)
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return distances of all pairs at all samples, shape (M, n), m; those above `near` may be lower bounds above
-        `near`. With `pairs`, the indices of the only pairs that count, the others are infinite.
+        """Return the distances of all pairs at all samples; above `near` they may be lower bounds. Shape (M, n), m.
+
+        With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
         distances = self.all_balls(frames)
         count = distances.shape[1]
@@ -283,7 +282,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return the distances of pairs at samples, (K,), m; those above `near`, (K,), may be lower bounds above it."""
+        """Return distances of pairs at samples, (K,), m; above `near`, (K,), they may be lower bounds."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -308,7 +307,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the gaps of pairs along given directions, the smaller one of both ends of an interval. Shape (K,), m.
+        """Return the gaps of pairs along given directions, the smaller of those at both interval ends. Shape (K,), m.
 
         The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
         """
@@ -320,16 +319,16 @@ class BodyPairs:
 
     @staticmethod
     def _in_world(frames: Frames, at: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        """Transform points from moving frames to the world, at samples."""
+        """Transform points from moving frames to the world at samples."""
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _ball_distance(self, offset: np.ndarray, pair: np.ndarray) -> np.ndarray:
-        """Return the gap between balls whose centres differ by `offset`."""
+        """Return the gap between the bounding balls of pairs whose centres differ by `offset`."""
         along_normal = (offset * self._normals[pair]).sum(axis=-1)
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Yield each group of pairs, which of the rows belong to it, and their indices in the group."""
+        """Yield each group of pairs with the positions of its rows in `rows`, and their indices in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -337,7 +336,7 @@ class BodyPairs:
 
 
 def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
-    """Group pairs of hulls with their reference frame, (n, 3), -1 for the world, by their kinds."""
+    """Group pairs (n, 3) of hulls by their kinds; the third column is the reference frame, -1 for the world."""
     kinds: dict[tuple[int, int], list[int]] = {}
     for i, (first, second, _) in enumerate(pairs):
         kinds.setdefault((hulls[first].kind, hulls[second].kind), []).append(i)
@@ -358,7 +357,7 @@ def frames_of(placements: np.ndarray) -> Frames:
 
 
 def _normal(first: Hull, second: Hull) -> np.ndarray:
-    """Return the normal of the half-space in a pair, directed from the first body to the second; zero without one."""
+    """Return the normal of the half-space in a pair, from the first body to the second; zero if there is none."""
     return first.normal if first.normal.size else -second.normal if second.normal.size else np.zeros(3)
 
 
@@ -447,7 +446,7 @@ class Separation:
         return tuple((names[first], names[second]) for first, second, _ in self.pairs)
 
     def of(self, pairs: Sequence[int]) -> Separation:
-        """Return a separation constraint for some of the pairs only."""
+        """Return the separation constraint of a subset of the pairs."""
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
         covers = {row: self.covers[pair] for row, pair in enumerate(keep) if pair in self.covers}
@@ -457,7 +456,7 @@ class Separation:
 
 
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
-    """Return the covering pairs by the index of the covered pair, without empty entries."""
+    """Return the non-empty covering pairs by the index of the covered pair, after checks."""
     covering: dict[int, np.ndarray] = {}
     for pair, rows in require.mapping(f"{what}: covers", covers, object).items():
         if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < count:
@@ -481,7 +480,7 @@ def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.nda
 
 
 def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
-    """Return rows of ``count`` integers, or raise ProblemError."""
+    """Return an array of ``count`` integers per row; raise ProblemError for anything else."""
     array = table(f"{what}: {label}", values)
     shaped = array.size % count == 0 and (array.ndim != 2 or not array.size or array.shape[1] == count)
     if not shaped or not np.isfinite(array).all() or (array % 1 != 0).any():
@@ -491,7 +490,7 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
 
 
 def stack_motion_bounds(what: str, bounds: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
-    """Return levers or turns, given by the name of a state, side by side for all movers; missing ones are zero.
+    """Return levers or turns, given by state name, as columns in the order of the movers; missing ones are zero.
 
     Args:
         movers: Size of each state that moves a body. count: Number of pairs.

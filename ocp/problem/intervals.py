@@ -23,7 +23,7 @@ Array: TypeAlias = np.ndarray
 
 
 class Interval(NamedTuple):
-    """Bounds of a number over each interval of time, with the structure of if_else expressions.
+    """Bounds of a number over each of M intervals of time, with the structure of if_else expressions.
 
     Attributes:
         low, high: Shape (M,).
@@ -38,7 +38,7 @@ class Interval(NamedTuple):
 
 
 def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
-    """Return the range of each entry of the only output of an SX function, in order.
+    """Return the range of each entry of the only output of an SX function for interval inputs.
 
     Args:
         function: Function of scalars whose instructions are those of `RULES`, see `check_instructions`.
@@ -62,7 +62,7 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
 
 
 def check_instructions(what: str, function: Any) -> None:
-    """Raise ProblemError, naming the instruction, if an SX function has an instruction without a rule."""
+    """Raise ProblemError if an SX function has an instruction without an interval rule, naming it."""
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
         if code not in RULES and code not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
@@ -84,18 +84,18 @@ def _out(low: Any, high: Any) -> Interval:
 
 
 def constant(value: float, like: Array) -> Interval:
-    """Return a number as an interval for as many intervals as an array has entries."""
+    """Return a number as an interval, repeated for each entry of an array."""
     return Interval(np.full(like.shape, value), np.full(like.shape, value))
 
 
 def _range_of(corners: list[Array]) -> Interval:
-    """Return the smallest and largest value at the corners as an interval."""
+    """Return the interval from the smallest to the largest value at the corners."""
     stacked = np.array(corners)
     return _out(stacked.min(axis=0), stacked.max(axis=0))
 
 
 def _without_warnings(rule: Callable[..., Interval]) -> Callable[..., Interval]:
-    """Return the rule without floating-point warnings."""
+    """Decorate an interval rule so that it emits no floating-point warnings."""
 
     def without_warnings(*operands: Interval) -> Interval:
         with np.errstate(all="ignore"):
@@ -115,7 +115,7 @@ def _opposite(first: Interval, second: Interval) -> bool:
 
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
-    """Return the range of a conditional: of one value if the test holds, of the other if it fails."""
+    """Return the range of if_else: that of `yes` where the test holds, of `no` where it fails, else of both."""
     holds, fails = decided(test)
     low = np.where(holds, yes.low, np.where(fails, no.low, np.minimum(yes.low, no.low)))
     high = np.where(holds, yes.high, np.where(fails, no.high, np.maximum(yes.high, no.high)))
@@ -123,7 +123,7 @@ def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
 
 
 def decided(test: Interval) -> tuple[Any, Any]:
-    """Return where a test holds in the whole interval, and where it fails in the whole interval. Shape (M,) each."""
+    """Return masks of the intervals in which a test always holds, and in which it always fails. Shape (M,) each."""
     return (test.low > 0) | (test.high < 0), (test.low == 0) & (test.high == 0)
 
 
@@ -184,7 +184,7 @@ def _absolute(x: Interval) -> Interval:
 
 
 def _rising(function: Callable[[Any], Any], low: float = -np.inf, high: float = np.inf) -> Callable[..., Interval]:
-    """Return the interval rule of an increasing function with the domain from low to high."""
+    """Return the interval rule of an increasing function whose domain is low to high."""
 
     def rule(x: Interval) -> Interval:
         inside = _clamped(x, low, high)
@@ -196,7 +196,7 @@ def _rising(function: Callable[[Any], Any], low: float = -np.inf, high: float = 
 
 
 def _falling(function: Callable[[Any], Any], low: float, high: float) -> Callable[..., Interval]:
-    """Return the interval rule of a decreasing function with the domain from low to high."""
+    """Return the interval rule of a decreasing function whose domain is low to high."""
     rising = _rising(lambda x: -function(x), low, high)
 
     return lambda x: _negative(rising(x))
@@ -207,7 +207,7 @@ def _negative(x: Interval) -> Interval:
 
 
 def _contains_multiple(x: Interval, first: float, step: float) -> Any:
-    """Return whether first + k step lies in the interval for an integer k, within rounding."""
+    """Return whether an interval contains first + k step for an integer k, within rounding."""
     # multiples of a turn are accurate to fifty units in the last place of the angle
     slack = 1e-14 * (1 + np.maximum(np.abs(x.low), np.abs(x.high)))
     return np.floor((x.high + slack - first) / step) >= np.ceil((x.low - slack - first) / step)
@@ -234,7 +234,7 @@ def _tangent(x: Interval) -> Interval:
 
 
 def _angle(y: Interval, x: Interval) -> Interval:
-    """Apply atan2: a rectangle without the origin and the branch cut has its extremes at the corners."""
+    """Return the range of atan2 over rectangles; without origin and branch cut its extremes are at corners."""
     result = _range_of([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
     crosses_cut = ~((x.low > 0) | (y.low > 0) | (y.high < 0))
     half = float(np.nextafter(np.pi, 4))
@@ -254,7 +254,7 @@ def _copysign(x: Interval, y: Interval) -> Interval:
 
 
 def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tuple[Any, Any]:
-    """Return the rounded quotient x / y, and for which intervals it is constant."""
+    """Return the rounded quotient x / y, and a mask of the intervals in which it is constant."""
     quotient = _divide(x, y)
     multiple = rounded(quotient.low)
     known = np.isfinite(multiple) & (multiple == rounded(quotient.high))
@@ -262,7 +262,7 @@ def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tupl
 
 
 def _modulo(x: Interval, y: Interval) -> Interval:
-    """Apply fmod: x minus the multiple of y, rounded towards zero; its sign is that of x."""
+    """Return the range of fmod: x minus a multiple of y, with the sign of x."""
     multiple, known = multiple_of(x, y, np.trunc)
     result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     largest = np.minimum(_absolute(y).high, _absolute(x).high)
@@ -273,7 +273,7 @@ def _modulo(x: Interval, y: Interval) -> Interval:
 
 
 def _remainder(x: Interval, y: Interval) -> Interval:
-    """Apply the remainder: x minus the nearest integer multiple of y."""
+    """Return the range of the remainder: x minus the nearest integer multiple of y."""
     multiple, known = multiple_of(x, y, np.rint)
     result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     half = np.minimum(_absolute(y).high / 2, _absolute(x).high)
@@ -283,7 +283,7 @@ def _remainder(x: Interval, y: Interval) -> Interval:
 
 
 def _below(x: Interval, y: Interval, *, strict: bool) -> Interval:
-    """Apply the test x < y or x <= y to intervals: 1 if true, 0 if false."""
+    """Return the range of the comparison x < y or x <= y: 1 if true, 0 if false."""
     always = x.high < y.low if strict else x.high <= y.low
     never = x.low >= y.high if strict else x.low > y.high
     return Interval(np.where(always, 1.0, 0.0), np.where(never, 0.0, 1.0))
@@ -311,7 +311,7 @@ def _or(x: Interval, y: Interval) -> Interval:
 
 
 def _step(function: Callable[[Any], Any]) -> Callable[..., Interval]:
-    """Return the interval rule of an increasing step function with integer values, which rounding does not affect."""
+    """Return the interval rule of an increasing step function with integer values, which are exact."""
     return lambda x: Interval(function(x.low), function(x.high))
 
 

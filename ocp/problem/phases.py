@@ -39,7 +39,7 @@ DURATION = "duration"
 
 @dataclass(frozen=True)
 class Phase:
-    """A phase of :class:`Phases`: symbols and expressions that couple it to others.
+    """A phase of :class:`Phases`, with expressions by which constraints can couple it to other phases.
 
     Attributes:
         name: Its name.
@@ -67,7 +67,7 @@ class Phase:
 
 
 class Phases(Problem):
-    """Several consecutive problems, joined to one problem.
+    """Several consecutive problems, joined into one problem.
 
     ``phases["carry"]`` has the symbols of a phase. :meth:`join` connects phases; ``end`` and ``start`` declare further
     conditions on their ends and starts. The horizon of the whole is 1, the fraction of every phase;
@@ -113,11 +113,11 @@ class Phases(Problem):
         return Phase(name, times.begin, times.duration, self)
 
     def of(self, phase: str) -> dict[str, Variable]:
-        """Return states and controls of a phase by their names in that phase."""
+        """Return the states and controls of a phase by their names in that phase."""
         return parts_of_phase(self[phase].name, {**self.declared.states, **self.declared.controls})
 
     def join(self, before: str, after: str, states: Mapping[str, Any] | None = None) -> None:
-        """Continue one phase in another: states of the same name have equal values.
+        """Declare that one phase continues another: states of the same name are equal at the junction.
 
         Args:
             before, after: Names of phases, in any order; a phase may be joined to several.
@@ -162,7 +162,7 @@ class Phases(Problem):
             self.end(what, gap, lower=0.0, upper=0.0, unit=unit)
 
     def minimize(self, running: Any = 0, terminal: Any = 0) -> None:
-        """Declare a terminal cost of ends of phases, which is added to the phases' own costs.
+        """Declare a terminal cost of states at ends of phases, which is added to the costs of the phases.
 
         Raises:
             ProblemError: ``running`` is not zero: it belongs to the problem of a phase.
@@ -183,7 +183,7 @@ class Phases(Problem):
 
 
 class _PhaseInserter:
-    """Declares the parts of a phase in the whole problem, in the symbols of the latter."""
+    """Declares the parts of a phase in the whole problem, with symbols of the whole problem."""
 
     def __init__(self, whole: Phases, name: str, problem: Problem) -> None:
         self.whole, self.name, self.problem = whole, name, problem
@@ -192,7 +192,7 @@ class _PhaseInserter:
         self.guess_duration: float | None = None  # duration over which guesses are read, s; None if unknown
 
     def declare(self, begin: Any) -> PhaseTimes:
-        """Declare all parts of the phase except its cost, which is returned with its times."""
+        """Declare all parts of the phase except its cost; return its times and its cost."""
         whole, declared = self.whole, self.problem.declared
         for parameter in declared.parameters.values():
             self._parameter(parameter)
@@ -244,7 +244,7 @@ class _PhaseInserter:
         return self.whole.symbols(ca.densify(placed))
 
     def _column(self, values: Any) -> Any:
-        """Substitute entry by entry, so that entries that are numbers remain numbers."""
+        """Return a column in the symbols of the whole problem; entries that are numbers stay numbers."""
         entries = ca.vertsplit(values)
         numbers = [not ca.symvar(entry) for entry in entries]
         placed = [
@@ -262,7 +262,7 @@ class _PhaseInserter:
         self._replace(parameter.symbol, symbol)
 
     def _duration(self) -> tuple[Any, float | None]:
-        """Return the duration as an expression and as a number; None instead of the number if it is free."""
+        """Return the duration as an expression and as a number; the number is None if the duration is free."""
         horizon = self.problem.declared.horizon
         assert horizon is not None
         if horizon.fixed:
@@ -322,7 +322,7 @@ class _PhaseInserter:
 
 
 def parts_of_phase(phase: str, pool: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the states, controls or other entries that belong to a phase, by their names in the phase."""
+    """Return those states, controls or other entries that belong to a phase, by their names in it."""
     prefix = f"{phase}."
     return {name.removeprefix(prefix): value for name, value in pool.items() if name.startswith(prefix)}
 
@@ -334,5 +334,5 @@ def _by_name(what: str, value: Any) -> Mapping[str, Any]:
 
 
 def _stretched(function: Callable[[Any], Any], length: float) -> Callable[[Any], Any]:
-    """Convert a function of the time of a phase to a function of the phase's time fraction."""
+    """Convert a function of a phase's time to a function of its time fraction."""
     return lambda fraction: function(fraction * length)

@@ -43,7 +43,7 @@ Declared = TypeVar("Declared", bound="Problem")
 
 
 def _about_its_name(method: Declare) -> Declare:
-    """Add the name of a declaration to the errors that it raises."""
+    """Decorate a method of Problem: errors that it raises name the declaration."""
 
     @wraps(method)
     def declare(self: Any, name: Any, *args: Any, **values: Any) -> Any:
@@ -105,7 +105,7 @@ class Problem:
     # ---- copies and files ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the problem as data, without guesses that are functions; see `to_record`."""
+        """Return the problem as data, without those guesses that are functions; see `to_record`."""
         return to_record(self.name, self.symbols, self.time, self.declared)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -117,13 +117,13 @@ class Problem:
 
     @classmethod
     def from_record(cls, state: dict[str, Any]) -> Problem:
-        """Return the problem whose :meth:`__getstate__` returned this data."""
+        """Return the problem from data that :meth:`__getstate__` has returned."""
         problem = cls.__new__(cls)
         problem.__setstate__(state)
         return problem
 
     def __copy__(self) -> Problem:
-        """Return a problem of the same symbols that can be extended independently."""
+        """Return a copy with the same symbols, which can be extended independently."""
         duplicate = Problem(self.name, self.symbols)
         duplicate.time = self.time
         for name, value in vars(self.declared).items():
@@ -191,7 +191,7 @@ class Problem:
 
     @_about_its_name
     def parameter(self, name: str, size: int = 1) -> Any:
-        """Declare a parameter, whose value is given to the solve, and return its symbol, shape (n, 1)."""
+        """Declare a parameter, whose value is passed to each solve; return its symbol, shape (n, 1)."""
         size = require.count(f"parameter {name!r}: size", size)
         self.declared.parameters[name] = Variable(name, self._symbol("parameter", name, size))
         return self.declared.parameters[name].symbol
@@ -220,7 +220,7 @@ class Problem:
 
     @_about_its_name
     def integral(self, name: str, rate: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> Any:
-        """Declare ``lower <= integral of rate dt <= upper`` over the horizon; return the running integral, a state.
+        """Declare ``lower <= integral of rate dt <= upper``; return the running integral, which is a state.
 
         Args:
             name: Unique among states and constraints.
@@ -244,7 +244,7 @@ class Problem:
 
     @_about_its_name
     def signal(self, name: str, track: Callable[[Any], Any]) -> Any:
-        """Declare a known function of time and return the symbol of its value, shape (n, 1).
+        """Declare a known function of time; return the symbol of its value, shape (n, 1).
 
         Use it for expensive functions of time alone, such as interpolants or paths of many segments. Signals are
         evaluated before the solve and never differentiated twice. The function may require MX symbols even if the
@@ -261,7 +261,7 @@ class Problem:
     def horizon(
         self, value: Value = None, *, lower: Value = None, upper: Value = None, guess: float | None = None
     ) -> Any:
-        """Fix the final time (``value``, s) or free it (``lower``, ``upper``, ``guess``), and return its symbol.
+        """Declare the final time as fixed (``value``, s) or free (``lower``, ``upper``, ``guess``); return its symbol.
 
         A free horizon must be positive: so must ``lower`` (default 1e-6 s).
         """
@@ -273,7 +273,7 @@ class Problem:
         return self.declared.horizon.symbol
 
     def at_start(self, variable: Any) -> Any:
-        """Return the symbol of a state or control at the start, for conditions that couple both ends. Shape (n, 1)."""
+        """Return the symbol of a state or control at the start, for conditions that involve both ends. Shape (n, 1)."""
         declared = self._find({**self.declared.states, **self.declared.controls}, variable, "at_start")
         if declared.name not in self.declared.at_start:
             self.declared.at_start[declared.name] = self.symbols.sym(f"{declared.name}_at_start", declared.size)
@@ -282,7 +282,7 @@ class Problem:
     # ---- equations -------------------------------------------------------------------------------------------
 
     def dynamics(self, state: Any, derivative: Value) -> None:
-        """Declare ``d state / dt = derivative``, shape (n, 1), of states, controls, parameters, time, horizon."""
+        """Declare ``d state / dt = derivative``, shape (n, 1), in states, controls, parameters, time and horizon."""
         variable = self._find(self.declared.states, state, "dynamics")
         if variable.name in self.declared.dynamics:
             raise ProblemError(f"state {variable.name!r}: dynamics declared twice", name=variable.name)
@@ -336,7 +336,7 @@ class Problem:
         unit: str = "",
         tolerance: Value = None,
     ) -> None:
-        """Declare ``lower <= expression <= upper`` at all times for the audit alone; no method enforces it.
+        """Declare ``lower <= expression <= upper`` at all times for the audit to check; no method enforces it.
 
         Use it for conditions that follow from the other constraints up to accumulated errors, such as the position of a
         tip whose velocity is constrained.
@@ -457,7 +457,7 @@ class Problem:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
 
     def _inner(self) -> list[Any]:
-        """Symbols that constraints inside the horizon may use: states, controls, parameters, signals, time, horizon."""
+        """Symbols for constraints inside the horizon: states, controls, parameters, signals, time, horizon."""
         d = self.declared
         pools = (d.states, d.controls, d.parameters, d.signals)
         return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]
@@ -490,7 +490,7 @@ class Problem:
         tolerance: Value = None,
         known: Sequence[Any] = (),
     ) -> Constraint:
-        """Return a new constraint on the symbols inside the horizon and on the ``known`` ones."""
+        """Return a new constraint on symbols inside the horizon and on the ``known`` symbols."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
         return self._reader.constraint(
             kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance

@@ -59,7 +59,7 @@ INTEGRATOR_OPTIONS: dict[str, tuple[str, type]] = {
 
 
 class FunctionReader:
-    """Builder of functions from records, which rejects anything that a `FunctionWriter` cannot have written.
+    """Builder of functions from records; it rejects anything that a `FunctionWriter` does not write.
 
     Args:
         records: As of a `FunctionWriter`, from an untrusted source.
@@ -97,7 +97,7 @@ class FunctionReader:
             self._work.append(work)
 
     def _rebuild(self, record: Mapping[str, Any], name: str) -> tuple[Any, int]:
-        """Rebuild a function from a list of operations; also return how many operations an evaluation takes.
+        """Rebuild a function from its operations; also return how many operations one evaluation takes.
 
         It has SX symbols, or MX symbols if it calls other functions: only these differentiate all calls as CasADi does.
         """
@@ -153,7 +153,7 @@ class FunctionReader:
 
 
 def from_entries(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any:
-    """Return a matrix of a sparsity pattern from its entries."""
+    """Return a matrix with a sparsity pattern from its nonzero entries."""
     return kind(pattern, ca.vertcat(*entries) if entries else kind(0, 1))
 
 
@@ -162,7 +162,7 @@ def _nonzeros(matrix: Any) -> list[Any]:
 
 
 def _declared_entries(record: Mapping[str, Any]) -> int:
-    """Return the number of entries of the arguments and results that a record declares."""
+    """Return the number of argument and result entries that a record declares."""
     if record["kind"] == "operations":
         return sum(abs(shape[0] * shape[1]) for shape in (*record["inputs"], *record["outputs"]))
     sizes = [abs(int(record.get(what, 1))) for what in ("count", "size", "columns")]
@@ -174,7 +174,7 @@ def _entries(function: Any) -> int:
 
 
 def _call(callee: Any, entries: list[Any]) -> list[Any]:
-    """Return the entries of all results of a function call, given the entries of all its arguments."""
+    """Call a function with the entries of all its arguments; return the entries of all its results."""
     if len(entries) != _entries(callee):
         raise ProblemError(f"a call has {len(entries)} arguments, not {_entries(callee)}", name="arguments")
     arguments, begin = [], 0
@@ -231,7 +231,7 @@ def _read_pattern(shape: Any) -> Any:
 
 
 def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return CasADi's function `low`: the index of the table interval that contains a number."""
+    """Return the CasADi function `low`, the index of the table interval that contains a number."""
     table, modes = _floats(record["table"], finite=True), ("linear", "exact", "binary")
     count, mode = _whole(record["count"], "count", 0, MAX_ENTRIES), _whole(record["mode"], "mode", 0, 2)
     if len(table) < 2 or (np.diff(table) < 0).any():
@@ -241,7 +241,7 @@ def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return the function that reads entries of a table at computed positions; nan outside the table."""
+    """Return the function that looks up table entries at computed positions; nan outside the table."""
     table, x = _floats(record["table"]), ca.MX.sym("x", _whole(record["count"], "count", 0, MAX_ENTRIES))
     if not len(table):
         raise ProblemError("a table is empty", name="table")
@@ -340,7 +340,7 @@ ARRAY_NAMES = ("integers", "numbers")
 
 
 def from_record(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, Any, Any, Any]:
-    """Return the name, the type of symbols, the symbol of time and all declarations, with new symbols.
+    """Return name, type of symbols, symbol of time, and all declarations of a problem, with new symbols.
 
     Args:
         record: As :func:`to_record` returns it, from an untrusted source.
@@ -388,7 +388,7 @@ def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[
 
 
 def _symbols_in(value: Any) -> Iterator[dict[str, Any]]:
-    """Yield the records of symbols in a record of declarations."""
+    """Yield those parts of a record of declarations that describe symbols."""
     if isinstance(value, dict) and "input" in value:
         yield value
     elif isinstance(value, dict | list):
@@ -397,7 +397,7 @@ def _symbols_in(value: Any) -> Iterator[dict[str, Any]]:
 
 
 def unpack_record(structure: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the record whose parts :func:`pack_record` returned.
+    """Return the record that :func:`pack_record` has split into structure and arrays.
 
     Raises:
         ValueError, KeyError, TypeError: The parts are damaged.

@@ -31,7 +31,7 @@ __all__ = ["FunctionWriter", "pack_record", "to_record"]
 
 
 class FunctionWriter:
-    """Writer of functions as records, each once, after the functions that it calls.
+    """Writer of functions as records; each function is written once, after the functions that it calls.
 
     Attributes:
         records: For each function a dictionary of text, numbers, lists and arrays, as `FunctionReader` takes them.
@@ -45,7 +45,7 @@ class FunctionWriter:
         self._alive: list[Any] = []  # keeps functions alive: CasADi reuses the hash of a deleted one
 
     def write(self, function: Any) -> int:
-        """Return the number of a function's record.
+        """Write a function, unless that has been done, and return the number of its record.
 
         Raises:
             ProblemError: The function, or one that it calls, cannot be written, such as a Python callback.
@@ -76,7 +76,7 @@ class FunctionWriter:
         return self._register(key, len(self.records) - 1)
 
     def _forwarded_to(self, record: dict[str, Any]) -> int | None:
-        """Return the number of the function to which a function only forwards its arguments; else None.
+        """Return the number of the function to which a record only forwards its arguments; else None.
 
         Without this check, each save of a loaded problem would wrap its tables in one more function.
         """
@@ -98,21 +98,19 @@ class FunctionWriter:
         return number
 
     def _leaf(self, record: dict[str, Any]) -> Any:
-        """Store a function as one record, without splitting it into operations, and return the function rebuilt from
-        the record.
-        """
+        """Store a function as a single record, without its operations; return the function rebuilt from it."""
         function = BUILDERS[record["kind"]](record, ())
         self._alive.append(function)
         self._append(function.__hash__(), record, function)
         return function
 
     def _call_leaf(self, record: dict[str, Any], entries: Sequence[Any], pattern: Any) -> Any:
-        """Call the function of a record on one column and return the result."""
+        """Call the function of a record with one column, and return the result."""
         argument = ca.vertcat(*entries) if entries else ca.SX(0, 1)
         return from_entries(pattern, self._leaf(record).call([argument], False, True)[0].nonzeros())
 
     def _as_scalars(self, function: Any) -> Any:
-        """Convert a function to SX symbols; parts that are not scalar arithmetic become calls."""
+        """Convert a function to SX symbols, with calls for the parts that are not scalar arithmetic."""
         kind = function.class_name()
         if kind == "SXFunction":
             return function
@@ -124,7 +122,7 @@ class FunctionWriter:
             raise _unwritable(function) from error
 
     def _interpret(self, function: Any, inputs: Sequence[Any]) -> list[Any]:
-        """Return the results of a function of matrices, evaluated on SX matrices."""
+        """Evaluate a function of matrices on SX matrices, operation by operation."""
         values: dict[int, Any] = {}
         outputs: list[list[Any]] = [[] for _ in range(function.n_out())]
         for k in range(function.n_instructions()):
@@ -179,7 +177,7 @@ class FunctionWriter:
         return list(step.expand().call(list(arguments)))
 
     def _gather(self, node: Any, arguments: Sequence[Any]) -> Any:
-        """Return the entries of a table at computed positions."""
+        """Return the entries of a table at computed positions, or a call that does so."""
         where, chosen = node.info(), [argument.nonzeros() for argument in arguments[1:]]
         sides = {
             side: [ca.SX(k) for k in range(*(where[side][key] for key in ("start", "stop", "step")))]
@@ -256,7 +254,7 @@ def _unwritable(function: Any) -> ProblemError:
 
 
 def _pattern(pattern: Any) -> list[Any]:
-    """Return rows, columns and, if sparse, the positions of the entries column by column."""
+    """Return number of rows, number of columns and, if sparse, the positions of the entries column by column."""
     shape = [pattern.size1(), pattern.size2()]
     return shape if pattern.is_dense() else [*shape, pattern.find()]
 
@@ -266,7 +264,7 @@ def _size(pattern: list[Any]) -> int:
 
 
 def _call_on_scalars(function: Any, inputs: Sequence[Any]) -> list[Any]:
-    """Return the results of any function on SX matrices, as a call if CasADi can make one."""
+    """Evaluate any function on SX matrices, as a call if CasADi supports that."""
     if function.class_name() == "Switch":  # on scalars CasADi compares the case number, which it otherwise truncates
         case = ca.if_else(inputs[0] < 0, ca.ceil(inputs[0]), ca.floor(inputs[0]))
         inputs = [case, *inputs[1:]]
@@ -282,7 +280,7 @@ def _numbers(matrix: Any) -> np.ndarray:
 
 
 def _fields(function: Any, kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Parse values that CasADi's debugging output states by name: `int`, `float` or lists of them.
+    """Parse values in CasADi's debugging output, given by name and type: `int`, `float` or lists of them.
 
     The text comes from a function of this process, never from a file.
     """
@@ -364,7 +362,7 @@ def _integrator_record(function: Any, oracle: int) -> dict[str, Any]:
 
 
 def to_record(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
-    """Return a problem as names, numbers and arrays. Guesses that are functions are left out.
+    """Return a problem as names, numbers and arrays, without those guesses that are functions.
 
     Args:
         name: Name of the problem.
@@ -419,7 +417,7 @@ def symbol_name(symbol: Any) -> str:
 
 
 def pack_record(record: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """Return the structure of a record, which JSON can hold, and its arrays, concatenated by type."""
+    """Split a record into its structure, which JSON can represent, and its arrays, concatenated by type."""
     chunks: dict[str, list[np.ndarray]] = {name: [] for name in ARRAY_NAMES}
     lengths = dict.fromkeys(chunks, 0)
 

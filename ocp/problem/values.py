@@ -20,7 +20,7 @@ def is_symbolic(value: Any) -> bool:
 
 
 def stacked(what: str, value: Any) -> Any:
-    """Return an expression as one column; the entries of a list or tuple are stacked."""
+    """Return an expression, or a list or tuple of expressions, as one column."""
     try:
         return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))
     except NOT_NUMBERS as error:
@@ -29,12 +29,12 @@ def stacked(what: str, value: Any) -> Any:
 
 
 def symbols_of(*functions: Any) -> Any:
-    """Return the symbols to call functions with: ``casadi.SX`` if all are SX functions, which inlines them, else MX."""
+    """Return the symbol type for calls of functions: ``casadi.SX`` if all are SX functions, else ``casadi.MX``."""
     return ca.SX if all(function.is_a("SXFunction") for function in functions) else ca.MX
 
 
 def identity(symbol: Any) -> int:
-    """Return a number that identifies a symbol: equal only for equal scalar SX or equal MX symbols."""
+    """Return a number that identifies a symbol; only equal scalar SX or equal MX symbols have the same number."""
     return int(symbol.element_hash() if isinstance(symbol, ca.SX) else symbol.__hash__())
 
 
@@ -53,7 +53,7 @@ def table(what: str, value: Any) -> np.ndarray:
 
 
 def constant(expression: Any) -> np.ndarray:
-    """Return the numbers of a column of constants, nan for entries that depend on parameters. Shape (n,)."""
+    """Return a column of constants as numbers, with nan for entries that depend on parameters. Shape (n,)."""
     entries = ca.vertsplit(expression)
     if isinstance(expression, ca.MX):
         if not ca.symvar(expression):
@@ -80,7 +80,7 @@ def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
 
 
 def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise ProblemError if a value (nan: free) is infinite or outside its bounds (nan: not known yet)."""
+    """Raise ProblemError if a value is infinite or outside its bounds; nan marks a free value or unknown bound."""
     for i, (number, low, high) in enumerate(zip(value, lower, upper, strict=True)):
         details: dict[str, Any] = {"value": float(number), "limit": (float(low), float(high))}
         if np.isinf(number):
@@ -92,7 +92,7 @@ def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndar
 
 
 def check_horizon(what: str, value: np.ndarray) -> None:
-    """Raise ProblemError unless a horizon is a positive finite number (nan: depends on parameters)."""
+    """Raise ProblemError unless a horizon is positive and finite, or nan because it depends on parameters."""
     if np.isinf(value[0]) or value[0] <= 0:
         words = f"{what} must be positive and finite, not {value[0]:g} s"
         raise ProblemError(words, value=float(value[0]))
@@ -102,7 +102,7 @@ BLOCK_SIZES = (512, 32, 8, 1)  # samples per call: one map of all samples takes 
 
 
 class Sampler:
-    """A function of columns that is evaluated at many samples at once, in blocks.
+    """A function of columns that is evaluated at many samples together, in blocks.
 
     Args:
         symbols: Arguments of the function, one column each.
@@ -150,7 +150,7 @@ class Sampler:
 def evaluate_in_blocks(
     function: Any, size: int, inputs: np.ndarray, outputs: list[np.ndarray], *, previous: np.ndarray | None = None
 ) -> None:
-    """Call a casadi function of ``size`` columns side by side, block by block, into existing arrays.
+    """Call a casadi function of ``size`` columns block by block, and store the results in existing arrays.
 
     Args:
         inputs, outputs: Input and outputs with samples as rows, in whole blocks. Shape (K size, n) each.
@@ -173,6 +173,6 @@ def evaluate_in_blocks(
 
 
 def evaluate_at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
-    """Return the outputs of a casadi function of dense columns at M samples; see :class:`Sampler`."""
+    """Return the outputs of a casadi function of dense columns at M samples, see :class:`Sampler`."""
     symbols = [ca.MX.sym(f"input{i}", function.numel_in(i)) for i in range(function.n_in())]
     return Sampler(symbols, list(function.call(symbols)))(*columns)

@@ -51,7 +51,7 @@ DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 class WorkerFailure(OSError):
-    """A worker failed for a reason that is not the task's, such as a full disk."""
+    """Error that a worker failed for a reason other than its task, such as a full disk."""
 
 
 # ---- one task ----------------------------------------------------------------------------------------------------
@@ -61,7 +61,7 @@ _LOCK = threading.RLock()
 
 
 def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: bool, limit_s: float) -> list[Payload]:
-    """Call :func:`attempt` for one job after another; begin none after ``limit_s``."""
+    """Call :func:`attempt` for one job after another; start no job after ``limit_s`` seconds."""
     began, results = time.perf_counter(), list[Payload]()
     for task, guess in jobs:
         results.append(attempt(function, task, near, guess))
@@ -71,7 +71,7 @@ def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: b
 
 
 def attempt(function: Function, task: str, with_guess: bool, guess: Payload | None) -> Payload:
-    """Call the function with a task, given by its text, and with its neighbour's result if `with_guess`.
+    """Call the function with a task, given as text; with `with_guess` also pass the result of its neighbour.
 
     Returns:
         The payload of the result, or of the name and message of the function's exception.
@@ -103,14 +103,14 @@ def attempt(function: Function, task: str, with_guess: bool, guess: Payload | No
 
 
 def failed(status: str, error: str, message: str) -> Payload:
-    """Return the payload of a task that ended without a result."""
+    """Return the payload of a task that ended without a result, with the reason."""
     empty: dict[str, Any] = {"value": None, "files": [], "cost": None, "verdict": None, "seconds": 0.0}
     empty["inputs"] = {"kept": {}}
     return Payload({"status": status, "error": error, "message": message, **empty})
 
 
 def message_of(error: BaseException) -> str:
-    """Return the message of an exception, with the line where it was raised unless it is one of the package."""
+    """Return the message of an exception, with the line that raised it unless it is an exception of this package."""
     words = str(error).encode("utf-8", "replace").decode()
     if isinstance(error, DetailedError | ModelError):
         return words
@@ -189,7 +189,7 @@ class EngineSettings:
 
 
 class Job(NamedTuple):
-    """A task to run: its key, its text, and a neighbour's result."""
+    """A task to run: its key, its text, and the result of its neighbour."""
 
     key: str
     task: str
@@ -346,7 +346,7 @@ class Engine:
         return max(0, self._threads - len(self._running))
 
     def share(self, ready: int) -> int:
-        """Return how many of the waiting jobs to send together, so that each thread gets several chunks."""
+        """Return how many of the waiting jobs to send at once, such that each thread gets several chunks."""
         return max(1, min(self._chunk_size, ready // (4 * max(1, self._threads))))
 
     def submit(self, jobs: list[Job]) -> None:
@@ -366,7 +366,7 @@ class Engine:
         future.add_done_callback(lambda _: self._finished.put(number))
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """Return the outcomes of the jobs that finish within some seconds, as soon as there is one."""
+        """Return the outcomes of the jobs that finish within some seconds, as soon as the first one is available."""
         self._check_scheduler()
         numbers = []
         with suppress(queue.Empty):
@@ -377,7 +377,7 @@ class Engine:
         return [outcome for future, jobs in finished for outcome in self._outcomes(future, jobs)]
 
     def _outcomes(self, future: Any, jobs: list[Job]) -> list[Outcome]:
-        """Wait for a chunk of jobs and return their outcomes; jobs of a lost worker have none."""
+        """Wait for a chunk of jobs and return their outcomes; jobs of a lost worker have no payload."""
         try:
             payloads = [Payload(*each) for each in future.result(timeout=self.settings.patience)]
         except WorkerFailure:
@@ -411,7 +411,7 @@ class Engine:
 
 
 def checked_cluster(cluster: Any) -> Any:
-    """Return a cluster: the address of a scheduler, or a `distributed.Client`, which stays open.
+    """Return a cluster after checks: the address of a scheduler, or a `distributed.Client`, which stays open.
 
     Raises:
         ProblemError: It is neither.

@@ -56,14 +56,14 @@ DATA = "numbers, texts, True, False, None, and lists and dictionaries by name of
 
 
 class Payload(NamedTuple):
-    """A result as transferred: the record and the bytes of its files."""
+    """A result in the form in which workers send it: the record and the bytes of its files."""
 
     record: dict[str, Any]
     files: tuple[bytes, ...] = ()
 
 
 def as_data(value: Any, where: str, extract: Callable[[Any, tuple[Any, ...]], bool] = lambda value, at: False) -> Any:
-    """Return a value as data: arrays and tuples as lists, numbers of numpy as Python's.
+    """Convert a value to plain data: arrays and tuples to lists, NumPy numbers to Python numbers.
 
     Args:
         value: The value.
@@ -114,7 +114,7 @@ def as_data(value: Any, where: str, extract: Callable[[Any, tuple[Any, ...]], bo
 
 
 def canonical_text(value: Any, where: str) -> str:
-    """Return the canonical text of data: names sorted, 1 and 1.0 distinct, floats with all digits.
+    """Return the canonical text of data: names sorted, floats with all digits, 1 and 1.0 distinguished.
 
     Raises:
         ProblemError: As :func:`as_data`.
@@ -128,12 +128,12 @@ def canonical_text(value: Any, where: str) -> str:
 
 
 def key_of(text: str) -> str:
-    """Return the key of a task's text: 32 hexadecimal digits of its SHA-256."""
+    """Return the key of a task: the first 32 hexadecimal digits of the SHA-256 hash of its text."""
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def pack_result(value: Any) -> Payload:
-    """Return the payload of a function's result, with its cost and its verdict.
+    """Convert the result of a function to a payload, with its cost and its verdict.
 
     The cost is that of a plan or solution, the ``"cost"`` of a dictionary or that of the only plan in it, or the number
     itself. The verdict is the ``"verdict"`` of a dictionary, or whether the audit of the only plan passes; otherwise
@@ -170,7 +170,7 @@ def pack_result(value: Any) -> Payload:
 
 
 def unpack_result(payload: Payload) -> Any:
-    """Return the result of a payload of :func:`pack_result`; tuples and arrays are lists.
+    """Convert a payload of :func:`pack_result` back to the result; tuples and arrays become lists.
 
     Raises:
         ProblemError: A file is damaged.
@@ -235,7 +235,7 @@ RECORD_FIELDS = {
 
 
 class ResultStore:
-    """The records in a folder.
+    """Folder in which the records of the results of one function are stored.
 
     Attributes:
         folder: The folder.
@@ -315,7 +315,7 @@ class ResultStore:
         return store
 
     def _begin(self) -> None:
-        """Write the head of the store, which names the function."""
+        """Write the header file of the store, which names the function and its version."""
         text = json.dumps({"format": FORMAT, "function": self.function, "version": self.version}, indent=1).encode()
         write_whole(self.folder / HEAD, lambda stream: stream.write(text))
 
@@ -390,7 +390,7 @@ class ResultStore:
         write_whole(path, lambda stream: stream.write(text), synced=False)
 
     def payload(self, record: dict[str, Any]) -> Payload:
-        """Return a record with its files.
+        """Return the payload of a record: the record and the contents of its files.
 
         Raises:
             OSError: A file is missing.
@@ -403,7 +403,7 @@ class ResultStore:
         return Payload(record, tuple(files))
 
     def value(self, record: dict[str, Any]) -> Any:
-        """Return the function value that a record stores."""
+        """Return the function's result that a record stores."""
         return unpack_result(self.payload(record))
 
     def recorded(self) -> Iterator[str]:

@@ -100,7 +100,7 @@ def run_batch(
     source, digests = source_version(sys.modules[function.__module__]), cache(digest_of)
 
     def is_current(record: dict[str, Any]) -> bool:
-        """Return whether a record would be reproduced by running its task."""
+        """Return whether a stored record is still valid, so that its task need not run again."""
         files = record["inputs"].get("kept")
         unchanged = record["inputs"].get("source") == source and isinstance(files, dict)
         unchanged = unchanged and all(digests(file) == digest for file, digest in files.items())
@@ -136,7 +136,7 @@ def run_batch(
 
 
 class _PendingTasks:
-    """Tasks of a batch without a result."""
+    """The tasks of a batch that have no result yet."""
 
     def __init__(
         self,
@@ -181,7 +181,7 @@ class _PendingTasks:
                     bar.set_postfix(failed=self.failures, refresh=False)
 
     def _suspect(self, key: str, deaths: int, max_deaths: int) -> None:
-        """Isolate a task that was running when a worker died; give it up after too many dead workers."""
+        """Mark a task that ran when a worker died, to run alone; give it up after too many dead workers."""
         self.deaths[key] += deaths
         if key == self.isolated and self.deaths[key] >= max_deaths:
             self._end(key, failed("killed", "", f"it ended {self.deaths[key]} workers"))
@@ -189,7 +189,7 @@ class _PendingTasks:
             self.suspects.append(key)
 
     def _submit(self, engine: Engine) -> None:
-        """Send as many tasks as the workers can take; a suspect task runs alone."""
+        """Send as many tasks as the workers can take; a task that may have killed a worker runs alone."""
         if self.suspects or self.isolated:
             if not engine.is_idle or not engine.room():
                 return
@@ -204,7 +204,7 @@ class _PendingTasks:
             engine.submit([Job(key, self.texts[key], self._guess(key)) for key in keys])
 
     def _guess(self, key: str) -> Payload | None:
-        """Return the result of the nearest neighbour, which serves as the guess of a task."""
+        """Return the result of a task's nearest neighbour, which serves as its guess."""
         parent = self._neighbour(key)
         record = None if parent is None else self.store.read(parent)
         return None if record is None else self.store.payload(record)
@@ -217,7 +217,7 @@ class _PendingTasks:
         return parent
 
     def _end(self, key: str, payload: Payload) -> None:
-        """Store the outcome of a task."""
+        """Store the outcome of a task, and release the tasks that wait for it."""
         record = {"key": key, "task": json.loads(self.texts[key]), "neighbour": self._neighbour(key), **payload.record}
         record["inputs"] = {"source": self.source, **record["inputs"]}
         self.store.write(record, payload.files)
@@ -251,7 +251,7 @@ def texts_of(tasks: Any) -> dict[str, str]:
 
 
 def worker_count(count: int | None) -> int:
-    """Return the number of processes to start; None: one for each core that this process may use."""
+    """Return the number of processes to start; by default one for each core that this process may use."""
     if count is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     require.count("cluster", count, 1, MAX_WORKERS)
@@ -266,7 +266,7 @@ def names_of(argument: str, names: Any) -> tuple[str, ...]:
 
 
 def name_of(function: Any) -> str:
-    """Return the name of a function for its store: ``module:name``; the module of a script is the name of its file.
+    """Return the name of a function for its store, ``module:name``; a script's module is named after its file.
 
     Raises:
         ProblemError: A worker cannot find the function by name, as for a lambda, a nested function, a method, or a
@@ -298,7 +298,7 @@ def name_of(function: Any) -> str:
 
 
 def source_version(function: Any) -> str:
-    """Return digits that change with the code of a function or module; "" if there is no source."""
+    """Return a digest that changes with the code of a function or module; "" if there is no source."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError):
@@ -307,7 +307,7 @@ def source_version(function: Any) -> str:
 
 
 def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str | None]:
-    """Return the key of each task's neighbour, in an order in which neighbours come first; None for the first task.
+    """Return the key of each task's neighbour (None for the first), in an order in which neighbours come first.
 
     The tasks alone determine the neighbours. Ordered by their keys, which looks random, they form generations of 1, 1,
     2, 4, 8, ... tasks, and the neighbour of a task is the nearest task of all earlier generations. Neighbours thus come

@@ -22,7 +22,7 @@ Group = str | Callable[[Any], Any]
 
 
 class BatchError(DetailedError, RuntimeError):
-    """Tasks of a batch failed; all others are done, and all results are stored.
+    """Error that some tasks of a batch failed; all other tasks are done, and all results are stored.
 
     Attributes:
         batch: The results.
@@ -36,7 +36,7 @@ class BatchError(DetailedError, RuntimeError):
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a task.
+    """Result of one task of a batch.
 
     Attributes:
         key: Its name in the folder.
@@ -63,7 +63,7 @@ class Result:
 
     @property
     def value(self) -> Any:
-        """Value of the function, read from the folder; arrays and tuples are lists, plans are plans.
+        """Value that the function returned, read from the folder; arrays and tuples are lists, plans are plans.
 
         Raises:
             SolveError: The task is not done; gives the reason.
@@ -79,8 +79,7 @@ class Result:
         return self._store.value(record)
 
     def row(self) -> dict[str, Any]:
-        """Return the result as a row of a table: ``COLUMNS``, then numbers and texts as ``task.NAME`` and
-        ``result.NAME``.
+        """Return the result as a table row: ``COLUMNS``, then numbers and texts as ``task.NAME``, ``result.NAME``.
 
         Longer entries of a task are given as JSON.
         """
@@ -101,7 +100,7 @@ def row_of(record: Mapping[str, Any], store: ResultStore) -> Result:
 
 
 class Batch:
-    """Results in the order of their tasks, each distinct task once.
+    """Results of a batch in the order of its tasks; tasks that occur twice have one result.
 
     Attributes:
         folder: Folder of the results.
@@ -135,7 +134,7 @@ class Batch:
 
     @property
     def summary(self) -> str:
-        """Numbers of finished and failed tasks, the first reason, and how to repeat them; one line."""
+        """Numbers of finished and failed tasks, the first reason of failure, and how to repeat them, in one line."""
         done = self.counts.get("done", 0)
         counts = f"{self.folder.name}: {len(self)} tasks: {done} done, {len(self) - done} failed"
         first = next((result for result in self.results if result.status != "done"), None)
@@ -150,7 +149,7 @@ class Batch:
             raise BatchError(self.summary, self, name=self.folder.name, value=count, limit=0)
 
     def best(self, by: Group) -> dict[Any, Result]:
-        """Return the result of least cost in each group, among those that are done and whose verdict is not False.
+        """Return the lowest-cost result of each group, among the finished ones whose verdict is not False.
 
         Args:
             by: Name of an entry of the tasks, or a function of a task; its value, a text or number, is the group.
@@ -220,7 +219,7 @@ class Batch:
 
 
 def read_batch(folder: str | os.PathLike[str]) -> Batch:
-    """Return all results in a folder, in the order of their keys, without computing any.
+    """Return all results in a folder, in the order of their keys, without computing anything.
 
     Raises:
         ProblemError: The folder is not that of a batch.

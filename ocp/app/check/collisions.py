@@ -26,7 +26,7 @@ MAX_REPORTED_PAIRS = 20
 
 
 def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
-    """Return the machine, with joint limits widened if the motion exceeds them or a prismatic joint has none."""
+    """Return the machine with joint limits that contain the motion; prismatic joints get limits if they have none."""
     robot = machine.robot
     low, high = (getattr(motion.position.coefficients, side)(axis=(0, 1)) for side in ("min", "max"))
     joints = []
@@ -64,7 +64,7 @@ def prove_clearance(scene: CollisionScene, motion: Motion) -> Clearance:
 
 
 def clearance_rows(scene: CollisionScene, motion: Motion, bases: Array | None) -> tuple[list[Row], list[Fault]]:
-    """Return rows and faults of the clearance.
+    """Return table rows and faults for the clearance between bodies.
 
     If the base moves, with configurations `bases` (M, base_size) at the samples, distances are computed at the samples
     and midway between them, without a proof.
@@ -116,7 +116,7 @@ def _distance_text(distance: float) -> str:
 
 
 def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault]) -> list[Fault]:
-    """Return the faults, each with the time of the first sample that violates the clearance."""
+    """Return the faults with the time at which the clearance is first violated."""
     if not faults:
         return []
     worst_times = np.array([fault.time for fault in faults])
@@ -133,7 +133,7 @@ def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault])
 
 
 def _sampled(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
-    """Check the distances at the samples and midway between them; return rows and faults."""
+    """Check the distances at the samples and midway between them; return table rows and faults."""
     middles = (motion.t[1:] + motion.t[:-1]) / 2
     times = np.concatenate([motion.t, middles])
     joints = motion.position.at(times)
@@ -160,7 +160,7 @@ def _sampled(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[list[
 def path_rows(
     machine: Machine, motion: Motion, bases: Array | None, path: Waypoints, *, tolerance: float, angle: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Return rows and faults of the distances between the tip's path and the waypoints, and of the tool axis.
+    """Return table rows and faults for the distance of the tip from the path, and for the tool axis.
 
     The tip is sampled four times in every interval, and more finely at the largest distance. The path consists of
     straight lines between the waypoints. The angle is that of the z axes, if the waypoints have orientations.
@@ -222,14 +222,14 @@ def path_rows(
 
 
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
-    """Return a row of the table for a value and its limit, which may be infinite."""
+    """Return the table row for a value and its limit, which may be infinite."""
     bounded = bool(np.isfinite(limit))
     verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.INFO
     return Row(name, value, limit if bounded else None, unit, time, verdict)
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:
-    """Return the z axis of the tool at path parameters (K,): waypoint numbers with fractions. Shape (K, 3)."""
+    """Return the tool's z axis at path parameters (K,), which are fractional waypoint numbers. Shape (K, 3)."""
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -239,7 +239,7 @@ def _axes(path: Waypoints, parameter: Array) -> Array:
 
 
 def _between(t: Array, values: Array, times: Array) -> Array:
-    """Interpolate samples linearly, quaternions with normalisation. Shape (K, n)."""
+    """Interpolate samples linearly in time; quaternions are normalised. Shape (K, n)."""
     interpolated = np.column_stack([np.interp(times, t, column) for column in values.T])
     if values.shape[1] == 7:
         interpolated[:, 3:] /= np.linalg.norm(interpolated[:, 3:], axis=1)[:, None]
@@ -247,7 +247,7 @@ def _between(t: Array, values: Array, times: Array) -> Array:
 
 
 def _distances(points: Array, corners: Array) -> tuple[Array, Array]:
-    """Return the distances of points (K, 3) from the polyline through corners (M, 3), and where it is nearest.
+    """Return the distances of points (K, 3) from the polyline through corners (M, 3), and the nearest positions.
 
     The latter are numbers of the preceding corners plus fractions. Shape (K,) each.
     """

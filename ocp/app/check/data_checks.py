@@ -132,7 +132,7 @@ BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.q
 def clean_trajectory(
     raw: RawTrajectory, robot: Robot, bounds: JointBounds, *, unit_known: bool = False, unwrap: bool = False
 ) -> CleanedTrajectory:
-    """Return the usable part of a trajectory, with its faults.
+    """Return the part of a trajectory that can be checked, with the faults of the rest.
 
     Args:
         raw: The trajectory as written.
@@ -185,7 +185,7 @@ def clean_trajectory(
 def _columns(
     raw: RawTrajectory, robot: Robot, base: Sequence[str], faults: list[Fault], notes: list[str]
 ) -> tuple[list[int], Indices]:
-    """Match the columns of a file with joints; return the columns and the indices of their joints."""
+    """Match the columns of a file to joints; return the used columns and the indices of their joints."""
     names = robot.joint_names
     joints = [k for k, name in enumerate(names) if name in raw.names]
     missing = [name for name in names if name not in raw.names]
@@ -221,7 +221,7 @@ def _columns(
 
 
 def _finite(raw: RawTrajectory, used: list[int], joints: Indices, faults: list[Fault], notes: list[str]) -> Indices:
-    """Return the indices of the samples in which all values are numbers. Shape (K,)."""
+    """Return the indices of the samples without nan or infinite values. Shape (K,)."""
     finite = np.isfinite(raw.t)
     if not finite.all():
         k = int(np.flatnonzero(~finite)[0])
@@ -258,7 +258,7 @@ def _count(invalid: Any, raw: RawTrajectory, k: int) -> str:
 
 
 def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> Indices:
-    """Return the indices of the samples that remain when times must increase."""
+    """Return the indices of the samples with increasing times; add faults for the others."""
     t = raw.t[finite_rows]
     steps = np.diff(t)
     descriptions = (steps < 0, "goes back from {:.6g} s to {:.6g} s"), (steps == 0, "{:.6g} s is repeated")
@@ -273,7 +273,7 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return a time unit below 1 s in which times are plausible, or "", and the largest velocity over its limit.
+    """Return a plausible time unit below 1 s ("" if there is none), and the largest ratio of velocity to its limit.
 
     The share is that of the fastest joint if the times are in seconds. Plausible are samples at 10 kHz or less, and a
     fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
@@ -285,7 +285,7 @@ def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
 
 
 def _in_seconds(t: Array, q: Array, velocity: Array, faults: list[Fault]) -> Array:
-    """Return the times in seconds; convert integers that are so far apart that they must be in a smaller unit."""
+    """Return the times in seconds; convert whole numbers whose spacing shows that they are in a smaller unit."""
     if len(t) < 3 or not (t == np.rint(t)).all() or (step := float(np.median(np.diff(t)))) < THRESHOLDS.longest_step:
         return t
     unit = likely_unit(t, q, velocity)[0] or ("nanoseconds" if step >= 1e5 else "microseconds")
@@ -334,7 +334,7 @@ def _in_units(
 def _worst_in_degrees(
     t: Array, q: Array, turning: Sequence[int], limits: tuple[Array, Array, Array], margin: Array
 ) -> int | None:
-    """Return the joint farthest beyond what is possible in rad, if all joints are possible in degrees; else None.
+    """Return the joint that exceeds its limit most in rad if all joints are plausible in degrees; else None.
 
     At least half of the moving joints must be impossible in rad. If no joint has position limits, their velocities are
     compared with the velocity limits instead.
@@ -360,7 +360,7 @@ def _worst_in_degrees(
 def _unwrapped(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], limits: tuple[Array, ...], notes: list[str]
 ) -> tuple[Array, list[Fault]]:
-    """Remove jumps by whole turns from the positions; return them, with a fault for each limited joint that had some.
+    """Remove jumps by full turns from the positions; return them, with a fault for each limited joint that jumped.
 
     For a joint with limits, a jump is nearly a whole turn in a step that the joint is too slow for, or that no arm
     makes. It is removed if the limits allow, if necessary after a shift by whole turns.
@@ -390,7 +390,7 @@ def _unwrapped(
 
 
 def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str], faults: list[Fault]) -> Array:
-    """Return the times in s, converted if the velocities show a smaller unit; add faults of inconsistent velocities."""
+    """Return the times in s, converted if the velocities imply a smaller unit; add faults of wrong velocities."""
     if v is None or len(t) < 10:
         return t
     h = np.diff(t)[:, None]
@@ -431,7 +431,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
 def _jumps(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], velocity: Array, faults: list[Fault]
 ) -> None:
-    """Add a fault for each joint that jumps: a step far longer than those around it."""
+    """Add a fault for each joint that jumps, which means a step far longer than neighbouring steps."""
     h = np.diff(t)
     steps = np.diff(q, axis=0)
     speeds = steps / h[:, None]

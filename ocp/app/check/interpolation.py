@@ -57,7 +57,7 @@ class PiecewisePolynomial:
         return self.within(interval, np.clip((times - begin) / (end - begin), 0.0, 1.0))
 
     def within(self, interval: Indices, fraction: Array) -> Array:
-        """Return the values at fractions (M,), 0 to 1, of intervals (M,). Shape (M, n)."""
+        """Return the values in intervals (M,) at fractions (M,), 0 to 1, of their length. Shape (M, n)."""
         degree = self.coefficients.shape[1] - 1
         s = fraction[:, None]
         total = np.zeros((len(interval), self.coefficients.shape[2]))
@@ -72,7 +72,7 @@ class PiecewisePolynomial:
 
 
 def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
-    """Return the maxima of polynomials with Bernstein coefficients (K, d + 1), and where, 0 to 1. Shape (K,) each."""
+    """Return maxima of polynomials with Bernstein coefficients (K, d + 1), and their arguments in 0..1. Shape (K,)."""
     first, last = coefficients[:, 0], coefficients[:, -1]
     best, argument = np.maximum(first, last), np.where(last > first, 1.0, 0.0)
     tolerance = 1e-10 * np.abs(coefficients).max(axis=1, initial=0.0)  # far below the accuracy of any limit
@@ -96,7 +96,7 @@ def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
 
 
 def _halves(coefficients: Array) -> tuple[Array, Array]:
-    """Return the coefficients of both halves (de Casteljau). Shape (K, d + 1) each."""
+    """Return the Bernstein coefficients of both halves (de Casteljau's algorithm). Shape (K, d + 1) each."""
     left, right, row = [coefficients[:, 0]], [coefficients[:, -1]], coefficients
     for _ in range(coefficients.shape[1] - 1):
         row = (row[:, 1:] + row[:, :-1]) / 2
@@ -106,7 +106,7 @@ def _halves(coefficients: Array) -> tuple[Array, Array]:
 
 
 class MotionQuantity(NamedTuple):
-    """A quantity of every joint along a motion.
+    """A quantity, such as the velocity, of every joint along a motion.
 
     Attributes:
         pieces: The quantity as polynomials, or the constants between two times that divided differences give.
@@ -140,11 +140,11 @@ class Motion:
 
     @property
     def rule(self) -> Rule:
-        """The interpolation rule."""
+        """Name of the interpolation rule."""
         return "linear" if self.v is None else "cubic" if self.a is None else "quintic"
 
     def by(self, rule: Rule) -> Motion:
-        """Return the same samples with another rule of interpolation.
+        """Return the same samples with another interpolation rule.
 
         Raises:
             ProblemError: The rule needs velocities or accelerations that the samples do not have.
@@ -179,7 +179,7 @@ class Motion:
 
     @cached_property
     def velocity(self) -> PiecewisePolynomial:
-        """Velocities as polynomials, piecewise constant if the file has positions alone."""
+        """Velocities as polynomials; piecewise constant if the file has only positions."""
         return self.position.derivative()
 
     @cached_property
@@ -189,7 +189,7 @@ class Motion:
 
     @cached_property
     def digits(self) -> tuple[Array, Array, Array]:
-        """Half of the last written digit of positions, velocities and accelerations. Shape (n,) each."""
+        """Rounding error of the written positions, velocities and accelerations: half a last digit. Shape (n,) each."""
         none = np.zeros(self.q.shape[1])
         return tuple(none if values is None else half_digits(values) for values in (self.q, self.v, self.a))  # type: ignore[return-value]
 
@@ -217,7 +217,7 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return the least magnitude that every motion through the samples reaches in each interval.
+        """Return the magnitude that every motion through the samples must reach in each interval.
 
         Acceleration: a motion between given positions and velocities needs the least if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
@@ -253,7 +253,7 @@ class Motion:
         return peak(1.0), peak(-1.0)
 
     def _differences(self, values: Array, digits: Array, order: int) -> MotionQuantity | None:
-        """Estimate the time derivative of an order by divided differences, each over as many samples as it needs."""
+        """Estimate a time derivative by divided differences over as many samples as the rounding errors require."""
         if len(self.t) <= order:
             return None
         table, blur = values, np.broadcast_to(digits, values.shape)
@@ -267,7 +267,7 @@ class Motion:
 
 
 def half_digits(values: Array) -> Array:
-    """Return half of the last digit (or single-precision bit) with which each column is written. Shape (n,).
+    """Return the rounding error of each column: half its last digit, or half a single-precision bit. Shape (n,).
 
     A column of few digits may be exact: columns with digits coarser than a thousandth or with few values count as
     exact.

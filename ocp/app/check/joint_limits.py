@@ -120,7 +120,7 @@ def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> L
 def limit_rows(
     motion: Motion, robot: Robot, joints: Indices, bounds: JointBounds, *, share: float
 ) -> tuple[list[Row], list[Fault], list[str]]:
-    """Return rows and faults of all limits of the joints, and the quantities that could not be checked.
+    """Return table rows and faults for all limits of the joints, and the quantities that could not be checked.
 
     Args:
         motion: Motion of the joints.
@@ -151,7 +151,7 @@ def limit_rows(
 
 
 def audit_rows(audit: Audit) -> list[Row]:
-    """Return the findings of an audit as rows of a table."""
+    """Return the findings of an audit as table rows."""
     verdicts = [RowVerdict.INFO if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
     return [
         Row(f.name, f.value, f.limit, f.unit, f.time, verdict, f.note)
@@ -160,7 +160,7 @@ def audit_rows(audit: Audit) -> list[Row]:
 
 
 class _Side(NamedTuple):
-    """Maxima of a quantity towards one of its two limits, in every interval; values and limit are multiplied by `sign`.
+    """Largest values of a quantity towards its upper or lower limit in every interval, both multiplied by `sign`.
 
     Attributes:
         sign: 1 for the upper limit, -1 for the lower.
@@ -178,7 +178,7 @@ class _Side(NamedTuple):
 
     @classmethod
     def of(cls, quantity: MotionQuantity, column: int, sign: float, limit: float, tolerance: float) -> _Side:
-        """Return the maxima of one joint towards one of its limits, with the tolerance `room`."""
+        """Return the largest values of one joint towards one of its limits, with a tolerance of the limit."""
         coefficients, t = sign * quantity.pieces.coefficients[:, :, column], quantity.pieces.t
         needed = np.broadcast_to(quantity.needed[0 if sign > 0 else 1], quantity.blur.shape)[:, column]
         ends, enclosed = np.maximum(coefficients[:, 0], coefficients[:, -1]), coefficients.max(axis=1)
@@ -196,19 +196,19 @@ class _Side(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """Largest value minus the limit; -inf without a limit."""
+        """Largest value minus the limit; -inf if there is no limit."""
         return float(self.values.max() - self.limit)
 
     @property
     def worst_value(self) -> float:
-        """Largest value towards the limit, with its original sign."""
+        """Largest value towards the limit, with its original sign instead of multiplied by `sign`."""
         return self.sign * float(self.values.max())
 
 
 def _check_limits(
     quantity: MotionQuantity, column: int, order: str, name: str, unit: str, low: float, high: float, share: float
 ) -> tuple[tuple[float, float | None, str, float | None, RowVerdict], str, list[Fault]]:
-    """Return value, limit, unit, time and verdict of a row, a remark on a tolerated violation, and the faults."""
+    """Return value, limit, unit, time and verdict of a table row, a remark on tolerated violations, and the faults."""
     t, blur = quantity.pieces.t, np.asarray(quantity.blur)[:, column]
     tolerance = share * max((abs(one) for one in (low, high) if np.isfinite(one)), default=0.0)
     sides = [_Side.of(quantity, column, *one, tolerance) for one in ((1.0, high), (-1.0, -low))]
@@ -243,7 +243,7 @@ def _check_limits(
 def effort_rows(
     cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Check the torques that the file contains, at its samples."""
+    """Check the torques in the file against the torque limits, at the samples."""
     rows: list[Row] = []
     faults: list[Fault] = []
     if cleaned.efforts is None:
@@ -266,7 +266,7 @@ def effort_rows(
 def torque_rows(
     motion: Motion, machine: FixedBase | FreeFloating | Standing, bounds: JointBounds, share: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Return rows and faults of the torques by inverse dynamics, evaluated five times in every interval.
+    """Return table rows and faults for the torques by inverse dynamics, evaluated five times in every interval.
 
     With linear interpolation they are evaluated at the samples, with velocities and accelerations by differences. A
     floating base moves as the joints drive it, from rest, without gravity.
@@ -345,7 +345,7 @@ def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
 
 
 def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[list[Row], list[Fault]]:
-    """Return rows and faults of the zero moment point, of the vertical force and of friction."""
+    """Return table rows and faults for the zero moment point, the vertical force and the friction."""
     n = machine.joint_size
     q, v, a = (ca.SX.sym(name, n) for name in ("q", "v", "a"))
     reaction = machine.ground_reaction(q, v, a)
@@ -387,7 +387,7 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
 def floating_base_rows(
     machine: FreeFloating, motion: Motion, base: Array | None
 ) -> tuple[Array, list[Row], list[Fault]]:
-    """Return the configurations of a floating base at the samples, shape (M, base_size), with rows and faults.
+    """Return the base configurations at the samples, shape (M, base_size), with table rows and faults.
 
     If the file gives the base, its momentum is checked; otherwise it moves so that momentum is conserved.
     """
@@ -397,7 +397,7 @@ def floating_base_rows(
 
 
 def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
-    """Return the configurations of a floating base at the samples, shape (M, base_size), and rows of its displacement.
+    """Return the base configurations at the samples, shape (M, base_size), and table rows of the displacement.
 
     The base starts at its home and moves so that momentum stays zero. The classical Runge-Kutta method takes one step
     in every interval.
@@ -439,7 +439,7 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
 
 
 def momentum_rows(machine: FreeFloating, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
-    """Return rows and faults of the total momentum, which must be constant, with the base motion given in the file.
+    """Return table rows and faults for the total momentum, which must be constant under the given base motion.
 
     The velocity of the base is that of central differences.
     """

@@ -96,7 +96,7 @@ def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool =
 
 
 def _exchanged(names: list[str], pair: tuple[int, int], evidence: str) -> Fault:
-    """Return the suspicion that two columns are exchanged."""
+    """Return the suspicion that two columns of the file are exchanged."""
     both = " and ".join(names[k] for k in pair)
     text = f"the columns of {both} look exchanged: then {evidence}, which is far from true as written"
     return Fault("suspicion", both, f"{text}; correct the names, or pass --names-confirmed")

@@ -52,7 +52,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """Result of a check.
+    """Result of the check of a trajectory.
 
     Attributes:
         file, robot: Names of the file and of the robot.
@@ -132,7 +132,7 @@ class Check:
         return "\n".join([*lines, f"The trajectory {self.sentence}."])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result without the samples, as JSON can represent it."""
+        """Return the result as a dictionary for JSON, without the samples."""
         data = {name: getattr(self, name) for name in ("file", "robot", "joints", "samples", "duration", "rule")}
         data |= {"passed": self.passed, "verdict": self.sentence}
         data |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "suspicions", "rows")}
@@ -342,14 +342,14 @@ def check_trajectory(
 
 
 def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
-    """Return a sentence about the links whose meshes are missing, if there are any."""
+    """Return a sentence about links with missing meshes; empty if there are none."""
     shapes = [(link.name, shape) for link in robot.links for shape in link.collisions if shape.kind == "mesh"]
     names = [name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, folders) is None]
     return [f"clearance of {', '.join(dict.fromkeys(names))}, whose meshes are missing"] if names else []
 
 
 def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
-    """List the quantities that have no limit, joints of one kind together."""
+    """Name the quantities that have no limit, with the joints of one kind in one entry."""
     joints: dict[str, list[str]] = {}
     counts: dict[str, int] = {}
     for row in rows:
@@ -365,7 +365,7 @@ def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class PlanVerdict:
-    """Audit and check of a plan. A plan that breaks a limit of its machine must not be run, even if its task allows it.
+    """Audit of a plan, and check of its samples against the limits of its machine.
 
     Attributes:
         audit: Audit of the plan against its problem.
@@ -416,7 +416,7 @@ def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
 
 
 def _check_segment(piece: Piece, times: Array, name: str) -> Check:
-    """Return the check of one segment of a motion at its ends and at the given times that lie inside it."""
+    """Check one segment of a motion at its ends and at those of the given times that lie inside it."""
     plan, local = piece.plan, times - piece.begin
     inside = local[(local > 0) & (local < plan.horizon)]
     sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))
@@ -427,7 +427,7 @@ def _check_segment(piece: Piece, times: Array, name: str) -> Check:
 def _check_samples(
     machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
 ) -> Check:
-    """Return the check of times (M,), joints, rates and accelerations (M, n), the last two or None."""
+    """Check joints, and rates and accelerations if not None, at sample times. Shapes (M,) and (M, n)."""
     raw = RawTrajectory(tuple(robot.joint_names), *values, None, np.arange(1, len(values[0]) + 1), True, (), name)
     if not isinstance(machine, FreeFloating):  # the forces on a standing machine are those of its problem
         frame = machine.world_from_base(())
@@ -438,7 +438,7 @@ def _check_samples(
 
 
 def _worst(checks: Sequence[Check]) -> Check:
-    """Merge the checks of several motions: all faults, and the worst row of each quantity."""
+    """Merge the checks of several motions: keep all faults and, of each quantity, the worst row."""
     rows: dict[str, Row] = {}
     for row in (row for check in checks for row in check.rows):
         if row.name not in rows or _severity(row) > _severity(rows[row.name]):
@@ -452,6 +452,6 @@ def _worst(checks: Sequence[Check]) -> Check:
 
 
 def _severity(row: Row) -> tuple[bool, bool, float]:
-    """Return the sorting key that compares rows of one quantity by severity."""
+    """Return the sorting key by which rows of one quantity are compared."""
     size = abs(row.limit) if row.limit else 1.0
     return row.verdict is RowVerdict.FAILED, row.verdict is RowVerdict.UNDECIDED, abs(row.value) / size

@@ -105,7 +105,7 @@ def read_gcode(
 
 
 class _Reader:
-    """State of the machine while a file is read, and the sections read so far.
+    """Reader of a G-code file: the modal state, and the sections read so far.
 
     Positions are in metres in the frame of the program's start. `position` is the programmed one; `reached` is the end
     of the path, which differs from it because moves below a nanometre are dropped.
@@ -162,7 +162,7 @@ class _Reader:
         return Program(tuple(self.sections), self.start, notes)
 
     def _refuse(self, why: str, limit: Any = None) -> NoReturn:
-        """Raise ProblemError for the current line."""
+        """Raise a ProblemError about the current line."""
         raise line_error(self.file, self.block.number, self.block.text, why, limit=limit)
 
     def _note(self, text: str) -> None:
@@ -218,7 +218,7 @@ class _Reader:
                 self._note(f"{code_name(code)}: {IGNORED_CODES[code]}")
 
     def _set_modes(self, codes: set[int], words: dict[str, float]) -> None:
-        """Set units, plane, distance modes, coordinate system and path control."""
+        """Set units, plane, distance modes, coordinate system and path control from the codes of a block."""
         for code in codes:
             if code in (200, 210):
                 self.unit, self.has_unit = "inch" if code == 200 else "mm", True
@@ -245,7 +245,7 @@ class _Reader:
             self._note("G64: P is the tolerance of rounding" if tolerance else "G64: the caller's tolerance applies")
 
     def _set_system(self, code: int) -> None:
-        """Accept one coordinate system per program."""
+        """Accept a coordinate system, but only one per program."""
         if self.system is None and not self.moved and not self.moves:
             self.system = code
         if code != (540 if self.system is None else self.system):
@@ -274,7 +274,7 @@ class _Reader:
         self._note("G4: P is read as seconds")
 
     def _to_machine_position(self, code: int, words: dict[str, float]) -> None:
-        """Move to the machine's own position, if it is known."""
+        """Move to a position in the machine's own coordinates; if that is unknown, note the line and ignore it."""
         if code in (281, 301):
             self._refuse(f"{code_name(code)} stores a position of the machine; {REPOST}")
         axes = [i for i, axis in enumerate(AXES) if axis in words]
@@ -410,7 +410,7 @@ class _Reader:
             self._end_path()
 
     def _stop(self, words: dict[str, float]) -> bool:
-        """Execute the M words, reject unused words, and return whether the program ends."""
+        """Execute the M words and reject unused words; return whether the program ends."""
         is_end = False
         for code in (code for letter, code in self.block.codes if letter == "M"):
             kind, name = M_WORDS.get(code, ""), f"M{code // 10}"

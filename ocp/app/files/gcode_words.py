@@ -51,7 +51,7 @@ RADIUS_SHARE = 1e-3
 
 
 class ArcError(Exception):
-    """Numbers do not describe an arc.
+    """Error that numbers do not describe an arc.
 
     Attributes:
         why: Reason.
@@ -65,7 +65,7 @@ class ArcError(Exception):
 
 
 def center_from_radius(start: Array, end: Array, radius: float, *, clockwise: bool, gap: float) -> Array:
-    """Return the centre, shape (2,), m, of an arc in its plane; a negative radius selects the longer arc.
+    """Return the centre, shape (2,), m, of an arc of given radius; a negative radius selects the longer arc.
 
     Raises:
         ArcError: The radius is smaller than half the chord by more than `gap`, or the chord is zero.
@@ -85,7 +85,7 @@ def center_from_radius(start: Array, end: Array, radius: float, *, clockwise: bo
 def arcs_about_center(
     start: Array, end: Array, center: Array, *, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
 ) -> list[Arc | Helix]:
-    """Return arcs or helices from start to end: one, or two halves if no single centre serves both ends.
+    """Return arcs or helices from start to end: one, or two halves if no single centre fits both ends.
 
     Two are needed if a circle nearly closes but ends nearer to the centre than it starts.
 
@@ -144,7 +144,7 @@ def _moved(center: Array, first: Array, last: Array) -> Array:
 def _turned(
     start: Array, end: Array, center: Array, clockwise: bool, sweep: float, plane: tuple[int, int, int]
 ) -> Arc | Helix:
-    """Return the arc, or the helix if it rises or exceeds a full turn, that begins at `start` and turns by `sweep`."""
+    """Return the arc from `start` that turns by `sweep`; it is a helix if it rises or exceeds a full turn."""
     axis, middle = np.zeros(3), start.copy()
     axis[plane[2]] = -1.0 if clockwise else 1.0
     middle[list(plane[:2])] = center
@@ -225,7 +225,7 @@ NOT_RUN = "O-words (subroutines, loops, conditions) are not supported; post the 
 
 
 class Block(NamedTuple):
-    """Words of one line.
+    """Words (letters with numbers) of one line.
 
     Attributes:
         number: Line number in the file, from 1.
@@ -243,7 +243,7 @@ class Block(NamedTuple):
 
 
 def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
-    """Yield the blocks that have words, up to the second `%`.
+    """Yield the blocks that contain words, up to the second `%`.
 
     Raises:
         ProblemError: With the line: an invalid word, an unclosed comment, an expression, or a repeated letter.
@@ -302,7 +302,7 @@ def _without_comments(file: FileName, number: int, text: str) -> str:
 
 
 def _tenths(file: FileName, number: int, text: str, letter: str, value: str) -> int:
-    """Return a G or M code times ten, since codes such as G38.2 have one decimal."""
+    """Return ten times the number of a G or M code, because codes such as G38.2 have one decimal."""
     exact = float(value) * 10 if len(value) < 9 else -1.0
     if exact < 0 or abs(exact - round(exact)) > 1e-6:
         raise line_error(file, number, text, f"{letter}{value} is not a code; codes have at most one decimal")
@@ -310,7 +310,7 @@ def _tenths(file: FileName, number: int, text: str, letter: str, value: str) -> 
 
 
 def _refuse(file: FileName, number: int, text: str, line: str) -> None:
-    """Raise ProblemError for a line with something other than words."""
+    """Raise ProblemError for a line that contains anything but words."""
     if CONTROL.match(line):
         raise line_error(file, number, text, NOT_RUN)
     if any(sign in line for sign in "#[]=<>"):

@@ -26,7 +26,7 @@ __all__ = ["log_rerun", "read_joint_messages", "write_mcap"]
 
 
 def _with_parts(fields: str, **parts: str) -> str:
-    """Return the definition of a message: its header, its fields, and the types that they use."""
+    """Return the definition of a message type with its header, its fields, and the types they use."""
     parts["std_msgs/Header"] = "builtin_interfaces/Time stamp\nstring frame_id\n"
     parts |= {f"builtin_interfaces/{name}": "int32 sec\nuint32 nanosec\n" for name in ("Time", "Duration")}
     bar = "=" * 80
@@ -52,7 +52,7 @@ DEFINITIONS = {
 
 
 def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *, frame: str = "world") -> None:
-    """Write the joint states of a plan on `/joint_states`, and the path of its tip, if it has one, on `/tip_path`.
+    """Write the joint states of a plan to `/joint_states`, and the path of its tip, if any, to `/tip_path`.
 
     States are sensor_msgs/msg/JointState with velocities every `period` s, the first at 0 s of the log. The path is one
     nav_msgs/msg/Path with poses at the same times.
@@ -100,7 +100,7 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
 
 
 def _header(stamp: int, frame: str) -> dict[str, Any]:
-    """Return the header of a message with a stamp in ns."""
+    """Return the header of a message with a time stamp in ns."""
     seconds, nanoseconds = divmod(stamp, 10**9)
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
 
@@ -109,7 +109,7 @@ def _header(stamp: int, frame: str) -> dict[str, Any]:
 
 
 def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) -> tuple[str, list[tuple[int, Any]]]:
-    """Return the topic, and the stamps (ns) and fields of its joint states or joint trajectories.
+    """Return a topic with the time stamps (ns) and fields of its joint states or joint trajectories.
 
     A stamp is that of the message's header, or the log time if that is zero.
 
@@ -189,7 +189,7 @@ def _records(stream: IO[bytes]) -> Iterator[Any]:
 
 
 def _unpacked(chunk: Any) -> bytes:
-    """Return the contents of a chunk, never more than its declared size."""
+    """Return the decompressed contents of a chunk, limited to its declared size."""
     data, size = chunk.data, chunk.uncompressed_size
     if chunk.compression == "zstd":
         zstd = import_module("zstandard").ZstdDecompressor(max_window_size=INPUT_LIMITS.log_record_bytes)
@@ -202,7 +202,7 @@ def _unpacked(chunk: Any) -> bytes:
 
 
 def _fields(message: Any) -> Any:
-    """Return a message, or a list of messages, as dictionaries."""
+    """Convert a message, or a list of messages, to dictionaries."""
     if isinstance(message, list):
         return [_fields(each) for each in message] if message and hasattr(message[0], "__slots__") else message
     if not hasattr(message, "__slots__"):

@@ -34,7 +34,7 @@ DEFAULT_TOLERANCE_M = 5e-5
 
 
 class Note(NamedTuple):
-    """Words of a file that were ignored or interpreted in one of several ways.
+    """Remark about words of a file that were ignored or could be interpreted in several ways.
 
     Attributes:
         text: The words and their interpretation.
@@ -51,7 +51,7 @@ class Note(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """A path traversed at the programmed feed without a stop, such as a cut of a mill.
+    """A path that is traversed at the programmed feed without a stop, such as a cut of a mill.
 
     Attributes:
         path: Path of n segments.
@@ -68,7 +68,7 @@ class Cut:
 
     @property
     def name(self) -> str:
-        """Description with line numbers."""
+        """Description of the cut with its line numbers."""
         return f"cut, lines {self.lines[0]} to {self.lines[-1]}"
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> SmoothPath:
@@ -94,13 +94,13 @@ class Rapid:
 
     @property
     def name(self) -> str:
-        """Description with the line number."""
+        """Description of the rapid move with its line number."""
         return f"rapid, line {self.line}"
 
 
 @dataclass(frozen=True)
 class Pause:
-    """A stop.
+    """A pause: the tool stands still for some time.
 
     Attributes:
         duration: s; zero if the program waits for the operator.
@@ -114,7 +114,7 @@ class Pause:
 
     @property
     def name(self) -> str:
-        """Description with the line number."""
+        """Description of the pause with its line number."""
         return f"pause {self.why}, line {self.line}"
 
 
@@ -123,7 +123,7 @@ Section: TypeAlias = Cut | Rapid | Pause
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """Contents of a program file, in its order.
+    """Contents of a program file: cuts, rapid moves and pauses in order.
 
     Attributes:
         sections: Cuts, rapids and pauses; each starts where the previous one ends.
@@ -199,7 +199,7 @@ class Program:
     def schedule(
         self, limits: LineLimits, *, rapid: float | None = None, tolerance: float | None = None, **options: Any
     ) -> TimedProgram:
-        """Return the trajectory of the program: each section from rest to rest, cuts at their feeds, rapids straight.
+        """Return the trajectory of the program, in which each section runs from rest to rest.
 
         Args:
             limits: Limits of all sections; the speed, one number, also limits the feeds.
@@ -238,7 +238,7 @@ def checked_reversal(owner: str, value: Any) -> Reversal:
 
 
 def _counted(number: int, noun: str) -> str:
-    """Return a count with its noun, in the plural if necessary."""
+    """Return a number with its noun, in the plural if necessary."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
@@ -251,7 +251,7 @@ def _moved(points: Array, position: ArrayInput, orientation: ArrayInput) -> Arra
 
 
 def smoothed(path: Path, deviation: ArrayInput, options: dict[str, Any]) -> SmoothPath:
-    """Round a path within a deviation, with the options of models.smooth; raise its errors as ProblemError."""
+    """Round the corners of a path within a deviation by models.smooth; raise its errors as ProblemError."""
     known = {"kind", "shape", "overlap"}
     if unknown := [name for name in options if name not in known]:
         message = f"smooth: unknown option {unknown[0]!r}; known: {', '.join(sorted(known))}"
@@ -314,7 +314,7 @@ class TimedProgram:
         return tuple(each.name for each in self.program.sections)
 
     def at(self, time: ArrayLike) -> ProgramMotion:
-        """Return the motion at times (M,) of [0, duration], s. At a boundary it is that of the section that begins.
+        """Return the motion at times (M,) in [0, duration], s; a boundary belongs to the section that begins there.
 
         Raises:
             ProblemError: A time is not a number, or is outside by more than rounding.

@@ -88,20 +88,20 @@ def read_lines(
 
 
 def line_error(file: Any, number: int, text: str, why: str, *, limit: Any = None) -> ProblemError:
-    """Return the error of a numbered line: its text, what is wrong and what to do."""
+    """Return the error about a numbered line: its text, what is wrong, and what to do."""
     quoted = text.strip()
     quoted = quoted if len(quoted) <= QUOTED_CHARACTERS else quoted[:QUOTED_CHARACTERS] + " ..."
     return ProblemError(f"{file}, line {number}, {quoted!r}: {why}", name=f"line {number}", value=quoted, limit=limit)
 
 
 def missing_package(task: str, package: str, extra: str) -> ProblemError:
-    """Return the error of a task that needs a package of an extra that is not installed."""
+    """Return the error that a task needs an optional package which is not installed."""
     commands = f'pip install "selfmotion[{extra}]", or from a clone pip install ".[{extra}]"'
     return ProblemError(f"{task} needs the package {package}: {commands}", name=extra, value=package)
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a table's line without quotes; with semicolons as delimiters, a comma is a decimal point."""
+    """Split a line of a table into cells; if the delimiter is a semicolon, a comma is a decimal point."""
     if delimiter == " ":
         return [cell.strip("\"'") for cell in BEFORE_UNIT.sub("", line).split()]
     cells = [cell.strip().strip("\"'") for cell in line.split(delimiter)]
@@ -174,7 +174,7 @@ class _Container:
         self.value, self.anchor, self.count, self.key = value, anchor, 1, _NO_KEY
 
     def add(self, value: Any, count: int) -> None:
-        """Append a value, or the key or value of an entry, that counts as `count` values."""
+        """Append a list value, or the key or value of a mapping entry; it counts as `count` values."""
         self.count += count
         _check_count(self.count)
         if isinstance(self.value, list):
@@ -238,13 +238,13 @@ def _checked_tag(event: Any) -> Any:
 
 
 def _check_count(count: int) -> None:
-    """Raise ValueError if there are too many values."""
+    """Raise ValueError if a file contains more values than allowed."""
     if count > INPUT_LIMITS.tree_values:
         raise ValueError(f"it contains {count} values; at most {INPUT_LIMITS.tree_values} are allowed")
 
 
 def checked_depth(tree: Any) -> Any:
-    """Return a tree of values; raise ValueError if it is nested more than INPUT_LIMITS.nesting deep."""
+    """Return a tree of values; raise ValueError if it is nested deeper than INPUT_LIMITS.nesting."""
     level = [tree]
     for _ in range(INPUT_LIMITS.nesting + 1):
         level = [child for node in level for child in children_of(node)]

@@ -105,7 +105,7 @@ def read_obstacles(file: FileName) -> tuple[Shape, ...]:
 
 
 def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
-    """Return the shapes under [[obstacle]]; mesh files are relative to `folder`."""
+    """Return the shapes of the [[obstacle]] entries; paths of mesh files are relative to `folder`."""
     shapes = []
     for table in entries.tables("obstacle"):
         shape = table.choice("shape", SHAPES, REQUIRED)
@@ -119,7 +119,7 @@ def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
 
 
 def rotation_of(entries: TomlTable) -> Array:
-    """Return the rotation given by `rpy`, the identity if it is missing. Shape (3, 3)."""
+    """Return the rotation matrix of the entry `rpy`; the identity if it is missing. Shape (3, 3)."""
     angles = entries.vector("rpy", 3, "three angles, rad", (0.0, 0.0, 0.0))
     return np.array(rotation_from_rpy(*(float(angle) for angle in angles)), dtype=float)
 
@@ -184,7 +184,7 @@ class Task:
 
 
 def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
-    """Read a task file without planning.
+    """Read a task file without planning its motion.
 
     Args:
         file: Name of the file.
@@ -306,7 +306,7 @@ def _task(entries: TomlTable, folder: Path) -> TipTask:
 
 
 def _path_limit(entries: TomlTable, name: str, unit: str, default: Any = None) -> Any:
-    """Read a limit of the schedule along the path; reject a size that no machine has."""
+    """Read a speed, acceleration or other limit along the path; reject values that no machine has."""
     return entries.number(name, f"a number above 0, {unit}, of 1e-6 to 1e6", default, least=0.999e-6, most=1e6)
 
 
@@ -351,7 +351,7 @@ def _cost(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str,
 
 
 def _each(entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str) -> Any:
-    """Return one number for all joints, or one for each; unnamed joints get `other`. None if the entry is missing."""
+    """Return one number for all joints, or one for each, with a default for unnamed joints; None without the entry."""
     if name not in entries:
         return None
     if not isinstance(entries.raw(name), dict):
@@ -415,7 +415,7 @@ def _read_scene(
 
 
 def _outputs(entries: TomlTable | None, folder: Path) -> tuple[dict[str, Path], float]:
-    """Read the output files, by kind, and the sampling period."""
+    """Read the names of the output files by kind, and the sampling period."""
     if entries is None:
         return {}, 0.01
     outputs = {}

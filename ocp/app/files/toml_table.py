@@ -42,7 +42,7 @@ class TomlTable:
         return name in self._values
 
     def error(self, name: str | None, why: str) -> ProblemError:
-        """Return the error of an entry, or of the table, with the line, its text and what was expected."""
+        """Return the error about an entry or the table, with the line, its text, and the reason."""
         place = self.place if name is None else (*self.place, name)
         number = next((self._lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in self._lines), 1)
         text = self._texts[number - 1] if number <= len(self._texts) else ""
@@ -51,7 +51,7 @@ class TomlTable:
         return error
 
     def missing(self, name: str, expected: str) -> ProblemError:
-        """Return the error of a missing entry, or of an unknown entry with nearly its name."""
+        """Return the error about a missing entry; it names an unknown entry that is spelled similarly."""
         unknown = [key for key in self._values if key not in self._read_names]
         if similar := get_close_matches(name, unknown, n=1, cutoff=0.5):
             return self.error(similar[0], f"unknown entry {similar[0]}; did you mean {name}? It is {expected}")
@@ -73,15 +73,15 @@ class TomlTable:
         return value
 
     def text(self, name: str, expected: str = "a text", default: Any = None) -> Any:
-        """Return a text."""
+        """Return the entry of this name after checking that it is a non-empty text."""
         return self._read(name, default, expected, lambda value: isinstance(value, str) and value != "")
 
     def flag(self, name: str, default: bool = False) -> bool:
-        """Return true or false."""
+        """Return the entry of this name after checking that it is true or false."""
         return bool(self._read(name, default, "true or false", lambda value: isinstance(value, bool)))
 
     def choice(self, name: str, known: Iterable[str], default: Any = None) -> Any:
-        """Return one of the known words."""
+        """Return the entry of this name after checking that it is one of the known words."""
         words = tuple(known)
         expected = "one of " + ", ".join(f'"{word}"' for word in words)
         return self._read(name, default, expected, lambda value: isinstance(value, str) and value in words)
@@ -89,7 +89,7 @@ class TomlTable:
     def number(
         self, name: str, expected: str, default: Any = None, *, least: float = -np.inf, most: float = np.inf
     ) -> Any:
-        """Return a number above `least` and at most `most`."""
+        """Return the entry of this name after checking that it is a number above `least` and at most `most`."""
 
         def fits(value: Any) -> bool:
             return bool(np.isfinite(real(value)) and least < real(value) <= most)
@@ -98,7 +98,7 @@ class TomlTable:
         return value if value is None or value is default else float(value)
 
     def count(self, name: str, expected: str, default: Any = None) -> Any:
-        """Return an integer, 0 or more."""
+        """Return the entry of this name after checking that it is an integer, 0 or more."""
 
         def fits(value: Any) -> bool:
             return isinstance(value, int) and not isinstance(value, bool) and value >= 0
@@ -106,7 +106,7 @@ class TomlTable:
         return self._read(name, default, expected, fits)
 
     def vector(self, name: str, size: int | None, expected: str, default: Any = None) -> Any:
-        """Return a vector of `size` numbers, or of any number of them if `size` is None."""
+        """Return the entry of this name as a vector of `size` numbers, or of any number of them if `size` is None."""
 
         def fits(value: Any) -> bool:
             try:
@@ -119,7 +119,7 @@ class TomlTable:
         return value if value is None or value is default else np.array(value, dtype=float)
 
     def numbers_by_name(self, name: str, expected: str) -> dict[str, float]:
-        """Return a table of numbers by name, empty if it is missing."""
+        """Return the entry of this name as a table of numbers by name; empty if it is missing."""
         table = self.table(name, expected)
         values = {} if table is None else table._values
         for key, value in values.items():
@@ -128,14 +128,14 @@ class TomlTable:
         return {key: float(value) for key, value in values.items()}
 
     def texts(self, name: str, expected: str) -> tuple[str, ...]:
-        """Return a list of texts, empty if it is missing."""
+        """Return the entry of this name as a list of texts; empty if it is missing."""
         texts = self._read(
             name, [], expected, lambda value: isinstance(value, list) and all(isinstance(one, str) for one in value)
         )
         return tuple(texts)
 
     def pairs(self, name: str, expected: str) -> list[tuple[str, str]]:
-        """Return a list of pairs of texts, empty if it is missing."""
+        """Return the entry of this name as a list of pairs of texts; empty if it is missing."""
 
         def fits(value: Any) -> bool:
             return isinstance(value, list) and all(
@@ -149,12 +149,12 @@ class TomlTable:
         return self._read(name, default, "", lambda value: True)
 
     def table(self, name: str, expected: str = "a table", default: Any = None) -> TomlTable | None:
-        """Return a table within this one, or None if it is missing."""
+        """Return the table of this name within this one, or None if it is missing."""
         values = self._read(name, default, expected, lambda value: isinstance(value, dict))
         return None if values is None else self._inner(values, name)
 
     def _inner(self, values: Any, *place: Any) -> TomlTable:
-        """Return a nested table with its place in the file, so that its errors name the line."""
+        """Return a nested table that knows its place in the file, so that its errors name the line."""
         return TomlTable(self.file, values, place=(*self.place, *place), texts=self._texts, lines=self._lines)
 
     def tables(self, name: str) -> list[TomlTable]:
@@ -168,7 +168,7 @@ class TomlTable:
         return [self._inner(values, name, k) for k, values in enumerate(tables)]
 
     def only(self, *names: str) -> None:
-        """Reject all entries with other names than the given ones, before any is read.
+        """Raise ProblemError for entries with other names than the given ones, before any entry is read.
 
         Raises:
             ProblemError: An entry is unknown; names its line and the known entries.
@@ -177,7 +177,7 @@ class TomlTable:
         self.done()
 
     def done(self) -> None:
-        """Reject entries that were not read.
+        """Raise ProblemError if an entry has not been read, because it is then unknown.
 
         Raises:
             ProblemError: An entry is unknown; names its line and the known entries.

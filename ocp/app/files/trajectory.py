@@ -48,7 +48,7 @@ FORMATS = {".json": "json", ".yaml": "yaml", ".yml": "yaml", ".mcap": "mcap"}
 
 @dataclass(frozen=True, eq=False)
 class RawTrajectory:
-    """Joint trajectory as written in a file, with its faults.
+    """Joint trajectory as it is written in a file, faults included.
 
     Attributes:
         names: Names of the joints. The columns of a table may be something else, which the table does not say.
@@ -165,7 +165,7 @@ def _read_table(
 
 
 def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str, width: int) -> Array:
-    """Return the numbers of a table, nan for empty cells. Shape (M, width)."""
+    """Return the numbers of a table; empty cells become nan. Shape (M, width)."""
     split = [split_cells(row, delimiter) for row in rows]
     for row, number, cells in zip(rows, numbers, split, strict=True):
         if len(cells) != width:
@@ -189,7 +189,7 @@ def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str
 def _meanings(
     file: FileName, head: list[str], joints: frozenset[str]
 ) -> tuple[tuple[int, float] | None, dict[tuple[str, str], tuple[int, float]], list[str]]:
-    """Identify the columns of a table: time with its unit, the values of each joint by kind, and notes."""
+    """Identify the columns of a table: time and its unit, the values of each joint by kind; add notes."""
     if joint_names := table_joints(head):  # our own table: the names of its joints are not interpreted
         columns = [(name, kind) for kind in KINDS[:3] for name in joint_names]
         return (0, 1.0), {key: (column, 1.0) for column, key in enumerate(columns, 1)}, []
@@ -241,7 +241,7 @@ def _kind(name: str) -> tuple[str, str]:
 
 
 def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
-    """Search a tree for the outermost mapping with joint names and points; each value is visited once."""
+    """Find the outermost mapping with joint names and points in a tree of values."""
     level, visited = [tree], set[int]()
     for _ in range(depth + 1):
         next_level: list[Any] = []
@@ -257,7 +257,7 @@ def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
 
 
 def _from_points(file: FileName, tree: Any) -> RawTrajectory:
-    """Return the trajectory of a tree with joint names and trajectory points."""
+    """Return the trajectory in a tree of values that has joint names and trajectory points."""
     message = _trajectory_in(tree)
     if message is None:
         words = f"{file} contains no joint trajectory; joint_names and points are expected"
@@ -297,7 +297,7 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
 
 
 def _rows(file: FileName, word: str, points: list[Any], width: int) -> Array:
-    """Return one kind of values of all trajectory points. Shape (M, width)."""
+    """Return one kind of values, such as the velocities, of all trajectory points. Shape (M, width)."""
     rows = np.full((len(points), width), np.nan)
     for number, point in enumerate(points, 1):
         if not isinstance(point, list) or len(point) != width:

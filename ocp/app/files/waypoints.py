@@ -222,7 +222,7 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
 
 
 def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
-    """Return number, text and cells of each row; a comment before them that names the columns is the first row."""
+    """Return number, text and cells of each row; the first row may be a comment that names the columns."""
     rows: list[tuple[int, str, list[str]]] = []
     delimiter: str | None = None
     last_comment = (0, "")
@@ -243,7 +243,7 @@ def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
 
 
 def _name(cell: str) -> str:
-    """Return the standard name of a column, or "" if it has none."""
+    """Return the standard name of a column from its cell in the header, or "" if it has none."""
     match = HEAD.match(" ".join(cell.lower().split()))
     name = match[1].removeprefix("pose.") if match else ""
     return OTHER_NAMES.get(name, name)
@@ -278,7 +278,7 @@ def _unit(cell: str) -> str | None:
 
 
 def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[list[str], list[float], tuple[str, ...]]:
-    """Return each column's standard name ("" if it is ignored), its unit in SI, and the ignored columns."""
+    """Return for each column the standard name ("" if ignored) and the factor to SI units, and the ignored columns."""
     names: list[str] = []
     scales: list[float] = []
     ignored: list[str] = []
@@ -367,13 +367,13 @@ def _from_vectors(vectors: Array) -> Array:
 
 
 def _aligned(quaternions: Array) -> Array:
-    """Choose the sign of each quaternion so that it is the one nearer to its predecessor."""
+    """Choose the sign of each quaternion that makes it nearer to its predecessor."""
     signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(quaternions * np.cumprod(np.concatenate([[1.0], signs]))[:, None])
 
 
 def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
-    """Return orientations with a given tool axis as z axis, by parallel transport from row to row."""
+    """Return orientations whose z axes are the given tool axes, with least roll from row to row."""
     previous = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
     steps = np.column_stack([1 + (previous * axes).sum(axis=1), np.cross(previous, axes)])
     opposite = steps[:, 0] < 1e-7  # 1 + cosine; half of the digits of double precision

@@ -80,7 +80,7 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Contact of a standing machine with the ground.
+    """Contact polygon of a standing machine, with its zero moment points.
 
     Attributes:
         corners: Corners of the contact area. Shape (k, 2), m.
@@ -223,7 +223,7 @@ PAGE_SETTINGS = PageSettings()
 
 
 class ClosestPairs(NamedTuple):
-    """The two bodies with the smallest clearance margin at K times.
+    """The pair of bodies with the smallest clearance margin at each of K times.
 
     Attributes:
         t: s. Shape (K,).
@@ -308,7 +308,7 @@ def animate_solution(
     base: str = "base",
     **settings: Any,
 ) -> Animation:
-    """Sample the solution of a problem for display.
+    """Sample the solution of an optimal control problem for display.
 
     Args:
         solution: The solution.
@@ -389,7 +389,7 @@ def _between(times: Array, t: Array, values: Array) -> Array:
 def _animation(
     name: str, machine: Machine, samples: MotionSamples, own_curves: Sequence[Curve], **details: Any
 ) -> Animation:
-    """Return an animation with the curves that every motion has."""
+    """Return an animation with its own curves and those that every motion has."""
     t, relative = samples.t, PAGE_SETTINGS.same_cost
     effort = cumulative_integral(t, (samples.rates**2).sum(axis=1) / 2)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
@@ -411,13 +411,13 @@ def _animation(
 
 
 def _times(horizon: float) -> Array:
-    """Return uniform times of a motion."""
+    """Return uniformly spaced times from 0 to the horizon, s."""
     count = int(np.clip(np.ceil(PAGE_SETTINGS.per_second * horizon), PAGE_SETTINGS.least, PAGE_SETTINGS.most))
     return np.linspace(0.0, horizon, count + 1)
 
 
 def _torque_like(solution: Solution, joints: str) -> bool:
-    """Return whether the joints are differentiable enough for inverse dynamics."""
+    """Return whether the joints of a solution are smooth enough for inverse dynamics."""
     return len(solution.state_interpolant.nodes) > 2 and any(
         name != joints and values.shape[1] == solution.states[joints].shape[1]
         for name, values in solution.states.items()
@@ -425,7 +425,7 @@ def _torque_like(solution: Solution, joints: str) -> bool:
 
 
 def _audited(solutions: Sequence[Solution], judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
-    """Return the sentence, result and rows of the audit, or only a sentence if the solution has no problem."""
+    """Return the verdict's sentence, result and rows of the audit; without a problem only a sentence."""
     lost = next((solution.problem_lost for solution in solutions if solution.problem is None), None)
     if lost is not None:
         return {"verdict": f"There is no audit, because the file has no problem: {lost}."}
@@ -435,7 +435,7 @@ def _audited(solutions: Sequence[Solution], judge: Callable[[], Audit | PlanVerd
 
 
 def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
-    """Return the integral of the problem's running cost, and every row of its path constraints.
+    """Return the integral of the problem's running cost and every row of its path constraints as curves.
 
     The group of a row is the name of its constraint.
     """
@@ -455,7 +455,7 @@ def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[
 
 
 def _margins(rows: Sequence[Curve]) -> list[Curve]:
-    """Return the smallest margin of each inequality to its limits, and the largest error of each equation."""
+    """Return curves of the smallest margin of each inequality and of the largest error of each equation."""
     curves = []
     for name in dict.fromkeys(one.group for one in rows):
         group = [one for one in rows if one.group == name]
@@ -470,7 +470,7 @@ def _margins(rows: Sequence[Curve]) -> list[Curve]:
 
 
 def _closest_pairs(parts: Sequence[tuple[Solution, str, Array]], horizon: float) -> ClosestPairs | None:
-    """Return the closest bodies at uniform times of a motion, or None if they are unknown.
+    """Return the closest pair of bodies at uniform times of a motion, or None if it is unknown.
 
     Args:
         parts: As returned by `Plan.solved_parts` for these times.

@@ -192,7 +192,7 @@ def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
 
 
 def _turned(profile: Array) -> Triangles:
-    """Return the surface of revolution about z of a profile of points (radius, z), shape (k, 2)."""
+    """Return the surface of revolution about z of a profile of points (radius, z). Shape (k, 2)."""
     sides = SURFACE_STYLE.sides
     angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -220,7 +220,7 @@ def rod(start: Array, end: Array, radius: float) -> Triangles:
 
 
 def _rods(robot: Robot, shown: set[str]) -> list[tuple[str, Triangles]]:
-    """Return rods from joint to joint and to the tip, for links that have no surface of their own."""
+    """Return rods from joint to joint and to the tip, for links without a surface of their own."""
     ends = [(joint.parent, np.asarray(joint.translation, dtype=float)) for joint in robot.joints]
     if robot.tip is not None:
         ends.append((robot.tip, np.asarray(robot.tip_translation, dtype=float)))
@@ -237,7 +237,7 @@ def _rods(robot: Robot, shown: set[str]) -> list[tuple[str, Triangles]]:
 
 
 def _few(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
-    """Reduce the surfaces to at most `most` faces in all."""
+    """Coarsen the surfaces until they have at most `most` faces in total."""
     size = SURFACE_STYLE.min_cell
     coarse = surfaces
     while sum(len(mesh.faces) for _, mesh in coarse) > most and size < 1.0:
@@ -247,7 +247,7 @@ def _few(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Tr
 
 
 def _coarser(mesh: Triangles, size: float) -> Triangles:
-    """Return a mesh with the corners in each cell of a grid merged at their mean, without degenerate faces."""
+    """Return a mesh in which the vertices in each grid cell are merged to their mean, without degenerate faces."""
     cells = np.floor(mesh.vertices / size).astype(np.int64)
     _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     cell = cell.ravel()
@@ -273,7 +273,7 @@ def _parts(surfaces: list[tuple[str, Triangles]]) -> list[Part]:
 
 
 def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> Part:
-    """Return a part with normals: area-weighted means over the faces at a corner that do not meet at a crease."""
+    """Return a part with vertex normals, which are averaged over adjacent faces except across creases."""
     places, where = np.unique(np.round(vertices, 6) + 0.0, axis=0, return_inverse=True)
     faces = where.ravel()[faces]
     one, two, three = (places[faces[:, k]] for k in range(3))
@@ -372,7 +372,7 @@ Solid = tuple[Array, NDArray[np.intp]]
 
 
 class Obstacle(NamedTuple):
-    """A body, the convex hull of points inflated by a radius, or a half-space.
+    """An obstacle for display: the convex hull of points inflated by a radius, or a half-space.
 
     Attributes:
         core: Points. Shape (k, 3), m; for a half-space one point of its plane.
@@ -418,7 +418,7 @@ def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
 
 
 def obstacles_of(parts: Sequence[tuple[Solution, str, Array]]) -> list[Obstacle]:
-    """Return the obstacles in the problems of solutions.
+    """Return the obstacles in the problems of some solutions.
 
     A moving obstacle is attached to a frame that depends on time but on no state.
 
@@ -465,7 +465,7 @@ def obstacles_of_plan(plan: Plan, times: Array) -> list[Obstacle]:
 
 
 def _moves(problem: Problem, separation: Separation, frame: int) -> bool:
-    """Return whether a frame moves as a function of time alone."""
+    """Return whether the frame of an obstacle moves as a function of time alone."""
     if frame < 0:
         return False
     rows = separation.placements[12 * frame : 12 * frame + 12]

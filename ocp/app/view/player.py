@@ -40,7 +40,7 @@ SCRIPTS = ("scene.js", "curves.js", "player.js")
 
 
 class Buffers:
-    """Arrays in one block of bytes, referred to by their offsets."""
+    """Arrays in one block of bytes, each referred to by its offset."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -72,7 +72,7 @@ class Page(NamedTuple):
 def build_page(
     shown: Sequence[Animation], *, title: str = "", folders: Sequence[Any] = (), meshes: bool = True
 ) -> Page:
-    """Return the page of one motion, or of a motion and others to compare it with.
+    """Return the page that plays one motion, or a motion and others to compare it with.
 
     Args:
         shown: The motions.
@@ -122,7 +122,7 @@ def _fill_template(title: str, first: Animation, data: str) -> str:
 
 
 def _alike(a: Robot, b: Robot) -> bool:
-    """Return whether two robots look the same, so that one set of surfaces serves both."""
+    """Return whether two robots look the same, so that they can share one set of surfaces."""
     if a is b:
         return True
     names = [[part.name for part in robot.links] for robot in (a, b)]
@@ -136,7 +136,7 @@ def _alike(a: Robot, b: Robot) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
-    """Return for each link the moving link (or root) that it is fixed to, and its pose there."""
+    """Return for each link the moving link, or root, to which it is fixed, and its pose there."""
     carriers = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
     for joint in robot.joints:
         if joint.moves:
@@ -187,7 +187,7 @@ def _surface(vertices: Array, normals: Array, faces: NDArray[np.intp], buffers: 
 
 
 def _poses(frames: Frames, names: Sequence[str]) -> Array:
-    """Return positions and quaternions, with signs continuous over time. Shape (M, k, 7)."""
+    """Return positions and quaternions whose signs are continuous over time. Shape (M, k, 7)."""
     poses = []
     for name in names:
         quaternions = quaternion_from_rotation(frames.rotations[name])
@@ -275,7 +275,7 @@ def _solid(vertices: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[s
 
 
 def _plain(value: float | None) -> float | None:
-    """Return a number for JSON: None if it is not finite."""
+    """Return a number for JSON, or None if it is not finite."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
@@ -292,7 +292,7 @@ class PageServer:
     """
 
     def __init__(self, text: str, port: int = 0) -> None:
-        """Listen on a port or the next free one; 0: any port.
+        """Listen on the given port or the next free one; port 0 selects any.
 
         Raises:
             ProblemError: No port is free, or the number is invalid.
@@ -320,7 +320,7 @@ class PageServer:
 
 
 def _listening(page: bytes, port: int) -> ThreadingHTTPServer:
-    """Return a server of a page on the first free port."""
+    """Return a server for a page on the first free port."""
 
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -334,7 +334,7 @@ def _listening(page: bytes, port: int) -> ThreadingHTTPServer:
                 self.wfile.write(page)
 
         def log_message(self, *words: object) -> None:
-            """Log nothing: the user is the only visitor."""
+            """Suppress the log of requests, because the user is the only visitor."""
 
     if not 0 <= port < 65536:
         raise ProblemError(f"port {port} is invalid; use 0 to 65535", name="port", value=port, limit=(0, 65535))

@@ -112,7 +112,7 @@ def draw_joints(
 
 
 def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
-    """Draw the limits of the curves in an axes: dashed if they are close, as text if they are far.
+    """Draw the limits of curves: as dashed lines if they are near the curves, else as text.
 
     Curves with a range smaller than `min_range` are drawn as constant.
     """
@@ -135,7 +135,7 @@ def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
 
 
 def line_style(number: int) -> dict[str, Any]:
-    """Return the line style of a plan, number 0, or of a motion compared with it."""
+    """Return the line style of a plan (number 0), or of a motion that it is compared with."""
     return {"color": PLAN, "lw": 1.4} if number == 0 else {"color": COMPARED, "lw": 1.1, "ls": DASHES[number % 3]}
 
 
@@ -307,7 +307,7 @@ def html_of_solution(solution: Solution) -> str:
 
 
 def _widths(solution: Solution) -> dict[str, int]:
-    """Return the numbers of entries of states and controls."""
+    """Return the number of entries of each state and control by name."""
     return {name: values.shape[1] for name, values in {**solution.states, **solution.controls}.items()}
 
 
@@ -329,7 +329,7 @@ def _local(other: LocalSolution) -> dict[str, Array]:
 
 
 def _along(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times, s, and values of states and controls by name; a node has a value from either side.
+    """Return times (s) and values of states and controls by name; at a node both one-sided values are listed.
 
     States and controls of a phase are given over the interval of that phase.
     """
@@ -375,7 +375,7 @@ def _named(against: Any) -> dict[str, Any]:
 
 
 def _figure(figure: Any, size: tuple[float, float]) -> Any:
-    """Return a new figure, or the given one if it is empty; raise ProblemError if it is invalid."""
+    """Return a new figure, or the given figure if it is empty; raise ProblemError if it is invalid."""
     if figure is None:
         return Picture(figsize=size, layout="constrained")
     require.instance("plot: figure", figure, Figure)

@@ -73,7 +73,7 @@ class PictureStyle:
 
     @property
     def lens(self) -> float:
-        """Distance from which half the height of a picture is seen as length 1."""
+        """Focal length of the camera in units of half the picture's height."""
         return float(1 / np.tan(self.half_field_of_view))
 
 
@@ -119,7 +119,7 @@ class Camera(NamedTuple):
         return cls(eye @ axes, axes, size)
 
     def seen(self, points: Any) -> tuple[Array, Array]:
-        """Project points (..., 3): return their pixels from the upper left corner, (..., 2), and their depths, m."""
+        """Project points (..., 3): return their pixels, (..., 2), from the upper left corner, and their depths, m."""
         x, y, z = np.moveaxis((np.asarray(points, dtype=float) - self.eye) @ self.axes.T, -1, 0)
         depth = np.maximum(-z, 1e-9)
         width, height = self.size
@@ -127,7 +127,7 @@ class Camera(NamedTuple):
         return np.stack([width / 2 + scale * x, height / 2 - scale * y], axis=-1), depth
 
     def rays(self, cells: NDArray[np.intp]) -> Array:
-        """Return rays of depth 1 m through the centres of cells, which are numbered row by row. Shape (k, 3), m."""
+        """Return rays of depth 1 m through the centres of picture cells, numbered row by row. Shape (k, 3), m."""
         width, height = self.size
         row, column = np.divmod(cells, width)
         step = 2 / (PICTURE_STYLE.lens * height)
@@ -215,7 +215,7 @@ def render(
     floor: Floor | None = None,
     side_samples: int = PICTURE_STYLE.side_samples,
 ) -> NDArray[np.uint8]:
-    """Return the picture on white, each pixel the mean of `side_samples` squared. Shape (height, width, 3)."""
+    """Render layers on white; each pixel is the mean of `side_samples` squared samples. Shape (height, width, 3)."""
     width, height = camera.size
     fine = camera._replace(size=(side_samples * width, side_samples * height))
     solid = _Mesh.of([part for layer in layers if layer.opacity >= 1 for part in layer.parts if part.color[3] >= 1])
@@ -264,13 +264,13 @@ class _Mesh:
 
 
 def _projected(camera: Camera, mesh: _Mesh) -> tuple[Array, Array]:
-    """Project the corners of all triangles: return picture positions (f, 3, 2) and inverse depths (f, 3)."""
+    """Project the corners of all triangles: return their picture positions (f, 3, 2) and inverse depths (f, 3)."""
     positions, depths = camera.seen(mesh.corners)
     return positions[mesh.faces], (1.0 / depths)[mesh.faces]
 
 
 def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, NDArray[np.intp]]:
-    """Return the inverse depth of the nearest triangle at every cell centre, or -inf, and its index, or -1.
+    """Return the inverse depth and index of the nearest triangle at each cell centre; -inf and -1 if there is none.
 
     Args:
         places: Corners (f, 3, 2), in cells from the upper left.
@@ -314,7 +314,7 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
 
 
 def _counted(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Return the numbers 0, 1, ..., each repeated by its count, and the index of each repetition."""
+    """Return the numbers 0, 1, ..., each repeated `counts` times, and the index of each repetition."""
     which = np.repeat(np.arange(len(counts)), counts)
     return which, np.arange(len(which)) - (np.cumsum(counts) - counts)[which]
 
@@ -342,7 +342,7 @@ class _Sun:
 
     @classmethod
     def on(cls, mesh: _Mesh, camera: Camera) -> _Sun:
-        """Return the light of a scene with its shadow map, from a direction relative to the camera."""
+        """Return the light source of a scene, in a direction relative to the camera, with its depth map for shadows."""
         back = camera.axes[2]
         azimuth, elevation = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
         to_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
@@ -372,7 +372,7 @@ class _Sun:
 
 
 def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None) -> None:
-    """Draw the floor with the shadows on it into an empty picture."""
+    """Draw the floor and the shadows on it into an empty picture."""
     below = np.flatnonzero(camera.rays(np.arange(len(picture)))[:, 2] * (floor.height - camera.eye[2]) > 0)
     ray = camera.rays(below)
     place = camera.eye + ray * ((floor.height - camera.eye[2]) / ray[:, 2])[:, None]
@@ -387,7 +387,7 @@ def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun |
 
 
 def _shaded(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun: _Sun | None) -> Array:
-    """Return the colours of triangles (k,) at the points where rays (k, 3) from the eye meet them. Shape (k, 3)."""
+    """Return the colours of triangles (k,) where rays (k, 3) from the camera hit them. Shape (k, 3)."""
     a, b, c = (mesh.corners[mesh.faces[:, k]] for k in range(3))
     one, two, to = b - a, c - a, camera.eye - a
     # barycentric coordinates of the second and third corners (Moeller, Trumbore 1997)

@@ -88,7 +88,7 @@ class Report:
     notes: tuple[str, ...]
 
     def html(self) -> str:
-        """Return the page."""
+        """Return the HTML page of the report."""
         mood = "good" if self.passed else "bad"
         parts = [
             f'<p class="verdict {mood}">{escape(self.verdict)}</p>',
@@ -125,7 +125,7 @@ class Report:
 
 
 def _table(rows: Sequence[Row]) -> str:
-    """Return rows as an HTML table."""
+    """Return the rows of a check as an HTML table."""
     head = "<tr><th>quantity</th><th class=n>worst</th><th class=n>limit</th><th>unit</th><th class=n>at, s</th>"
     lines = [
         f"<tr><td>{escape(row.name)}</td><td class=n>{row.value:.5g}</td>"
@@ -139,7 +139,7 @@ def _table(rows: Sequence[Row]) -> str:
 
 
 def report_of_check(check: Check, machine: Machine, limits: Limits, scene: Scene) -> Report:
-    """Return the report of a check with these limits and this scene."""
+    """Return the report of a check, with the limits and the scene that it used."""
     motion, robot = check.cleaned.motion, machine.robot
     complete = len(check.joints) == robot.dof
     base_path = check.cleaned.base if machine.base_size else None
@@ -196,7 +196,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
 def draw_scene(
     machine: Machine, motion: Motion, bases: Array | None, obstacles: Sequence[Obstacle], *, folders: Sequence[Any] = ()
 ) -> bytes:
-    """Return a PNG of the robot at several times (the last one solid), its tip path, and obstacles.
+    """Return a PNG picture of the robot at several times, the last one solid, with its tip path and obstacles.
 
     Moving obstacles are drawn at the final time; `obstacles` has them at uniform times of the motion.
     """

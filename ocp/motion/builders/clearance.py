@@ -85,11 +85,11 @@ class ClearanceConstraints:
                 raise ProblemError(words, name="margins", value=pair, limit=len(self.scene.pairs))
 
     def holding(self, pairs: Sequence[int]) -> ClearanceConstraints:
-        """Return the constraints with more separated pairs."""
+        """Return the constraints with further pairs of bodies separated."""
         return replace(self, margins={**{int(pair): MARGIN for pair in pairs}, **self.margins})
 
     def separating(self, collisions: Sequence[Collision]) -> ClearanceConstraints:
-        """Return the constraints with the pairs of these collisions separated.
+        """Return the constraints with the pairs of bodies of these collisions separated.
 
         Two hulls of meshes are separated by their covers, which protrude and may overlap in every configuration. The
         covers have to gain as much distance as the hulls lack where these are closest.
@@ -98,7 +98,7 @@ class ClearanceConstraints:
         return replace(self, margins={**margins, **self.margins})
 
     def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
-        """Return the constraints with the margin of each violating pair increased by its violation."""
+        """Return constraints in which the separation margin of each violating pair is larger by its violation."""
         return replace(self, margins=widened(self.margins, self.scene.labels, proofs))
 
     def declare(
@@ -164,16 +164,16 @@ class ClearanceConstraints:
 
 
 class Separating(Protocol):
-    """Constraints that separate pairs of bodies by margins."""
+    """Interface of constraints that separate pairs of bodies by margins."""
 
     def widened(self, proofs: Sequence[Clearance]) -> Self:
-        """Return the constraints with the margin of each violating pair increased by its violation."""
+        """Return constraints in which the separation margin of each violating pair is larger by its violation."""
 
 
 def widened(
     margins: Mapping[int, float], labels: Sequence[tuple[str, str]], proofs: Sequence[Clearance]
 ) -> dict[int, float]:
-    """Return margins of pairs, m, increased by their violations.
+    """Return the margins of pairs, m, each increased by the violation of the pair.
 
     Args:
         margins: Margins by the index of the pair among the labels.
@@ -200,7 +200,7 @@ def clearance_of(
     seconds: Array,
     smooth: bool,
 ) -> Clearance:
-    """Prove the clearance of each pair over a motion of a machine on a fixed base among fixed obstacles.
+    """Prove the clearance of each pair during a motion of a machine on a fixed base among fixed obstacles.
 
     Args:
         joints: Function of fractions of the horizon (M,) that returns joints (M, n).
@@ -247,7 +247,7 @@ Constraints = TypeVar("Constraints", bound=Separating | None)
 
 
 def solve_with_clearance(clearance_constraints: Constraints, run: Callable[[Constraints], Solution]) -> Solution:
-    """Solve repeatedly: after each solve, also separate the pairs that collide in the solution.
+    """Solve repeatedly; after each solve, add separation constraints for the pairs that collide in the solution.
 
     Args:
         clearance_constraints: Clearance constraints of the first solve; None for none.
@@ -279,7 +279,7 @@ def is_clearance(name: Any) -> bool:
 
 
 def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
-    """Return an error about colliding bodies if that is the only failure of a solution, else None."""
+    """Return an error about colliding bodies if collisions are the only failure of a solution, else None."""
     failures = audit.failures
     if not failures or any(finding.name not in audit.clearances for finding in failures):
         return None
@@ -289,7 +289,7 @@ def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
 
 
 def _evaluated(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
-    """Return an expression of base, joints and time; MX expressions become calls of an SX function."""
+    """Evaluate an expression of base, joints and time; with MX arguments it becomes the call of an SX function."""
     arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
     if not any(isinstance(value, ca.MX) for value in arguments):
         return ca.SX(expression(*arguments))

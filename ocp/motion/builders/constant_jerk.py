@@ -50,7 +50,7 @@ NODES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 
 @dataclass(frozen=True)
 class ConstantJerkSettings:
-    """Settings of the motions.
+    """Settings of the motions of constant jerk.
 
     Attributes:
         still: Duration of a motion that stays where it is, s, since problems have a positive one.
@@ -72,7 +72,7 @@ SETTINGS = ConstantJerkSettings()
 
 
 class _Ramps(NamedTuple):
-    """Fastest profiles from rest to rest: times t_j, t_a and t_v, s, and peak velocities. Shape (..., n) each."""
+    """Fastest profiles from rest to rest: times of the phases, s, and peak velocities. Shape (..., n) each."""
 
     build_up: Array
     steady: Array
@@ -86,7 +86,7 @@ class _Ramps(NamedTuple):
 
 
 def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) -> _Ramps:
-    """Return the fastest profiles over absolute distances (..., n), zero for a joint that does not move.
+    """Return the fastest rest-to-rest profiles over distances (..., n); a joint with distance 0 does not move.
 
     With peak velocity V, each ramp lasts r = V / a + a / j, or 2 sqrt(V / j) if it does not reach the acceleration a.
     Both ramps together cover V r. The rest of the distance is covered at V.
@@ -108,8 +108,7 @@ def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) 
 
 
 def least_durations(distances: Array, bounds: JointBounds) -> Array:
-    """Return the least duration of each joint alone, from rest to rest within its velocity, acceleration and jerk
-    limits.
+    """Return the least duration of each joint alone, from rest to rest within velocity, acceleration and jerk limits.
 
     Args:
         distances: Absolute distances, rad or m. Shape (..., n).
@@ -138,7 +137,7 @@ class ConstantJerkMotion:
 
     @property
     def duration(self) -> float:
-        """Duration, s."""
+        """Duration of the motion, s."""
         return float(self.durations.sum())
 
     def slower(self, factor: float) -> ConstantJerkMotion:
@@ -159,7 +158,7 @@ class ConstantJerkMotion:
         )
 
     def solution(self, problem: Problem, method: str) -> Solution:
-        """Return the motion as a solution of `dynamics_problem` (without power), with no multipliers.
+        """Return the motion as a solution, without multipliers, of a `dynamics_problem` without power.
 
         Args:
             problem: The problem.
@@ -241,7 +240,7 @@ class TorqueLimits:
         return self._samplers[linearised]
 
     def slowed(self, motion: ConstantJerkMotion) -> ConstantJerkMotion:
-        """Return the motion slowed down just enough to keep the torque limits at samples.
+        """Return the motion slowed down by the smallest factor with which the torque limits hold at samples.
 
         Raises:
             SolveError: A joint cannot hold the machine at rest somewhere on the path.
@@ -264,7 +263,7 @@ class TorqueLimits:
 
 
 def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> ConstantJerkMotion:
-    """Return a fastest motion from rest to rest within velocity, acceleration and jerk limits.
+    """Return a time-optimal motion from rest to rest within velocity, acceleration and jerk limits.
 
     It is straight if a straight motion attains the least time.
 
@@ -294,7 +293,7 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:
-    """Return the durations of straight motions by changes (K, n) from rest to rest, s, without torque limits."""
+    """Return the durations of straight rest-to-rest motions by changes (K, n), s, without torque limits."""
     return np.asarray(_straight_profile(changes, bounds).duration)
 
 
@@ -303,7 +302,7 @@ def _columns(motion: ConstantJerkMotion) -> Sequence[Array]:
 
 
 def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
-    """Return velocity, acceleration and jerk limits; infinite ones are replaced where a profile needs finite ones."""
+    """Return velocity, acceleration and jerk limits, with infinite ones replaced where finite ones are required."""
     velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
     jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
     velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
@@ -318,7 +317,7 @@ def _profiles(distances: Array, bounds: JointBounds) -> _Ramps:
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the profiles of the path fraction of straight motions by changes (K, n). Shape (K,) each."""
+    """Return the profiles of the path fraction for straight motions by changes (K, n). Shape (K,) each."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [
@@ -328,7 +327,7 @@ def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
 
 
 def _straight(start: Array, change: Array, bounds: JointBounds) -> ConstantJerkMotion:
-    """Return the fastest straight motion by a change (n,); one without a change lasts for a moment."""
+    """Return the fastest straight motion by a change (n,); without a change, a motion that stays for a moment."""
     profile = _straight_profile(change[None], bounds)
     duration = float(profile.duration[0])
     if duration == 0:

@@ -41,7 +41,7 @@ LARGEST_SINE = 1 - 1e-9  # sine of q4 and cosine of q2, just below the end of th
 
 @dataclass(frozen=True)
 class RollGuessSettings:
-    """Settings of the first guess, a shortest path over a grid of times and rolls, refined in a tube.
+    """Settings of the first guess: a shortest path through a grid of times and rolls, then through finer grids near it.
 
     Attributes:
         times: Times of the grid.
@@ -71,7 +71,7 @@ SEARCH = RollGuessSettings()
 
 @interruptible
 def spline_targets(times: Any, targets: Any) -> Targets:
-    """Return a cubic spline through a table of targets, a function of time for problems with MX symbols.
+    """Return the cubic spline through a table of targets as a function of time, for problems with MX symbols.
 
     Args:
         times: At least 4 increasing times. Shape (samples,), s.
@@ -131,7 +131,7 @@ class RollSettings:
 
 @dataclass(frozen=True, eq=False)
 class RollObstacles:
-    """Obstacles of `roll_problem`, and how the rig avoids them.
+    """Obstacles of `roll_problem`, with the settings by which the rig avoids them.
 
     Attributes:
         scene: Obstacles.
@@ -264,7 +264,7 @@ def roll_problem(
     target = _column(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Evaluate an expression at the target of each time."""
+        """Evaluate an expression of target and roll at all times."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
@@ -282,7 +282,7 @@ def roll_problem(
 
 
 def _column(targets: Targets, time: Any) -> Any:
-    """Return the target at a symbol of time, shape (5, 1); raise ProblemError if it is invalid."""
+    """Evaluate the targets at a symbol of time, shape (5, 1); raise ProblemError if the result is invalid."""
     try:
         target = expression(targets(time))
     except RuntimeError:  # interpolants do not take SX symbols
@@ -299,13 +299,13 @@ def _column(targets: Targets, time: Any) -> Any:
 
 
 def _curve(targets: Targets, symbols: Any) -> Any:
-    """Return the targets as a casadi function of time."""
+    """Return the targets as a casadi function of time from a function or a table."""
     time = symbols.sym("time")
     return ca.Function("target", [time], [_column(targets, time)])
 
 
 def _violation(value: Any, lower: Any, upper: Any) -> Any:
-    """Return the sum of all violations of bounds."""
+    """Return the sum of all violations of lower and upper bounds."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
 
 
@@ -374,9 +374,7 @@ def least_cost_roll(
 
 
 def _lowest_cost_path(stage: Array, away: Any, spans: Array, rate_weight: float, rate_limit: float, step: float) -> Any:
-    """Return the roll index at each time on the lowest-cost path through the grid, with a penalty beyond the rate
-    limit.
-    """
+    """Return the roll index at each time on the lowest-cost path, with a penalty beyond the rate limit."""
     weights = np.convolve(np.append(spans, 0), [0.5, 0.5])[: len(stage)]
     weights[[0, -1]] = np.maximum(weights[[0, -1]], spans[[0, -1]] / 2)
     penalty = 1e3 * (np.ptp(stage[np.isfinite(stage)]) + rate_weight + 1e-9)

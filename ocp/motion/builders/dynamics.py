@@ -162,7 +162,7 @@ def dynamics_problem(
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Boundary conditions of a motion, checked against the limits; nan where free.
+    """Boundary conditions of a motion, checked against the limits; entries that are free are nan.
 
     Attributes:
         first, last: Joints at the start and at the end. Shape (n,).
@@ -204,7 +204,7 @@ class _Ends:
 
     @property
     def end(self) -> Array:
-        """Return the joints at the end of the guess; those without an end value stay at the start. Shape (n,)."""
+        """Return the joints at the end of the guess; joints with a free end keep their start value. Shape (n,)."""
         return np.where(np.isnan(self.last), self.start, self.last)
 
     def quintic(self, duration: float, order: int) -> Any:
@@ -276,7 +276,7 @@ def _declare_actuators(
 
 
 def _checked_end(name: str, value: Any, n: int) -> Array:
-    """Return joints or joint velocities at an end, nan where free. Shape (n,).
+    """Return joints or joint velocities at an end; entries that are free are nan. Shape (n,).
 
     Raises:
         ProblemError: The value has another size, or is infinite.
@@ -291,7 +291,7 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return typical angles, speeds, accelerations and jerks of reaction wheels, nan for other joints. Shape (4, n).
+    """Return typical angles, speeds, accelerations and jerks of reaction wheels; nan for other joints. Shape (4, n).
 
     Rotors are light and turn fast. Their scales are a quarter of the saturation speed and of the motor torque, or what
     1 N m s and 1 N m cause where these are unlimited.
@@ -307,7 +307,7 @@ def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
 
 
 def end_velocities(name: str, value: Any, n: int) -> Array:
-    """Return joint velocities at an end, nan where free, shape (n,); ProblemError unless numbers, "rest" or "free"."""
+    """Return joint velocities at an end from numbers, "rest" or "free", shape (n,); entries that are free are nan."""
     if isinstance(value, str):
         return np.full(n, 0.0 if require.choice(name, value, ("rest", "free")) == "rest" else np.nan)
     if value is None:
@@ -316,7 +316,7 @@ def end_velocities(name: str, value: Any, n: int) -> Array:
 
 
 def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: Any) -> None:
-    """Fix the configuration of the base at the end, its attitude by three equations."""
+    """Fix the configuration of the base at the end; its attitude is fixed by three equations."""
     if not machine.base_size:
         raise ProblemError("a fixed base has no end_base", name="end_base", value=end_base)
     goal = _checked_end("end_base", end_base, machine.base_size)
@@ -334,7 +334,7 @@ def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: An
 
 
 def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, motion: _Motion, duration: float) -> None:
-    """Constrain the tip accelerations to the tasks, and let the audit watch the pose errors."""
+    """Constrain the tip accelerations to the tasks, and declare the pose errors for the audit to watch."""
     base, joints, rates, second, *_ = motion
     if not np.isnan(ends.first).any():
         checked_tasks(equations, ends.base, ends.first, duration)

@@ -66,7 +66,7 @@ def dynamics_phases(
     cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
 ) -> Phases:
-    """Declare the motions to consecutive goals as the phases of one problem, of least total cost.
+    """Declare the motions to consecutive goals as the phases of one problem, which minimises their total cost.
 
     Args:
         machine: Machine on the way to the first goal, unless the goal has its own.
@@ -123,7 +123,7 @@ def dynamics_phases(
 
 
 def checked_goals(goals: Any) -> tuple[Goal, ...]:
-    """Return the goals of consecutive phases as a tuple.
+    """Return the goals of consecutive phases as a tuple, after checks.
 
     Raises:
         ProblemError: There are none; one is no Goal, is a pose, or has no duration; two have the same name.
@@ -181,7 +181,7 @@ def _rests(goal: Goal) -> bool:
 
 
 def _join(phases: Phases, before: str, after: str, goal: Goal) -> None:
-    """Make the states continuous between two phases, except those that are fixed at both ends."""
+    """Make the states continuous between two phases, except states that are fixed at both ends."""
     fixed: dict[str, Any] = {}
     if goal.joints is not None and not np.isnan(np.asarray(goal.joints, dtype=float)).any():
         fixed["joints"] = None
@@ -220,7 +220,7 @@ HOLDING = HoldingSettings()
 
 @dataclass(frozen=True, eq=False)
 class SolveSettings:
-    """Settings of a solve that is audited and repeated on finer meshes.
+    """Settings of a solve that is audited and, if the audit fails, repeated on finer meshes.
 
     Attributes:
         method: First mesh; None for that of the planner.
@@ -321,14 +321,14 @@ def _check_end_velocity(setup: DynamicsSetup) -> None:
 
 
 def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
-    """Return the fractions of a horizon at which tasks are less smooth."""
+    """Return the fractions of a horizon at which tasks have kinks or jumps."""
     tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]))
     return [float(at) for at in times / horizon if 0 < at < 1]
 
 
 def audit_error(audit: Audit, solution: Solution) -> SolveError:
-    """Return the error of the largest failure of an audit, relative to its tolerance."""
+    """Return the error about the failure of an audit that exceeds its tolerance most."""
     worst = max(audit.failures, key=lambda row: row.value / row.limit if row.limit else np.inf)
     words = f"the audit fails: {worst.name} {worst.value:.2g}"
     return SolveError(words, solution, name=worst.name, value=worst.value, limit=worst.limit, time=worst.time)
@@ -343,7 +343,7 @@ def within_limits(
     settings: SolveSettings | None = None,
     guess: Guess = None,
 ) -> Solution:
-    """Return a plan that satisfies its limits between the nodes and passes its audit; see `solve_dynamics`.
+    """Return a plan that satisfies its limits also between the nodes and passes its audit; see `solve_dynamics`.
 
     Args:
         declare: Declares the problem under clearance constraints.
@@ -383,7 +383,7 @@ def _first_within_limits(
     tolerances: Mapping[str, float] | None,
     begin: Guess,
 ) -> Solution:
-    """Return the plan of `within_limits` from several meshes, starting from a guess.
+    """Solve on finer and finer meshes from a guess, and return the first plan that `within_limits` accepts.
 
     Raises:
         SolveError: As `within_limits`; at once if collisions are all that is wrong with a plan.
@@ -437,7 +437,7 @@ def _first_within_limits(
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Yield plans on a mesh that satisfy their limits, or errors; the caller stops when a plan is good enough."""
+    """Yield plans on a mesh that satisfy their limits, or errors; the caller stops at the first good enough plan."""
     warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)
@@ -453,9 +453,7 @@ def _attempts(
 def _tightened(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
-    """Tighten the limits so that a plan satisfies them between the nodes; return it if it costs hardly more, or the
-    error.
-    """
+    """Tighten the limits so that they hold between the nodes; return the plan if it costs hardly more, or an error."""
     if largest_excess(problem, plan) <= HOLDING.excess:
         return plan
     own, largest = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.cost_increase * abs(plan.cost)
@@ -470,7 +468,7 @@ def _tightened(
 
 
 def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocation:
-    """Return the next mesh: refined where tightening was too costly, if only that failed; otherwise halved."""
+    """Return the next mesh: refined where limits were tightened if only the cost failed, otherwise halved."""
     if plan.bound_tightening is None or failure.solution is not plan or failure.name != "cost":
         return mesh.halved()
     nodes, amounts = plan.control_interpolant.breaks, plan.bound_tightening.max(axis=(0, 2))
@@ -479,7 +477,7 @@ def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocatio
 
 
 def _with_joint_names(error: SolveError, machines: Mapping[str, tuple[Machine, Limits | None]]) -> SolveError:
-    """Return the error with joint rows called by the joints' names: "torques of 'elbow'" for "torques[1]"."""
+    """Return the error with rows named by joints: "torques of 'elbow'" instead of "torques[1]"."""
 
     def joint_label(label: re.Match[str]) -> str:
         phase, quantity, row = label["phase"] or "", label["quantity"], int(label["row"])

@@ -50,7 +50,7 @@ def joint_motion_problem(
     length: bool = False,
     clearance_constraints: ClearanceConstraints | None = None,
 ) -> Problem:
-    """Declare a motion between two configurations of least squared rates or of least length in joint space.
+    """Declare a motion between two configurations of least squared joint rates, or of least length in joint space.
 
     The state is "joints", the control "rates". With weights w and rates u the cost is the integral of sum(w u^2) / 2,
     or the length, the integral of sqrt(sum(w u^2)).
@@ -253,7 +253,7 @@ def minimum_velocity_problem(
 def _attach_guess(
     motion: ToolMotion, base: Array, joints: Array, weights: Array, bounds: JointBounds, damping: float
 ) -> None:
-    """Set the damped local motion through all stretches as the guess of states and controls."""
+    """Set the damped local motion through all stretches as the guess of the states and controls of a problem."""
     motions: list[LocalMotion] = []
     place, at = base[None], joints[None]
     for stretch in motion.stretches:

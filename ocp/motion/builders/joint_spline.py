@@ -70,7 +70,7 @@ class _Along(NamedTuple):
 
 
 class _Torques(NamedTuple):
-    """Joint torques along a path as inertia a + drag v^2 + rest, with speed v and acceleration a. Shape (M, n) each."""
+    """Coefficients of the joint torques along a path, inertia a + drag v^2 + rest, by speed v and acceleration a."""
 
     inertia: Array
     drag: Array
@@ -78,7 +78,7 @@ class _Torques(NamedTuple):
 
 
 class PlanLike(Protocol):
-    """Interface of a plan of tasks, such as `ocp.Plan`."""
+    """Interface of a plan of tasks that `joint_path` uses, such as `ocp.Plan`."""
 
     @property
     def horizon(self) -> float: ...
@@ -90,7 +90,7 @@ class PlanLike(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PlannedJoints:
-    """Joints of a machine as functions of the distance along a path, from `joint_path`.
+    """Joints of a machine as functions of the distance along a path, built by `joint_path`.
 
     Attributes:
         machine: Machine of the joints.
@@ -116,7 +116,7 @@ class PlannedJoints:
         return _Along(*self.curves(self._checked(distance)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Return the torque coefficients at distances from the start. Shape (M,), m.
+        """Return the coefficients of the joint torques at distances from the start. Shape (M,), m.
 
         Raises:
             ProblemError: The base of the machine moves, or distances are invalid, see `at`.
@@ -128,7 +128,7 @@ class PlannedJoints:
         return _Torques(*self.forces(along.position, along.first, along.second))
 
     def _checked(self, distance: Any) -> Array:
-        """Return distances clipped to the path; raise ProblemError if they are off it."""
+        """Return distances clipped to the path; raise ProblemError if they exceed it by more than rounding."""
         try:
             s = np.atleast_1d(floats(distance))
         except NOT_NUMBERS as error:
@@ -149,7 +149,7 @@ def joint_path(
     samples: int = 400,
     names: Sequence[str] | None = None,
 ) -> PlannedJoints:
-    """Return joints along a path, from a plan at constant speed or from samples over the distance.
+    """Return the joints along a path as a spline, from a plan at constant speed or from samples.
 
     Args:
         machine: Machine of the joints.
@@ -187,7 +187,7 @@ def joint_path(
 
 
 def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
-    """Return distances (M,) and joints (M, n) of a plan; check that its tasks run along the path at constant speed."""
+    """Return distances (M,) and joints (M, n) of a plan; check that its tasks follow the path at constant speed."""
     if plan.targets and hasattr(path, "at"):
         t = plan.targets[0].t
         along = path.at(np.clip(length * plan.task_share(t), 0.0, length)).position
@@ -235,7 +235,7 @@ def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple
 
 
 class _PiecewisePolynomial:
-    """A spline as one polynomial per interval, about the middle of the interval.
+    """A spline, stored as one polynomial per interval about the middle of the interval.
 
     Args:
         breaks: Ends of the intervals. Shape (K + 1,), m.
@@ -262,7 +262,7 @@ class _PiecewisePolynomial:
 
 
 class _BatchedFunction:
-    """Casadi SX Function evaluated for many inputs at once, each instruction on rows of numbers."""
+    """Evaluator of a casadi SX Function for many inputs at once, with each instruction applied to arrays."""
 
     def __init__(self, function: Any) -> None:
         self.sizes = [function.size1_out(k) for k in range(function.n_out())]
@@ -311,7 +311,7 @@ class _BatchedFunction:
         return [part.T for part in np.split(results, np.cumsum(self.sizes)[:-1])]
 
     def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Return the table whose rows hold all intermediate values, and the instructions on these rows."""
+        """Return a table with a row for each intermediate value, and the instructions that work on these rows."""
         table = np.zeros((self.rows + len(self.constants), SPLINE.batch))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)
@@ -332,7 +332,7 @@ def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
 
 
 def _forces(machine: Machine) -> _BatchedFunction | None:
-    """Return the function (q, q', q'') -> (inertia, drag, rest) of the torques; None if the base is not fixed."""
+    """Return the function (q, q', q'') -> torque coefficients (inertia, drag, rest); None for a moving base."""
     if not isinstance(machine, FixedBase):
         return None
     q, first, second = (ca.SX.sym(name, machine.joint_size) for name in ("q", "first", "second"))

@@ -86,11 +86,11 @@ class TimingProblem:
 
     @property
     def method(self) -> Collocation:
-        """Return collocation with one jerk per interval, so that no quantity overshoots between the points."""
+        """Collocation with constant jerk in each interval, with which no quantity overshoots between points."""
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:
-        """Return the motion of a solution, with constant jerk in each interval.
+        """Return the motion of a solution, which has constant jerk in each interval.
 
         Raises:
             ProblemError: The jerk of the solution is not constant in its intervals.
@@ -120,7 +120,7 @@ class TimingProblem:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Return the distances at both ends over which the jerk is constant, m."""
+        """Distances at both ends over which the jerk is constant, m."""
         return _ends(self.reference, self.span)
 
 
@@ -142,7 +142,7 @@ class Fastest:
 
     @property
     def duration(self) -> float:
-        """Return the duration, s."""
+        """Duration of the motion, s."""
         return self.schedule.duration
 
 
@@ -200,7 +200,7 @@ def minimum_time_problem(
     guess: Schedule | None = None,
     intervals: int = 200,
 ) -> TimingProblem:
-    """Declare the problem of `solve_minimum_time`, for any method to solve.
+    """Declare the problem that `solve_minimum_time` solves, for solution by any method.
 
     The path constraints are "asked speed" (the line speed's limit), "centripetal acceleration", "joint velocity",
     "joint acceleration" and "joint jerk", each over its limit and only if limited. The boundary constraints are "start
@@ -251,7 +251,7 @@ def _declared(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the problem over a span of theta, in scaled units; `along` gives reference speed and path columns."""
+    """Declare the problem over a span of theta, in scaled units; `along` returns reference speed and path columns."""
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
     speeds = np.asarray(path.by_piece(limits.speed))
@@ -292,7 +292,7 @@ def _declared(
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Return limited quantities over their limits, by name; `values` are reference speed and path columns."""
+    """Return the ratios of quantities to their limits by name; `values` are reference speed and path columns."""
     demands: dict[str, Any] = {}
     if np.isfinite(limits.centripetal):
         demands["centripetal acceleration"] = v**2 * values[2] / limits.centripetal
@@ -313,7 +313,7 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 
 
 def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
-    """Return into how many parts to split each interval; the error falls with the square of the interval."""
+    """Return the number of parts into which each interval is to be split, as the error falls with its square."""
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
     distance_error, speed_error = distance / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
@@ -325,7 +325,7 @@ def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
-    """Return the distances before and after a span of the reference motion, m."""
+    """Return the distances that the reference motion covers before and after a span of its time, m."""
     # the jerk is constant there; the cube is accurate near the end, a difference of distances is not
     left = reference.duration - span[1]
     return float(reference.jerk[0] * span[0] ** 3 / 6), float(reference.jerk[-1] * left**3 / 6)

@@ -74,7 +74,7 @@ TABLES = TableSettings()
 
 
 def table(columns: Columns, breaks: Array) -> Any:
-    """Return a casadi Function time -> values (m, 1), with polynomials of degree 7 on cells between `breaks`.
+    """Return a casadi Function time -> values (m, 1) by polynomials of degree 7 on cells between `breaks`.
 
     At a break its value is that of the cell that begins there.
     """
@@ -122,7 +122,7 @@ def speed_limit(path: PathLike, limits: LineLimits, s: Array) -> Array:
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:
-    """Return speed limit, curvature, and three derivatives of the joints by the distance, at distances (M,).
+    """Return speed limit, curvature, and three joint derivatives by distance, at distances (M,).
 
     The curvature is zero if the centripetal acceleration is not limited. Shape (M, m).
 
@@ -138,7 +138,7 @@ def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s
 
 
 def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: LineMotion) -> Array:
-    """Return the largest ratio of speed, acceleration, jerk, centripetal and joint demands to their limits. Shape (M,).
+    """Return the largest ratio of all limited quantities of a motion to their limits. Shape (M,).
 
     Where the path's derivatives jump, the values after the jump count.
     """
@@ -155,7 +155,7 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 
 def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Return the ratio of each demand to its limit at unit line speed v, and the power p by which v^p scales it.
+    """Return each quantity's ratio to its limit at line speed v = 1, and the exponent p of its growth with v^p.
 
     The rows are the centripetal acceleration, then velocity, acceleration and jerk of each joint. Shapes (C, M), (C,).
     """
@@ -172,7 +172,7 @@ def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates 
 
 
 def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> Array:
-    """Return joint acceleration and jerk over their limits: q'' v^2 + q' a and q''' v^3 + 3 q'' v a + q' j.
+    """Return the ratios of joint acceleration q'' v^2 + q' a, and of jerk q''' v^3 + 3 q'' v a + q' j, to their limits.
 
     Shape (2 n, M).
     """
@@ -184,7 +184,7 @@ def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> 
 
 
 def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
-    """Return the largest demand in each interval of a profile, including both sides of jumps. Shape (K,)."""
+    """Return the largest ratio to a limit in each interval of a profile, on both sides of jumps. Shape (K,)."""
     inside = (np.arange(TABLES.points) + 0.5) / TABLES.points
     inside[0], inside[-1] = 1e-9, 1 - 1e-9
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
@@ -201,7 +201,7 @@ def _bernstein(x: Array) -> Array:
 
 
 def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
-    """Return a schedule's motion; if there is none, a slower one that surely satisfies all limits."""
+    """Return the motion of a schedule or, if there is none, a slower motion that surely satisfies all limits."""
     try:
         return schedule(path, limits, joints=joints).profile
     except ProblemError:
@@ -222,7 +222,7 @@ def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | Non
 
 
 def distinct(values: Array, tolerance: float) -> Array:
-    """Return sorted values without those within a tolerance of the one before; the last one stays."""
+    """Return sorted values without those within a tolerance of the previous one; the last one is kept."""
     ordered = np.sort(values)
     ordered = ordered[np.concatenate([[True], np.diff(ordered) > tolerance])]
     ordered[-1] = values.max()
@@ -230,7 +230,7 @@ def distinct(values: Array, tolerance: float) -> Array:
 
 
 def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, float], intervals: int) -> Array:
-    """Return nodes as fractions of a span of the reference's time, with at least `intervals` over the whole time.
+    """Return nodes, as fractions of a span of reference time, with at least `intervals` in the whole time.
 
     Args:
         reference: Reference motion; the changes of its jerk become nodes.

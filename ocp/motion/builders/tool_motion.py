@@ -43,7 +43,7 @@ ERRORS, START_ERRORS = "task errors", "start errors"
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """Settings of the pose-error feedback and of relaxed tasks.
+    """Settings of the feedback of pose errors and of relaxed tasks.
 
     Attributes:
         decay: Largest decay of a pose error over an interval of the mesh, as a power of e. Faster feedback would need a
@@ -87,7 +87,7 @@ class Stretch:
 
     @property
     def duration(self) -> float:
-        """Return the duration, s."""
+        """Duration of the stretch, s."""
         return self.end - self.begin
 
 
@@ -122,7 +122,7 @@ class ToolMotion:
 
 
 def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> tuple[Stretch, ...]:
-    """Divide the horizon into stretches with the same tasks; limit the pose feedback to what a mesh can follow.
+    """Divide the horizon into stretches with the same tasks, with the pose feedback limited to what a mesh can follow.
 
     Raises:
         ProblemError: A task begins or ends outside the horizon.
@@ -199,12 +199,12 @@ class ToolMotionSetup:
 
     @property
     def free(self) -> bool:
-        """Whether the start configuration is free, except that the tips are at the start poses of their tasks."""
+        """Whether the start configuration is free, apart from the start poses of the tasks."""
         return self.start is None or bool(np.isnan(self.start).any())
 
 
 def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: ToolMotionSetup) -> ToolMotion:
-    """Declare a motion along tasks with the least integral of half the weighted squared joint rates.
+    """Declare a motion along tasks that minimises the integral of half the weighted squared joint rates.
 
     Args:
         machine: Machine on a fixed or floating base.
@@ -246,7 +246,7 @@ def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: T
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """A problem that is being declared, with the data that all its stretches share."""
+    """An optimal control problem that is being declared, with data shared by all its stretches."""
 
     problem: Problem
     machine: Machine
@@ -255,15 +255,15 @@ class _Motion:
 
     @property
     def horizon(self) -> float:
-        """Return the horizon, s."""
+        """Horizon of the problem, s."""
         return self.stretches[-1].end
 
     def pace(self, stretch: Stretch) -> float:
-        """Return the ratio of time in a stretch to time in the problem."""
+        """Return the ratio of the stretch's time to the problem's time."""
         return stretch.duration / self.horizon
 
     def states(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare the joints, and the base if it moves."""
+        """Declare the joints of a stretch, and its base if that moves, as states."""
         machine, begins, ends = self.machine, stretch is self.stretches[0], stretch is self.stretches[-1]
         place: Any = np.zeros(0)
         if machine.base_size:
@@ -287,7 +287,7 @@ class _Motion:
         return declare_actuators(self.problem, self.machine, self.horizon, (place, joints), **options)
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare velocities by which tasks may deviate; return them and their running cost, or 0, 0 if not relaxed."""
+        """Declare velocities by which relaxed tasks may deviate; return them and their cost, or 0, 0 if not relaxed."""
         assert stretch.equations is not None
         if not self.setup.relaxed or not stretch.equations.size:
             return 0, 0
@@ -295,7 +295,7 @@ class _Motion:
         return FEEDBACK.relaxation * errors, ca.sumsqr(errors) / 2
 
     def constrain_clearance(self, stretch: Stretch, horizon: float | None) -> None:
-        """Declare the clearance constraints of a stretch; the horizon is None if the time is free."""
+        """Declare the clearance constraints of a stretch; `horizon` is None if the time is free."""
         if self.setup.clearance_constraints is not None:
             base = f"base{stretch.suffix}" if self.machine.base_size else self.machine.base_home()
             self.setup.clearance_constraints.declare(
@@ -305,7 +305,7 @@ class _Motion:
 
 
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
-    """Declare one of several stretches.
+    """Declare one stretch of a motion with several stretches.
 
     `known` has the slopes of the positions that the stretch before fixes at its end, see `_slopes`, or is None. Returns
     the states that continue in the next stretch, the running cost, and the slopes of the positions fixed here.
@@ -347,7 +347,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
 
 
 def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
-    """Declare the problem of `tool_motion_problem` with free time: a state over the task time s.
+    """Declare the problem of `tool_motion_problem` with free time, which is a state over the task time s.
 
     With q' = dq/ds and z = dt/ds the cost is the integral of (time_cost + q. W q. / 2) dt = (time_cost z + q' W q'/(2
     z)) ds, which is convex in q' and z. The tasks, J q' = v(s), and the rate limits, |q'| <= v z, are linear in them.
@@ -395,7 +395,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
 
 def _closure(motion: _Motion) -> Any:
-    """Declare and return the constant velocity by which a closed task may deviate so that the joint path closes.
+    """Declare and return a constant deviation velocity of a closed task, by which the joint path can close, too.
 
     If the joints return, a closed task returns by itself. Both conditions would contradict each other by the error of
     the discretisation; so the task may deviate by a velocity of that size.

@@ -106,7 +106,7 @@ def joint_torques(
 
 
 def checked_motors(name: str, machine: Any) -> Motors:
-    """Return the machine; raise ProblemError unless joint torques alone determine its motion."""
+    """Return the machine; raise ProblemError unless the joint torques alone determine its motion."""
     if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
         words = f"{name}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; use "
         words += "standing_problem for a standing machine"
@@ -116,7 +116,7 @@ def checked_motors(name: str, machine: Any) -> Motors:
 
 @dataclass(frozen=True, eq=False)
 class Actuation:
-    """Options of a motion whose controls are accelerations, or jerks if these are limited or weighted.
+    """Options of a motion whose controls are accelerations, or jerks if jerks are limited or weighted.
 
     Attributes:
         cost: Weights of all terms but the time; None for half the squared rates.
@@ -141,7 +141,7 @@ def declare_actuators(
     pace: Any,
     suffix: str = "",
 ) -> tuple[Any, Any, Any]:
-    """Declare velocities and accelerations within the limits; return both and the running cost (per second).
+    """Declare velocities and accelerations within their limits; return them and the running cost (per second).
 
     The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
     "power" where these are limited or weighted.
@@ -188,12 +188,12 @@ def declare_actuators(
 
 
 def weights_torques(cost: Cost) -> bool:
-    """Return whether a cost depends on the joint torques."""
+    """Return whether a cost depends on joint torques."""
     return bool(np.any(np.asarray(cost.effort))) or bool(cost.energy)
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
-    """Return the running cost of a motion (per second), without its time and positive power.
+    """Return the running cost of a motion (per second), without the costs of time and positive power.
 
     Args:
         machine: The machine.
@@ -222,7 +222,7 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
 
 
 def positive_power(problem: Problem, powers: Any, bounds: JointBounds, suffix: str = "") -> Any:
-    """Declare the positive power of each actuator as a control within its limit, W, and return the sum."""
+    """Declare each actuator's positive power as a control within its limit, W; return the sum."""
     power = problem.control(f"power{suffix}", powers.numel(), lower=0.0, upper=bounds.power, unit="W")
     problem.path(f"power{suffix}", power - powers, lower=0.0, unit="W")
     return ca.sum1(power)

@@ -40,7 +40,7 @@ Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilise
 
 @dataclass(frozen=True)
 class Layer:
-    """Secondary objective: a configuration index that the remaining freedom improves, below task and zero moment point.
+    """Secondary objective: a configuration index to be improved by the freedom that tasks and zero moment point leave.
 
     Attributes:
         index: ``joint_limits``, p1 (23), to be decreased; ``manipulability`` of the rows of the tasks, p2 (27), to be
@@ -65,7 +65,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Stabiliser:
-    """Gains of the law that keeps the inverted pendulum over a pinned zero moment point upright.
+    """Gains of the law that keeps a machine upright over a pinned zero moment point, like an inverted pendulum.
 
     The centre of mass is commanded y'' = -k2 y' - k1 (y - y*) + k0 L, with L the angular momentum about the point,
     dL/dt = -M g (y - y*): the characteristic polynomial is s^3 + k2 s^2 + k1 s + k0 M g.
@@ -135,7 +135,7 @@ class AccelerationOptions:
             require.count(name, getattr(self, name), least=1)
 
     def zmp_target(self, machine: Standing) -> Callable[[Any], Any]:
-        """Return the target of the zero moment point of a machine as a checked function of time."""
+        """Return the target of a machine's zero moment point as a checked function of time."""
         zmp = machine.most_stable_point if self.zmp is None else self.zmp
         if callable(zmp):
             return lambda time: checked_point(zmp(time), "zmp")
@@ -144,14 +144,14 @@ class AccelerationOptions:
 
 
 class _TaskHierarchy:
-    """Joint accelerations built task by task, each in the null space of the tasks before."""
+    """Joint accelerations for tasks of decreasing priority, each in the null space of those before."""
 
     def __init__(self, size: int) -> None:
         self.accelerations: Any = ca.DM.zeros(size)
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add a task, rows q'' = target, with the least change of the accelerations found so far."""
+        """Add a task, rows q'' = target, with the least change of the accelerations so far."""
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
@@ -163,7 +163,7 @@ class _TaskHierarchy:
 
 
 def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
-    """Raise ProblemError if a law is unknown or needs more joints than the machine has.
+    """Raise ProblemError if a law is unknown, or needs more joints than the machine has.
 
     Args:
         machine: The machine.
@@ -191,7 +191,7 @@ def accelerations(
     external: External | None = None,
     options: AccelerationOptions | None = None,
 ) -> Any:
-    """Return the joint accelerations of a law. Shape (n, 1).
+    """Return the joint accelerations that a law commands. Shape (n, 1).
 
     Args:
         machine: The machine.
@@ -237,7 +237,7 @@ def accelerations(
 
 
 def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
-    """Return rows and values of the commanded acceleration of the centre of mass.
+    """Return rows and values of a task that commands the acceleration of the centre of mass.
 
     `right` is C of (18), minus the moment of weight and wrenches about the place: it vanishes for a centre of mass at
     y*, and -C / (M g) is the distance of the centre of mass beyond y*.
@@ -261,7 +261,7 @@ TIP_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Stop:
-    """Reason why a motion ends before its horizon.
+    """Reason why a motion ends before its horizon, with the time.
 
     Attributes:
         reason: ``lift_off``: the vertical ground force is not positive. ``divergence``: a joint exceeds the speed
@@ -278,7 +278,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class AccelerationSolution:
-    """Motion of an acceleration-level law.
+    """Motion that results from an acceleration-level control law.
 
     Attributes:
         law: The law.
@@ -295,7 +295,7 @@ class AccelerationSolution:
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Failures of the motion, () if there is none.
+        """Failures of the motion; () if there are none.
 
         ``lift_off``, ``divergence``, ``breakdown`` as for Stop; ``leaves_foot``: the zero moment point leaves the
         support; ``joint_limits``; ``leaves_path``: a tip leaves its pose by more than 1e-3 (m or rad).
@@ -392,7 +392,7 @@ def resolve_accelerations(
 
 
 class _Simulation:
-    """Integration of the state (q, q') over fixed steps, many steps in one call."""
+    """Integrator of the state (q, q') with fixed steps, many steps in one call."""
 
     def __init__(self, law: Any, n: int, step: float, options: AccelerationOptions) -> None:
         self.step, self._law, self._n = step, law, n
@@ -433,7 +433,7 @@ class _Simulation:
 
 
 class _Recorder:
-    """Records samples of the motion up to the first failure."""
+    """Recorder of the samples of a motion up to its first failure."""
 
     def __init__(self, motion: Any, law: Any, stop_at_lift_off: bool, speed_limit: float) -> None:
         self._motion, self._law = motion, law
@@ -442,7 +442,7 @@ class _Recorder:
         self.state = np.zeros(0)
 
     def add(self, times: Array, states: Array) -> Stop | None:
-        """Evaluate and record samples; return a Stop at the first one that fails."""
+        """Evaluate and record samples; return a Stop for the first sample that fails, else None."""
         n = states.shape[1] // 2
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
@@ -471,7 +471,7 @@ class _Recorder:
         return Stop("divergence", at, words)
 
     def results(self) -> tuple[StandingMotion, Array]:
-        """Return the recorded motion and its pose errors (M,)."""
+        """Return the recorded motion and its pose errors, shape (M,)."""
         joined = {name: np.concatenate([record[name] for record in self._records]) for name in self._records[0]}
         gap = joined.pop("gap")
         return StandingMotion(**joined), gap

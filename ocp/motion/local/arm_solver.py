@@ -54,13 +54,13 @@ ARM = ArmSettings()
 
 
 def sample_shares(first: int, count: int, dimension: int) -> Array:
-    """Return samples first, ..., first + count - 1 of a low-discrepancy sequence. Shape (count, dimension)."""
+    """Return `count` samples of a low-discrepancy sequence from index `first` on. Shape (count, dimension)."""
     return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
 
 
 @dataclass(frozen=True, eq=False)
 class ArmSolver:
-    """All IK solutions of an arm within its limits. Use `arm_solver` to build it.
+    """Solver of all inverse kinematics of an arm within its limits. Use `arm_solver` to build it.
 
     Attributes:
         chain: Chain of the arm.
@@ -77,7 +77,7 @@ class ArmSolver:
     upper: Array
 
     def redundant_positions(self, solver: PoseSolver, shares: Array) -> Array:
-        """Return positions of the redundant joints at fractions (M, k) of their ranges."""
+        """Convert fractions (M, k) of the ranges of the redundant joints to their positions."""
         joints = list(solver.redundant)
         if not joints:
             return shares[:, :0]
@@ -90,7 +90,7 @@ class ArmSolver:
     def solve(
         self, solver: PoseSolver, positions: Array, rotations: Array, redundant: Array, *, turns: bool = True
     ) -> tuple[Solutions, NDArray[np.bool_]]:
-        """Return all isolated solutions at M poses within the limits, and for which poses some may be missing.
+        """Return all isolated solutions at M poses within the limits, and flags of poses where some may be missing.
 
         Revolute joints are shifted by whole turns in all ways that keep the limits; unlimited ones are between -pi and
         pi. Joints that do not move the tip are at 0.
@@ -114,7 +114,7 @@ class ArmSolver:
         return self._within_limits(solutions._replace(joints=solutions.joints[:, :n]), turns), doubtful
 
     def _within_limits(self, solutions: Solutions, turns: bool) -> Solutions:
-        """Return the solutions within the limits, in all full turns of the joints that keep them."""
+        """Return the solutions within the limits, repeated for all full turns of joints that stay within them."""
         windows, order = self._windows, list(self.chain.order)
         start, shiftable = windows.low if turns else windows.middle, windows.shiftable
         joints = solutions.joints.copy()
@@ -132,7 +132,7 @@ class ArmSolver:
 
     @cached_property
     def _windows(self) -> _Windows:
-        """Full-turn windows of the joint ranges, into which solutions are shifted."""
+        """Intervals of one full turn within the joint ranges, into which solutions are shifted."""
         below, above, revolute = np.isfinite(self.lower), np.isfinite(self.upper), self.chain.revolute
         both, lower, upper = below & above & revolute, self.lower - ARM.excess, self.upper + ARM.excess
         low = np.where(below, lower, upper - TURN)
@@ -152,7 +152,7 @@ def _whole_turns(counts: tuple[int, ...]) -> Array:
 
 
 class _Windows(NamedTuple):
-    """Full-turn windows of the position limits of revolute joints.
+    """Intervals of one full turn within the position limits of revolute joints.
 
     Attributes:
         lower, upper: Limits, beyond which lies only rounding. Shape (n,).
@@ -173,7 +173,7 @@ class _Windows(NamedTuple):
 
 
 def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = None) -> ArmSolver | None:
-    """Return the solver of an arm; None if no six of its joints have a regular problem.
+    """Return the solver of an arm; None if no choice of six joints has a regular kinematic problem.
 
     Args:
         chain: Chain of the arm.
@@ -208,7 +208,7 @@ def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = No
 
 
 def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
-    """Return how well conditioned the remaining problem is for each choice of redundant joints.
+    """Return how well conditioned the inverse kinematics are for each choice of redundant joints.
 
     This is the geometric mean, at random configurations, of the least singular value of the Jacobian of the others.
     """

@@ -29,7 +29,7 @@ TURN = 2 * np.pi
 
 @dataclass(frozen=True)
 class NewtonSettings:
-    """Settings of Newton's method; lengths are shares of the size of the arm.
+    """Settings of Newton's method; lengths are relative to the size of the arm.
 
     Attributes:
         steps: Largest number of steps.
@@ -63,7 +63,7 @@ NEWTON = NewtonSettings()
 
 
 class Motion(NamedTuple):
-    """Rigid motions v -> turn v + shift. Shapes (M, 3, 3), (M, 3)."""
+    """Rigid motions v -> turn v + shift of M samples. Shapes (M, 3, 3), (M, 3)."""
 
     turn: Array
     shift: Array
@@ -73,7 +73,7 @@ class Motion(NamedTuple):
         return Motion(self.turn[chosen], self.shift[chosen])
 
     def after(self, first: Motion) -> Motion:
-        """Return the composition of these motions with motions that are applied first."""
+        """Return the composition: first the given motions, then these."""
         return Motion(self.turn @ first.turn, self.at(first.shift))
 
     def rotate(self, vectors: Array) -> Array:
@@ -100,7 +100,7 @@ class SymbolicAxis(NamedTuple):
 
     @classmethod
     def of(cls, direction: Array, point: Array, revolute: bool) -> SymbolicAxis:
-        """Return a symbolic axis with numeric direction and point."""
+        """Return a symbolic axis from numeric direction and point."""
         return cls(expression(direction), expression(point), revolute)
 
     def moved(self, motion: Frame) -> SymbolicAxis:
@@ -108,7 +108,7 @@ class SymbolicAxis(NamedTuple):
         return self._replace(direction=ca.mtimes(motion.rotation, self.direction), point=motion.point(self.point))
 
     def frame(self, position: Any) -> Frame:
-        """Return the rigid motion of the joint for a position."""
+        """Return the rigid motion that a joint position causes."""
         if not self.revolute:
             return Frame(ca.DM.eye(3), self.direction * position)
         turn = rotation(self.direction, position)
@@ -120,19 +120,19 @@ class SymbolicAxis(NamedTuple):
         return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
 
     def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
-        """Return the constant, cosine and sine parts of fixed . R(sign angle) vector. Shape (1, 3)."""
+        """Return constant, cosine and sine coefficients of fixed . R(sign angle) vector. Shape (1, 3)."""
         constant = ca.dot(fixed, self.direction) * ca.dot(self.direction, vector)
         sine = sign * ca.dot(fixed, cross(self.direction, vector))
         return ca.horzcat(constant, ca.dot(fixed, vector) - constant, sine)
 
 
 def compose(first: Frame, second: Frame) -> Frame:
-    """Return the motion that applies the second one, then the first."""
+    """Return the composition of two motions, of which the second is applied first."""
     return Frame(ca.mtimes(first.rotation, second.rotation), first.point(second.position))
 
 
 def inverse(frame: Frame) -> Frame:
-    """Return the inverse motion."""
+    """Return the inverse of a rigid motion."""
     return Frame(frame.rotation.T, -ca.mtimes(frame.rotation.T, frame.position))
 
 
@@ -177,7 +177,7 @@ class Chain:
 
     @classmethod
     def of(cls, machine: Machine) -> Chain | None:
-        """Return the chain to the tip of a machine; None if its base moves or a joint of the chain follows another."""
+        """Return the chain to a machine's tip; None if its base moves, or if a joint of the chain is a follower."""
         robot = machine.robot
         path = () if robot.tip is None else [joint for joint in robot.path_to(robot.tip_link) if joint.moves]
         if machine.base_size or any(joint.mimic is not None for joint in path):
@@ -194,7 +194,7 @@ class Chain:
         return cls(axes, points, revolute, position, np.array(ca.DM(pose.rotation)), order, size)
 
     def extended(self, axes: Array, points: Array) -> Chain:
-        """Return the chain with further revolute joints between the last joint and the tip. Shapes (k, 3), (k, 3)."""
+        """Return the chain with added revolute joints between the last joint and the tip. Shapes (k, 3), (k, 3)."""
         n, count = len(self.axes), len(axes)
         return replace(
             self,
@@ -211,7 +211,7 @@ class Chain:
 
     @cached_property
     def _tip_function(self) -> Sampler:
-        """Function of all joints, the rows of a rotation and a position -> error, Jacobian and pose of the tip."""
+        """Function (joints, rows of goal rotation, goal position) -> pose error, Jacobian and pose of the tip."""
         joints, turn, shift = ca.SX.sym("q", len(self.axes)), ca.SX.sym("turn", 9), ca.SX.sym("shift", 3)
         frame, moved = Frame(ca.DM.eye(3), ca.DM(3, 1)), list[SymbolicAxis]()
         for j in self.order:
@@ -238,7 +238,7 @@ class Chain:
         return positions, rotations.reshape(-1, 3, 3)
 
     def linearize(self, joints: Array, free: Sequence[int], goal: Motion) -> tuple[Array, Array]:
-        """Return pose errors (K, 6) of joints (K, n) and the Jacobian of the tip in the free joints (K, 6, m).
+        """Return pose errors (K, 6) at joints (K, n), and the tip's Jacobian by the free joints (K, 6, m).
 
         The errors are the rotation as the axial vector 2 sin(angle) / 2, or (3, 3, 3) beyond a right angle, and the
         displacement as a share of the size of the arm.
@@ -250,7 +250,7 @@ class Chain:
         return errors, jacobians.transpose(0, 2, 1)
 
     def refine(self, pose: NDArray[np.intp], joints: Array, free: Sequence[int], goal: Motion) -> Solutions:
-        """Refine candidates by Newton's method in the free joints; return each solution once.
+        """Refine candidates by Newton's method in the free joints; return the distinct solutions.
 
         Args:
             pose: Pose of each candidate. Shape (K,).
@@ -277,14 +277,14 @@ class Chain:
         return self.distinct(Solutions(pose[good], joints[good], _are_singular(jacobians[good])), free, goal)
 
     def union(self, first: Solutions, second: Solutions, free: Sequence[int], goal: Motion) -> Solutions:
-        """Return the solutions of two sets, each once."""
+        """Return the distinct solutions of two sets."""
         if not len(first.pose):
             return second
         parts = (np.concatenate(pair) for pair in zip(first, second, strict=True))
         return self.distinct(Solutions(*parts), free, goal)
 
     def distinct(self, solutions: Solutions, numbers: Sequence[int], goal: Motion) -> Solutions:
-        """Return each solution once, sorted by pose, with angles between -pi and pi.
+        """Return the distinct solutions, sorted by pose, with angles between -pi and pi.
 
         Args:
             solutions: The solutions.
@@ -312,7 +312,7 @@ class Chain:
 
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the pairs of solutions, sorted by pose, that belong to the same pose. Shapes (P,)."""
+    """Return the index pairs of solutions, sorted by pose, that belong to the same pose. Shapes (P,)."""
     if not len(pose) or pose[0] == pose[-1]:
         return _pairs(len(pose))
     first = np.arange(len(pose))[:, None]
@@ -340,7 +340,7 @@ def _damped_steps(jacobian: Array, missed: Array) -> Array:
 
 
 def _are_singular(jacobians: Array) -> NDArray[np.bool_]:
-    """Return which Jacobians (K, 6, m) have a singular value below the limit.
+    """Return which of the Jacobians (K, 6, m) have a singular value below the limit.
 
     The product of the five others is at most (|J|^2 / 5)^(5 / 2), so that the determinant tells most regular ones.
     """

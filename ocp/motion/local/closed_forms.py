@@ -39,7 +39,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class NearbySettings:
-    """Settings of the search at poses near those whose solutions may be incomplete.
+    """Settings of the search at poses near those for which solutions may be missing.
 
     Attributes:
         pairs: Number of pairs of poses.
@@ -57,7 +57,7 @@ NEARBY = NearbySettings()
 
 @dataclass(frozen=True, eq=False)
 class PoseSolver(ABC):
-    """Inverse kinematics of a chain for given positions of its redundant joints.
+    """Inverse kinematics of a chain for given positions of its redundant joints (base class).
 
     Attributes:
         chain: The chain.
@@ -69,12 +69,12 @@ class PoseSolver(ABC):
 
     @cached_property
     def free(self) -> list[int]:
-        """Indices of the joints that are solved for, in the order of the chain."""
+        """Indices of the joints that are solved for, in the order along the chain."""
         return [j for j in self.chain.order if j not in self.redundant]
 
     @abstractmethod
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return solutions at M poses, all at regular ones.
+        """Return solutions at M poses; at regular poses these are all solutions.
 
         Args:
             tips: Poses of the tip in the world.
@@ -86,7 +86,7 @@ class PoseSolver(ABC):
         """
 
     def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, Mask]:
-        """Return all isolated solutions at M poses, and for which poses solutions may be missing. Shape (M,).
+        """Return all isolated solutions at M poses, and flags of poses where some may be missing. Shape (M,).
 
         Where they may be, and at singularities, solutions at poses nearby are candidates too: isolated solutions depend
         continuously on the pose, and of a family some members are found.
@@ -109,7 +109,7 @@ class PoseSolver(ABC):
         return solutions, doubtful
 
     def _nearby(self, tips: Motion) -> Iterator[Motion]:
-        """Yield poses near given ones, on opposite sides of them."""
+        """Yield pairs of poses near the given ones, on opposite sides of them."""
         rng = np.random.default_rng(NEARBY.seed)
         for _ in range(NEARBY.pairs):
             turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
@@ -118,7 +118,7 @@ class PoseSolver(ABC):
                 yield Motion(tips.turn @ rotation, tips.shift + sign * self.chain.size * shift)
 
     def solutions(self, positions: Array, rotations: Array, redundant: Array) -> tuple[NDArray[np.intp], Array]:
-        """Return the poses (K,) and the joints (K, n) of all isolated solutions; see `solve`."""
+        """Return all isolated solutions: the index of the pose, (K,), and the joints, (K, n); see `solve`."""
         solutions, _ = self.solve(positions, rotations, redundant)
         return solutions.pose, solutions.joints
 
@@ -131,7 +131,7 @@ SIX, SCARA = 6, 4
 
 @dataclass(frozen=True)
 class FormSettings:
-    """Tolerances of the closed forms; lengths are shares of the size of the arm.
+    """Tolerances of the closed forms; lengths are relative to the size of the arm.
 
     Attributes:
         straight: Up to this much, also in rad, axes count as meeting or parallel; Newton's method refines.
@@ -151,7 +151,7 @@ FORMS = FormSettings()
 
 @dataclass(frozen=True, eq=False)
 class ClosedForm(PoseSolver):
-    """Closed form of the inverse kinematics of an arm.
+    """Closed-form solution of the inverse kinematics of an arm.
 
     Attributes:
         kind: "meeting" or "parallel", by the axes of three of its joints, or "scara".
@@ -162,7 +162,7 @@ class ClosedForm(PoseSolver):
     triple: tuple[int, ...]
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return solutions; where they belong to families, some may be missing. See `PoseSolver.solve_regular`."""
+        """Return solutions at M poses; families of solutions may be incomplete. See `PoseSolver.solve_regular`."""
         arguments = np.concatenate([redundant, tips.turn.reshape(-1, 9), tips.shift], axis=1)
         count, families = len(arguments), np.zeros(len(arguments), dtype=bool)
         if self.kind == "scara":
@@ -183,7 +183,7 @@ class ClosedForm(PoseSolver):
         return self.chain.refine(pose, joints, self.free, tips), np.zeros_like(families), families
 
     def _loop(self) -> _SymbolicLoop:
-        """Return the closure equation of the free joints; joints behind the three special axes move to its front."""
+        """Return the closure equation of the free joints, rotated so that the three special axes come last."""
         chain = self.chain
         symbols, fixed = ca.SX.sym("pose", len(self.redundant) + 12), Frame(ca.DM.eye(3), ca.DM(3, 1))
         points, axes = chain.points.copy(), list[SymbolicAxis]()
@@ -202,12 +202,12 @@ class ClosedForm(PoseSolver):
         return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
 
     def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
-        """Return the solutions as one column, each in the order of the free joints."""
+        """Return the solutions as one column, with the free joints of each in their order."""
         return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
 
     @cached_property
     def _planar_function(self) -> Sampler:
-        """Function of a pose -> two solutions of a SCARA, and by how much the pose is out of reach."""
+        """Function from a pose to two solutions of a SCARA, and the distance by which the pose is out of reach."""
         symbols, axes, order, goal = self._loop()
         triple = [axes[order.index(j)] for j in self.triple]
         slide = next(axis for axis in axes if not axis.revolute)
@@ -218,7 +218,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function of a pose -> pairs of angles of x and z, residuals, and how well these are determined."""
+        """Function of a pose -> pairs of angles of joints x and z, their residuals and their conditioning."""
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
         offsets = (x.point - y.point) / size, (z.point - y.point) / size
@@ -243,9 +243,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function of a pose and angles of x and z -> two solutions, their excess over the reach, and the lever arm of
-        y.
-        """
+        """Function of a pose and angles of x and z -> two solutions, excess over the reach, lever arm of y."""
         symbols, (x, y, z, *triple), order, goal = self._loop()
         angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"
         before, after = z.frame(angles[1]), compose(inverse(x.frame(angles[0])), goal)
@@ -277,7 +275,7 @@ class _SymbolicLoop(NamedTuple):
 
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
-    """Return the closed forms of a chain: one for each choice of redundant joints that leaves one.
+    """Return the closed forms of a chain, one for each choice of redundant joints with which one exists.
 
     Args:
         chain: The chain.
@@ -289,7 +287,7 @@ def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[C
 
 
 def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
-    """Return the closed form of four joints, if they are those of a SCARA."""
+    """Return the closed form of a chain of four joints if they are those of a SCARA, else no form."""
     revolute = tuple(j for j in chain.order if chain.revolute[j])
     prismatic = [j for j in chain.order if not chain.revolute[j]]
     if len(prismatic) != 1 or _kind_of(chain, revolute) != "parallel":
@@ -304,7 +302,7 @@ def is_scara(chain: Chain) -> bool:
 
 
 def _six_joint_forms(chain: Chain, lockable: tuple[int, ...]) -> tuple[ClosedForm, ...]:
-    """Return the closed forms of six revolute joints, one for each choice of redundant joints."""
+    """Return closed forms of chains with six free revolute joints, one for each choice of redundant joints."""
     n, forms = len(chain.order), list[ClosedForm]()
     for redundant in combinations(lockable, n - SIX) if n >= SIX else ():
         if not chain.revolute[[j for j in chain.order if j not in redundant]].all():
@@ -316,7 +314,7 @@ def _six_joint_forms(chain: Chain, lockable: tuple[int, ...]) -> tuple[ClosedFor
 
 
 def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
-    """Classify three consecutive axes: "parallel", "meeting" in a point, or "" for neither."""
+    """Classify three consecutive axes: "parallel", "meeting" (in a point), or "" for neither."""
     axes, points = chain.axes, chain.points
     if not chain.revolute[list(triple)].all():
         return ""
@@ -330,7 +328,7 @@ def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
 
 
 def _meeting_point(chain: Chain, triple: tuple[int, ...]) -> tuple[Array, float]:
-    """Return the point nearest to three axes, and its largest distance from them."""
+    """Return the point nearest to three joint axes, and its largest distance from one of them."""
     axes, points = chain.axes[list(triple)], chain.points[list(triple)]
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     projected = np.einsum("kij,kj->ki", projectors, points)
@@ -340,8 +338,7 @@ def _meeting_point(chain: Chain, triple: tuple[int, ...]) -> tuple[Array, float]
 
 @cache
 def _pair_solver() -> Any:
-    """Return the CasADi function that solves two equations in two angles, with residuals and how well angles are
-    determined.
+    """Return the CasADi function that solves two equations for two angles, with residuals and conditioning.
 
     The equations are a [cos, sin](first) + b [cos, sin](second) = c. The singular value decomposition b = L diag(s) R,
     in closed form, separates them: with a' = L' a and c' = L' c the remainders w = c' - a' [cos, sin](first) satisfy
@@ -392,8 +389,7 @@ def _rotation(angle: Any) -> Any:
 
 
 def _close_roots(f: Harmonics) -> Any:
-    """Return eight angles that include all roots of a trigonometric polynomial, double roots as close pairs. Shape (8,
-    1).
+    """Return eight angles that include all roots of a trigonometric polynomial; double roots become close pairs. (8, 1)
 
     Of two roots close to each other the general method may find only one. The parabola of the same value, slope and
     curvature there has both.
@@ -412,7 +408,7 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Solve cosine cos(q) + sine sin(q) = value: the two roots are the first result plus and minus the second.
+    """Solve cosine cos(q) + sine sin(q) = value: return m and h such that the two roots are m + h and m - h.
 
     Without a root, return the angle that comes nearest to the value.
     """
@@ -421,7 +417,7 @@ def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
 
 
 def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
-    """Return two solutions of meeting axes for a rotation, or of parallel ones for a planar motion.
+    """Return two solutions of three joints with meeting axes (a rotation) or parallel axes (a planar motion).
 
     The second result is the share by which the motion exceeds what the axes can do; the solutions are then the nearest.
     """

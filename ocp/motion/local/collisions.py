@@ -73,7 +73,7 @@ def distances_along(
     cutoff: float = np.inf,
     pairs: Sequence[int] | None = None,
 ) -> Array:
-    """Return the distances of all pairs at samples of a motion. Shape (M, n), m.
+    """Return the distances of all pairs of bodies at samples of a motion; larger ones are cut off. Shape (M, n), m.
 
     The penetration depth of a pair with a mesh or a cylinder is an estimate.
 
@@ -94,7 +94,7 @@ def distances_along(
 
 
 def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:
-    """Return the pairs closer than the clearance, each at its closest sample, the worst first.
+    """Return the pairs closer than the clearance, each at its closest sample, in order of severity.
 
     The arguments are those of `distances_along`.
     """
@@ -120,7 +120,7 @@ def _cover_distance(scene: CollisionScene, pair: int, base: Array, joints: Array
 
 
 def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
-    """Return the placements as a function of base, joints and time, and all pairs of bodies, cached with the scene."""
+    """Return the frames of bodies as a function of (base, joints, time), and all pairs of bodies; both are cached."""
     cached: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
     if cached is None:
         machine = scene.machine
@@ -134,7 +134,7 @@ def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
 
 
 def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -> CollisionScene:
-    """Return a collision scene; ProblemError unless it is of the machine and treats joint limits as `limits` says."""
+    """Return a collision scene; raise ProblemError if it is of another machine or treats joint limits otherwise."""
     if require.instance("scene", value, CollisionScene).machine is not machine:
         words = "scene belongs to another machine; build it from this one: CollisionScene(machine, ...)"
         raise ProblemError(words, name="scene", value=value)
@@ -196,7 +196,7 @@ def slide_apart(
     target = scene.clearance + SLIDING.spare
 
     def distances(configurations: Array) -> Array:
-        """Return the distances of all pairs; beyond the target a lower bound is enough. Shape (K, P)."""
+        """Return the distances of all pairs; above the target they may be lower bounds. Shape (K, P)."""
         return distances_along(scene, base, configurations, np.full(len(configurations), time), cutoff=target)
 
     best, current, clearance = joints.copy(), joints.copy(), np.full(count, -np.inf)
@@ -215,7 +215,7 @@ def slide_apart(
 
 
 def _step(jacobian: Array, distances: Array, gradients: Array, target: float) -> Array:
-    """Return the joint step (n,) that separates close pairs and, to first order, does not move the tips."""
+    """Return a joint step (n,) that separates close pairs and, to first order, leaves the tips in place."""
     close = distances < target
     projector = np.eye(jacobian.shape[1]) - np.linalg.pinv(jacobian) @ jacobian
     rows = gradients[:, close].T @ projector

@@ -41,7 +41,7 @@ COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPL
 
 
 def _half_angle_products() -> Array:
-    """Return the products of (1, cos h, sin h) and (cos h/2, sin h/2) as combinations of half-angle terms. (3, 2, 4)"""
+    """Return products of (1, cos h, sin h) and (cos h/2, sin h/2) by half-angle terms. Shape (3, 2, 4)."""
     products = np.zeros((3, 2, 4))
     products[0] = np.eye(2, 4)
     products[1] = [[0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]]
@@ -54,7 +54,7 @@ PRODUCTS = _half_angle_products()
 
 @dataclass(frozen=True)
 class EliminationSettings:
-    """Settings of the elimination.
+    """Settings of inverse kinematics by elimination.
 
     Attributes:
         rank: Singular values of the eliminated products below this share of the largest count as zero.
@@ -93,12 +93,12 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return the vector products of vectors; for small arrays faster than numpy's function."""
+    """Return the vector products of vectors, faster than numpy for small arrays."""
     return np.asarray(a[..., NEXT] * b[..., AFTER] - a[..., AFTER] * b[..., NEXT])
 
 
 def axial(turn: Array) -> Array:
-    """Return the axial vectors of rotations, 2 sin(angle) times their axes. Shapes (M, 3, 3) to (M, 3)."""
+    """Return the vectors 2 sin(angle) axis of rotations. Shapes (M, 3, 3) to (M, 3)."""
     return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
 
 
@@ -131,7 +131,7 @@ class Axis(NamedTuple):
 
 
 class Opening(NamedTuple):
-    """Choice of the joint at which the kinematic loop is opened, and of the roles x, y, z, a, b, c of its joints.
+    """Choice of the joint at which the kinematic loop is opened, and of the joints for the roles x, y, z, a, b, c.
 
     Attributes:
         first: Number of the joint x; the others follow in the order of the loop.
@@ -145,7 +145,7 @@ class Opening(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """Closure equations of six joints, opened at a joint: the product of x, y, z, a, b, c is the goal, at M poses."""
+    """Closure equations of six joints at M poses, opened at a joint: the motions of x, y, z, a, b, c give the goal."""
 
     joints: list[Axis]
     goal: Motion
@@ -153,7 +153,7 @@ class _Loop(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Candidate solutions from one opening of the loop.
+    """Candidate solutions that result from one opening of the loop.
 
     Attributes:
         pose: Pose of each candidate. Shape (K,).
@@ -181,7 +181,7 @@ class Elimination(PoseSolver):
     openings: tuple[Opening, ...]
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return solutions at M poses, all at regular ones; see `PoseSolver.solve_regular`.
+        """Return solutions at M poses; at regular poses these are all solutions, see `PoseSolver.solve_regular`.
 
         Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
         number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
@@ -204,13 +204,13 @@ class Elimination(PoseSolver):
         return solutions, mixed, doubtful
 
     def prescribe(self, redundant: Array) -> Array:
-        """Return joints with the redundant ones (M, k) at given positions and the others at 0. Shape (M, n)."""
+        """Return joint vectors with given positions of the redundant joints (M, k), others at 0. Shape (M, n)."""
         joints = np.zeros((len(redundant), len(self.chain.axes)))
         joints[:, list(self.redundant)] = redundant
         return joints
 
     def refine(self, pose: NDArray[np.intp], free: Array, prescribed: Array, goal: Motion) -> Solutions:
-        """Return the solutions that Newton's method finds from candidates for the free joints (K, m) at poses (K,)."""
+        """Refine candidates for the free joints (K, m) at poses (K,) by Newton's method; return the solutions."""
         joints = prescribed[pose]
         joints[:, self.free] = free
         return self.chain.refine(pose, joints, self.free, goal)
@@ -229,7 +229,7 @@ class Elimination(PoseSolver):
 
 
 def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | None:
-    """Return the solver of six joints of a chain; None if no eigenvalue problem of theirs is regular.
+    """Return the elimination solver of six joints of a chain; None if no opening has a regular eigenvalue problem.
 
     At random configurations the openings are sorted by the condition of their problems. The first ones are taken that
     find the most of these configurations again, and the most solutions.
@@ -269,14 +269,14 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
 
 
 def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
-    """Open the loop at a joint: the joints before it move to the end of the loop, transformed by the goal pose."""
+    """Open the loop at a joint: joints before it move to the end of the loop, transformed by the goal pose."""
     back = goal.inverse
     joints = [axes[(first + i) % SIX] for i in range(SIX)]
     return _Loop([axis.moved(back) if i >= SIX - first else axis for i, axis in enumerate(joints)], goal, size)
 
 
 def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
-    """Eliminate x and y: return left singular vectors and ranks of their products, and the coefficients of z, a, b.
+    """Eliminate joints x and y: return the singular vectors and ranks of their equations, and the remaining equations.
 
     Shapes (M, 15, 15), (M,), (M, 15, 3, 3, 3), the last (1, ...) if it is the same for all poses.
     """
@@ -291,12 +291,12 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
 
 
 def _reversed(axis: Axis) -> Axis:
-    """Return the axis with opposite direction, about which the joint moves backwards."""
+    """Return the axis with opposite direction, for the inverse motion of its joint."""
     return axis._replace(direction=-axis.direction)
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return line coordinates transformed by joints, as coefficients of products of cosines and sines.
+    """Return the line coordinates after joint motions, as coefficients of products of cosines and sines.
 
     Args:
         axes: Axes of the joints, the one that moves the line element first in front.
@@ -335,7 +335,7 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
-    """Return the polynomial matrix of the eigenvalue problem: coefficients of 1, cos h, sin h. Shape (M, 3, 12, 12)."""
+    """Return the matrices of the eigenvalue problem: coefficients of 1, cos h and sin h. Shape (M, 3, 12, 12)."""
     count, _, rows = annihilators.shape
     equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
     equations = equations.reshape(count, rows, 3, 3, 3).transpose(0, 1, *(2 + role for role in roles))
@@ -349,7 +349,7 @@ def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]
 
 
 def _companions(matrices: Array) -> tuple[Array, Array, Array]:
-    """Return companion matrices in tan((h - pole) / 2), the poles, and reciprocal condition numbers at the poles.
+    """Return companion matrices for tan((h - pole) / 2), their poles, and reciprocal condition numbers there.
 
     Shapes (M, 24, 24), (M,), (M,).
     """
@@ -372,7 +372,7 @@ def _companions(matrices: Array) -> tuple[Array, Array, Array]:
 
 
 def _inverses(matrices: Array) -> Array:
-    """Return the inverses of matrices, those of exactly singular ones infinite."""
+    """Return the inverses of matrices; those of exactly singular matrices are infinite."""
     try:
         return np.asarray(np.linalg.inv(matrices))
     except np.linalg.LinAlgError:
@@ -382,7 +382,7 @@ def _inverses(matrices: Array) -> Array:
 
 
 def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening) -> _Candidates:
-    """Return candidates from the real eigenvalues of one opening, including double ones."""
+    """Return candidate solutions from the real eigenvalues, single or double, of one opening of the loop."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)
     matrices = _matrices(singular_vectors[:, :, opening.rank :], remaining, opening.roles)
@@ -409,7 +409,7 @@ def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening)
 
 
 def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
-    """Return the angles g and h of products (K, 4, 3) of (cos g/2, sin g/2, cos 3g/2, sin 3g/2) and (1, cos h, sin h).
+    """Return angles g and h from eigenvectors (K, 4, 3), which are products of a function of g and one of h.
 
     The third result is the largest deviation from such products, of which the largest is 1.
     """
@@ -432,7 +432,7 @@ def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
 
 
 def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
-    """Return the positions (K, 6) of all joints of a loop from those of its middle joints z, a and b (K, 3).
+    """Return the positions (K, 6) of all joints of a loop from those of the middle joints z, a and b (K, 3).
 
     The motions of x and y are found from e_x^-1 (G p, G l) = e_y (p', l'), which is linear in their cosines and sines.
     """

@@ -38,7 +38,7 @@ ROTATION_TOLERANCE = 1e-6
 
 
 class ToolFreedom(Enum):
-    """Freedom that a task leaves in the orientation of the tip."""
+    """Part of the orientation of the tip that a task leaves free."""
 
     NONE = "none"
     ROLL = "roll"
@@ -47,7 +47,7 @@ class ToolFreedom(Enum):
 
 
 class Incompleteness(Flag):
-    """Reasons why IK configurations of a pose may be missing; no flag means that all are found.
+    """Reasons why IK configurations of a pose may be missing; without a flag, all are found.
 
     Attributes:
         SAMPLED: The arm is redundant. Its configurations form families, of which those at samples are listed.
@@ -62,7 +62,7 @@ class Incompleteness(Flag):
 
 @dataclass(frozen=True, eq=False)
 class IkConfigurations:
-    """IK configurations of an arm at N poses; each one reaches its pose to rounding.
+    """IK configurations of an arm at N poses; each reaches its pose up to rounding.
 
     Attributes:
         joints: Configurations of all poses. Shape (K, n), rad or m.
@@ -78,7 +78,7 @@ class IkConfigurations:
 
     @property
     def complete(self) -> NDArray[np.bool_]:
-        """For which poses all configurations are found. Shape (N,), bool."""
+        """Mask of the poses for which all configurations are found. Shape (N,), bool."""
         return np.array([not reason for reason in self.reasons], dtype=bool)
 
     def at(self, pose: int) -> Array:
@@ -91,14 +91,14 @@ class IkConfigurations:
 
 
 def idle_positions(lower: Array, upper: Array) -> Array:
-    """Return positions for joints without effect: mid-range, or the allowed value nearest to 0."""
+    """Return positions for joints without effect: the middle of the range, or the allowed value nearest to 0."""
     with np.errstate(invalid="ignore"):
         middle = (lower + upper) / 2
     return np.asarray(np.where(np.isfinite(middle), middle, np.clip(0.0, lower, upper)))
 
 
 class IkSolver:
-    """Solver of all IK configurations of an arm on a fixed base, prepared once for any number of poses.
+    """Solver of all IK configurations of an arm on a fixed base, prepared for any number of poses.
 
     Six joints have at most 16 configurations, which are found in closed form or by elimination. With further joints,
     and where the task leaves angles of the tip open, these parameters are sampled, so that configurations on all
@@ -117,7 +117,8 @@ class IkSolver:
         limits: bool = True,
         samples: int = 36,
     ) -> None:
-        """
+        """Prepare the solver of an arm.
+
         Args:
             machine: Machine on a fixed base.
             link, point: Link of the tip, and its origin in the frame of the link, (3,), m; None: the tip of the robot.
@@ -180,7 +181,7 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class PreparedArm:
-    """Arm prepared for repeated inverse kinematics, see `IkSolver`.
+    """Arm prepared for repeated inverse kinematics by an `IkSolver`.
 
     Attributes:
         arm: Solver of the arm.
@@ -202,7 +203,7 @@ class PreparedArm:
     def of(
         cls, tip: Machine, lower: Array, upper: Array, *, free: ToolFreedom, tool_axis: Array, within: float = 0.0
     ) -> PreparedArm | None:
-        """Return the prepared arm; None if its base moves or no six joints determine the pose of its tip."""
+        """Return the prepared arm; None if its base moves, or if no six joints determine the pose of its tip."""
         chain = Chain.of(tip)
         if chain is None or (free is ToolFreedom.CONE and len(chain.order) < SIX):
             return None
@@ -224,13 +225,13 @@ class PreparedArm:
         return not (self.sampled_angles or self.arm.solvers[0].redundant)
 
     def parameters(self, solver: PoseSolver) -> tuple[str, ...]:
-        """Return the names of the parameters that are sampled with a solver."""
+        """Return the names of the parameters that are sampled if this solver is used."""
         return (*(self.names[j] for j in solver.redundant), *("roll", "azimuth", "tilt")[: self.sampled_angles])
 
     def solve(
         self, solver: PoseSolver, positions: Array, rotations: Array, shares: Array, *, turns: bool = True
     ) -> tuple[Array, NDArray[np.intp], tuple[Incompleteness, ...]]:
-        """Return configurations (K, n), their poses (K,), and why some may be missing at each of N poses.
+        """Return configurations (K, n), their poses (K,), and for each of N poses why some may be missing.
 
         Args:
             solver: One of the solvers of the arm.
@@ -270,11 +271,11 @@ class PreparedArm:
 
     @cached_property
     def _idle(self) -> NDArray[np.bool_]:
-        """Which joints have no effect on the tip. Shape (n,)."""
+        """Mask of the joints that have no effect on the tip. Shape (n,)."""
         return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
 
     def _rotations(self, shares: Array) -> Array:
-        """Return rotations of the tip in its own frame at fractions (0 to 1) of the free angles. Shape (S, 3, 3)."""
+        """Return rotations of the tip in its own frame for fractions (0 to 1) of the free angles. Shape (S, 3, 3)."""
         rolled = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return np.asarray(rolled.as_matrix())
@@ -288,7 +289,7 @@ class PreparedArm:
 
 
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
-    """Return positions (N, 3) and rotations (N, 3, 3)."""
+    """Return positions (N, 3) and rotations (N, 3, 3) after checks."""
     places, turns = np.asarray(positions, dtype=float), np.asarray(rotations, dtype=float)
     single = places.ndim == 1
     places, turns = (places[None], turns[None]) if single else (places, turns)
@@ -305,7 +306,7 @@ def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
 
 
 class IkBranches:
-    """IK configurations of one pose task at samples of its free parameters. Use `ik_branches` to build it.
+    """IK configurations of one pose task at samples of its free parameters. Use `ik_branches` to create it.
 
     Attributes:
         arm: The prepared arm.
@@ -319,7 +320,7 @@ class IkBranches:
     def configurations(
         self, targets: Array, count: int, number: int = 0, *, turns: bool = True, choices: int | None = None
     ) -> IkConfigurations:
-        """Return the configurations of all branches within the limits, joints without limits between -pi and pi.
+        """Return configurations of all branches within the limits; unlimited joints are between -pi and pi.
 
         Args:
             targets: Targets of the equations. Shape (size,).
@@ -359,7 +360,7 @@ class IkBranches:
 
 
 def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranches | None:
-    """Return the IK branches of a task, None for tasks and machines that have no solver.
+    """Return the IK branches of a task; None if task or machine has no solver.
 
     Args:
         equations: Equations of one pose of the tip of an arm in the world: the whole pose, a position and a direction
@@ -393,7 +394,7 @@ def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranc
 def ik_configurations(
     machine: Machine, task: TipTask, *, time: float = 0.0, limits: bool = True, samples: int = 36
 ) -> IkConfigurations:
-    """Return the IK configurations of an arm on all branches of a pose task, and whether the set is complete.
+    """Return IK configurations of an arm on all branches of a pose task, and whether they are all.
 
     For many poses of one arm, prepare an `IkSolver`.
 

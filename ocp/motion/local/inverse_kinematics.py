@@ -39,7 +39,7 @@ LARGEST_SEED = 2**64
 
 @dataclass(frozen=True)
 class IkSettings:
-    """Settings of the Levenberg-Marquardt iterations and of the selection of their solutions.
+    """Settings of the Levenberg-Marquardt iterations, and of the choice among their solutions.
 
     Attributes:
         slide_spread: Range of the starts of prismatic joints without limits, m.
@@ -101,7 +101,7 @@ IK_OPTIONS = IkOptions()
 
 @dataclass(frozen=True)
 class IkSolution:
-    """Joint positions at a target pose.
+    """Solution of inverse kinematics: joint positions at a target pose.
 
     Attributes:
         joints: Shape (joint_size,), rad or m.
@@ -116,7 +116,7 @@ class IkSolution:
 
 
 class Unreachable(ProblemError):
-    """No joint positions were found for a pose.
+    """Error that no joint positions were found for a pose.
 
     Attributes:
         joints: The nearest miss. Shape (joint_size,).
@@ -156,7 +156,7 @@ def inverse_kinematics(
     scene: CollisionScene | None = None,
     options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
-    """Return distinct joint vectors at which the machine satisfies its pose tasks, the best first.
+    """Return distinct joint vectors at which the machine satisfies its pose tasks, in order of preference.
 
     If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches, see
     `ik_configurations`. With more joints than rows they form families, of which members at samples of the free
@@ -242,7 +242,7 @@ def inverse_kinematics_at(
     near: Array | None = None,
     options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
-    """Return IK solutions on a fixed base for known targets from random starts alone; see `inverse_kinematics`.
+    """Return IK solutions on a fixed base for known targets, from random starts only; see `inverse_kinematics`.
 
     Raises:
         Unreachable: No start leads to the pose.
@@ -254,7 +254,7 @@ def inverse_kinematics_at(
 
 @dataclass(frozen=True)
 class _MultiStart:
-    """Iterations from many starts towards the pose tasks at one time; fields as for `inverse_kinematics`."""
+    """Solver that iterates from many starts towards the pose tasks at one time."""
 
     equations: TaskEquations
     base: Array
@@ -264,8 +264,7 @@ class _MultiStart:
     options: IkOptions = IK_OPTIONS
 
     def solve(self, first: Array, random: int) -> list[IkSolution]:
-        """Return the solutions from starts (K, n), the best first; unlimited angles of the last `random` ones are
-        wrapped.
+        """Return the solutions from starts (K, n), best first; unlimited angles of the last `random` are wrapped.
 
         Raises:
             Unreachable: There is no solution.
@@ -283,7 +282,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return solutions on all known branches, (K, n), and the number of random starts for missing ones."""
+        """Return known solutions of all branches, (K, n), and how many random starts are needed for missing ones."""
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count
@@ -296,14 +295,14 @@ class _MultiStart:
         return joints, count - len(joints)
 
     def iterate(self, joints: Array) -> tuple[Array, Array]:
-        """Return joints (K, n) and largest pose errors (K,) after the iterations from these joints."""
+        """Return joints (K, n) and largest pose errors (K,) to which the iterations from given joints lead."""
         fixed = ca.DM(self.base), ca.DM(self.targets)
         function = self.equations.pose_residual_function
         options: Any = {"tolerance": self.options.tolerance, "iterations": int(self.options.iterations), "fixed": fixed}
         return gauss_newton(function, joints, self.lower, self.upper, **options)
 
     def rank(self, joints: Array, errors: Array) -> list[IkSolution]:
-        """Return the distinct solutions among candidates, the best first."""
+        """Return the distinct solutions among candidates, in order of preference."""
         solved, lower, upper = np.flatnonzero(errors <= self.options.tolerance), self.lower, self.upper
         if not solved.size:
             return []
@@ -321,12 +320,12 @@ class _MultiStart:
 
     @property
     def _revolute(self) -> NDArray[np.bool_]:
-        """Which joints are revolute. Shape (n,)."""
+        """Mask of the revolute joints. Shape (n,)."""
         return np.array([joint.kind != "prismatic" for joint in self.equations.machine.robot.moving_joints])
 
 
 def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, *, near: Any = None, seed: int) -> Array:
-    """Return the starts: those of `near`, then `count` random ones between the limits. Shape (K, n)."""
+    """Return start configurations: those of `near`, then `count` random ones between the limits. Shape (K, n)."""
     size, rng = machine.joint_size, np.random.default_rng(seed)
     prismatic = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
     span = np.where(prismatic, IK_SETTINGS.slide_spread, np.pi)
@@ -355,7 +354,7 @@ def gauss_newton(
     iterations: int,
     fixed: Sequence[Any] = (),
 ) -> tuple[Array, Array]:
-    """Return joints (K, n) and largest residuals (K,) after damped Gauss-Newton iterations from starts.
+    """Run damped Gauss-Newton iterations from starts; return joints (K, n) and largest residuals (K,).
 
     Args:
         function: CasADi Function of the joints and `fixed` -> (residual, its Jacobian).
@@ -400,7 +399,7 @@ def gauss_newton(
 def distinct_solutions(
     solutions: list[IkSolution], revolute: NDArray[np.bool_], apart: float = IK_OPTIONS.apart
 ) -> list[IkSolution]:
-    """Return the first of each group of solutions within `apart`, angles modulo full turns."""
+    """Return one representative of each group of solutions within `apart`; angles are compared modulo full turns."""
     distinct: list[IkSolution] = []
     kept = np.zeros((len(solutions), len(revolute)))
     for solution in solutions:
@@ -413,7 +412,7 @@ def distinct_solutions(
 
 
 def spread_points(points: Array, count: int) -> NDArray[np.intp]:
-    """Return the indices of `count` points (K, n) far from each other: each is the farthest from those before it."""
+    """Return the indices of `count` mutually distant points (K, n): each is the farthest from those before it."""
     chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
     while len(chosen) < count:
@@ -425,7 +424,7 @@ def spread_points(points: Array, count: int) -> NDArray[np.intp]:
 def _closest_collisions(
     solutions: list[IkSolution], scene: CollisionScene, base: Array, time: float
 ) -> list[Collision | None]:
-    """Return for each solution its closest pair below the clearance, or None."""
+    """Return for each solution its closest pair of bodies below the clearance, or None."""
     collisions = (find_collisions(scene, base[None], solution.joints[None], np.array([time])) for solution in solutions)
     return [next(iter(each), None) for each in collisions]
 
@@ -487,6 +486,6 @@ def unreachable_error(
 
 
 def describe_miss(distance: float, angle: float) -> str:
-    """Describe a pose error by its distance, m, and angle, rad; a part at rounding level is left out."""
+    """Describe a pose error by its distance, m, and angle, rad, without a part at rounding level."""
     parts = [(distance, "m"), (angle, "rad")]
     return " and ".join(f"{value:.3g} {unit}" for value, unit in parts if value > 1e-9 * (distance + angle)) or "0 m"

@@ -39,7 +39,7 @@ MAX_INTEGRATOR_STEPS = 20000
 
 @dataclass(frozen=True)
 class LocalSolution:
-    """Motion from local redundancy resolution, at M sample times.
+    """Motion from local redundancy resolution (resolved-rate control) at M sample times.
 
     Attributes:
         t: Times, the first 0. Shape (M,), s.
@@ -77,9 +77,7 @@ class LocalSolution:
         return f"<LocalSolution of {self.t[-1]:.6g} s, {self.joints.shape[1]} joints: cost {self.cost[-1]:.6g}{end}>"
 
     def at(self, time: float) -> dict[str, Array]:
-        """Return "base" and "joints" by cubic and "joint_rates" by linear interpolation; the end values beyond the
-        ends.
-        """
+        """Interpolate "base" and "joints" cubically and "joint_rates" linearly; end values are kept beyond the ends."""
         time = float(np.clip(time, self.t[0], self.t[-1]))
         rates = np.array([np.interp(time, self.t, column) for column in self.joint_rates.T])
         if len(self.t) == 1:
@@ -99,7 +97,7 @@ class LocalSolution:
 
 @dataclass(frozen=True, eq=False)
 class RateOptions:
-    """Options of the least joint rates and of their integration.
+    """Options of the computation of least joint rates, and of their integration.
 
     Attributes:
         weights: Positive weights of the squared joint rates that are minimised. Shape (joint_size,); all 1 if None.
@@ -131,7 +129,7 @@ def resolve(
     scene: CollisionScene | None = None,
     options: RateOptions | None = None,
 ) -> LocalSolution:
-    """Integrate x2' = G# v, equation (26) of the free-floating paper with u = 0, and the motion of the base.
+    """Compute a motion along tasks by resolved-rate control, x2' = G# v, with the motion of the base, (26) with u = 0.
 
     The drift of the machine at rest and the feedback of pose tasks are part of v.
 
@@ -178,7 +176,7 @@ def resolve(
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
-    """Return G' (G G' + damping^2 1)^-1 v, the least joint rates for a velocity, G# v when undamped. Shape (n, k).
+    """Return the least joint rates for a task velocity v, G' (G G' + damping^2 1)^-1 v. Shape (n, k).
 
     With weights W^-1 G' (G W^-1 G' + damping^2 1)^-1 v, W their diagonal matrix.
 
@@ -194,7 +192,7 @@ def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any
 
 
 def _sample_times(samples: Any, horizon: float) -> Array:
-    """Return the sample times of a count or an array of times; raise ProblemError unless they cover the horizon."""
+    """Return sample times from their number or from an array; raise ProblemError unless they cover the horizon."""
     if not isinstance(samples, list | tuple | np.ndarray):
         count = real(samples)
         if not (2 <= count <= INPUT_LIMITS.count and count == int(count)):
@@ -214,7 +212,7 @@ def _sample_times(samples: Any, horizon: float) -> Array:
 
 
 class _Model:
-    """Differential equations of (base, joints) and the reported outputs, as CasADi functions of (time, state)."""
+    """Differential equations of (base, joints) and reported outputs, as CasADi functions of (time, state)."""
 
     def __init__(self, equations: TaskEquations, weights: Array, damping: float, symbols: Any) -> None:
         machine = equations.machine
@@ -234,12 +232,12 @@ class _Model:
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
     def integrator(self, start: float, times: Array, tolerance: float) -> Any:
-        """Return the integrator of state and cost from `start` to the times."""
+        """Return the integrator of state and cost from `start` to the given times."""
         problem = {"t": self.time, "x": self.state, "ode": self.ode, "quad": self.running}
         return _cvodes(problem, start, times, tolerance)
 
     def one_interval(self, tolerance: float) -> Any:
-        """Return an integrator from p[0] over p[1] seconds, for any interval between samples."""
+        """Return an integrator from time p[0] over p[1] seconds, for any interval between samples."""
         span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
         rates = ca.Function("at", [self.time, self.state], [self.ode, self.running])
         ode, running = rates(span[0] + fraction * span[1], self.state)
@@ -254,7 +252,7 @@ def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: floa
 
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
-    """Return states and costs at all times that integration reaches, and the reason if it stops early."""
+    """Return states and costs at all times that the integration reaches, and the reason if it stops early."""
     try:
         result = model.integrator(times[0], times[1:], tolerance)(x0=first)
         states = np.vstack([first, np.array(result["xf"]).T])
@@ -317,7 +315,7 @@ CORRECTIONS = 2
 
 @dataclass(frozen=True, eq=False)
 class LocalMotion:
-    """K local motions at M times, tracked by resolved-rate control.
+    """K local motions at M times, computed by resolved-rate control.
 
     Attributes:
         t: Times. Shape (M,), s.
@@ -352,7 +350,7 @@ class LocalMotion:
 
     @classmethod
     def through(cls, times: Array, base: Array, joints: Array, weights: Array) -> LocalMotion:
-        """Return motions through configurations (K, M, n) at times (M,), with rates by forward differences."""
+        """Return motions through configurations (K, M, n) at times (M,); their rates are forward differences."""
         rates = np.diff(joints, axis=1) / np.diff(times)[:, None]
         cost = np.einsum("kmn,n,m->k", rates**2, weights, np.diff(times)) / 2
         rates, zeros = np.concatenate([rates, rates[:, -1:]], axis=1), np.zeros(len(joints))
@@ -365,7 +363,7 @@ class LocalMotion:
         return cls(motions[0].t, *(np.concatenate([getattr(motion, name) for motion in motions]) for name in names))
 
     def straight_to(self, joints: Array) -> LocalMotion:
-        """Return motions straight in joint space from given starts to joints (K, joint_size), without a task."""
+        """Return motions on straight lines in joint space from the given starts to joints (K, joint_size)."""
         share = ((self.t - self.t[0]) / (self.t[-1] - self.t[0]))[:, None]
         displacement = (joints - self.joints[:, 0])[:, None]
         rates = np.repeat(displacement / (self.t[-1] - self.t[0]), len(self.t), axis=1)
@@ -388,7 +386,7 @@ def track_tasks(
     lower: Array,
     upper: Array,
 ) -> LocalMotion:
-    """Track tasks from several configurations.
+    """Track tasks from several start configurations by resolved-rate control.
 
     Args:
         equations: Equations of the tasks.
@@ -427,7 +425,7 @@ def track_tasks(
         return matrix, right, error, np.where(np.isfinite(errors_along), errors_along, np.inf)
 
     def move_base(step: Array, duration: float) -> Array:
-        """Return the base (K, base_size) after joint steps and a duration of drift."""
+        """Return the base (K, base_size) after steps of the joints and a duration of drift."""
         if motion is None:
             return base_now
         drift = np.array(motion(base_now.T, joints_now.T, np.zeros_like(joints_now).T)).T
@@ -468,7 +466,7 @@ def track_tasks(
 
 
 def _cone_function(equations: TaskEquations) -> Any:
-    """Return the CasADi function (base, joints, targets) -> cone cosines and their gradients by the joints."""
+    """Return the CasADi function (base, joints, targets) -> cosines in cones, and their gradients by the joints."""
     machine = equations.machine
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
     targets = ca.SX.sym("targets", equations.target_function().numel_out())
@@ -482,7 +480,7 @@ def _cone_function(equations: TaskEquations) -> Any:
 def _damped_rates(
     matrix: Array, velocities: Array, weights: Array, damping: float, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the least weighted rates (K, n) for task velocities (K, m); joints about to leave their limits stop."""
+    """Return the least weighted rates (K, n) for task velocities (K, m); joints that would leave their limits stop."""
     finite: Any = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(velocities).all(axis=1)
     matrix, velocities = np.where(finite[:, None, None], matrix, 0.0), np.where(finite[:, None], velocities, 0.0)
     size = np.sqrt((matrix**2).sum(axis=(1, 2)) / max(matrix.shape[1], 1))

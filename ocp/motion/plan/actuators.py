@@ -46,7 +46,7 @@ ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 
 
 def limits_actuators(limits: Limits) -> bool:
-    """Return whether limits apply to more than positions and rates."""
+    """Return whether limits include other limits than those of positions and rates."""
     return any(getattr(limits, quantity) is not None for quantity in ACTUATOR_LIMITS)
 
 
@@ -56,12 +56,12 @@ def weights_actuators(cost: Cost) -> bool:
 
 
 def without_actuators(limits: Limits) -> Limits:
-    """Return the limits with position and rate limits only."""
+    """Return the limits of positions and rates only."""
     return replace(limits, acceleration=None, jerk=None, torque=None, power=None)
 
 
 def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
-    """Return the cost of the motion of a plan by the trapezoidal rule; joints that the plan holds do not count."""
+    """Return the cost of a plan's motion by the trapezoidal rule; joints that the plan holds do not count."""
     machine = hold_joints(plan.machine, plan.held) if plan.held else plan.machine
     sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
     free = [name not in plan.held for name in plan.names]
@@ -106,7 +106,7 @@ class ActuatorDemand:
 
     @classmethod
     def of(cls, plan: SolvedPlan, limits: Limits) -> ActuatorDemand | None:
-        """Return the largest demand of a plan; None if no actuator is limited.
+        """Return the largest actuator demand of a plan, relative to its limit; None if no actuator is limited.
 
         The limits are those of the joints that the plan does not hold.
         """
@@ -139,7 +139,7 @@ class ActuatorDemand:
 
 
 def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
-    """Solve again within the actuator limits, with a motion without these limits as the guess.
+    """Solve a request again within its actuator limits; the guess is a motion that ignores these limits.
 
     Args:
         request: The request. If many starts are equally good, the motion has its own start.
@@ -185,7 +185,7 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
 
 
 def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError:
-    """Return the error extended by the actuator demand of the motion that ignores the limits."""
+    """Return the error with the actuator demand of the motion that ignores the limits added to its text."""
     details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
     words = "no motion within the actuator limits was found"
     if demand is not None:
@@ -196,7 +196,7 @@ def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError
 
 
 def _set_guess(motion: ToolMotion, unlimited: SolvedPlan) -> None:
-    """Set the guess of the states and controls of a problem to a motion without actuator limits."""
+    """Set the guess of the states and controls of a problem to a motion that ignores actuator limits."""
     fractions = np.linspace(0.0, 1.0, CHECKED_TIMES)
     sample = unlimited.solution.at_fraction(fractions)
     pace = sample[PACE] if unlimited.rate_name == SLOPES else 1.0

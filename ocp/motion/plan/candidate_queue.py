@@ -47,11 +47,11 @@ class Solver:
         return None
 
     def same_path(self, solution: Solution, reference: Solution) -> bool:
-        """Return whether two solutions are the same motion."""
+        """Return whether two solutions have the same path and so are the same motion."""
         return False
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error that no candidate passes: the reasons by frequency, and the last error of a solve."""
+        """Return the error that no candidate passes its audit, with the reasons, the most frequent first."""
         reasons = Counter(str(candidate.reason) for candidate in candidates).most_common()
         listed = "\n".join(f"  {count} of {len(candidates)} candidates: {reason}" for reason, count in reasons)
         last = next((candidate.solution for candidate in candidates if candidate.solution is not None), None)
@@ -68,13 +68,13 @@ class Solver:
         return error
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, which also stores the other candidates."""
+        """Return the first candidate as the plan, which also lists the other candidates."""
         raise NotImplementedError
 
 
 @dataclass
 class _Motion:
-    """Motion to which candidates of a batch converge: the first of them, and duplicates that wait for its result."""
+    """Motion to which candidates converge: the first of them, and duplicates that wait for its result."""
 
     first: Candidate
     waiting: list[Candidate] = field(default_factory=list)
@@ -88,7 +88,8 @@ class CandidateQueue:
     """
 
     def __init__(self, solver: Solver, settings: PlannerSettings, *, include_costlier: bool = False) -> None:
-        """
+        """Create an empty queue for a solver.
+
         Args:
             solver: Solver of the candidates.
             settings: Settings of the planner.
@@ -101,12 +102,12 @@ class CandidateQueue:
 
     @property
     def cost(self) -> float:
-        """Cost of the best candidate that passed; inf if none did."""
+        """Cost of the best candidate that passed its audit; inf if none did."""
         return min((candidate.cost for candidate in self.candidates if candidate.passed), default=np.inf)
 
     @property
     def passed(self) -> bool:
-        """Whether a candidate passed."""
+        """Whether a candidate passed its audit."""
         return bool(np.isfinite(self.cost))
 
     @property
@@ -116,12 +117,12 @@ class CandidateQueue:
 
     @property
     def exhausted(self) -> bool:
-        """Whether candidates have failed without a collision, none has passed, and the time for failures is over."""
+        """Whether no candidate has passed or collided, although failed candidates have used up the allowed time."""
         seconds = time.thread_time() - self._began
         return seconds > self.settings.refusal_time and bool(self.candidates) and not (self.passed or self.collided)
 
     def run(self, seeds: Iterable[Candidate], include_costlier: bool = False) -> None:
-        """Advance a batch of seeds until no candidate can cost less than the best one that passed.
+        """Advance the candidates of a batch until none of them can cost less than the best one that passed.
 
         Args:
             seeds: Seeds in the order of their first solve.
@@ -152,7 +153,7 @@ class CandidateQueue:
         self.candidates += [candidate.rejected(duplicate) for motion in self._motions for candidate in motion.waiting]
 
     def plan(self) -> SolvedPlan:
-        """Return the plan of the best candidate that passed, with the others and the reasons of their rejection.
+        """Return the plan of the best candidate that passed; it also lists the rejected ones with their reasons.
 
         Raises:
             SolveError: No candidate passed.
@@ -179,7 +180,7 @@ class CandidateQueue:
         heappush(self._heap, (cost, -candidate.stage, self._pushed, candidate))
 
     def _find_motion(self, candidate: Candidate) -> _Motion | None:
-        """Return the known motion to which a candidate converged on its first mesh; None for a new one."""
+        """Return the known motion to which a candidate converged on its first mesh; None if its motion is new."""
         if candidate.stage not in (Stage.COARSE, Stage.FINE) or candidate.separations or candidate.solution is None:
             return None
         if any(motion.first.seed is candidate.seed for motion in self._motions):
@@ -194,7 +195,7 @@ class CandidateQueue:
         return None
 
     def _prune(self, candidate: Candidate) -> Reason | None:
-        """Return the reason for which a candidate need not be advanced; None if it must."""
+        """Return the reason why a candidate need not be advanced; None if it must be advanced."""
         settings, stage, best = self.settings, candidate.stage, self.cost
         if stage is Stage.SEED:
             if not candidate.seed.tracked and np.isfinite(self._least):
@@ -216,7 +217,7 @@ class CandidateQueue:
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, candidate: Candidate) -> bool:
-        """Return whether a candidate of equal cost has passed; if all motions are needed, also of equal path."""
+        """Return whether a candidate of equal cost has passed; if costlier motions are needed, also of equal path."""
         passed = [c for c in self.candidates if c.passed]
         same = [c for c in passed if abs(candidate.cost - c.cost) <= self.settings.same_cost * c.cost]
         if not self._always_costlier or candidate.solution is None:
@@ -224,7 +225,7 @@ class CandidateQueue:
         return any(c.solution is not None and self.solver.same_path(candidate.solution, c.solution) for c in same)
 
     def _take(self, previous: Candidate, advanced: Candidate) -> None:
-        """Process the result of an advance: store a finished candidate, or push it to the queue again."""
+        """Store a candidate that is finished after an advance, or push it to the queue again."""
         if not advanced.passed:
             self.candidates.append(advanced)
             self._failures += previous.stage is not Stage.SEED
@@ -242,14 +243,14 @@ class CandidateQueue:
             self._push(advanced)
 
     def _replace(self, rejected: Candidate) -> None:
-        """Resume the candidates that waited for a candidate that was rejected."""
+        """Resume the duplicates that waited for a candidate which was rejected."""
         for motion in [motion for motion in self._motions if motion.first.seed is rejected.seed]:
             self._motions.remove(motion)
             for candidate in motion.waiting:
                 self._push(candidate)
 
     def _learn_error(self, coarse: Candidate, fine: Candidate) -> None:
-        """Update the estimated error of the coarse mesh, unless the candidate converged to another motion."""
+        """Update the estimated cost error of the coarse mesh, unless the candidate converged to another motion."""
         assert coarse.solution is not None
         assert fine.solution is not None
         if self.solver.same_path(coarse.solution, fine.solution):

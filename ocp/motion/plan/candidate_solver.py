@@ -59,7 +59,8 @@ class CandidateSolver(Solver):
     """
 
     def __init__(self, request: PlanRequest, start: Array, reference: Array) -> None:
-        """
+        """Prepare the solver for the candidates of a request.
+
         Args:
             request: The request.
             start, reference: As in `tool_motion_problem`.
@@ -102,18 +103,18 @@ class CandidateSolver(Solver):
         return [advanced, *self._free_start(advanced)]
 
     def with_own_cost(self) -> CandidateSolver:
-        """Return the solver with a last stage that minimises the cost of the request instead of the joint rates."""
+        """Return the solver with an additional last stage, which minimises the cost of the request."""
         solver = copy(self)
         solver.last = Stage.ACTUATED
         return solver
 
     def own_cost(self, candidate: Candidate) -> float:
-        """Return the cost, as the request defines it, of the motion of an audited candidate."""
+        """Return the cost of an audited candidate's motion, as the request defines it."""
         assert self.request.cost is not None
         return cost_of_motion(self.plan([candidate]), self.request.cost)
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
-        """Return whether the tasks are nearly dependent along a local motion; its candidate then relaxes them."""
+        """Return whether the tasks are nearly dependent along a local motion, so that its candidate relaxes them."""
         return self._can_relax and is_nearly_singular(self.motion.stretches, local)
 
     @property
@@ -121,14 +122,14 @@ class CandidateSolver(Solver):
         return self.request.time_cost is None
 
     def _may_relax(self, candidate: Candidate) -> bool:
-        """Return whether to solve a rejected candidate again with relaxed tasks; not if bodies collide."""
+        """Return whether to solve a rejected candidate again with relaxed tasks, which does not help in collisions."""
         seed, reason = candidate.seed, candidate.reason
         if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or _is_separated(candidate):
             return False
         return self._can_relax and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
-        """Return the reason why the solver found no motion: the violation of its last iterate, or else of the seed."""
+        """Return why the solver found no motion: the violation of its last iterate or, without one, of the seed."""
         samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
         if not samples:
             return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
@@ -138,7 +139,7 @@ class CandidateSolver(Solver):
         return limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
 
     def _turned_over(self, solution: Solution) -> Reason | None:
-        """Return a rejection reason if a tool is upside down at a free start; the task equations hold there as well."""
+        """Return a rejection reason if the tool at a free start is turned by more than 90 degrees from its target."""
         if self.request.start is not None:
             return None
         for sample in self._motion_samples(solution):
@@ -197,7 +198,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.REFINED, cost=solution.cost, solution=solution)
 
     def _audit(self, candidate: Candidate) -> Candidate:
-        """Audit a candidate; on failure refine its mesh or widen separations, if that may help.
+        """Audit a candidate; if it fails, refine its mesh or increase separation margins where that may help.
 
         If many starts are equally good, the optimality of one of them is undetermined. The motion is then solved and
         audited with its start fixed.
@@ -241,7 +242,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return a new candidate with a free start, from one that passed with a fixed start."""
+        """Return a new candidate with a free start from a candidate that passed with a fixed start."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints
@@ -262,7 +263,7 @@ class CandidateSolver(Solver):
         return replace(candidate, cost=np.nan, solution=None).rejected(reason)
 
     def _separate_pairs(self, candidate: Candidate, stage: Stage, collisions: list[Collision]) -> Candidate:
-        """Solve a candidate again with more separated pairs."""
+        """Solve a candidate again, with separation constraints for the pairs that collide."""
         assert candidate.constraints is not None
         constraints = candidate.constraints.separating(collisions)
         reason = self._collision_reason(collisions[0])
@@ -277,7 +278,7 @@ class CandidateSolver(Solver):
     def prepared(
         self, candidate: Candidate, fine: bool, cost: float = np.inf
     ) -> tuple[ToolMotion, Collocation, Prepared]:
-        """Return the problem of a candidate, its first mesh, and both prepared for guesses of about this cost."""
+        """Return the problem of a candidate, its first mesh, and both prepared for guesses of similar cost."""
         settings, separated = self.settings, _is_separated(candidate)
         margins: tuple[Any, ...] = ()
         if candidate.constraints is not None and separated:
@@ -303,7 +304,7 @@ class CandidateSolver(Solver):
         return declared_motion(self.request, **options, relaxed=relaxed)
 
     def _start(self, candidate: Candidate) -> Array:
-        """Return the joints at the start, nan where free; joints that move separated bodies are not ignorable."""
+        """Return the joints at the start, nan where free; joints that move separated bodies stay free."""
         if candidate.seed.fixed:
             return candidate.start
         constraints = candidate.constraints
@@ -315,12 +316,11 @@ class CandidateSolver(Solver):
     def _options(
         self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return solver options for a problem with separated bodies: the cost bounds the initial barrier parameter.
+        """Return solver options for a problem with separated bodies, with a barrier parameter limited by the cost.
 
         An interior-point method with barrier parameter mu leads to a point whose cost exceeds the least one by mu for
         each limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier
-        alone determines where
-        it leads: far away from the bodies, into another homotopy class.
+        alone determines the result: a motion far away from the bodies, in another homotopy class.
         """
         declared = motion.problem.declared
         min_barrier = self.settings.negligible_rate * motion.horizon
@@ -340,7 +340,7 @@ class CandidateSolver(Solver):
     def _audit_and_refine(
         self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool
     ) -> tuple[Solution, Audit]:
-        """Return a motion and its audit, on finer meshes if the audit requires them.
+        """Audit a motion, and solve it on finer meshes if the audit requires that; return motion and audit.
 
         With `check`, a solve that fails on a finer mesh is repeated from other guesses and diagnosed.
         """
@@ -358,7 +358,7 @@ class CandidateSolver(Solver):
         return solution, audit
 
     def _refine_for_tasks(self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool) -> Solution:
-        """Refine the mesh where tips deviate or joints exceed their limits, as long as that may reduce the error."""
+        """Refine the mesh where tips deviate or joints exceed limits, as long as that reduces the errors enough."""
         settings, deviations = self.settings, self._deviations(motion, solution)
         for _ in range(settings.max_refinements):
             if deviations.max() <= settings.tip_tolerance:
@@ -379,7 +379,7 @@ class CandidateSolver(Solver):
         return solution
 
     def _deviations(self, motion: ToolMotion, solution: Solution) -> Array:
-        """Return the largest error in each mesh interval: of the tips, or of joints beyond limits, m and rad. (N,)"""
+        """Return the largest error of tips, or of joints beyond limits, in each mesh interval (N,), m and rad."""
         fractions, samples = self._samples(solution), self.settings.samples_per_interval
         sample, worst = solution.at_fraction(fractions), np.zeros(len(fractions))
         robot = self.request.machine.robot
@@ -399,12 +399,12 @@ class CandidateSolver(Solver):
         return np.asarray(np.maximum(worst[:-1], worst[1:]).reshape(-1, samples).max(axis=1))
 
     def _samples(self, solution: Solution) -> Array:
-        """Return fractions of the horizon: several per mesh interval, and the end."""
+        """Return fractions of the horizon: several samples in each mesh interval, and the end."""
         nodes, count = solution.state_interpolant.breaks, self.settings.samples_per_interval
         return np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(count) / count).ravel(), 1.0)
 
     def same_path(self, solution: Solution, reference: Solution) -> bool:
-        """Return whether two motions are the same but for mesh errors and full turns of joints."""
+        """Return whether two motions have the same path, apart from mesh errors and full turns of joints."""
         samples = np.linspace(0.0, 1.0, self.settings.compared_samples)
         names = [f"joints{stretch.suffix}" for stretch in self.motion.stretches]
         paths = [np.hstack([each.at_fraction(samples)[name] for name in names]) for each in (solution, reference)]
@@ -415,7 +415,7 @@ class CandidateSolver(Solver):
     # ---- collisions --------------------------------------------------------------------------------------------------
 
     def collisions(self, candidate: Candidate) -> list[Collision]:
-        """Return the closest approaches of colliding pairs that are not separated, the worst first."""
+        """Return the closest approaches of colliding pairs without separation constraints, in order of severity."""
         constraints, solution = candidate.constraints, candidate.solution
         if constraints is None or solution is None:
             return []
@@ -434,12 +434,12 @@ class CandidateSolver(Solver):
         return [collision for collision in self._collisions[1] if collision.pair not in constraints.margins]
 
     def collision(self, candidate: Candidate) -> Reason | None:
-        """Return the reason of the worst collision in its motion; None without collisions."""
+        """Return the rejection reason for the worst collision of a candidate; None if it is collision-free."""
         collisions = self.collisions(candidate)
         return self._collision_reason(collisions[0]) if collisions else None
 
     def local_collisions(self, seed: Seed) -> list[Collision]:
-        """Return the collisions in a local motion, the worst first."""
+        """Return the collisions in the local motion of a seed, in order of severity."""
         constraints, collisions = self.request.clearance_constraints, list[Collision]()
         for motion in seed.local if constraints is not None else ():
             assert constraints is not None
@@ -448,11 +448,11 @@ class CandidateSolver(Solver):
 
     @property
     def no_clear_configuration(self) -> bool:
-        """Whether at some time every configuration that satisfies the tasks is in collision."""
+        """Whether all configurations that satisfy the tasks at some checked time are in collision."""
         return any(isinstance(value, Unreachable) for value in self._clear_counts.values())
 
     def _count_clear_at(self, time: float) -> int | Unreachable | None:
-        """Return the cached `count_clear_configurations` at a time."""
+        """Return the result of `count_clear_configurations` at a time, from the cache if possible."""
         if time not in self._clear_counts:
             self._clear_counts[time] = count_clear_configurations(self.request, time)
         return self._clear_counts[time]
@@ -479,7 +479,7 @@ class CandidateSolver(Solver):
         return SolveError(words, error.solution, error.conflicts, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the first candidate as a plan that also stores the other candidates."""
+        """Return the first candidate as the plan, which also lists the other candidates."""
         best, parts = candidates[0], parts_of(self.motion.stretches)
         assert best.solution is not None
         if self.request.time_cost is not None:

@@ -65,7 +65,7 @@ def plan_sequence(
     *,
     constraints: ClearanceConstraints | None,
 ) -> PhasedPlan:
-    """Plan the motion to goals one after the other, as the phases of one problem of least total cost.
+    """Plan motions to consecutive goals as the phases of one problem, which minimises their total cost.
 
     A pose is reached in the configuration that is nearest to the goal before it.
 
@@ -115,7 +115,7 @@ def plan_sequence(
 def plan_goal(
     machine: Machine, goal: Goal, horizon: Any, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> SolvedPlan:
-    """Plan the motion to one goal: around obstacles, or with its tasks, machine and base as one phase of a problem.
+    """Plan the motion to one goal: around obstacles, or as one phase of a problem with its own tasks and machine.
 
     Args:
         machine: Arm on a fixed or floating base.
@@ -132,7 +132,7 @@ def plan_goal(
 
 
 def _has_only_target(goal: Goal) -> bool:
-    """Return whether a goal has no tasks on the way and changes neither the machine nor the base."""
+    """Return whether a goal is only a target: without tasks on the way, and without change of machine or base."""
     has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
     return not has_tasks and goal.machine is None and goal.base is None
 
@@ -221,13 +221,13 @@ def with_joints(goal: Goal, joints: Array) -> Goal:
 
 
 def _phased(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
-    """Return the plan of a solution that has phases."""
+    """Return the plan whose motion is a solution with phases."""
     candidate = Candidate(start, solution.cost, None, Stage.AUDITED, solution)
     return PhasedPlan(machine, solution, parts_of_phases(solution), (candidate,))
 
 
 def nearest_configuration(machine: Machine, goal: Goal, near: Array, *, limits: Limits, seed: int) -> Array:
-    """Return the joints at the pose of a goal that are nearest to others. Shape (n,).
+    """Return the joints at the pose of a goal that are nearest to the given ones. Shape (n,).
 
     Raises:
         Unreachable, ProblemError: As `inverse_kinematics`.
@@ -241,7 +241,7 @@ def nearest_configuration(machine: Machine, goal: Goal, near: Array, *, limits: 
 def goal_configurations(
     machine: Machine, goal: Goal, near: Array, *, limits: Limits, constraints: ClearanceConstraints | None, seed: int
 ) -> Array:
-    """Return configurations at a goal that keep limits and clearance, the nearest to others first. Shape (K, n).
+    """Return configurations at a goal within limits and clearance, sorted by distance from `near`. Shape (K, n).
 
     The tip of a goal with a region is at the centre of the region, and at random places in it. Joints that do not move
     the tip stay where they are.
@@ -279,7 +279,7 @@ def goal_configurations(
 
 
 def _points_inside(region: Box | Sphere | None, seed: int) -> Array:
-    """Return random points of a region in world, none without one. Shape (K, 3), m."""
+    """Return random points in a region, in world; none without a region. Shape (K, 3), m."""
     if region is None:
         return np.zeros((0, 3))
     center: Array = np.array(region.position, dtype=float)
@@ -301,8 +301,7 @@ def plan_to_stand(
     constraints: ClearanceConstraints | None,
     wrenches: External | None,
 ) -> SolvedPlan:
-    """Plan a motion that satisfies the tasks with the zero moment point inside the foot, at the cost of
-    `solve_standing`.
+    """Plan a motion that satisfies the tasks while the zero moment point stays inside the foot.
 
     The joints start and end at rest if their tasks do; else they may move there. Candidates start from every
     configuration that inverse kinematics finds and that stands; with search "start", from the best conditioned one that
@@ -354,7 +353,7 @@ def plan_to_stand(
 
 @dataclass
 class _StandingSolver(Solver):
-    """Solver of the candidates of a standing machine in one stage: `solve_standing` solves, refines and audits."""
+    """Solver of the candidates of a standing machine, with one stage, in which `solve_standing` does everything."""
 
     machine: Standing
     tasks: list[TipTask]
@@ -363,7 +362,7 @@ class _StandingSolver(Solver):
     start_is_fixed: bool
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """Return the candidate, audited or rejected.
+        """Return the candidate after its solve: audited, or rejected.
 
         Raises:
             ProblemError, SolveError: Errors of a given start.
@@ -377,7 +376,7 @@ class _StandingSolver(Solver):
         return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the plan of the first candidate, with the others."""
+        """Return the first candidate as the plan, which also lists the others."""
         best = candidates[0].solution
         assert best is not None
         parts = (Part(0.0, self.duration, ""),)
@@ -385,7 +384,7 @@ class _StandingSolver(Solver):
 
 
 def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
-    """Return "rest" if the tasks are at rest at a time, else "free"."""
+    """Return "rest" if the tips are at rest at a time, else "free"."""
     try:
         check_rest(equations, time)
     except ProblemError:
@@ -394,7 +393,7 @@ def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
 
 
 def _takes_scalars(equations: TaskEquations) -> bool:
-    """Return whether the tracks can be expressed by SX symbols."""
+    """Return whether the functions of time in the tasks accept SX symbols."""
     try:
         equations.targets(ca.SX.sym("time"))
     except (RuntimeError, NotImplementedError):
@@ -405,7 +404,7 @@ def _takes_scalars(equations: TaskEquations) -> bool:
 def _start_configurations(
     machine: Standing, tasks: list[TipTask], start: Any, limits: Limits | None, seed: int
 ) -> list[Array]:
-    """Return the joints at the start, the best conditioned first."""
+    """Return joint vectors at the start, in order of their conditioning."""
     if start is not None:
         return [start]
     poses = [task for task in tasks if task.is_pose]

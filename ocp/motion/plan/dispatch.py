@@ -58,7 +58,7 @@ def plan(
     time_limit: float | None = None,
     progress: Callable[[str], Any] | bool | None = None,
 ) -> Plan:
-    """Plan the lowest-cost motion that satisfies the tasks: the least integral of half the squared joint rates.
+    """Plan the lowest-cost motion that satisfies the tasks, by default with the least integral of squared joint rates.
 
     Args:
         machine: A machine on a fixed or floating base, or standing, see `plan_to_stand`.
@@ -130,7 +130,7 @@ def _plan(
     search: Search,
     seed: int,
 ) -> Plan:
-    """Select the planner for the tasks and pass the arguments of `plan` to it."""
+    """Select the planner for the tasks, and call it with the arguments of `plan`."""
     options: dict[str, Any] = {"cost": cost, "limits": limits, "seed": seed}
     wrenches = scene.wrenches if isinstance(scene, Scene) else None
     if wrenches is not None and (not isinstance(machine, Standing) or isinstance(tasks, Steps)):
@@ -174,7 +174,7 @@ def _plan(
 
 
 def _is_sequence(tasks: Any) -> bool:
-    """Return whether tasks are a sequence of goals and tasks, or of groups of tasks; not goals or tasks alone.
+    """Return whether tasks are a sequence of motions: goals mixed with tasks, or groups of tasks.
 
     Raises:
         ProblemError: A part is neither a goal nor tasks.
@@ -200,7 +200,7 @@ def _is_sequence(tasks: Any) -> bool:
 
 
 def _check_unused(reason: str, **arguments: Any) -> None:
-    """Raise ProblemError about the first argument that is not None."""
+    """Raise ProblemError about the first argument that is not None, because this planner does not use it."""
     for name, value in arguments.items():
         if value is not None:
             raise ProblemError(f"{reason} takes no {name}; leave it out", name=name, value=value)
@@ -270,7 +270,7 @@ def _goal_problem(
     limits: Limits | None,
     clearance_constraints: ClearanceConstraints | None,
 ) -> Problem:
-    """Declare the motion to goals: at constant speed if velocities alone are weighted and limited, else smooth."""
+    """Declare the motion to goals: at constant speed if only velocities are weighted and limited, else smooth."""
     state, joints, base = Start.of(start, machine)
     is_smooth = limits is not None and limits_actuators(limits)
     is_smooth = is_smooth or (cost is not None and cost.terms != ("velocity",))

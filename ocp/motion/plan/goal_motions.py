@@ -125,7 +125,7 @@ class GoalRequest:
 
 @dataclass(frozen=True, eq=False)
 class GoalTask:
-    """Checked request: bounds, start, goals in all turns, metric, and collision checks."""
+    """Checked request for a motion to goals: bounds, start, goals in all turns, metric, and collision checks."""
 
     request: GoalRequest
     bounds: JointBounds
@@ -142,7 +142,7 @@ class GoalTask:
 
     @property
     def is_dynamic(self) -> bool:
-        """Whether the motion is smooth: actuators are limited, or more than velocity or length is the cost."""
+        """Whether the motion is smooth, because actuators are limited or more than velocity or length is weighted."""
         return limits_actuators(self.limits) or not set(self.request.cost.terms) <= {"velocity", "length"} or self.moves
 
     @property
@@ -157,7 +157,7 @@ class GoalTask:
 
     @property
     def is_fastest(self) -> bool:
-        """Whether the motion is time-optimal: only a free time is the cost, and no power is limited."""
+        """Whether the motion is time-optimal: the cost is a free time alone, and no power is limited."""
         is_free = self.request.horizon is None and self.request.cost.terms == ("time",)
         return is_free and not np.isfinite(self.bounds.power).any()
 
@@ -172,7 +172,7 @@ class GoalTask:
 
 
 def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return the audited motions along paths at constant speed."""
+    """Return motions at constant speed along paths, with their audits."""
     request = task.request
     fastest = np.where(np.isfinite(task.bounds.velocity), task.bounds.velocity, request.settings.unlimited_rate)
     candidates = []
@@ -193,14 +193,14 @@ def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate
 
 
 def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return the audited motions along paths."""
+    """Return motions along paths, as the limits and the cost require, with their audits."""
     if task.is_fastest:
         return [_fastest(task, path) for path in paths]
     return _within_actuator_limits(task, paths) if task.is_dynamic else _at_constant_speed(task, paths)
 
 
 def synchronised_candidates(task: GoalTask) -> list[Candidate]:
-    """Return the fastest motion without obstacles, audited, if it happens to be collision-free; else no motion.
+    """Return the fastest motion that ignores obstacles, with its audit, if it is collision-free; else no motion.
 
     No motion is faster unless torques slow it down.
     """
@@ -221,7 +221,7 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
 
 
 def _fastest(task: GoalTask, path: JointPath) -> Candidate:
-    """Return the locally fastest motion near a path, audited; if none is found, one that stops at corners."""
+    """Return a locally fastest motion near a path with its audit or, if none is found, one that stops at corners."""
     settings = task.request.settings.fastest
     ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
     limits = MotionLimits(task.motions, task.bounds, task.torques, *ends)
@@ -243,7 +243,7 @@ def _fastest(task: GoalTask, path: JointPath) -> Candidate:
 
 
 def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return audited motions within actuator limits: with stops at corners and, if time is left, without."""
+    """Return audited motions within actuator limits: first with stops at corners, then, if time is left, without."""
     request, settings, bounds = task.request, task.request.settings, task.bounds
     candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
     for path in paths:
@@ -269,7 +269,7 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
 
 
 def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
-    """Return whether a candidate passed its audit and its cost is within tolerance of the lower bound."""
+    """Return whether a candidate passed its audit with a cost that equals the lower bound within tolerance."""
     if not candidate.passed or candidate.solution is None:
         return False
     bound = cost_bound(task, candidate.solution.horizon)
@@ -278,7 +278,7 @@ def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _PathProblem:
-    """Problem of moving along one path within actuator limits.
+    """Problem of a motion near one path, within actuator limits.
 
     Attributes:
         task: Checked request.
@@ -294,11 +294,11 @@ class _PathProblem:
 
     @property
     def horizon_guess(self) -> float:
-        """Horizon, s, or its guess."""
+        """Horizon or, if it is free, its guess, s."""
         return self.motion.duration if self.fixed is None else self.fixed
 
     def declare(self, clearance: ClearanceConstraints | None) -> Problem:
-        """Declare the problem."""
+        """Declare the problem, with or without clearance constraints."""
         task, ends = self.task, {"start": self.path.joints[0], "end": self.path.joints[-1]}
         guess = self.horizon_guess
         least = 0.0 if task.moves else least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()
@@ -315,7 +315,7 @@ class _PathProblem:
         return dynamics_problem(task.request.machine, (), horizon, **ends, limits=limits, cost=cost, setup=setup)
 
     def stopping(self) -> Candidate:
-        """Return the motion that stops at corners, slowed down to a fixed horizon, with its audit."""
+        """Return the motion that stops at corners, slowed down to the horizon if that is fixed, with its audit."""
         task, factor = self.task, self.horizon_guess / self.motion.duration
         if task.request.cost.energy or np.isfinite(task.bounds.power).any() or task.moves:
             words = "motions with stops are not offered where power counts, or the machine moves at an end"
@@ -328,12 +328,12 @@ class _PathProblem:
         return replace(self, motion=self.motion.slower(factor)).candidate("stops at the corners of a path")
 
     def candidate(self, method: str) -> Candidate:
-        """Audit the motion and return it as a candidate; `method` describes how it was found."""
+        """Audit the motion and return it as a candidate; `method` says how it was computed."""
         problem = self.declare(self.task.request.clearance_constraints)
         return _audited(self.task, self.motion.solution(problem, method), self.path)
 
     def smooth(self) -> Candidate:
-        """Solve for a motion without stops, with the path as the guess, and return it with its audit."""
+        """Solve for a motion without stops, guessed from the path, and return it with its audit."""
         task, joints = self.task, self.path.joints
         settings, duration = task.request.settings, self.horizon_guess
         times = np.linspace(0.0, duration, settings.guess_times)
@@ -354,7 +354,7 @@ class _PathProblem:
 
 
 def _audited(task: GoalTask, solution: Solution, path: JointPath) -> Candidate:
-    """Return the candidate of a solution, with a reason if it is not feasible or could not be audited in time."""
+    """Return a solution as a candidate, rejected if it is not feasible or could not be audited in time."""
     candidate = Candidate(path.joints[0], solution.cost, None, Stage.FINE, solution)
     task.report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
     try:
@@ -372,7 +372,7 @@ def _audited(task: GoalTask, solution: Solution, path: JointPath) -> Candidate:
 
 
 def cost_bound(task: GoalTask, horizon: float) -> float | None:
-    """Return a lower bound of the cost of any motion to one of the goals; None if it moves at an end.
+    """Return a lower bound of the cost of any motion to a goal; None if the machine moves at an end.
 
     Straight motions have the least length and squared rates. No joint reaches its goal faster than by itself.
     """

@@ -40,7 +40,7 @@ __all__ = ["plan_to_goal"]
 
 @interruptible
 def plan_to_goal(request: GoalRequest) -> SolvedPlan:
-    """Return the lowest-cost motion found from the start to one of the goals; with actuators, at rest at both ends.
+    """Return the lowest-cost motion from the start to a goal that was found; with actuator limits, from rest to rest.
 
     Raises:
         ProblemError: Sizes do not match; the start, or every goal, is outside the limits or collides: names the pair of
@@ -64,7 +64,7 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
 
 
 def _checked(request: GoalRequest) -> GoalTask:
-    """Return the checked request, with goals of unlimited joints shifted by full turns near the start.
+    """Return the checked request, with goals of unlimited joints shifted by full turns to be near the start.
 
     Raises:
         ProblemError: As `plan_to_goal`.
@@ -129,7 +129,7 @@ def _collision(scene: Any, name: str, collision: Any) -> ProblemError:
 
 
 def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal: Array, turns: int) -> list[Array]:
-    """Return the goal with joints shifted by full turns within their limits, the nearest to the start first."""
+    """Return a goal in all full turns of its unlimited joints within limits, the one nearest to the start first."""
     nearest = start + space.difference(goal, start)
     shifts = []
     for joint in range(len(goal)):
@@ -144,7 +144,7 @@ def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal
 
 
 def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
-    """Search collision-free paths of several homotopy classes, the shortest first.
+    """Search for collision-free paths of several homotopy classes, and sort them by length.
 
     Raises:
         SolveError: None was found.
@@ -177,7 +177,7 @@ def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
 
 
 def _best(task: GoalTask, candidates: list[Candidate]) -> SolvedPlan:
-    """Return the plan of the lowest-cost candidate, with a lower bound of the cost of all motions.
+    """Return the lowest-cost candidate as the plan, with a lower bound of the cost of all motions.
 
     Raises:
         SolveError: None passed its audit.

@@ -70,7 +70,7 @@ __all__ = [
 def plan_from_configurations(
     request: PlanRequest, configurations: Array, solver: CandidateSolver
 ) -> tuple[SolvedPlan, float | None]:
-    """Return the plan that results from start configurations, and a lower bound of its cost or None.
+    """Return the plan that starts from one of some configurations, and a lower bound of its cost or None.
 
     Args:
         request: The request.
@@ -112,7 +112,7 @@ def plan_from_configurations(
 
 
 def _finished(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
-    """Return the plan of the lowest-cost candidate.
+    """Return the plan of the lowest-cost candidate, as measured by the cost of the request.
 
     If the request has another cost than the squared rates, all motions that passed are solved again at that cost, in
     the order of the cost that they have without a change.
@@ -130,7 +130,7 @@ def _finished(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates of local motions: those that satisfy their tasks first, then by increasing cost.
+    """Return candidates from local motions, sorted by whether they satisfy their tasks, then by cost.
 
     Args:
         motions: K local motions through each stretch.
@@ -169,7 +169,7 @@ def _repair(
 
 
 def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configurations: Array, thorough: bool) -> None:
-    """Try configurations one after the other, the best conditioned first, until one leads to a plan.
+    """Try configurations one after the other, in order of their conditioning, until one leads to a plan.
 
     Args:
         thorough: Whether failures are diagnosed, since nothing else is tried.
@@ -185,7 +185,7 @@ def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configuratio
 
 
 def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch) -> None:
-    """Solve the classes of motions that may contain the optimum; if none passes, try one motion of every class.
+    """Solve the classes of motions that may contain the optimum; if all fail, solve one motion of every class.
 
     A free start and a coarse mesh may lead away from a nearly optimal motion. Motions of the search that promise a
     lower cost than the plan are therefore also solved with their start fixed, until the plan is close to its bound.
@@ -219,7 +219,7 @@ def _check_dead_end(search: TaskSearch) -> None:
 def _search_cells(
     queue: CandidateQueue, solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array
 ) -> None:
-    """Solve candidates from a cell search over the states of a floating machine, and from its local motions.
+    """Solve candidates from a cell search over the states of a floating machine, and those from local motions.
 
     Raises:
         Unreachable, DeadEnd: As in `CellSearch`, if no local motion leads to a plan either.
@@ -255,7 +255,7 @@ def _search_cells(
 
 
 def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Solve candidates in collision again: from their own local motions, then from fixed, collision-free starts.
+    """Solve candidates in collision again, from their own local motions, then from fixed, collision-free starts.
 
     Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
     motions belong to different homotopy classes; those without collision, or with the least, come first. A free start
@@ -308,7 +308,7 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
 
 
 def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
-    """Plan a request with held joints; `whole` is the request before any joints were held.
+    """Plan a request with some joints held; `whole` is the request before any joints were held.
 
     Raises:
         ProblemError, SolveError: As in `plan`.
@@ -352,7 +352,7 @@ def clearance_for(
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """Options of `plan` that tasks of tips take, as the user gave them.
+    """Options of `plan` for tasks of tips, before they are checked.
 
     Attributes:
         start, cyclic, cost, limits, search, seed: As in `plan`.
@@ -367,7 +367,7 @@ class PlanOptions:
 
 
 def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOptions) -> PlanRequest:
-    """Check the arguments of `plan`, except those of the collision scene.
+    """Check the arguments of `plan`, except the scene, and return them as a request.
 
     Raises:
         ProblemError: As in `plan`.
@@ -412,7 +412,7 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
-    """Check the weights of the cost of tip tasks and return the cost.
+    """Return the cost of tip tasks after a check of its weights.
 
     Args:
         free: Whether the horizon is free.

@@ -50,7 +50,7 @@ AT_START = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SequenceRequest:
-    """Options of all motions of a sequence.
+    """Options that all motions of a sequence share.
 
     Attributes:
         machine: Machine on a fixed or floating base.
@@ -76,7 +76,7 @@ class SequenceRequest:
 
 
 class _State(NamedTuple):
-    """Configuration and joint velocities at the junction of two motions; None where they are still unknown."""
+    """Configuration and joint velocities at the junction of two motions; None if not yet known."""
 
     joints: Array | None
     base: Array
@@ -84,18 +84,18 @@ class _State(NamedTuple):
 
     @classmethod
     def end_of(cls, plan: SolvedPlan, smooth: bool) -> _State:
-        """Return the state at the end of a motion; the rates are zero if they may jump."""
+        """Return the state at the end of a motion; its rates are zero if rates may jump."""
         at = plan.at(plan.horizon)
         return cls(at["joints"], at.get("base", np.zeros(0)), _velocity(at["rates"], smooth))
 
 
 def _velocity(rates: Array, smooth: bool) -> Any:
-    """Return the joint velocity at a junction: "rest" if it is zero or may jump."""
+    """Return the joint velocity at a junction: "rest" if it is zero, or if rates may jump."""
     return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
 
 
 def plan_consecutive(request: SequenceRequest, parts: Sequence[Goal | TipTask | Sequence[TipTask]]) -> SequencePlan:
-    """Plan motions to goals and along tasks one after the other.
+    """Plan motions to goals and motions along tasks, one after the other.
 
     Args:
         request: The options.
@@ -110,7 +110,7 @@ def plan_consecutive(request: SequenceRequest, parts: Sequence[Goal | TipTask | 
 
 @dataclass(eq=False)
 class _Sequence:
-    """Motions of a sequence that have been planned so far, with the state at their end."""
+    """The motions of a sequence that are already planned, and the state at their end."""
 
     request: SequenceRequest
     parts: tuple[Any, ...]
@@ -128,7 +128,7 @@ class _Sequence:
             raise ProblemError(words, name="start")
 
     def plan(self) -> SequencePlan:
-        """Plan all parts."""
+        """Plan all parts of the sequence."""
         led: SolvedPlan | None = None  # the next part, if the goal before it has been chosen for it
         for number, (part, following) in enumerate(zip_longest(self.parts, self.parts[1:]), 1):
             if isinstance(part, Goal):
@@ -154,7 +154,7 @@ class _Sequence:
         self.state = _State.end_of(plan, self.request.smooth)
 
     def _joints_near(self, goal: Goal) -> Array | None:
-        """Return the joint values of a goal; joints that the goal leaves open keep their current values."""
+        """Return the joints of a goal; joints that the goal leaves open have their current values."""
         if goal.joints is None or self.state.joints is None:
             return self.state.joints
         joints = floats(goal.joints).ravel()
@@ -163,7 +163,7 @@ class _Sequence:
         return np.where(np.isnan(joints), self.state.joints, joints)
 
     def _plan_goal(self, goal: Goal) -> SolvedPlan:
-        """Return the motion to a goal from the present state."""
+        """Return the motion from the current state to a goal."""
         request = self.request
         own = self.machine if goal.machine is None else checked_motors("goal: machine", goal.machine)
         if own.robot.joint_names != self.machine.robot.joint_names:
@@ -178,7 +178,7 @@ class _Sequence:
         return plan_goal(own, replace(goal, machine=None), horizon, options, constraints=self._constraints())
 
     def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
-        """Return the motion along tasks: from the joints `near` if these are at their start, else from any joints."""
+        """Return the motion along tasks, from the joints `near` if the tasks start there, else from any joints."""
         request, machine = self.request, self.machine
         options: dict[str, Any] = {"cost": request.cost, "limits": request.limits, "seed": request.seed}
         options |= {"search": request.search, "start": None}
@@ -195,7 +195,7 @@ class _Sequence:
         return plan_request(checked)
 
     def _approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
-        """Add the motion to the start of a task and return the motion along the task."""
+        """Add the motion to the start of a task, and return the motion along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
@@ -216,7 +216,7 @@ class _Sequence:
         return self._plan_tasks(tasks, joints) if turned else plan
 
     def _constraints(self) -> ClearanceConstraints | None:
-        """Return the clearance constraints of the present machine.
+        """Return the clearance constraints of the current machine.
 
         Raises:
             ProblemError: An obstacle moves.
@@ -229,20 +229,20 @@ class _Sequence:
 
 
 def _is_at_start(machine: Machine, tasks: Any, joints: Array) -> bool:
-    """Return whether joints are where the tasks at the start of a motion begin; velocity tasks begin anywhere."""
+    """Return whether joints satisfy the tasks at the start of their motion; velocity tasks begin anywhere."""
     first = [task for task in ((tasks,) if isinstance(tasks, TipTask) else tasks) if not task.begin]
     return _misses(bind(machine, first), joints) <= AT_START if first else True
 
 
 def _misses(equations: TaskEquations, joints: Array) -> float:
-    """Return the largest pose errors of joints at time 0, m and rad; axes may lie anywhere in their cones."""
+    """Return the largest pose error of joints at time 0, m or rad; tool axes may lie anywhere in their cones."""
     at: tuple[Any, ...] = np.zeros(1), None, joints[None]
     errors = equations.errors(*at), equations.cone_violations(*at)
     return max(float(np.abs(each).max(initial=0.0)) for each in errors)
 
 
 def _led_to(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return a goal with the joints and the velocity at the start of a task, if that start satisfies the goal."""
+    """Return a goal with the joints and velocity at the start of a task if that start satisfies the goal."""
     first = plan.at(0.0)
     if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
         return goal
@@ -269,7 +269,7 @@ def _rests(request: PlanRequest) -> tuple[bool, bool]:
 
 
 def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:
-    """Return a velocity as numbers; zeros for "rest"."""
+    """Return a velocity as numbers, which are zero for "rest"."""
     return np.zeros_like(like["rates"]) if isinstance(velocity, str) else floats(velocity)
 
 
@@ -294,7 +294,7 @@ def plan_in_segments(
     scene: Scene | Literal[False] | None = None,
     seed: int = 0,
 ) -> SegmentedPlan:
-    """Plan tasks in the fewest segments, between which the arm reconfigures, at the least cost.
+    """Plan tasks in the fewest segments, at the least cost; the arm reconfigures between segments.
 
     If one motion does the tasks, there is one segment, the plan of `plan(..., search="global")`. Else the tasks are
     divided at time samples, refined to a thousandth of the horizon where that may save a segment. Among divisions into
@@ -380,7 +380,7 @@ def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
 
 
 def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, after: Array) -> Reconfiguration:
-    """Return a motion between two configurations of all joints: straight, or around obstacles."""
+    """Return a motion between two configurations of all joints, straight or around obstacles."""
     machine, whole = require.instance("machine", request.machine, FixedBase), request.whole or request.machine
     free = [name not in request.held for name in whole.robot.joint_names]
     goal = GoalRequest(

@@ -38,7 +38,7 @@ SINGULAR = SingularSettings()
 
 
 def is_nearly_singular(stretches: Sequence[Stretch], motions: Sequence[LocalMotion]) -> bool:
-    """Return whether the task rows become nearly dependent somewhere along a local motion."""
+    """Return whether the rows of the tasks become nearly dependent somewhere along a local motion."""
     for stretch, motion in zip(stretches, motions, strict=True):
         if stretch.equations is None or not stretch.equations.size:
             continue
@@ -99,7 +99,7 @@ class MotionSample:
 
 
 def limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason | None:
-    """Return the reason that joint rates exceed their limits, about the joint with the largest excess; else None."""
+    """Return the reason that a joint, the one with the largest excess, exceeds its rate limit; None if none does."""
     reasons = []
     for sample in samples:
         shares = _rate_shares(request, sample.rates)
@@ -116,7 +116,7 @@ def limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reaso
 
 
 def describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
-    """Return the reason that a motion misses its tasks: when, by how much, and which joint is at its limit there."""
+    """Return the reason that a motion misses its tasks: time, amount, and a joint at its limit there."""
     sample, k, misses = samples[0], 0, (0.0, 0.0)
     for each in samples:
         distances, angles = each.misses()
@@ -146,12 +146,12 @@ def describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) ->
 
 
 def _rate_shares(request: PlanRequest, rates: Array) -> Array:
-    """Return rates relative to their limits; joints that do not move have zero."""
+    """Return joint rates relative to their limits; the share of a joint at rest is zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.nan_to_num(np.abs(rates) / request.bounds.velocity, nan=0.0)
 
 
 def _joint(request: PlanRequest, joint: int) -> tuple[str, str]:
-    """Return the name of a joint and the unit of its position."""
+    """Return the name of a joint, and the unit of its position."""
     moving = request.machine.robot.moving_joints[joint]
     return moving.name, "m" if moving.kind == "prismatic" else "rad"

@@ -76,7 +76,7 @@ class WaypointSettings:
 
 
 class _Path(NamedTuple):
-    """Path through all waypoints.
+    """Joint path through all waypoints, in one or several segments.
 
     Attributes:
         cost: Its cost.
@@ -205,7 +205,7 @@ class _WaypointPlanner:
         self._section_joint = robot.joint_names.index(names[0]) if self.manifolds.size > 1 else None
 
     def plan(self, counted: bool) -> PathPlan:
-        """Return the lowest-cost path through all waypoints, in the fewest segments if `counted`.
+        """Return the lowest-cost path through all waypoints; with `counted`, in the fewest segments.
 
         Some waypoints are searched, and the paths found are extended to all waypoints. If that fails, the waypoints
         where it fails, or more closely spaced ones, are searched as well.
@@ -242,7 +242,7 @@ class _WaypointPlanner:
         return self._best_plan(paths, bound)
 
     def _segmented_paths(self, search: AtlasSearch, segmented: bool) -> tuple[list[list[Segment]], float]:
-        """Return paths through the searched waypoints, each as segments, and a lower bound of their cost."""
+        """Return segmented paths through the searched waypoints, and a lower bound of their cost."""
         if segmented:
             result = fewest_segments(search)
             return ([], np.inf) if result is None else ([result[0]], result[1])
@@ -250,7 +250,7 @@ class _WaypointPlanner:
         return [[Segment(0, len(path) - 1, path, search.path_cost(path), bound)] for path in paths], bound
 
     def _best_plan(self, paths: list[_Path], bound: float) -> PathPlan:
-        """Return the plan of the lowest-cost valid path.
+        """Return the plan whose path is the lowest-cost valid one.
 
         Raises:
             SolveError: No path is valid.
@@ -274,14 +274,14 @@ class _WaypointPlanner:
         )
 
     def _candidate(self, path: _Path, is_best: bool) -> Candidate:
-        """Return a path as a candidate of the plan."""
+        """Return a path as a candidate of the plan, valid or rejected."""
         reason = Reason(Rejection.INFEASIBLE, path.failure) if path.failure else Reason(Rejection.COSTLIER)
         return Candidate(path.joints[0], path.cost, None if is_best else reason, Stage.FINE)
 
     # ---- searched waypoints ------------------------------------------------------------------------------------------
 
     def _strides(self) -> tuple[list[int], int]:
-        """Return the strides of the searches in order, and how many of them always run."""
+        """Return the strides of the searches in order, and the number of searches that are always made."""
         settings, count = self.settings, len(self.positions)
         if self._section_joint is None:
             halves = int(np.log2(settings.stride)) + 1
@@ -292,7 +292,7 @@ class _WaypointPlanner:
         return [-(-count // settings.first_steps), *strides], 2
 
     def _search_with_stride(self, stride: int, known: AtlasSearch | None = None) -> AtlasSearch | None:
-        """Search every n-th waypoint; the stride n is doubled while the atlas needs too many charts.
+        """Search every n-th waypoint; the stride n doubles as long as the atlas requires too many charts.
 
         None if it has no more waypoints than a known search.
         """
@@ -311,7 +311,7 @@ class _WaypointPlanner:
             stride *= 2
 
     def _search_at_failures(self, search: AtlasSearch, path: _Path | None) -> AtlasSearch | None:
-        """Search again with the waypoints where a path is invalid; None if there are none or too many."""
+        """Search again, including waypoints where a path is invalid; None if there are none, or too many."""
         chosen = search.times.astype(int)
         if path is None or self._section_joint is not None or np.isin(path.invalid, chosen).all():
             return None
@@ -323,7 +323,7 @@ class _WaypointPlanner:
             return None
 
     def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
-        """Return the search over some waypoints: all configurations, or sections if two directions are free."""
+        """Return the search over some waypoints: of all configurations or, with two free directions, on sections."""
         manifolds = SelfMotionManifolds(self.space, self.manifolds.equations, self.manifolds.targets[chosen])
         distances = np.diff(chosen)[:, None]
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
@@ -341,7 +341,7 @@ class _WaypointPlanner:
         return SectionSearch(*arguments, **options, **sections, joint=joint)
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
-        """Return the error about where all paths end, located among the waypoints between the searched ones."""
+        """Return the error that all paths end, located among the waypoints that the search skipped."""
         error, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
         if error is None:
             return SolveError("no path goes through the waypoints", name="waypoints")
@@ -350,7 +350,7 @@ class _WaypointPlanner:
         return (None if len(refined) == len(chosen) else dead_end(self._search(refined), WAYPOINT)) or error
 
     def _negligibly_relaxed_paths(self, search: AtlasSearch) -> list[_Path]:
-        """Return paths with a negligible pose relaxation, which a diagnosis finds where the search found none.
+        """Return paths that require only a negligible relaxation of poses, as a diagnosis finds them; else none.
 
         Raises:
             SolveError: There is none.
@@ -372,7 +372,7 @@ class _WaypointPlanner:
     # ---- paths through all waypoints ---------------------------------------------------------------------------------
 
     def _extend(self, search: AtlasSearch, chain: list[Segment]) -> _Path:
-        """Return a path through all waypoints near segments through some of them.
+        """Return a path through all waypoints from segments through some of them.
 
         It is invalid if it reconfigures between two waypoints that are not consecutive.
         """
@@ -398,7 +398,7 @@ class _WaypointPlanner:
         return TipTask(position=self.positions[number], orientation=self.rotations[number])
 
     def _seeds(self, number: int) -> Array:
-        """Return cached configurations at a waypoint."""
+        """Return inverse kinematics solutions at a waypoint, from the cache if possible."""
         if number not in self._seed_cache:
             try:
                 seeds = self.manifolds.seeds(number, self.joint_limits, self.seed + number)
@@ -409,7 +409,7 @@ class _WaypointPlanner:
         return self._seed_cache[number]
 
     def _interpolate(self, chosen: NDArray[np.intp], chain: list[Segment]) -> Array:
-        """Return joints at all waypoints, (N, n), near segments through some, shifted by full turns into the limits."""
+        """Interpolate segments through some waypoints at all waypoints, with full turns into limits. Shape (N, n)."""
         numbers = np.arange(len(self.positions))
         path = np.concatenate([segment.joints for segment in chain])
         joints = np.column_stack([np.interp(numbers, chosen, column) for column in path.T])
@@ -421,7 +421,7 @@ class _WaypointPlanner:
         return joints
 
     def _check_path(self, joints: Array, breaks: tuple[int, ...]) -> tuple[str, NDArray[np.intp]]:
-        """Return the limit that a path violates, "" if none, and the waypoints at which it is violated."""
+        """Return the name of a limit that a path violates ("" if none), and the waypoints where it does."""
         names, indices = self.machine.robot.joint_names, np.arange(len(joints))
         errors = np.abs(self.manifolds.linearize(indices, joints)[0]).max(axis=1)
         excess = np.maximum(joints - self.upper, self.lower - joints)
@@ -452,7 +452,7 @@ class _WaypointPlanner:
 
 
 def _path_weights(weights: Any, size: int) -> Array:
-    """Return the weights of the joints in a length, 0 for joints that do not count. Shape (size,)."""
+    """Return the weights of the joints in a path length; 0 for joints that do not count. Shape (size,)."""
     if weights is None:
         return np.ones(size)
     array = require.array("weights", weights, (size,), meaning="one for each joint")
@@ -463,7 +463,7 @@ def _path_weights(weights: Any, size: int) -> Array:
 
 
 def _step(step: Any, size: int) -> Array:
-    """Check the largest displacement between waypoints and return it for each joint. Shape (n,)."""
+    """Return the largest displacement of each joint between waypoints, after checks. Shape (n,)."""
     try:
         steps = floats(step)
         if steps.shape in ((), (1,), (size,)) and (steps > 0).all():

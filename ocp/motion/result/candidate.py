@@ -69,12 +69,12 @@ class Reason:
         return self.kind.value + (self.detail and f": {self.detail}") + (self.remedy and f"; {self.remedy}")
 
     def record(self) -> dict[str, Any]:
-        """Return the reason as data for a file."""
+        """Return the reason as plain data for a file."""
         return {**asdict(self), "kind": self.kind.name}
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Reason:
-        """Return the reason stored in a record; its values are checked because files are not trusted.
+        """Return the reason from data of a file; values are checked because files are not trusted.
 
         Raises:
             KeyError, TypeError, ValueError: The record is damaged.
@@ -85,7 +85,7 @@ class Reason:
 
     @classmethod
     def of_error(cls, kind: Rejection, error: Exception) -> Reason:
-        """Return a reason with the first line of an error, and its value, limit and time if they are numbers."""
+        """Return a reason from an exception: its first line, and its value, limit and time if they are numbers."""
         numbers = {name: getattr(error, name, None) for name in ("value", "limit", "time")}
         details: dict[str, Any] = {name: float(x) for name, x in numbers.items() if isinstance(x, int | float)}
         name = getattr(error, "name", None)
@@ -93,7 +93,7 @@ class Reason:
 
 
 def collision_reason(pair: Collision | ClosestPair, limit: float, remedy: str = "") -> Reason:
-    """Return the reason that two bodies are closer than a limit, m."""
+    """Return the rejection reason that two bodies are closer than a limit, m."""
     return Reason(Rejection.COLLISION, str(pair), " and ".join(pair.bodies), pair.distance, limit, pair.time, remedy)
 
 
@@ -124,7 +124,7 @@ class Seed:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Motion that may become the plan.
+    """Motion that may become the plan, with the state of its solution process.
 
     Attributes:
         start: Initial joints of the search, rad or m. Shape (n,).
@@ -157,7 +157,7 @@ class Candidate:
 
     @classmethod
     def of_record(cls, record: Sequence[Any], solution: Solution | None) -> Candidate:
-        """Return the candidate of a plan file; its motion is the given solution unless it was rejected.
+        """Return a candidate from the data of a plan file; `solution` is its motion unless it was rejected.
 
         Args:
             record: As `record` returns it; it is not trusted.
@@ -172,21 +172,21 @@ class Candidate:
         return cls(np.array(start, dtype=float), float(cost), rejection, Stage(stage), motion)
 
     def record(self) -> list[Any]:
-        """Return start, cost, stage and reason, as a file holds them."""
+        """Return start, cost, stage and reason as plain data for a file."""
         return [self.start.tolist(), self.cost, int(self.stage), self.reason and self.reason.record()]
 
     @property
     def passed(self) -> bool:
-        """Whether the candidate was not rejected."""
+        """Whether the candidate has not been rejected."""
         return self.reason is None
 
     def rejected(self, reason: Reason) -> Candidate:
-        """Return the candidate, rejected for a reason; if bodies were separated, their collision is named first."""
+        """Return the candidate as rejected, for this reason or for an earlier collision that it led to."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
 
     def finished(self) -> Candidate:
-        """Return the candidate in the form in which a plan lists it, without intermediate data."""
+        """Return the candidate without intermediate data, as a plan lists it."""
         solution = self.solution if self.stage >= Stage.FINE else None
         return Candidate(self.start, self.cost, self.reason, self.stage, solution, audit=self.audit)

@@ -39,7 +39,7 @@ UNDECIDED = "a path through waypoints is compared with its lower bound, not with
 
 
 class PathPoses(NamedTuple):
-    """Tool poses that a path through waypoints must keep, and the largest step between them.
+    """Tool poses that a path through waypoints must reach, and the largest joint step between them.
 
     Attributes:
         positions, rotations: Poses of the tip at the waypoints, in world. Shapes (N, 3), m, and (N, 3, 3).
@@ -53,7 +53,7 @@ class PathPoses(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PathPlan(Plan):
-    """Joint path of straight motions between configurations: through tool poses, or to a goal.
+    """Joint path of straight motions between configurations, through tool poses or to a goal.
 
     A path has no times of its own. The plan passes it in the least time at constant joint rates between waypoints
     within the velocity limits; `ocp.joint_path` and `schedule` time it under further limits.
@@ -85,7 +85,7 @@ class PathPlan(Plan):
 
     @property
     def cost(self) -> float:
-        """Cost of the path, without reconfigurations."""
+        """Cost of the path; reconfigurations do not count."""
         return self.path_cost
 
     @property
@@ -119,7 +119,7 @@ class PathPlan(Plan):
 
     @property
     def steps(self) -> Array:
-        """Largest displacement of each joint between waypoints, without reconfigurations. Shape (n,), rad or m."""
+        """Largest displacement of each joint between waypoints; reconfigurations do not count. Shape (n,), rad or m."""
         steps = np.delete(np.abs(np.diff(self.joints, axis=0)), list(self.reconfigurations), axis=0)
         return np.asarray(steps.max(axis=0, initial=0.0))
 
@@ -136,13 +136,13 @@ class PathPlan(Plan):
         return np.zeros((len(times), self.machine.joint_size if name == "accelerations" else 0))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return nothing, since the path solves no optimal control problem."""
+        """Return an empty list, since the path solves no optimal control problem."""
         return []
 
     # ---- audit -------------------------------------------------------------------------------------------------------
 
     def clearance(self) -> Clearance | None:
-        """Return the proven clearance between waypoints, without reconfigurations; None if it is not checked."""
+        """Return the proven clearance between waypoints, except in reconfigurations; None if it is not checked."""
         if self.constraints is None:
             return None
         t, horizon = self.t, self.horizon
@@ -180,7 +180,7 @@ class PathPlan(Plan):
         return f"the best of {len(self.candidates)} paths"
 
     def _pose_findings(self, poses: PathPoses) -> list[Finding]:
-        """Return the largest pose errors, and the largest excess of a displacement."""
+        """Return the findings about the largest pose errors and about the largest excess of a joint step."""
         t, tips = self.t, tip_poses(self.machine, np.zeros((len(self.joints), 0)), self.joints)
         misses = np.abs(tips[:, :3] - poses.positions)
         turns = scipy.spatial.transform.Rotation.from_quat(
@@ -205,7 +205,7 @@ class PathPlan(Plan):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan."""
+        """Return the arrays that are written to the file of the plan, by name."""
         arguments = {"machine": self.machine, "limits": self.limits, "constraints": self.constraints}
         head, numbers = pack_record(
             {
@@ -280,7 +280,7 @@ def _check_constraints(constraints: Any) -> None:
 def _largest(
     name: str, values: Array, limit: float, times: Array, names: tuple[str, ...] = (), unit: str = ""
 ) -> Finding:
-    """Return the finding of the largest positive value in a row for each time."""
+    """Return the finding about the largest positive entry of values, with one row per time."""
     if not values.size:
         return Finding(name, 0.0, limit, unit=unit)
     row, column = np.unravel_index(int(np.argmax(values)), values.shape)

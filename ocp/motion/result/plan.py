@@ -38,7 +38,7 @@ TIME_TOLERANCE = 1e-9
 
 
 class PlanSample(NamedTuple):
-    """Plan at M times.
+    """Samples of a plan at M times.
 
     Attributes:
         t: s. Shape (M,).
@@ -60,7 +60,7 @@ class PlanSample(NamedTuple):
 
 
 class Plan(ABC):
-    """Lowest-cost motion found that passes its audit.
+    """Lowest-cost motion that was found and passes its audit (base class of all plans).
 
     Attributes:
         machine: The machine.
@@ -90,7 +90,7 @@ class Plan(ABC):
 
     @property
     def gap(self) -> float | None:
-        """Relative amount by which the cost may exceed the lowest one, according to the bound; None without a bound."""
+        """Relative amount by which the cost may exceed the lower bound of all motions; None without a bound."""
         if self.bound is None:
             return None
         return (self.cost - self.bound) / self.cost if self.cost > 0 else 0.0
@@ -116,7 +116,7 @@ class Plan(ABC):
 
     @abstractmethod
     def _values_at(self, name: str, times: Array) -> Array:
-        """Return "joints", "rates", "accelerations" or "base" at checked times (M,). Shape (M, n)."""
+        """Return "joints", "rates", "accelerations" or "base" at times (M,) that have been checked. Shape (M, n)."""
 
     def __getitem__(self, name: str) -> Array:
         """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
@@ -135,7 +135,7 @@ class Plan(ABC):
         return {name: values[0] if times.ndim == 0 else values for name, values in values_by_name.items()}
 
     def sample(self, period: float) -> PlanSample:
-        """Sample the motion every `period` s from 0; the last sample is at the horizon.
+        """Return samples of the motion every `period` s from 0; the last one is at the horizon.
 
         Rates may jump where the tasks do, such as where a path begins at full speed. Accelerations there are those
         after the jump.
@@ -146,7 +146,7 @@ class Plan(ABC):
         return self.sampled(sample_times("sample: period", period, self.horizon))
 
     def sampled(self, times: Any) -> PlanSample:
-        """Sample the motion at times (M,), s."""
+        """Return samples of the motion at times (M,), s."""
         t = np.atleast_1d(self._checked_times(times))
         at = self.at(t)
         bases = at["base"] if "base" in at else np.zeros((len(t), 0))
@@ -165,7 +165,7 @@ class Plan(ABC):
 
     @abstractmethod
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return, in order, the solutions that make up the plan at increasing times (M,), s.
+        """Return the solutions that make up the plan at increasing times (M,), s, in order.
 
         Each comes with the suffix of the names of its states, and with the times in it, shape (K,), s; all K add up to
         M. The list is empty for a plan that solves no optimal control problem.
@@ -192,7 +192,7 @@ class Plan(ABC):
         return tuple(self._audits.values())
 
     def limit_findings(self) -> list[Finding]:
-        """Return the largest excess of joints and rates over the limits of the machine."""
+        """Return the findings about joints and rates that exceed the limits of the machine most."""
         robot, t = self.machine.robot, np.union1d(self.t, np.linspace(0.0, self.horizon, CHECKED_TIMES))
         at, findings = self.at(t), list[Finding]()
         for name, values, lower, upper in (
@@ -213,7 +213,7 @@ class Plan(ABC):
         return f"<Plan of {self.horizon:.6g} s: {len(self.names)} joints, {self._costs}, {self._counts}>"
 
     def __str__(self) -> str:
-        """Return the cost, the joints that stand still, and the rejected motions by reason, in at most 15 lines."""
+        """Return cost, held joints, and rejected motions with their reasons, in at most 15 lines."""
         moving = [name for name in self.names if name not in self.held]
         lines = [f"plan of {self.horizon:.6g} s for {', '.join(moving)}: {self._costs}; {self._counts}"]
         if self.held:
@@ -262,7 +262,7 @@ class Plan(ABC):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the plan to one `.npz` file, atomically. The file is data: reading it runs nothing.
+        """Write the plan to one `.npz` file atomically. It contains only data: reading it executes nothing.
 
         Raises:
             ProblemError, OSError: As in `Solution.save`; or a machine of an unknown kind.
@@ -275,11 +275,11 @@ class Plan(ABC):
 
     @abstractmethod
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan; raise as `save`."""
+        """Return the arrays that are written to the file of the plan, by name; raises the errors of `save`."""
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
-        """Read a file that `save` wrote. Of the candidates, only the plan has its solution.
+        """Read a file that `save` has written; only the plan itself has its solution, other candidates have none.
 
         The problem is declared again from the request by the planner's own code, so that the audit checks the motion
         against the machine, limits, tasks and obstacles of the request. The bound and the other candidates are read as
@@ -292,12 +292,12 @@ class Plan(ABC):
         return plan
 
     def trajectory(self, period: float) -> JointTrajectory:
-        """Return the joint trajectory with a point every `period` s."""
+        """Return the joint trajectory, sampled every `period` s."""
         sample = self.sample(period)
         return JointTrajectory(self.names, sample.t, sample.joints, sample.rates, sample.accelerations)
 
     def table(self, period: float = 0.01) -> dict[str, Array]:
-        """Return columns by name with a row every `period` s, as for pandas, polars or pyarrow.
+        """Return columns by name, with a row every `period` s, for pandas, polars or pyarrow.
 
         They are `time` (s), the joints (rad or m), and `NAME.velocity` and `NAME.acceleration` of each. Shape (M,)
         each.
@@ -309,7 +309,7 @@ class Plan(ABC):
         return columns
 
     def write_csv(self, path: str | os.PathLike[str], period: float = 0.01) -> None:
-        """Write the `table` of times and joints every `period` s, in full precision, with a header."""
+        """Write the `table` of times and joints, sampled every `period` s, in full precision, with a header."""
         columns = self.table(period)
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
@@ -318,7 +318,7 @@ class Plan(ABC):
         write_text(path, stream.getvalue())
 
     def to_ros(self, period: float = 0.01) -> dict[str, Any]:
-        """Return a dictionary with the fields of trajectory_msgs/msg/JointTrajectory, a point every `period` s."""
+        """Return the fields of trajectory_msgs/msg/JointTrajectory as a dictionary, sampled every `period` s."""
         return self.trajectory(period).to_ros()
 
     # ---- helpers -----------------------------------------------------------------------------------------------------
@@ -339,7 +339,7 @@ class Plan(ABC):
         return np.asarray(np.clip(times, 0.0, self.horizon))
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
-        """Return the poses of the tip at checked times (M,). Shape (M, 7)."""
+        """Return the poses of the tip at times (M,) that have been checked. Shape (M, 7)."""
         return tip_poses(self.machine, bases, joints)
 
 

@@ -88,7 +88,7 @@ def _machine_of(arguments: Mapping[str, Any]) -> Machine:
 
 @dataclass(frozen=True, eq=False)
 class MotionRequest:
-    """Builder and arguments from which a problem was declared.
+    """Name of the builder that declared a problem, and its arguments, so that it can be declared again.
 
     Attributes:
         builder: Name of the builder in BUILDERS.
@@ -106,7 +106,7 @@ class MotionRequest:
 
     @property
     def held(self) -> Mapping[str, float]:
-        """Positions of the joints that the machine has but the problem does not, by name."""
+        """Positions of the joints that the problem holds, by name."""
         held: Mapping[str, float] = self.arguments.get("held", {})
         return held
 
@@ -139,7 +139,7 @@ def declared_motion(
     actuation: Actuation | None = None,
     relaxed: bool = False,
 ) -> ToolMotion:
-    """Declare the optimal control problem of a request; the result remembers how to declare it again.
+    """Declare the optimal control problem of a request; the result can be declared again from a file.
 
     Args:
         request: The request.
@@ -189,7 +189,7 @@ MACHINE_NAMES = ("machine", "chaser")
 
 
 def machines_of_phases(request: MotionRequest | None) -> tuple[Machine, ...]:
-    """Return the machine of each phase of a problem; none if it has no phases or is not known."""
+    """Return the machine of each phase of a problem; empty if it has no phases or is unknown."""
     if request is None:
         return ()
     arguments = request.arguments
@@ -202,7 +202,7 @@ def machines_of_phases(request: MotionRequest | None) -> tuple[Machine, ...]:
 
 
 def request_of(problem: Problem | None) -> MotionRequest | None:
-    """Return the origin of a problem, or None if it is unknown."""
+    """Return the builder and arguments from which a problem was declared, or None if unknown."""
     origin = None if problem is None else problem.origin
     if isinstance(origin, tuple):  # name and arguments of a builder that does not import this module
         origin = MotionRequest(*origin)
@@ -267,7 +267,7 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _scene_fields(scene: CollisionScene) -> dict[str, Any]:
-    """Return the arguments of a collision scene, with the bodies that cover meshes in place of mesh files."""
+    """Return the arguments of a collision scene, with the bodies that cover meshes instead of mesh files."""
     return {
         "obstacles": scene.obstacles,
         "clearance": scene.clearance,
@@ -284,13 +284,13 @@ def _scene_fields(scene: CollisionScene) -> dict[str, Any]:
 
 
 def _put_track(name: str, track: Callable[[Any], Any], writer: FunctionWriter) -> dict[str, Any]:
-    """Return a function of time, and its rate if it has one, as a record."""
+    """Return the record of a function of time and, if it has one, of its rate."""
     parts = {"track": track, "rate": getattr(track, "rate", None)}
     return {role: writer.write(_traced(name, part)) for role, part in parts.items() if part is not None}
 
 
 def _traced(name: str, track: Callable[[Any], Any]) -> Any:
-    """Turn a function of time into a CasADi function by calling it with a symbol."""
+    """Convert a function of time to a CasADi function by calling it with a symbol."""
     for symbols in (ca.SX, ca.MX):
         time = symbols.sym("time")
         try:
@@ -304,7 +304,7 @@ def _traced(name: str, track: Callable[[Any], Any]) -> Any:
 
 
 def restored_request(record: Any) -> MotionRequest:
-    """Rebuild a request from a record of `stored_request`, whose contents are checked because files are not trusted.
+    """Rebuild a request from a record of `stored_request`, after checks because files are not trusted.
 
     Raises:
         ProblemError: The record is damaged.
@@ -331,7 +331,7 @@ def restored_request(record: Any) -> MotionRequest:
 
 
 def _read(value: Any, functions: list[Any], machines: tuple[Machine, Machine] | None) -> Any:
-    """Rebuild a value from a record; `machines` are the machine, and the machine with its held joints locked."""
+    """Rebuild a value from a record; `machines` are the machine without and with its held joints locked."""
 
     def read(part: Any) -> Any:
         return _read(part, functions, machines)

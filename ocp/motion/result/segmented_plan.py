@@ -35,7 +35,7 @@ JUMP_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Reconfiguration:
-    """Motion between two segments to another configuration with the same tool pose.
+    """Motion between two segments to another configuration at the same tool pose.
 
     Attributes:
         time: Time of the tasks, which wait, s.
@@ -65,7 +65,7 @@ class Reconfiguration:
 
 
 class Piece(NamedTuple):
-    """One of several consecutive plans, with its name and start time, s."""
+    """One of several consecutive plans, with its start time (s) and its name."""
 
     begin: float
     plan: SolvedPlan
@@ -73,7 +73,7 @@ class Piece(NamedTuple):
 
 
 class ConsecutivePlans(Plan):
-    """Plan that consists of consecutive plans; each starts where the previous one ends.
+    """Plan that consists of consecutive plans, each of which starts where the previous one ends.
 
     Attributes:
         machine, candidates, bound, targets: As in `Plan`.
@@ -85,11 +85,11 @@ class ConsecutivePlans(Plan):
     @property
     @abstractmethod
     def pieces(self) -> tuple[Piece, ...]:
-        """The plans, in order, with the times at which they begin."""
+        """The consecutive plans, with the times at which they begin."""
 
     @property
     def _plans(self) -> tuple[SolvedPlan, ...]:
-        """Plans whose costs, bounds and candidates make up those of the whole plan."""
+        """Plans whose costs, bounds and candidates count for the whole plan."""
         return tuple(piece.plan for piece in self.pieces)
 
     # ---- values ------------------------------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def bound(self) -> float | None:  # type: ignore[override]
-        """Lower bound of the cost for fixed ends of all plans; None if the bound of a plan is unknown."""
+        """Sum of the lower bounds of all plans, for fixed ends; None if one of them is unknown."""
         bounds = [plan.bound for plan in self._plans]
         return None if None in bounds else float(sum(bounds))  # type: ignore[arg-type]
 
@@ -119,7 +119,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
-        """The solution, if the plan consists of a single one.
+        """The solution, if the whole plan consists of a single one; else None.
 
         Raises:
             ProblemError: There are several.
@@ -154,7 +154,7 @@ class ConsecutivePlans(Plan):
         return values
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solved parts of all segments; see `Plan.solved_parts`."""
+        """Return the solved parts of all plans; see `Plan.solved_parts`."""
         pieces = self.pieces
         which = np.searchsorted([piece.begin for piece in pieces], times, side="right") - 1
         parts: list[tuple[Solution, str, Array]] = []
@@ -166,7 +166,7 @@ class ConsecutivePlans(Plan):
     # ---- audit -------------------------------------------------------------------------------------------------------
 
     def _audit(self, **settings: Any) -> Audit:
-        """Audit all segments and the junctions between them, and sum up the suboptimality of the segments."""
+        """Audit all segments and their junctions, and add up the suboptimality of the segments."""
         findings: list[Finding] = []
         undecided, clearances, losses = "", dict[str, Clearance](), list[float]()
         for piece in self.pieces:
@@ -189,12 +189,12 @@ class ConsecutivePlans(Plan):
         return Audit(self.kind, tuple(findings), undecided, clearances=clearances)
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the findings at the junctions: how far joints and base jump there."""
+        """Return the findings about jumps of joints and base at the junctions."""
         names = ("joints", *(("base",) if self.machine.base_size else ()))
         return [self._jump_finding(name) for name in names] if len(self.pieces) > 1 else []
 
     def _jump_finding(self, name: str) -> Finding:
-        """Return the largest difference of "joints", "rates" or "base" from the end of a motion to the next one."""
+        """Return the finding about the largest jump of "joints", "rates" or "base" between consecutive motions."""
         jumps = [
             np.abs(after.plan.at(0.0)[name] - before.plan.at(before.plan.horizon)[name])
             for before, after in pairwise(self.pieces)
@@ -206,7 +206,7 @@ class ConsecutivePlans(Plan):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SequencePlan(ConsecutivePlans):
-    """Motions to goals and along tasks in sequence, with the motions that lead to the tasks.
+    """Motions to goals and along tasks in sequence, including the motions that approach the tasks.
 
     Attributes:
         machine: Machine of the first motion; all motions have its joints.
@@ -224,7 +224,7 @@ class SequencePlan(ConsecutivePlans):
 
     @cached_property
     def pieces(self) -> tuple[Piece, ...]:
-        """The motions, in order, with the times at which they begin."""
+        """The motions of the sequence, with the times at which they begin."""
         begins = np.cumsum([0.0, *(plan.horizon for plan in self.parts[:-1])]).tolist()
         return tuple(map(Piece, begins, self.parts, self.phases))
 
@@ -237,7 +237,7 @@ class SequencePlan(ConsecutivePlans):
         return poses
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the findings at the junctions: how far joints and base jump, and rates that must be continuous."""
+        """Return the findings about jumps of joints and base at junctions, and of rates that must be continuous."""
         rates = [self._jump_finding("rates")] if self.smooth and len(self.parts) > 1 else []
         return super()._junction_findings() + rates
 
@@ -251,7 +251,7 @@ class SequencePlan(ConsecutivePlans):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan; those of each motion are named after it."""
+        """Return the arrays that are written to the file of the plan; names start with the motion they belong to."""
         head = {"phases": list(self.phases), "smooth": self.smooth}
         arrays = {self.kind: np.frombuffer(json.dumps(head).encode(), np.uint8)}
         for number, plan in enumerate(self.parts):
@@ -275,14 +275,14 @@ class SequencePlan(ConsecutivePlans):
 
 
 def _plan_of(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], prefix: str) -> SolvedPlan:
-    """Return the plan whose arrays in a file have names with a prefix."""
+    """Return the plan from those arrays of a file whose names begin with a prefix."""
     own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
     return (PhasedPlan if PHASED in own else SolvedPlan).of_arrays(path, own)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SegmentedPlan(ConsecutivePlans):
-    """Motions along consecutive segments of the tasks, with reconfigurations between them while the tasks pause.
+    """Motions along consecutive segments of tasks, and reconfigurations between them, during which tasks pause.
 
     Attributes:
         machine: The arm.
@@ -318,7 +318,7 @@ class SegmentedPlan(ConsecutivePlans):
 
     @property
     def pieces(self) -> tuple[Piece, ...]:
-        """Segments and motions between them, in order, with the times at which they begin."""
+        """Segments and reconfigurations in order, with the times at which they begin."""
         plans: list[SolvedPlan] = [self.segments[0]]
         for reconfiguration, segment in zip(self.reconfigurations, self.segments[1:], strict=True):
             plans += [*((reconfiguration.motion,) if reconfiguration.motion is not None else ()), segment]
@@ -327,7 +327,7 @@ class SegmentedPlan(ConsecutivePlans):
         return tuple(map(Piece, begins, plans, names))
 
     def task_share(self, times: Any) -> Array:
-        """Return the fraction of the task time that has passed; it stands still during reconfigurations."""
+        """Return the fraction of the task time that has passed; it is constant during reconfigurations."""
         pieces = self.pieces
         waits = [piece.plan.horizon * all(piece.plan is not segment for segment in self.segments) for piece in pieces]
         ends, lost = [piece.begin + piece.plan.horizon for piece in pieces], np.cumsum(waits)
@@ -336,7 +336,7 @@ class SegmentedPlan(ConsecutivePlans):
         return np.asarray(np.minimum(task_times / self.task_horizon, 1.0))
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the number of reconfigurations without a motion, and how far joints jump."""
+        """Return the findings about reconfigurations without a motion, and about jumps of joints."""
         if not self.reconfigurations:
             return []
         missing = [each for each in self.reconfigurations if each.motion is None]
@@ -359,7 +359,7 @@ class SegmentedPlan(ConsecutivePlans):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan; those of each motion are named after it."""
+        """Return the arrays that are written to the file of the plan; names start with the motion they belong to."""
         head, numbers = pack_record(
             {
                 "start_times": list(self.start_times),

@@ -40,7 +40,7 @@ TARGET_TIMES = 401
 
 
 class Part(NamedTuple):
-    """Interval of a plan, s, and the suffix of its states and controls in the solution."""
+    """Time interval of a plan, s, and the suffix of the names of its states and controls in the solution."""
 
     begin: float
     end: float
@@ -93,7 +93,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, np.concatenate([self.solution[own + part.suffix] for part in self.parts]))
 
     def _of_all_joints(self, name: str, values: Array) -> Array:
-        """Return joint values of the solution by name, (M, m), extended by the joints that are held."""
+        """Return joint values of the solution, (M, m), extended by the joints that are held."""
         return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
 
     def _values_at(self, name: str, times: Array) -> Array:
@@ -108,7 +108,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, self._over(times, values))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solution once for each part; see `Plan.solved_parts`."""
+        """Return the solution, once for each part; see `Plan.solved_parts`."""
         begins = [part.begin for part in self.parts]
         which = np.clip(np.searchsorted(begins, times, "right") - 1, 0, len(begins) - 1)
         return [
@@ -122,7 +122,7 @@ class SolvedPlan(Plan):
         return request_of(self.solution.problem)
 
     def task_share(self, times: Any) -> Array:
-        """Return the share of the tasks' own time that has passed; see `Plan.task_share`."""
+        """Return the fraction of the tasks' own time that has passed; see `Plan.task_share`."""
         if CLOCK not in self.solution.states:
             return super().task_share(times)
         return self._fractions(self.parts[0], np.atleast_1d(self._checked_times(times)))
@@ -141,7 +141,7 @@ class SolvedPlan(Plan):
     # ---- targets -----------------------------------------------------------------------------------------------------
 
     def with_targets(self, tasks: Sequence[TipTask]) -> SolvedPlan:
-        """Return the plan with the task targets at TARGET_TIMES times."""
+        """Return the plan with the target poses of its tasks, sampled at TARGET_TIMES times."""
         times = np.linspace(0.0, self.horizon, TARGET_TIMES)
         clock = times
         if CLOCK in self.solution.states:
@@ -155,7 +155,7 @@ class SolvedPlan(Plan):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan.
+        """Return the arrays that are written to the file of the plan, by name.
 
         They hold the request, from which `load` declares the problem again. For a problem that the user declared, they
         hold the machine and the expressions of the problem, operation by operation.
@@ -218,7 +218,7 @@ class SolvedPlan(Plan):
     # ---- time of the motion and time of the solution -----------------------------------------------------------------
 
     def _check_parts(self) -> None:
-        """Raise ValueError if the parts do not match the solution, or its joints not the machine."""
+        """Raise ValueError unless the parts match the solution, and its joints match the machine."""
         ends = [0.0, *(part.end for part in self.parts)]
         contiguous = all(part.begin == end < part.end for part, end in zip(self.parts, ends, strict=False))
         clock = self.solution.states.get(CLOCK)
@@ -237,7 +237,7 @@ class SolvedPlan(Plan):
 
     @property
     def rate_name(self) -> str:
-        """Name of the joint rates in the solution; SLOPES are derivatives by the path, to be divided by the pace."""
+        """Name of the joint rates in the solution; SLOPES are derivatives by task time, to be divided by the pace."""
         names = {**self.solution.states, **self.solution.controls}
         return next(name for name in RATES if name + self.parts[0].suffix in names)
 
@@ -254,7 +254,7 @@ class SolvedPlan(Plan):
         return np.asarray((slope * pace - sample[name] * change) / pace**3 / self.solution.horizon)
 
     def _slope(self, name: str, fraction: Array) -> Array:
-        """Return the derivative of a state or control by the fraction. Shape (M, n)."""
+        """Return the derivative of a state or control by the horizon fraction. Shape (M, n)."""
         is_state = name in self.solution.states
         pool = self.solution.states if is_state else self.solution.controls
         interpolant = self.solution.state_interpolant if is_state else self.solution.control_interpolant
@@ -273,7 +273,7 @@ class SolvedPlan(Plan):
         return np.asarray((low + high) / 2)
 
     def _over(self, times: Array, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate each part at the times (M,) that it covers; where two parts meet, the later one counts."""
+        """Evaluate each part at those of the times (M,) that it covers; a junction belongs to the later part."""
         begins = [part.begin for part in self.parts]
         which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(self.parts) - 1)
         result: Array | None = None
@@ -286,7 +286,7 @@ class SolvedPlan(Plan):
 
 
 def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
-    """Return the parts of a plan that consists of stretches."""
+    """Return the parts of a plan: the time interval and the name suffix of each stretch."""
     return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)
 
 
@@ -308,7 +308,7 @@ class PhasedPlan(SolvedPlan):
 
     @cached_property
     def machines(self) -> tuple[Machine, ...]:
-        """Machine of each phase; the first one for all, if the problem was declared by the user."""
+        """Machine of each phase; the first machine for all if the user declared the problem."""
         machines = machines_of_phases(self.request)
         return machines if len(machines) == len(self.parts) else (self.machine,) * len(self.parts)
 
@@ -318,7 +318,7 @@ class PhasedPlan(SolvedPlan):
 
     @cached_property
     def _joint_indices(self) -> dict[str, NDArray[np.intp]]:
-        """Indices of the joints of the first machine in the joint vector of each phase, by phase. Shape (n,)."""
+        """For each phase, the indices of the first machine's joints in the phase's joint vector. Shape (n,)."""
         orders = {}
         for name, machine in zip(self.phases, self.machines, strict=True):
             joints = list(machine.robot.joint_names)
@@ -356,11 +356,11 @@ class PhasedPlan(SolvedPlan):
         return poses
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan."""
+        """Return the arrays that are written to the file of the plan, by name."""
         return {**super().arrays(path), PHASED: np.ones(1)}
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return nothing: the phases of one problem are not evaluated one by one."""
+        """Return an empty list, because the phases of one problem are not evaluated separately."""
         return []
 
     def _check_parts(self) -> None:
@@ -379,5 +379,5 @@ class PhasedPlan(SolvedPlan):
 
 
 def parts_of_phases(solution: Solution) -> tuple[Part, ...]:
-    """Return the parts of a plan of several phases."""
+    """Return the parts of a plan: the time interval and the name of each phase."""
     return tuple(Part(begin, end, name) for name, (begin, end) in solution.phases.items())

@@ -95,7 +95,7 @@ SOLVER: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """Constraints of a motion.
+    """Constraints of a motion: clearance, joint limits, torque limits and end velocities.
 
     Attributes:
         motions: Proofs of clearance.
@@ -114,7 +114,7 @@ class MotionLimits:
 def fastest_motion_near(
     limits: MotionLimits, path: Array, settings: FastestMotionSettings = FastestMotionSettings()
 ) -> ConstantJerkMotion:
-    """Return a locally fastest motion in the neighbourhood of a path, with the first and the last joints of the path.
+    """Return a locally fastest motion near a path, with the same first and last joints as the path.
 
     A motion from rest to rest keeps the torque limits between the knots, too: it is slowed down where it does not.
 
@@ -143,7 +143,7 @@ def fastest_motion_near(
 
 
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
-    """Run the sequence of linear programs; return the fastest feasible motion and the last trust region.
+    """Solve linear programs in sequence; return the fastest feasible motion and the last trust region.
 
     It is the last motion if none is feasible. The sequence ends when the duration decreases by less than `least_gain`.
 
@@ -179,7 +179,7 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Iterate of the search: a motion with its linearised constraints.
+    """Iterate of the search: a motion, with its constraints linearised there.
 
     Attributes:
         points: Control points. Shape (K, n).
@@ -197,7 +197,7 @@ class _State:
 
     @property
     def excess(self) -> float:
-        """Largest violation of a limit, relative to it; 0 if the motion is feasible."""
+        """Largest relative violation of a limit; 0 if the motion is feasible."""
         return max(0.0, float((self.usages - self.allowed).max(initial=0.0)))
 
     @property
@@ -205,7 +205,7 @@ class _State:
         return self.excess == 0
 
     def merit(self, penalty: float) -> float:
-        """Return the merit of the iterate: the logarithm of the duration plus a penalty of the excess."""
+        """Return the merit of the iterate: logarithm of the duration plus penalty times excess."""
         return float(np.log(self.duration)) + penalty * self.excess
 
 
@@ -214,7 +214,7 @@ _Rows: TypeAlias = tuple[Any, Array, Array, float]
 
 
 class _Search:
-    """Sequence of linear programs for motions in one spline basis."""
+    """Sequential linear programming for the fastest motion in a spline basis."""
 
     def __init__(self, limits: MotionLimits, path: Array, settings: FastestMotionSettings) -> None:
         self.limits, self.settings, bounds = limits, settings, limits.bounds
@@ -242,7 +242,7 @@ class _Search:
         self._fix_ends()
 
     def _breaks(self, path: Array) -> Array:
-        """Return the knots as fractions of the duration: short intervals at both ends, equal ones between."""
+        """Return the knots as fractions of the duration, with short intervals at both ends."""
         bounds, settings = self.limits.bounds, self.settings
         with np.errstate(divide="ignore", invalid="ignore"):
             build_up = np.where(np.isfinite(bounds.acceleration), bounds.acceleration / bounds.jerk, 0.0).max()
@@ -259,12 +259,12 @@ class _Search:
         return np.asarray(breaks / breaks[-1])
 
     def _values(self, places: Array, order: int) -> Any:
-        """Return the matrix that maps control points to values of a derivative at given places. Shape (M, K)."""
+        """Return the matrix that maps control points to values of a derivative at fractions (M,). Shape (M, K)."""
         knots = self.knots[order : len(self.knots) - order]
         return BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
 
     def _fix_ends(self) -> None:
-        """Fix the control points that the end conditions determine, as `fixed` + T `moving`; the others are free.
+        """Set the control points that the end conditions determine to `fixed` + T `moving`; the others are free.
 
         A joint is at rest at an end, or has a given velocity there and no acceleration.
         """
@@ -283,9 +283,7 @@ class _Search:
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
     def guess(self, path: Array) -> tuple[Array, float]:
-        """Return initial control points along a path, and a duration with which a motion from rest to rest keeps its
-        rate limits.
-        """
+        """Return control points along a path, and a duration that keeps the rate limits from rest to rest."""
         p, ramp = self.degree, self.settings.ramp
         at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
         top = 1 / (1 - ramp)
@@ -301,7 +299,7 @@ class _Search:
         return points, duration if duration > 0 else 1.0
 
     def evaluate(self, points: Array, duration: float) -> _State:
-        """Evaluate the constraints of a motion, given its duration and its free control points."""
+        """Evaluate and linearise the constraints of a motion, given its free control points and its duration."""
         inner = points.ravel()[self.free]
         points = (self.fixed + duration * self.moving).ravel()
         points[self.free] = inner
@@ -319,7 +317,7 @@ class _Search:
         return _State(points, duration, matrix.tocsr(), np.concatenate(usages), allowed)
 
     def _derivative_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
-        """Yield the rows of velocity, acceleration and jerk, each in both directions."""
+        """Yield the constraint rows of velocity, acceleration and jerk, each in both directions."""
         for order in range(1, self.degree + 1):
             limited = np.flatnonzero(np.isfinite(self.largest[order - 1]))
             if not len(limited):
@@ -333,14 +331,14 @@ class _Search:
                 yield sign * matrix, by_duration, sign * usages, LIMIT_TOLERANCE
 
     def _clearance_rows(self, points: Array) -> _Rows:
-        """Return the rows of the pairs of bodies near each other at the samples."""
+        """Return the constraint rows of pairs of bodies that are near each other at samples."""
         margin, basis = self.settings.margin, self._values(self.places, 0)
         at, _, distance, gradient = self.limits.motions.near_pairs(basis @ points, self.settings.reach)
         matrix = self._row_matrix(basis[at], -gradient / margin)
         return matrix, np.zeros(len(at)), 2 - distance / margin, 0.5
 
     def _torque_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
-        """Yield the rows of the torques at the knots in both directions."""
+        """Yield the constraint rows of the torques at the knots, in both directions."""
         torques, share = self.limits.torques, self.settings.torque_share
         first, second = self.at_torques[1] @ points / duration, self.at_torques[2] @ points / duration**2
         values, slopes = torques.linearised(self.at_torques[0] @ points, first, second)
@@ -355,7 +353,7 @@ class _Search:
             yield sign * matrix, sign * by_duration.ravel(), sign * (values * scale).ravel(), (1 - share) / 2
 
     def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
-        """Return constraint rows by control points, from weights (R, K) and derivatives by joints (R, n)."""
+        """Return constraint rows for the control points, from basis values (R, K) and derivatives by joints (R, n)."""
         weights = sp.coo_array(basis)
         row = np.repeat(weights.row, self.size)
         column = (weights.col[:, None] * self.size + np.arange(self.size)).ravel()
@@ -363,7 +361,7 @@ class _Search:
         return sp.csr_array((values, (row, column)), shape=(len(by_joint), self.count * self.size))
 
     def step(self, state: _State, region: float) -> _State | None:
-        """Return the motion after a step within a trust region; None if the program has no solution."""
+        """Return the motion after a step within a trust region; None if the linear program has no solution."""
         settings, bounds, count = self.settings, self.limits.bounds, len(self.free)
         travel = np.where(self.has_rate_limit, bounds.velocity * state.duration, self.spread) * region
         points = state.points.ravel()[self.free]
@@ -388,7 +386,7 @@ class _Search:
         return self.evaluate(moved.reshape(self.count, self.size), state.duration * (1 + change[count]))
 
     def add_places(self, state: _State) -> bool:
-        """Add constraints at collisions between the samples; return whether there were any."""
+        """Add constraints at collisions between the samples; return whether there are collisions."""
         dense = np.linspace(0.0, 1.0, self.settings.finer * (len(self.breaks) - 1) + 1)[1:-1]
         at, pair, distance, _ = self.limits.motions.near_pairs(self._values(dense, 0) @ state.points, 0.0)
         worst = {each: at[pair == each][distance[pair == each].argmin()] for each in np.unique(pair).tolist()}
@@ -396,7 +394,7 @@ class _Search:
         return bool(worst)
 
     def motion(self, state: _State) -> ConstantJerkMotion:
-        """Return an iterate as a motion of constant jerk."""
+        """Return an iterate as a motion with phases of constant jerk."""
         duration = state.duration
         joints, rates = (self._values(self.breaks[:-1], order) @ state.points for order in (0, 1))
         accelerations = (self.derivatives[2] @ state.points)[: len(self.breaks) - 1] / duration**2

@@ -54,7 +54,7 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class StraightMotionSettings:
-    """Resolution of the proofs.
+    """Resolution of the collision proofs for straight motions.
 
     Attributes:
         finest: Approach of two bodies within half an interval below which it is not halved again, m. The motion counts
@@ -92,14 +92,14 @@ class StraightMotions:
             self._levers, self._turns = self.scene.levers.joints, self.scene.levers.joint_turns
 
     def collisions(self, joints: Array) -> list[Collision]:
-        """Return the pairs closer than the clearance in a configuration (n,), the worst first."""
+        """Return the pairs closer than the clearance in a configuration (n,), in order of severity."""
         if self.scene is None:
             return []
         collisions = find_collisions(self.scene, np.zeros(0), joints[None], np.zeros(1))
         return [collision for collision in collisions if collision.distance < self._required]
 
     def near_pairs(self, joints: Array, reach: float) -> tuple[Indices, Indices, Array, Array]:
-        """Return the pairs of bodies closer than the clearance plus a reach, m, in configurations (M, n).
+        """Return the pairs closer than clearance plus `reach`, m, in configurations (M, n).
 
         Returns:
             Configuration and pair of each, their distance beyond the clearance, m, shape (K,) each, and its gradient,
@@ -147,7 +147,7 @@ class StraightMotions:
         clear: NDArray[np.bool_],
         intervals: tuple[Indices, Array, Array],
     ) -> None:
-        """Halve intervals until all pairs are decided; mark motions that may collide.
+        """Bound distances on ever shorter intervals, and unset `clear` for motions that may collide.
 
         Args:
             lines: Starts and ends of the motions.
@@ -197,7 +197,7 @@ class StraightMotions:
             middle = np.concatenate([middle[kept] - shift, middle[kept] + shift])
 
     def _frames_on(self, lines: tuple[Array, Array], motion: Indices, places: Array) -> Frames:
-        """Return the frames of the bodies on straight motions (K,), each at a fraction from 0 to 1 of its length."""
+        """Return the frames of the bodies on K straight motions, each at a fraction of its length."""
         starts, ends = lines[0][motion], lines[1][motion]
         return self._frames(starts + places[:, None] * (ends - starts))
 
@@ -243,7 +243,7 @@ def shorten(
     random: np.random.Generator,
     settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
-    """Return a path that is not longer and consists of straight motions that are proven collision-free.
+    """Shorten a path; the result consists of straight motions that are proven collision-free.
 
     Args:
         motions: Proofs of clearance.
@@ -271,7 +271,7 @@ def shorten(
 
 
 def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, *, rungs: int = 32) -> bool:
-    """Return whether two paths are homotopic: straight motions between points at equal fractions are collision-free.
+    """Return whether two paths are homotopic, as shown by collision-free straight motions at equal fractions.
 
     Paths of one homotopy class need not satisfy this; paths that do can replace each other as guesses. They are
     compared at as many places as there are `rungs`.
@@ -281,12 +281,12 @@ def same_class(motions: StraightMotions, first: Array, second: Array, scale: Arr
 
 
 def _places(path: Array, scale: Array) -> Array:
-    """Return the arc length at each configuration of the path. Shape (M,)."""
+    """Return the arc length at each configuration of a path. Shape (M,)."""
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1)))
 
 
 def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Callable[[Array], Array]) -> Array:
-    """Return the lowest-cost path from the first to the last corner along collision-free straight motions.
+    """Return the lowest-cost path from first to last corner through some of the corners, free of collisions.
 
     Args:
         motions: Proofs of clearance.
@@ -312,7 +312,7 @@ def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Ca
 
 
 def _cut(motions: StraightMotions, path: Array, scale: Array, random: np.random.Generator, batch: int) -> Array:
-    """Replace parts of the path by straight shortcuts between random points, those that save most first."""
+    """Replace parts of the path by straight shortcuts between random points, those with the largest savings first."""
     places = _places(path, scale)
     ends = np.sort(random.random((batch, 2)) * places[-1], axis=1)
     begins, stops = (points_along(path, scale, ends[:, side] / places[-1]) for side in (0, 1))
@@ -333,7 +333,7 @@ def _cut(motions: StraightMotions, path: Array, scale: Array, random: np.random.
 
 @dataclass(frozen=True)
 class LengthSettings:
-    """Settings of the optimisation.
+    """Settings of the optimisation of the path length.
 
     Attributes:
         motion: Length of the straight motions, in the metric of the path.
@@ -408,7 +408,7 @@ def optimise_length(
 
 
 def _resampled(motions: StraightMotions, path: Array, scale: Array, count: int) -> Array:
-    """Divide the path into about equal motions that are proven collision-free; keep old corners where necessary.
+    """Divide the path into motions of similar length that are proven collision-free; keep corners if necessary.
 
     It is the old path if the motions cannot be proven, since halves of a proven motion need not be.
     """
@@ -433,7 +433,7 @@ def _step(
     inertia: float,
     settings: LengthSettings,
 ) -> Array:
-    """Return the step of the chain (m + 1, n) to the minimum of the energy under linearised constraints."""
+    """Return the step of the chain (m + 1, n) to the least energy under linearised constraints."""
     inner, n = len(chain) - 2, chain.shape[1]
     places = np.empty((2 * len(chain) - 1, n))
     places[::2], places[1::2] = chain, (chain[:-1] + chain[1:]) / 2
@@ -464,7 +464,7 @@ def _step(
 
 
 def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
-    """Project a target onto the polyhedron rows z >= least, which contains z = 0."""
+    """Return the point of the polyhedron rows z >= least, which contains 0, that is nearest to a target."""
     needed = least - rows @ target
     active = np.flatnonzero(needed > -np.inf)
     if not len(active) or needed.max() <= 0:
@@ -480,7 +480,7 @@ def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
 
 
 def _clear_step(motions: StraightMotions, chain: Array, moved: Array, smallest: float) -> tuple[Array, Array]:
-    """Shorten each step of the chain until its motions are collision-free; return the chain and the fractions used."""
+    """Reduce each step of the chain until its motions are collision-free; return chain and step fractions."""
     shares = np.ones(len(chain))
     while True:
         trial = chain + shares[:, None] * (moved - chain)

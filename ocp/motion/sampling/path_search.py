@@ -50,7 +50,7 @@ class RandomTreeSettings:
 
 @dataclass(frozen=True, eq=False)
 class TreeSearch:
-    """Request for a path between a start and goals by random trees.
+    """Settings and bounds of a search for a path from a start to goals by random trees.
 
     Attributes:
         motions: Proofs of clearance.
@@ -84,7 +84,7 @@ class _Tree:
         return np.asarray(((nodes**2).sum(axis=1) - 2 * points @ nodes.T).argmin(axis=1))
 
     def branch(self, index: int) -> Array:
-        """Return the nodes from a node to its root. Shape (K, n)."""
+        """Return the path in the tree from a node to its root. Shape (K, n)."""
         indices = [index]
         while self.parents[indices[-1]] >= 0:
             indices.append(int(self.parents[indices[-1]]))
@@ -94,7 +94,7 @@ class _Tree:
 def connect(
     search: TreeSearch, start: Array, goals: Array, *, random: np.random.Generator, most_samples: int
 ) -> Array | None:
-    """Return a path of straight motions, each proven collision-free, from the start to a goal; None if none is found.
+    """Return a path of proven collision-free straight motions from the start to a goal; None if none is found.
 
     Args:
         search: Proofs of clearance, box and metric.
@@ -134,13 +134,13 @@ def connect(
 
 
 def _step_towards(starts: Array, targets: Array, step: float, scale: Array) -> Array:
-    """Move configurations (K, n) towards their targets by at most one step, as in a random tree."""
+    """Move configurations (K, n) towards their targets by at most one step, as random trees grow."""
     length = np.linalg.norm((targets - starts) * scale, axis=1, keepdims=True)
     return np.where(length <= step, targets, starts + (targets - starts) * (step / np.maximum(length, step)))
 
 
 def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step: float) -> tuple[int, int] | None:
-    """Extend a tree from new nodes towards targets (K, n) of the other tree, step by step.
+    """Extend a tree from new nodes towards targets (K, n) in the other tree, step by step.
 
     Returns:
         Which of the targets is reached, and the tree's node there; None if none is.
@@ -180,7 +180,7 @@ class PathSearchSettings:
 
 @dataclass(frozen=True, eq=False)
 class JointPath:
-    """Collision-free path of straight motions in joint space.
+    """Collision-free path of straight motions in joint space, with its length.
 
     Attributes:
         joints: Corners with both ends. Shape (M, n), rad or m.
@@ -202,7 +202,7 @@ def find_paths(
     seed: int,
     settings: PathSearchSettings = PathSearchSettings(),
 ) -> list[JointPath]:
-    """Return collision-free paths from a start to goals, the shortest first; empty if none was found.
+    """Return collision-free paths from a start to goals, sorted by length; empty if none was found.
 
     If the straight motion to the nearest goal is clear, no path is shorter, and only straight motions are returned.
 
@@ -250,7 +250,7 @@ def _path_of(joints: Array, goals: Array, scale: Array) -> JointPath:
 
 
 def _with_path(search: TreeSearch, paths: list[JointPath], path: JointPath) -> list[JointPath]:
-    """Add a path to paths sorted by length; only the shortest one of each homotopy class stays."""
+    """Add a path to paths sorted by length, and keep only the shortest path of each homotopy class."""
     others = []
     for other in paths:
         if other.goal == path.goal and same_class(search.motions, other.joints, path.joints, search.scale):

@@ -33,7 +33,7 @@ __all__ = ["Grid", "coarse_grid", "make_grid", "reachable_bounds"]
 
 @dataclass(frozen=True)
 class GridSettings:
-    """Settings of the grids. Shares are relative.
+    """Settings of the grids; shares are relative.
 
     Attributes:
         halvings: Largest number of halvings of an interval of the first grid.
@@ -73,7 +73,7 @@ SETTINGS = GridSettings()
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Nodes along a path, with the limits to evaluate there.
+    """Nodes along a path at which the limits are evaluated.
 
     Attributes:
         path, limits, joints: As of the schedule.
@@ -94,7 +94,7 @@ class Grid:
     sharp: bool = True
 
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
-        """Return the limit rows at the start and at the end of the intervals between two nodes. Shape (N,) each.
+        """Return the limit rows at start and end of each interval between two nodes. Shape (N,) each.
 
         They are evaluated on request: all rows of a long path would fill the memory.
         """
@@ -107,13 +107,13 @@ class Grid:
         return rows.take(slice(count)), rows.take(right)
 
     def parts(self) -> list[tuple[int, int]]:
-        """Split the nodes into blocks of bounded size; return the first and last node of each."""
+        """Divide the nodes into blocks of bounded size; return the first and last node of each block."""
         ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]
         return list(pairwise(ends))
 
 
 class _Cells(NamedTuple):
-    """Intervals that resolve the limits. Shape (N,) each.
+    """Intervals that are short enough to resolve the limits. Shape (N,) each.
 
     Attributes:
         begin: Beginnings of the intervals, m.
@@ -130,7 +130,7 @@ class _Cells(NamedTuple):
 
 
 def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> Grid:
-    """Return the grid of a path.
+    """Return the grid of a path on which its limits are resolved.
 
     Args:
         path, limits: As of the schedule.
@@ -163,7 +163,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
 def _halved(
     path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, requested: tuple[Array, Array]
 ) -> _Cells:
-    """Halve the intervals between places until their limit rows vary almost linearly.
+    """Halve the intervals between positions on the path until their limit rows vary almost linearly.
 
     Args:
         path, limits, joints: As for `make_grid`.
@@ -192,7 +192,7 @@ def _halved(
 
 
 def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
-    """Return initial nodes of a path, not halved, that are fine enough to find where limits are active."""
+    """Return a coarse grid that is fine enough to find where limits are active."""
     bounds = np.asarray(path.bounds, dtype=float)
     s = np.unique(np.concatenate([path.sample_distances(SETTINGS.cells, 1), bounds]))
     requested = np.asarray(path.by_piece(limits.speed)[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
@@ -200,7 +200,7 @@ def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
 
 
 def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:
-    """Raise ProblemError if a limit is violated at rest, as by a torque that does not hold the load."""
+    """Raise ProblemError if a limit is violated at rest, as when a torque cannot hold the load."""
     usages = np.abs(rows.acceleration[:, :, 2])
     at, row = np.unravel_index(int(usages.argmax()), usages.shape)
     if usages[at, row] >= 1:
@@ -210,7 +210,7 @@ def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:
 
 
 def _separate(places: Array, nodes: Array) -> Array:
-    """Return the places in order, without those too close to a node or to each other."""
+    """Return the positions in order, without those that are too close to a node or to each other."""
     s = np.unique(places)
     for _ in range(3):
         gap = np.diff(s)
@@ -232,7 +232,7 @@ def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Arr
 
 
 def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
-    """Return which intervals have middle values that differ from the mean of their ends, at top speed. Shape (N,)."""
+    """Return which intervals have limit rows that are not linear enough, at the fastest steady speed. Shape (N,)."""
     sides = left, middle, right
     kinds = (
         # by the squared speed, as the rows of speed are in the program
@@ -250,7 +250,7 @@ def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.boo
 def reachable_bounds(
     distance: Array, caps: Array, *, left: Rows, right: Rows, at_rest: tuple[bool, bool]
 ) -> tuple[Array, Array]:
-    """Return upper bounds of the squared speeds at nodes (N + 1,) and of the accelerations in intervals (N,).
+    """Return upper bounds of squared speeds at nodes (N + 1,) and of accelerations in intervals (N,).
 
     Args:
         distance: Nodes. Shape (N + 1,), m.
@@ -274,7 +274,7 @@ def _acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> 
 
 
 def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
-    """Return the highest squared speeds at nodes within the caps and the acceleration bounds of the intervals."""
+    """Return the highest squared speeds at nodes that caps and acceleration bounds of the intervals allow."""
     gain = np.concatenate([[0.0], np.cumsum(2 * rates * np.diff(distance))])
     squares = caps.copy()
     squares[[i for i, rest in zip((0, -1), at_rest, strict=True) if rest]] = 0.0
@@ -284,7 +284,7 @@ def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tupl
 
 
 def _time_nodes(cells: _Cells, length: float) -> Array:
-    """Split intervals so that they are also short in time and shrink towards both ends; return the nodes."""
+    """Split intervals so that motion passes them quickly, the more so near both ends; return the nodes."""
     _, top, rates, acceleration, jerk = cells
     s = np.append(cells.begin, length)
     caps = np.minimum(np.append(top, np.inf), np.insert(top, 0, np.inf)) ** 2
@@ -319,5 +319,5 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
 
 
 def _group_indices(sizes: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return 0, 1, ... in each group of the given sizes."""
+    """Return the numbers 0, 1, ... within each group of the given sizes."""
     return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)

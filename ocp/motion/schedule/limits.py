@@ -34,7 +34,7 @@ BLOCK_SIZE = 20_000
 
 
 class PathLike(Protocol):
-    """Protocol of a path of a schedule; models.paths.SmoothPath has it."""
+    """Interface of a path for schedules, which models.paths.SmoothPath provides."""
 
     @property
     def length(self) -> float: ...
@@ -60,7 +60,7 @@ class JointRates(Protocol):
 
 
 class TorqueRates(Protocol):
-    """Joint torques along a path, linear in the motion of the line: inertia a + drag v^2 + rest. Shape (M, n) each."""
+    """Joint torques along a path by speed v and acceleration a: inertia a + drag v^2 + rest. Shape (M, n) each."""
 
     @property
     def inertia(self) -> Array: ...
@@ -71,7 +71,7 @@ class TorqueRates(Protocol):
 
 
 class JointPath(Protocol):
-    """Joints as a function of distance, as from models.scara_along and ocp.joint_path.
+    """Interface of joints as a function of distance, which models.scara_along and ocp.joint_path provide.
 
     With torque limits it also has `torques(distance) -> TorqueRates`.
     """
@@ -129,7 +129,7 @@ class ToolLimits:
 
 @dataclass(frozen=True, eq=False)
 class LineLimits:
-    """Limits of a schedule.
+    """Limits of the speed schedule along a path: of the line, the tool and the joints.
 
     Attributes:
         speed: Requested line speed, m/s: one number, or one for each segment of the task.
@@ -158,7 +158,7 @@ class LineLimits:
                 require.instance("joint limits" if name == "joints" else "tool limits", getattr(self, name), kind)
 
     def of_joints(self, count: int) -> Array:
-        """Return velocity, acceleration and jerk limits of `count` joints, infinite instead of 0. Shape (3, count).
+        """Return velocity, acceleration and jerk limits of `count` joints, where 0 becomes infinite. Shape (3, count).
 
         Joints with a limit of 0 do not move, see `check_line`.
         """
@@ -166,11 +166,11 @@ class LineLimits:
         return np.where(values == 0, np.inf, values)
 
     def torques(self, count: int) -> Array:
-        """Return torque limits of `count` joints. Shape (count,)."""
+        """Return the torque limits of `count` joints. Shape (count,)."""
         return np.asarray(self._of_joints(count, ("torque",))[0])
 
     def _of_joints(self, count: int, names: tuple[str, ...]) -> Array:
-        """Check the limits with these names and return them for `count` joints."""
+        """Return the limits with these names for `count` joints, after checks."""
         joints = self.joints or JointLimits()
         rows = []
         for name in names:
@@ -183,7 +183,7 @@ class LineLimits:
 
 
 def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, zero: bool = False) -> None:
-    """Raise ProblemError unless a limit is positive, of at most these dimensions, and finite if `finite`.
+    """Raise ProblemError unless a limit is positive, of at most `dimensions` dimensions, and finite if required.
 
     With `zero` it may also be 0.
     """
@@ -208,7 +208,7 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, ze
 
 
 def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> JointPath | None:
-    """Check the limits of a path and return the limited joints, or None.
+    """Check path, limits and joints; return the joints if they are limited, else None.
 
     Raises:
         ProblemError: Path, limits or joints have the wrong type, or there are joint limits without joints.
@@ -229,7 +229,7 @@ def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> 
 
 
 def _check_still(path: PathLike, limits: LineLimits, joints: JointPath) -> None:
-    """Raise ProblemError if a joint moves along the path whose velocity, acceleration or jerk is limited to 0."""
+    """Raise ProblemError if a joint whose velocity, acceleration or jerk is limited to 0 moves along the path."""
     own, count = limits.joints or JointLimits(), len(joints.names)
     for name in ("velocity", "acceleration", "jerk"):
         is_zero = np.asarray(getattr(own, name), dtype=float).ravel() == 0
@@ -256,7 +256,7 @@ def check_joints(joints: JointPath) -> None:
 
 
 def rates_along(joints: JointPath, distance: Array) -> JointRates:
-    """Return joints and their derivatives at distances (M,), after checks.
+    """Return joints and their derivatives by distance at distances (M,), after checks.
 
     Raises:
         ProblemError: A shape is not (M, n), or a value is not finite.
@@ -285,7 +285,7 @@ def rates_along(joints: JointPath, distance: Array) -> JointRates:
 
 
 def curvature_along(path: PathLike, distance: Array) -> Array:
-    """Return the curvature at distances (M,), 1/m; ProblemError for a wrong shape or a value that is not finite."""
+    """Return the curvature at distances (M,), 1/m; raise ProblemError if it has a wrong shape or is not finite."""
     value = np.asarray(path.curvature(distance), dtype=float)
     if value.shape != np.shape(distance):
         message = f"the path's curvature has shape {value.shape}, expected {np.shape(distance)}"
@@ -298,7 +298,7 @@ def curvature_along(path: PathLike, distance: Array) -> Array:
 
 
 def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
-    """Return torque coefficients at distances (M,), after checks.
+    """Return the coefficients of the joint torques at distances (M,), after checks.
 
     Raises:
         ProblemError: The joints have no torques, a shape is not (M, n), or a value is not finite.
@@ -317,7 +317,7 @@ def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
 
 
 def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Array]:
-    """Return tangent, curvature vector, its rate, and turn rate at unit speed, at distances (M,). Shape (M, 3) each."""
+    """Return tangent, curvature vector and its rate, and tool turn rate per distance, at (M,). Shape (M, 3) each."""
     missing = [name for name in ("at", "turn") if not callable(getattr(path, name, None))]
     if missing:
         message = f"tool limits need a path with places and turns, as models.smooth makes it; it has no {missing[0]}"
@@ -327,7 +327,7 @@ def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Ar
 
 
 def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -> None:
-    """Raise ProblemError for jerk limits of joints or tool on a path whose curvature jumps, where it jumps most."""
+    """Raise ProblemError if joint or tool jerks are limited although the path's curvature jumps."""
     joints_limited = joints is not None and np.isfinite(limits.of_joints(len(joints.names))[2]).any()
     tool_limited = limits.tool is not None and np.isfinite(limits.tool.jerk).any()
     jumps = path.curvature_jumps() if joints_limited or tool_limited else np.zeros(0)
@@ -344,7 +344,7 @@ def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -
 
 
 class Rows(NamedTuple):
-    """Coefficients of all limits at S places of a path.
+    """Coefficients of all limits at S positions on a path.
 
     Attributes:
         speed: k of each row. Shape (S, K), s/m.
@@ -361,9 +361,7 @@ class Rows(NamedTuple):
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
     def steady(self) -> tuple[Array, NDArray[np.intp]]:
-        """Return the greatest steady speed at each place, m/s, and the index of its limit in `limit_names`. Shape (S,)
-        each.
-        """
+        """Return the greatest steady speed at each position, m/s, and the index of its limit. Shape (S,) each."""
         with np.errstate(divide="ignore", invalid="ignore"):
             available = 1 - np.sign(self.acceleration[:, :, 1]) * self.acceleration[:, :, 2]
             speeds = np.concatenate(
@@ -381,13 +379,11 @@ class Rows(NamedTuple):
 
     @property
     def total(self) -> int:
-        """Number of limit rows at a place."""
+        """Number of limit rows at a position."""
         return sum(kind.shape[1] for kind in self)
 
     def usage(self, motion: LineMotion) -> Array:
-        """Return the value of each limited quantity over its limit, signed, in a motion at the places. Shape (S, K + L
-        + P).
-        """
+        """Return the signed ratio of each limited quantity to its limit during a motion. Shape (S, K + L + P)."""
         v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
         acceleration, jerk = self.acceleration, self.jerk
         return np.concatenate(
@@ -401,12 +397,12 @@ class Rows(NamedTuple):
 
 
 def limit_names(limits: LineLimits, joints: JointPath | None) -> tuple[str, ...]:
-    """Return the name of the limit of each row, in the order of `Rows.usage`."""
+    """Return the names of the limits in the order of the columns of `Rows.usage`."""
     return tuple(name for kind in _names_by_kind(limits, joints) for name in kind)
 
 
 def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[str], list[str], list[str]]:
-    """Return the names of the rows of speed, acceleration and jerk."""
+    """Return the names of the limits by kind: speed, acceleration and jerk."""
     speed, acceleration, jerk = ["centripetal acceleration"], ["line acceleration"], []
     if np.isfinite(limits.jerk):
         jerk = ["line jerk"]
@@ -425,7 +421,7 @@ def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[s
 
 
 def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
-    """Return the number of acceleration rows that are torques; they come last."""
+    """Return the number of torque rows, which are the last of the acceleration rows."""
     if joints is None or not np.isfinite(limits.torques(len(joints.names))).any():
         return 0
     return len(joints.names)
@@ -434,7 +430,7 @@ def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
 def limit_rows(
     path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array, *, torques: bool = True
 ) -> Rows:
-    """Return the limit coefficients at distances (S,) of a path; torques are zero unless `torques`.
+    """Return the limit coefficients at distances (S,) along a path, with zero for torques unless `torques`.
 
     Raises:
         ProblemError: Curvature or joints are not finite, as at a singular arm, or have a wrong shape.
@@ -453,7 +449,7 @@ def limit_rows(
 
 
 def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
-    """Return the limit coefficients at the distances of one block."""
+    """Return the limit coefficients at distances of at most one block."""
     speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _names_by_kind(limits, joints))
     if not s.size:
         return Rows(speed[:, :, 0], acceleration, jerk)

@@ -69,7 +69,7 @@ SETTINGS = ScheduleSettings()
 
 
 def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
-    """Return a motion from rest to rest within line limits and below the maximum velocity curve.
+    """Return a motion from rest to rest that stays below the maximum velocity curve and the line limits.
 
     Raises:
         ProblemError: The curvature is not finite, or no plan below the curve is found.
@@ -85,7 +85,7 @@ def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfil
 
 
 def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
-    """Return distances, the maximum velocity curve there (G,), and the requested speed between them (G - 1,)."""
+    """Return distances, the maximum velocity curve at them (G,), and requested speeds between them (G - 1,)."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
@@ -104,7 +104,7 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
 def _refined(
     path: PathLike, limits: LineLimits, s: Array, bounds: Array, of_pieces: Array
 ) -> tuple[Array, Array, Array]:
-    """Refine the distances of the `_velocity_curve` over some segments until they resolve it."""
+    """Refine the distances for `_velocity_curve` over some pieces of the path until they resolve it."""
 
     def permitted_at(places: Array) -> Array:
         with np.errstate(divide="ignore"):
@@ -126,7 +126,7 @@ def _refined(
 
 
 def _unresolved(length: float, s: Array, permitted: Array, requested: Array, acceleration: float) -> NDArray[np.bool_]:
-    """Return which intervals are too coarse for the permitted speed where it limits the motion.
+    """Return which intervals are too coarse to resolve the permitted speed where it limits the motion.
 
     It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.
     """
@@ -146,14 +146,14 @@ def _unresolved(length: float, s: Array, permitted: Array, requested: Array, acc
 
 
 def _constant_zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
-    """Merge neighbouring intervals of one speed into zones."""
+    """Merge neighbouring intervals with the same speed into zones."""
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(speed))])
     same = np.ones(len(starts))
     return Zones(s[np.append(starts, len(speed))], speed[starts], limits.acceleration * same, limits.jerk * same)
 
 
 def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, everywhere: bool) -> bool:
-    """Lower zone speeds, in place, where a profile is too fast; return whether there was any."""
+    """Lower zone speeds, in place, where a profile is too fast; return whether a speed was lowered."""
     speeds = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // BLOCK_SIZE + 1)])
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
@@ -181,7 +181,7 @@ def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfil
 
 @dataclass(frozen=True)
 class Dip:
-    """Part of a path on which the schedule is slower than requested.
+    """Part of a path on which the schedule is slower than requested, and the limit that causes it.
 
     Attributes:
         start, end: Distances along the path, m.
@@ -212,7 +212,7 @@ class Dip:
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """Motion along a path over time.
+    """Motion along a path over time, as planned by `schedule`.
 
     Attributes:
         path: The path.
@@ -234,19 +234,19 @@ class Schedule:
 
     @property
     def duration(self) -> float:
-        """Duration, s."""
+        """Duration of the motion, s."""
         return self.profile.duration
 
     def at(self, time: ArrayLike) -> LineMotion:
-        """Return the motion at times in [0, duration]. Shape (M,), s."""
+        """Return the motion at times (M,) in [0, duration], s."""
         return self.profile.at(time)
 
     def time_at(self, distance: ArrayLike) -> Array:
-        """Return the times at which the path reaches distances from its start. Shape (M,), s."""
+        """Return the times at which the motion reaches distances (M,) from the start of the path, s."""
         return self.profile.at_distance(distance).t
 
     def sample(self, period: float) -> LineMotion:
-        """Return the motion every `period` s from the start; the last sample, at the end, may come earlier.
+        """Return the motion every `period` s from the start, and at the end.
 
         Raises:
             ProblemError: The period is not positive, or too short.
@@ -254,7 +254,7 @@ class Schedule:
         return self.at(sample_times("sample period", period, self.duration))
 
     def function(self) -> Any:
-        """Return the CasADi function of time, see SpeedProfile.function."""
+        """Return the motion as a CasADi function of time, see SpeedProfile.function."""
         return self.profile.function()
 
 
@@ -301,7 +301,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
 
 def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
-    """Return the speed profile of the line where it satisfies all limits, and the fastest motion elsewhere."""
+    """Return the speed profile of the line where that satisfies all limits, else the fastest motion."""
     count = len(grid.requested)
     if line_profile is None:
         return fastest_profile(Stretch(grid, 0, count))
@@ -339,7 +339,7 @@ def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> Speed
 
 
 def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
-    """Return the intervals of the grid in which a motion violates a limit. Shape (N,)."""
+    """Return which intervals of the grid contain a violation of a limit. Shape (N,)."""
     violated = np.zeros(len(grid.requested), dtype=bool)
     # inside an interval the jerk may change and the speed may have its maximum
     peaks = profile.at(
@@ -358,7 +358,7 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
 
 
 def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float) -> list[tuple[int, int]]:
-    """Return first and last nodes of the stretches to plan again; they end at steady speeds or at path ends.
+    """Return first and last nodes of the stretches to plan again, which end at steady speeds or path ends.
 
     They extend beyond the violated intervals by `extent` times the length of a ramp to rest.
     """
@@ -385,7 +385,7 @@ def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], e
 
 
 def _reaches_speed_at_ends(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
-    """Return whether a motion has the requested speed near the ends of its stretch, except at path ends."""
+    """Return whether a motion has the requested speed near the ends of its stretch; path ends are excepted."""
     length = motion.distance[-1] - motion.distance[0]
     for node, inside in ((first, first), (last, last - 1)):
         if node in (0, len(grid.requested)):
@@ -411,7 +411,7 @@ def _cut_profile(profile: SpeedProfile, begin: float, end: float) -> SpeedProfil
 
 
 def _find_dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Dip, ...]:
-    """Return the stretches below the requested speed where a limit other than those of the line is active."""
+    """Return the stretches below the requested speed whose active limit is not one of the line."""
     middle = profile.at_distance((grid.distance[:-1] + grid.distance[1:]) / 2)
     line_rows = [k for k, name in enumerate(names) if name.startswith("line ")]
     cause, steady = np.zeros(len(grid.requested), dtype=np.intp), np.zeros(len(grid.requested))

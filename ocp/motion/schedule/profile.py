@@ -35,13 +35,13 @@ class LineMotion(NamedTuple):
 
 
 def integrate_jerk(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple[Any, Any, Any]:
-    """Return distance, speed and acceleration after a time of constant jerk; numbers, arrays or CasADi."""
+    """Return distance, speed and acceleration after a time at constant jerk, for numbers, arrays or CasADi."""
     s = time * (speed + time * (acceleration / 2 + time * jerk / 6))
     return s, speed + time * (acceleration + time * jerk / 2), acceleration + time * jerk
 
 
 def segment_index(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "right"] = "right") -> NDArray[np.intp]:
-    """Return the index of the interval between increasing bounds (K + 1,) that contains each place.
+    """Return the index of the interval between increasing bounds (K + 1,) that contains each position.
 
     `side` chooses the interval at a bound; places beyond the ends belong to the first and last interval.
     """
@@ -49,7 +49,7 @@ def segment_index(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "r
 
 
 def _checked_values(value: ArrayLike, upper: float, name: str, problem: str) -> Array:
-    """Return a row of numbers clipped to [0, most]; ProblemError if one is outside by more than rounding."""
+    """Return numbers clipped to [0, upper]; raise ProblemError if one is outside by more than rounding."""
     try:
         # a contiguous array occupies its memory; a broadcast view could claim any size
         plain = isinstance(value, np.ndarray) and value.dtype == float and value.flags.c_contiguous
@@ -108,7 +108,7 @@ class SpeedProfile:
         return float(self.t[-1])
 
     def at(self, time: ArrayLike) -> LineMotion:
-        """Return the motion at times in [0, duration], shape (M,), s; at a jump the later jerk.
+        """Return the motion at times (M,) in [0, duration], s; where the jerk jumps, it has the later value.
 
         Raises:
             ProblemError: A time is nan, or outside by more than rounding.
@@ -122,7 +122,7 @@ class SpeedProfile:
         return motion
 
     def at_distance(self, distance: ArrayLike) -> LineMotion:
-        """Return the motion at distances from the start, shape (M,), m; at a place of rest, its first time.
+        """Return the motion at distances (M,) from the start, m; at a position of rest, when it is reached.
 
         Raises:
             ProblemError: A distance is nan, or off the path by more than rounding.
@@ -135,15 +135,14 @@ class SpeedProfile:
         return self._motion(segment, np.where(s == length, np.diff(self.t)[-1], inside))
 
     def peaks(self) -> LineMotion:
-        """Return the motion at all candidates for the largest speed: segment ends and zeros of the acceleration."""
+        """Return the motion at all times where the speed may be largest: segment ends and zero acceleration."""
         with np.errstate(divide="ignore", invalid="ignore"):
             zero = -self.acceleration[:-1] / self.jerk
         inside = np.flatnonzero((zero > 0) & (zero < np.diff(self.t)))
         return self.at(np.concatenate([self.t, self.t[:-1][inside] + zero[inside]]))
 
     def function(self) -> Any:
-        """Return the CasADi function time (s) -> (distance, speed, acceleration, jerk), with MX tables for code
-        generation.
+        """Return the CasADi function time (s) -> (distance, speed, acceleration, jerk), with its tables as MX.
 
         Times outside are clipped to the ends.
         """
@@ -159,13 +158,13 @@ class SpeedProfile:
         return ca.Function("profile", [time], outputs, ["time"], ["distance", "speed", "acceleration", "jerk"])
 
     def _motion(self, segment: NDArray[np.intp], t: Array) -> LineMotion:
-        """Return the motion at times (M,) after the start of segments (M,)."""
+        """Return the motion at times (M,) after the starts of given segments (M,)."""
         s, v, a, j = self.distance[segment], self.speed[segment], self.acceleration[segment], self.jerk[segment]
         distance, speed, acceleration = integrate_jerk(v, a, j, t)
         return LineMotion(self.t[segment] + t, s + distance, np.maximum(speed, 0.0), acceleration, j)
 
     def _time_inside(self, segment: NDArray[np.intp], distance: Array) -> Array:
-        """Return the times (M,) after the start of segments (M,) at which given distances (M,) are covered."""
+        """Return the times (M,), counted from the start of given segments (M,), at which distances (M,) are covered."""
         v, a, j, high = self.speed[segment], self.acceleration[segment], self.jerk[segment], np.diff(self.t)[segment]
         even = (a == 0) & (j == 0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -193,7 +192,7 @@ class SpeedProfile:
 
 
 def profile_through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
-    """Return two segments of constant jerk between each two nodes, and one beside a node at rest.
+    """Return a profile through nodes: two segments of constant jerk between nodes, one beside a node at rest.
 
     Over a distance h, T follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, which two jerks of T/2 each satisfy.
 

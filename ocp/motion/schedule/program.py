@@ -40,7 +40,7 @@ __all__ = ["INTERIOR", "Program", "ProgramSettings", "Spline", "SplineRows", "le
 
 @dataclass(frozen=True)
 class ProgramSettings:
-    """Settings of the interior point. Shares are relative; complementarity is over the time.
+    """Settings of the interior-point method; shares are relative, complementarity is relative to the time.
 
     Attributes:
         steps: Largest number of steps.
@@ -76,7 +76,7 @@ INTERIOR = ProgramSettings()
 
 
 class SplineRows(NamedTuple):
-    """Constraint rows c . (x, x', x'') <= bound, or <= bound x^(-1/2) for jerk limits.
+    """Constraint rows c . (x, x', x'') <= bound or, for jerk limits, <= bound x^(-1/2).
 
     Attributes:
         interval: Interval of the place. Shape (M,).
@@ -96,7 +96,7 @@ class SplineRows(NamedTuple):
 
 
 class Spline:
-    """Quadratic spline of the squared speed over nodes, shape (N + 1,), m, with N + 2 coefficients."""
+    """Quadratic spline of the squared speed x over nodes, shape (N + 1,), m, with N + 2 coefficients."""
 
     def __init__(self, nodes: Array) -> None:
         self.nodes, self.h = nodes, np.diff(nodes)
@@ -105,7 +105,7 @@ class Spline:
         self.share = before / self.width
 
     def part(self, at: NDArray[np.intp]) -> Spline:
-        """Return the spline with a subset of the coefficients, as if these were neighbours."""
+        """Return the spline with a subset of the coefficients, which then count as neighbours."""
         part, last = copy(self), len(self.h)
         part.h = self.h[np.minimum(at[:-2], last - 1)]
         nodes = np.minimum(at[:-1], last)
@@ -118,11 +118,11 @@ class Spline:
         return b[:-1] + self.share * step, 2 * step / self.width
 
     def through(self, x: Array, slope: Array) -> Array:
-        """Return the coefficients of the spline with x and x' at the nodes. Shape (N + 1,) each."""
+        """Return the spline's coefficients from x and x' at the nodes. Shape (N + 1,) each."""
         return np.append(x - self.share * self.width * slope / 2, x[-1])
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
-        """Return (x, x', x'') at places as linear functions of their interval's three coefficients. Shape (3, 3, M)."""
+        """Return (x, x', x'') in intervals as linear functions of their three coefficients. Shape (3, 3, M)."""
         h, share = self.h[interval], self.share[interval]
         inside = fraction * h
         first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
@@ -136,7 +136,7 @@ class Spline:
 
 
 class Program(NamedTuple):
-    """Minimum-time program of a stretch.
+    """Minimum-time program of a stretch of a path.
 
     Attributes:
         spline: Squared speed.
@@ -154,9 +154,7 @@ class Program(NamedTuple):
     fixed: NDArray[np.intp]
 
     def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
-        """Return the program of some intervals (B,) with fixed motion between them, and the indices of its
-        coefficients.
-        """
+        """Return the program of some intervals (B,), with fixed motion between them, and the coefficients' indices."""
         count = len(self.spline.h)  # stretches are concatenated, with two intervals without rows between them
         cuts = np.flatnonzero(np.diff(free) > 1)
         first, last = free[np.append(0, cuts + 1)], free[np.append(cuts, len(free) - 1)] + 1
@@ -183,7 +181,7 @@ class Program(NamedTuple):
 
 
 class _EndConditions:
-    """End conditions on the coefficients: fixed ones, and one that follows from its neighbour at rest."""
+    """End conditions on the coefficients: some are fixed, and one follows from its neighbour at rest."""
 
     def __init__(self, program: Program) -> None:
         n, h, (first, last) = len(program.upper), program.spline.h, program.rest
@@ -205,13 +203,13 @@ class _EndConditions:
             change[outer] = ratio * change[inner]
 
     def reduce(self, slope: Array) -> None:
-        """Reduce a gradient to the free coefficients, in place."""
+        """Reduce a gradient to that of the free coefficients, in place."""
         for outer, inner, ratio in self.sides:
             slope[inner] += ratio * slope[outer]
         slope[self.fixed] = 0.0
 
     def band(self, main: Array, first: Array, second: Array) -> Array:
-        """Return the diagonals of a Hessian, reduced to the free coefficients, for `_BandSolver`.
+        """Return the diagonals of a Hessian for `_BandSolver`, reduced to the free coefficients.
 
         Args:
             main, beside, apart: Its diagonals by all coefficients, changed in place. Shape (n,), (n - 1,), (n - 2,).
@@ -232,7 +230,7 @@ class _EndConditions:
 
 
 class _BandSolver:
-    """Solver of symmetric positive definite equations with five diagonals, given by the lower ones. Shape (3, n).
+    """Solver of symmetric positive definite systems with five diagonals, given by three. Shape (3, n).
 
     Raises:
         LinAlgError: The equations are not positive definite, for example when only rounding errors remain.
@@ -253,7 +251,7 @@ class _BandSolver:
 
 
 class _Constraints:
-    """Constraints of a program: positive coefficients, their upper bounds, and the rows, jerk limits last.
+    """Constraints of a program: positive coefficients, bounded coefficients, then limit rows with jerk limits last.
 
     Values of constraints, shape (M,), are in this order.
 
@@ -292,7 +290,7 @@ class _Constraints:
         self.middles = INTERIOR.block * np.arange(self.blocks.max() + 1) + (INTERIOR.block - 1) / 2
 
     def evaluate(self, b: Array) -> tuple[Array, Array]:
-        """Return violations and scales of the constraints at b, and linearise the jerk constraints there."""
+        """Return violations and scales of the constraints at coefficients b, and linearise jerk limits there."""
         coefficients, sharp = self._coefficients(b), self.alone + self.jerk
         at = _weighted_sum(self.square, [each[self.jerk :] for each in coefficients])
         root = self.sharp / np.sqrt(at)
@@ -308,18 +306,18 @@ class _Constraints:
         return gap, size
 
     def change_of(self, change: Array) -> Array:
-        """Return the changes of the constraints for a change of the coefficients. Shape (M,)."""
+        """Return the changes of all constraints for a change of the coefficients. Shape (M,)."""
         return self._all_values(change, _weighted_sum(self.gradients, self._coefficients(change)))
 
     def gathered(self, values: Array) -> Array:
-        """Return the sum of row gradients, weighted by values, for each coefficient. Shape (N + 2,)."""
+        """Return the gradients of all constraints, weighted by values and summed. Shape (N + 2,)."""
         out = self._spread(self.gradients * values[self.alone :])
         out[1:-1] -= values[: self.count]
         out[self.bounded] += values[self.count : self.alone]
         return out
 
     def squares(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return the diagonals of the weighted sum of outer products of gradients. Shape (N + 2,), (N + 1,), (N,)."""
+        """Return the weighted sum of outer products of gradients by its diagonals. Shapes (N + 2,), (N + 1,), (N,)."""
         g = self.gradients
         pulled = g * values[self.alone :]
         main = self._spread(g * pulled)
@@ -328,15 +326,15 @@ class _Constraints:
         return main, self._spread([g[0] * pulled[1], g[1] * pulled[2]]), self._spread([g[0] * pulled[2]])
 
     def _coefficients(self, b: Array) -> list[Array]:
-        """Return the three coefficients of the interval of each row."""
+        """Return the three spline coefficients of each row's interval."""
         return [b[k : self.count + k].take(self.row_interval) for k in range(3)]
 
     def _all_values(self, b: Array, rows: Array) -> Array:
-        """Return the values of all constraints from those of the rows."""
+        """Return the values of all constraints from the values of the rows."""
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
     def _spread(self, values: Iterable[Array]) -> Array:
-        """Sum over the rows of each interval and assign the sums to its coefficients, or pairs of these.
+        """Sum values over the rows of each interval, and add the k-th sums to the k-th coefficient of the interval.
 
         Shapes (M - `alone`,) each to (N + number of values - 1,).
         """
@@ -347,7 +345,7 @@ class _Constraints:
         return out
 
     def longest(self, rates: Array, share: float, of_positive: float) -> Array:
-        """Return step lengths of at most 1, one per interval, that vary slowly along the path. Shape (N,).
+        """Return step lengths of at most 1, one per interval, which vary slowly along the path. Shape (N,).
 
         Args:
             rates: Relative rates of change of values that stay positive. Shape (M,).
@@ -369,12 +367,12 @@ class _Constraints:
 
 
 def _weighted_sum(weights: Array, values: list[Array]) -> Array:
-    """Return the sum of three products."""
+    """Return the sum of three weights times values."""
     return np.asarray(weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2])
 
 
 def least_time(program: Program, start: Array, *, accuracy: float, center: float) -> Array:
-    """Return the coefficients of the fastest motion. Shape (N + 2,).
+    """Return the coefficients of the fastest motion by an interior-point method. Shape (N + 2,).
 
     Args:
         program: Program of the stretch.
@@ -397,7 +395,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
     multiplier = center * _travel_time(spline.share, cost_weights, b)[0] / len(gap) / slack
 
     def solve(right: Array) -> Array:
-        """Return the change of the coefficients."""
+        """Return the Newton step of the coefficients."""
         ends.reduce(right)
         change = equations.solve(right)
         ends.follow(change)
@@ -478,14 +476,14 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
 
 def _violations(gap: Array, slack: Array, size: Array, count: int) -> Array:
-    """Return the relative violations that the slacks leave; zero for the first `count` rows, which always hold."""
+    """Return the relative violations that slacks leave; zero for the first `count` rows, which always hold."""
     violation = (gap + slack) / size
     violation[:count] = 0.0
     return np.asarray(violation)
 
 
 def _travel_time(share: Array, weights: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
-    """Return the travel time, its gradient and the bands of its Hessian (main and two upper diagonals).
+    """Return the travel time, its gradient, and its Hessian as main and two upper diagonals.
 
     `weights` are the path lengths that the quadrature points represent.
     """

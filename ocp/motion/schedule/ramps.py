@@ -40,7 +40,7 @@ REACH_MARGIN = 1e-6
 
 
 class Zones(NamedTuple):
-    """Consecutive stretches of a path, each with constant limits.
+    """Consecutive stretches of a path, each with its own constant limits.
 
     Attributes:
         bounds: Distances at which the zones begin, and the end. Shape (Z + 1,), m.
@@ -68,7 +68,7 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
 
 
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
-    """Return the distance (m) of the shortest change from one speed to another; raises as ramp_time."""
+    """Return the distance (m) of the shortest change between two speeds; raises the errors of `ramp_time`."""
     for name, value in (("first", first), ("last", last)):
         require.nonnegative(f"ramp: {name}", value)
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
@@ -145,7 +145,7 @@ def fastest_motion(distance: float, first: float, last: float, limits: tuple[flo
 
 
 def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
-    """Return whether a motion ends at its distance and final speed, with all speeds within the limits."""
+    """Return whether a motion has its distance and final speed, with all speeds within the limits."""
     s, v, a = 0.0, first, 0.0
     error = ROUNDING_SHARE * top
     for t, j in phases:
@@ -157,7 +157,7 @@ def _closes(phases: Phases, distance: float, first: float, last: float, top: flo
 
 
 def _two_ramps(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
-    """Return a motion that ramps up to the highest possible speed, keeps it, and ramps down."""
+    """Return a motion that accelerates to the highest possible speed, keeps it, and decelerates."""
 
     def needed(peak: float) -> float:
         return ramp_distance(first, peak, acceleration, jerk) + ramp_distance(peak, last, acceleration, jerk)
@@ -176,7 +176,7 @@ def _two_ramps(distance: float, first: float, last: float, top: float, accelerat
 
 
 def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
-    """Return the shortest change of the speed by `change` (m/s)."""
+    """Return the quickest change of the speed by `change` (m/s)."""
     size, sign = abs(change), 1.0 if change > 0 else -1.0
     if size == 0:
         return ()
@@ -190,7 +190,7 @@ def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
 
 
 def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
-    """Return the line speed from rest to rest, as fast as possible with zero acceleration at the bounds of zones.
+    """Return the fastest line speed from rest to rest, with zero acceleration at the bounds of zones.
 
     A backward and a forward pass find the speeds at the bounds; each zone is then the fastest motion between them. The
     result is time-optimal for one zone, and for several up to the condition of zero acceleration at their bounds.
@@ -219,7 +219,7 @@ def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
 
 
 def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
-    """Return the motions through all zones as one profile, given the speeds at their bounds. Shape (Z + 1,), m/s."""
+    """Return the motions through all zones as one profile, for given speeds at their bounds. Shape (Z + 1,), m/s."""
     counts = np.array([len(phases) for phases in motions])
     durations, jerks = np.array([phase for phases in motions for phase in phases]).reshape(-1, 2).T
     if not durations.size or not np.isfinite(durations).all():
@@ -241,12 +241,12 @@ def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
 
 
 def _limited(speed: float, other_end: float, length: float, limits: tuple[float, float, float]) -> float:
-    """Return the greater speed at the ends of a zone, lowered to what is reachable from the other end."""
+    """Return the greater speed at the ends of a zone, lowered to what can be reached from the other end."""
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
 def reachability_passes(distance: Array, caps: Array, *, p: Array, q: Array, low: Array, high: Array) -> Array:
-    """Return the greatest squared speeds at nodes, from rest to rest. Shape (N + 1,).
+    """Return the greatest squared speeds at nodes, from rest to rest, by passes in both directions. Shape (N + 1,).
 
     Args:
         distance: Nodes. Shape (N + 1,), m.
@@ -290,7 +290,7 @@ def reachability_passes(distance: Array, caps: Array, *, p: Array, q: Array, low
 
 
 def _feasible_squares(p: Array, q: Array, low: Array, high: Array, caps: Array) -> tuple[Array, Array]:
-    """Return bounds of the squared speeds for which the rows of an interval permit an acceleration. Shape (N,) each."""
+    """Return bounds of the squared speeds for which an interval's rows allow some acceleration. Shape (N,) each."""
     floor, ceiling = np.zeros(len(p)), caps.copy()
     count = p.shape[1]
     with np.errstate(divide="ignore", invalid="ignore"):

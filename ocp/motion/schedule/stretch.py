@@ -44,7 +44,7 @@ ACTIVE_SHARE = 0.98
 
 @dataclass(frozen=True)
 class StretchSettings:
-    """Settings of the fastest motion. Shares are relative.
+    """Settings of the fastest motion; shares are relative.
 
     Attributes:
         rounds: Largest number of rounds of tightening.
@@ -106,7 +106,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
 def _solve_window(
     window: Window, seam: int, before: EnforcedRows | None
 ) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
-    """Return the motion of a window up to its seam; limits are tightened until it satisfies them well beyond.
+    """Return the motion of a window up to the start of the next one, with limits tightened as far as necessary.
 
     Args:
         window: The window.
@@ -130,7 +130,7 @@ def _solve_window(
 
 
 def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> tuple[Array, Array | None]:
-    """Tighten limits until a motion satisfies them; return squared speeds and, with jerk limits, slopes at the nodes.
+    """Tighten limits until a motion satisfies them; return squared speeds and, with jerk limits, slopes at nodes.
 
     If few intervals still violate them, these are planned again with their neighbours, between fixed motions.
 
@@ -186,7 +186,7 @@ def _seam_shares(window: Window, seam: int) -> Array:
 
 
 def _without_jerk(window: Window, margins: Margins) -> Array:
-    """Return the highest squared speeds at the nodes without jerk limits, by a forward and a backward pass."""
+    """Return the highest squared speeds at nodes if jerks are unlimited, by a forward and a backward pass."""
     grid = window.grid
     left, right = window.rows[0], window.rows[-1]
     h = np.diff(window.nodes)[:, None]
@@ -200,14 +200,14 @@ def _without_jerk(window: Window, margins: Margins) -> Array:
 
 
 def _row_speed_caps(window: Window) -> Array:
-    """Return the squared speeds that speed limits allow at nodes, from both sides."""
+    """Return the squared speeds that speed limits allow at nodes, using both neighbouring intervals."""
     left, right = (window.rows[k].speed.max(axis=1, initial=0.0) for k in (0, -1))
     with np.errstate(divide="ignore"):
         return np.asarray(np.maximum(np.append(left, 0.0), np.insert(right, 0, 0.0)) ** -2.0)
 
 
 def _node_minimum(of_intervals: Array) -> Array:
-    """Return the smaller value of the two neighbouring intervals at each node."""
+    """Return the smaller value of the two intervals that meet at each node."""
     return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 
@@ -285,7 +285,7 @@ def _with_jerk(
 
 
 def _resolve(program: Program, known: Array, accuracy: float) -> Array:
-    """Solve a program with the solution of a similar one as the guess; if that fails, with a guess further inside."""
+    """Solve a program from the solution of a similar one; if that fails, from a guess farther inside."""
     free = np.ones(len(known), dtype=bool)
     free[program.fixed] = False
     start = np.where(free, SETTINGS.again, 1.0) * known
@@ -297,7 +297,7 @@ def _resolve(program: Program, known: Array, accuracy: float) -> Array:
 
 
 def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: Ends) -> Array:
-    """Return initial squared speeds, below the greatest ones (N + 1,), that jerk limits allow from rest.
+    """Return initial squared speeds below the greatest ones (N + 1,) that jerk limits allow from rest.
 
     From rest x^(3/4) grows by the square root of 9/2 of the jerk times the distance; a known motion may slow down
     likewise.
@@ -315,7 +315,7 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
 
 
 def _rest_jerk(near: Rows, far: Rows, width: float, side: int, shares: Array) -> float:
-    """Return the greatest jerk of the first (side 0) or last interval, which starts or ends at rest."""
+    """Return the greatest jerk of the first (side 0) or last interval, at whose outer end the motion rests."""
     of = [near.jerk[0], far.jerk[0]] if side == 0 else [near.jerk[-1], far.jerk[-1]]
     sign, share = 1.0 - 2.0 * side, shares[0 if side == 0 else -1]
     ratio = 0.0
@@ -335,7 +335,7 @@ def _spline_rows(
     speeds: Array,
     in_motion: tuple[bool, bool],
 ) -> SplineRows:
-    """Return the enforced rows of a program, and speeds at its nodes and inside intervals whose speed was tightened.
+    """Return the enforced rows of a program, and speeds at its nodes and where speeds were tightened.
 
     Args:
         places: Rows where intervals begin, inside them, and where they end. Shape (N,) each.
@@ -374,7 +374,7 @@ def _spline_rows(
 
 
 def _jerk_place(inside: float) -> float:
-    """Return the place in an interval where the spline's jerk x''/2 v equals the constant jerk of its half.
+    """Return the position in an interval at which the spline's jerk x''/2 v equals that of its half.
 
     With a = a0 + x''/2 (s - s0), two jerks over half the time T each lead to the speed and acceleration at its end if
     they are x''/2 (v0 + a0 T / 6) and x''/2 (v0 + a0 5 T / 6), up to terms of second order.
@@ -383,7 +383,7 @@ def _jerk_place(inside: float) -> float:
 
 
 def _speed_ratios(spline: Spline, b: Array) -> Array:
-    """Return the speeds at the `HELD` places relative to those at their `_jerk_place`. Shape (4, N)."""
+    """Return the ratios of speeds at the `HELD` positions to those at their `_jerk_place`. Shape (4, N)."""
     x, slope = spline.at_nodes(b)
     second = np.diff(slope) / spline.h
 
@@ -396,13 +396,13 @@ def _speed_ratios(spline: Spline, b: Array) -> Array:
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
-    """Return rows that bound squared speeds times `of` by one."""
+    """Return the rows that bound squared speeds, multiplied by `of`, by one."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
     return SplineRows(interval, fraction, fraction, coefficients, np.ones(len(of)), none)
 
 
 def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -> NDArray[np.bool_]:
-    """Return which acceleration and jerk limits a motion might reach. Shape (N, K + L + P).
+    """Return which acceleration and jerk limits a motion may reach. Shape (N, K + L + P).
 
     Args:
         rows: Rows in N intervals.

@@ -25,7 +25,7 @@ KINDS = ("positions", "velocities", "accelerations")
 
 @dataclass(frozen=True, eq=False)
 class JointTrajectory:
-    """Sampled joint trajectory.
+    """Joint trajectory, sampled over time.
 
     Attributes:
         names: Names of the n joints.
@@ -65,14 +65,14 @@ class JointTrajectory:
         return f"<JointTrajectory of {', '.join(self.names)} at {len(self.t)} times, {self.t[0]:g} to {self.t[-1]:g} s>"
 
     def write_csv(self, path: str | FilePath[str]) -> None:
-        """Write columns t and position, velocity, acceleration of each joint, in full precision."""
+        """Write time, and position, velocity and acceleration of each joint, as CSV in full precision."""
         head = ["t", *(f"{column_name(name)}.{kind}" for kind in KINDS for name in self.names)]
         rows = np.column_stack([self.t, self.positions, self.velocities, self.accelerations])
         write_text(path, "\n".join([",".join(head), *(",".join(map(repr, row)) for row in rows.tolist()), ""]))
 
     @classmethod
     def read_csv(cls, path: str | FilePath[str]) -> JointTrajectory:
-        """Read a file from write_csv, bit for bit; ProblemError for any other file."""
+        """Read a file that write_csv has written, bit for bit; raise ProblemError for any other file."""
         try:
             text = read_regular(checked_path(path), MAX_FILE_BYTES).decode()
         except (OSError, ValueError) as error:
@@ -115,7 +115,7 @@ class JointTrajectory:
 
     @classmethod
     def from_ros(cls, message: Mapping[str, Any]) -> JointTrajectory:
-        """Read a message from to_ros, with times to the nanosecond; ProblemError if a field is missing."""
+        """Read a message that to_ros has returned; raise ProblemError if a field is missing."""
         try:
             points = message["points"]
             stamps = [p["time_from_start"] for p in points]
@@ -129,7 +129,7 @@ class JointTrajectory:
 
 
 def _numbers(what: str, value: Any) -> Array:
-    """Return a value as an array; ProblemError if it is not numeric."""
+    """Return a value as an array; raise ProblemError if it is not numeric."""
     try:
         return floats(value)
     except NOT_NUMBERS as error:
@@ -137,7 +137,7 @@ def _numbers(what: str, value: Any) -> Array:
 
 
 def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, Array, Array]:
-    """Return joints, velocities, accelerations and jerks in a motion along the path. Shape (M, n) each.
+    """Return joints, velocities, accelerations and jerks for a motion along the path. Shape (M, n) each.
 
     q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
     """
@@ -150,7 +150,7 @@ def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, A
 
 
 def joint_trajectory(schedule: Schedule, joints: JointPath, period: float) -> JointTrajectory:
-    """Return the joints every `period` s from the start to the end of a schedule; ProblemError for a bad period.
+    """Return the joints every `period` s over a whole schedule; raise ProblemError for an invalid period.
 
     Times are whole nanoseconds, those of the ROS message, and the joints are those at these times. The last time is the
     first one at or after the end, at rest.

@@ -20,7 +20,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """Settings of the windows. Shares are of the limits.
+    """Settings of the windows; shares are relative to the limits.
 
     Attributes:
         room: Share of the limits reserved for what happens between the places where rows are enforced: half of the
@@ -72,7 +72,7 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Window(Stretch):
-    """Part of a stretch that is solved at once.
+    """Part of a stretch that is solved as one program.
 
     Attributes:
         rows: Rows where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
@@ -102,7 +102,7 @@ class Window(Stretch):
         return cls(grid, first, last, ends, every, bends)
 
     def fine_rows(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
-        """Return the limit rows at the inner points that divide some intervals into `fine` parts, point by point.
+        """Return the limit rows at the inner points that divide intervals into `fine` parts, in order of the points.
 
         Shape ((SETTINGS.fine - 1) B,); with torques, which take longest, on request.
         """
@@ -119,7 +119,7 @@ class Window(Stretch):
 
     @property
     def torques(self) -> slice:
-        """Slice of `limit_names` that are torques."""
+        """Slice of the torque limits in `limit_names`."""
         speed, acceleration, _ = (kind.shape[1] for kind in self.rows[0])
         count = torque_rows(self.grid.limits, self.grid.joints)
         return slice(speed + acceleration - count, speed + acceleration)
@@ -141,17 +141,17 @@ class Margins(NamedTuple):
     jerk: Array
 
     def take(self, part: slice) -> Margins:
-        """Return the margins of some intervals, as views."""
+        """Return the margins of some intervals, as views of the same memory."""
         return Margins(*(margin[part] for margin in self))
 
     def times(self, share: Array) -> Margins:
-        """Return the margins multiplied by a factor for each interval. Shape (N,)."""
+        """Return the margins multiplied by a factor for each interval (N,)."""
         return Margins(self.speed * share, self.acceleration * share[:, None], self.jerk * share[:, None])
 
 
 @dataclass(eq=False)
 class EnforcedRows:
-    """Limit rows that are enforced in a window, with their margins.
+    """Limit rows that are enforced in a window, and the margins of the limits.
 
     Attributes:
         margins: Shares of the bounds, lowered where bounds are violated although their rows are enforced there.
@@ -177,12 +177,12 @@ class EnforcedRows:
         return cls(margins, times, held, np.ones((len(HELD), count)))
 
     def part(self, first: int, last: int) -> EnforcedRows:
-        """Return a view of the intervals from `first` up to `last`."""
+        """Return the rows of the intervals from `first` up to `last`, as views of the same memory."""
         part = slice(first, last)
         return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
 
     def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
-        """Enforce rows close to their bounds, also in neighbouring intervals, and one jerk row in each interval.
+        """Enforce rows close to their bounds, also in neighbouring intervals, and one jerk limit in each interval.
 
         Args:
             used, values: Usage of the limits, see `limit_usage`.
@@ -196,7 +196,7 @@ class EnforcedRows:
         self.hold_jerk(jerks)
 
     def release(self, values: Array, jerks: Array, seam: int) -> None:
-        """Release rows far from their bounds, but keep at least one jerk row in every interval.
+        """Release rows far from their bounds, but keep at least one jerk limit in each interval.
 
         Intervals shared with the previous or next window keep all rows.
         """
@@ -211,7 +211,7 @@ class EnforcedRows:
         self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce rows (2, N, K + L + P) where they are used most; return which of them were enforced before."""
+        """Enforce rows (2, N, K + L + P) where their usage is largest; return which were enforced before."""
         already = np.zeros(rows.shape, dtype=bool)
         sign, at, row = np.nonzero(rows)
         place = (values[:, at, row] * (1 - 2 * sign)).argmax(axis=0)
@@ -220,7 +220,7 @@ class EnforcedRows:
         return already
 
     def lower(self, used: Array, held: NDArray[np.bool_], rows: Rows, seam: int) -> None:
-        """Lower the bounds of violated rows that are enforced already, further at each call.
+        """Tighten the bounds of violated rows that are enforced already, by more at each call.
 
         Args:
             used: Usage of the limits. Shape (2, N, K + L + P).
@@ -243,7 +243,7 @@ class EnforcedRows:
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
-    """Return the motion with given squared speeds, and slopes with jerk limits, at the first nodes of a stretch."""
+    """Return the motion with given squared speeds (with jerk limits also slopes) at the first nodes of a stretch."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     v = np.sqrt(x)
     if slope is not None:
@@ -255,7 +255,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProf
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return use of limits in some intervals (B,): the largest in each direction, and that at the `HELD` places.
+    """Return the usage of limits in some intervals (B,): the largest in each direction, and at `HELD` positions.
 
     Shapes (2, N, K + L + P) and (4, N, K + L + P), zero in the other intervals.
 
@@ -327,14 +327,14 @@ def limit_usage(
 
 
 def _parabola_errors(rows: list[Array]) -> Array:
-    """Return the largest errors of parabolas through rows at three of five equidistant places. Shape (N, L, 3)."""
+    """Return the largest errors of parabolas through three of five equidistant values of rows. Shape (N, L, 3)."""
     a, b, c, d, e = rows
     # the third difference gives the cubic term; a parabola misses at most 1/(9 sqrt 3) of it
     return np.asarray(np.maximum(np.abs(d - a + 3 * (b - c)), np.abs(e - b + 3 * (c - d))) / (9 * np.sqrt(3)))
 
 
 def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
-    """Return rows that look satisfied but may be violated between three places. Shape (N, K + L + P)."""
+    """Return the rows that hold at three positions but may be violated between them. Shape (N, K + L + P)."""
     v, a, j = (
         np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
         for kind in ("speed", "acceleration", "jerk")
@@ -352,7 +352,7 @@ def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[Lin
 def _fine_usage(
     window: Window, profile: SpeedProfile, intervals: NDArray[np.intp], f: Array, known: Array, torques: bool
 ) -> Array:
-    """Return the largest use of each limit, in both directions, by dense samples of some intervals. Shape (2, B, R).
+    """Return the largest usage of each limit in both directions, from dense samples of intervals. Shape (2, B, R).
 
     Args:
         window, profile: As for `limit_usage`.
@@ -381,7 +381,7 @@ def _fine_usage(
 
 
 def _vertex(values: Array, places: list[Array]) -> Array:
-    """Return the vertex of a parabola through three values if it lies between them, else the first value."""
+    """Return the vertex of the parabola through three values, if it lies between them, else the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -77,7 +77,7 @@ class CellSettings:
 
 
 def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArray[np.bool_]:
-    """Return which local motions (K,) reach their poses and track most of the prescribed velocities."""
+    """Return which of K local motions reach their poses and track most of the prescribed velocities."""
     count = len(motions[0].cost)
     missing, prescribed = np.zeros(count), np.zeros(count)
     for stretch, motion in zip(request.stretches, motions, strict=True):
@@ -92,7 +92,7 @@ def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArra
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """States reached at a time.
+    """States that the search reaches at one time.
 
     Attributes:
         time: s.
@@ -112,10 +112,11 @@ class _Layer:
 
 
 class CellSearch:
-    """Cell search for motions of a floating machine from start configurations through all stretches of a request."""
+    """Cell search for motions of a floating machine, from start configurations through all stretches of a request."""
 
     def __init__(self, request: PlanRequest, configurations: Array, settings: CellSettings = CellSettings()) -> None:
-        """
+        """Run the search passes, from few states to many.
+
         Args:
             request: The request.
             configurations: Joints at the start. Shape (K, n).
@@ -163,7 +164,7 @@ class CellSearch:
             raise locate_error(request, unreachable, unreachable.time) from error
 
     def _cost_estimate(self, configurations: Array) -> float:
-        """Estimate the cost of the tasks, as if the machine always moved as well as at the start."""
+        """Estimate the cost of the tasks from the rates that the best start configuration requires for them."""
         request, total, count = self.request, 0.0, self._settings.seats
         base = np.tile(request.base, (len(configurations), 1))
         for stretch, kinematics in zip(request.stretches, self._kinematics, strict=True):
@@ -173,12 +174,12 @@ class CellSearch:
         return total
 
     def local_motions(self) -> list[list[LocalMotion]]:
-        """Return for each search, the largest first, the lowest-cost motion of each class through all stretches."""
+        """Return the lowest-cost motion of each class for each search pass, the largest pass first."""
         return [search.local_motions() for search in reversed(self._searches)]
 
 
 class _CellPass:
-    """One pass of the cell search, with limited cost and a limited number of states.
+    """One pass of the cell search, with a limited cost and a limited number of states.
 
     Attributes:
         cost: Cost of the best path.
@@ -196,7 +197,7 @@ class _CellPass:
         seed: int,
         settings: CellSettings,
     ) -> None:
-        """Set up a pass over motions of limited cost, with the full number of states or with a few."""
+        """Set up a pass over motions of limited cost; with `full`, it keeps the full number of states."""
         self.request, self.kinematics, self.max_cost, self._settings = request, kinematics, max_cost, settings
         self.states = settings.states if full else int(settings.few * settings.states)
         self.root, self._rng = np.sqrt(request.weights), np.random.default_rng(seed)
@@ -206,7 +207,7 @@ class _CellPass:
         self.cost = np.inf
 
     def search(self, configurations: Array) -> None:
-        """Search from configurations (K, n) to the end.
+        """Search from start configurations (K, n) to the end of the request.
 
         Raises:
             DeadEnd: No state reaches it.
@@ -238,7 +239,7 @@ class _CellPass:
     def _expand(
         self, kinematics: ReducedKinematics, layer: _Layer, task: TaskKinematics, time: float, limited: bool
     ) -> tuple[_Layer | None, Counter[tuple[int, int]]]:
-        """Propagate the states of a layer to a time; return the best state of each cell, or None if there is none.
+        """Propagate the states of a layer to a time; return the best state of each cell, or None if none remains.
 
         Also count, if the joints are `limited`, the states that each limit of each joint stops, by (joint,
         `LimitSide`).
@@ -282,7 +283,7 @@ class _CellPass:
         return expanded.select(best), limit_counts
 
     def _sample_self_motions(self, count: int, r: int) -> Array:
-        """Sample self-motions of each state, as coordinates in its null space. Shape (count, C, r)."""
+        """Return random self-motions of each state as coordinates in its null space. Shape (count, C, r)."""
         levels = self._settings.levels
         share = np.linspace(-1.0, 1.0, levels)
         rates = self._max_rate * np.sign(share) * share**2  # finer near zero, where most motions are
@@ -295,7 +296,7 @@ class _CellPass:
         return np.asarray(samples)
 
     def _best_of_cells(self, base: Array, joints: Array, cost: Array, resize: bool) -> Indices:
-        """Return the lowest-cost state of each cell; `resize` lets cells grow or shrink to the number of states."""
+        """Return the lowest-cost state of each cell; with `resize`, the cells adapt to the number of states."""
         attitude = base[:, 2:] if base.shape[1] == 3 else 2 * base[:, 3:]
         points = np.hstack([joints * self.root, attitude * np.sqrt(np.mean(self.root**2))])
         hash_weights = np.random.default_rng(0).uniform(1.0, 2.0, size=points.shape[1])
@@ -333,7 +334,7 @@ class _CellPass:
         return np.asarray(valid)
 
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
-        """Correct states to the poses of tasks that begin now, and return them."""
+        """Correct states to the poses of tasks that begin at their time, and return the corrected states."""
         states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
         corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
         base, joints, pose_error = corrected
@@ -388,7 +389,7 @@ class _CellPass:
         return motions
 
     def _local_motion(self, layers: Sequence[_Layer], paths: Indices) -> LocalMotion:
-        """Return the motions along paths through layers, given as rows of states (L, K)."""
+        """Return motions along paths through layers; rows of `paths` (L, K) are the indices of the states."""
         times = np.array([layer.time for layer in layers])
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)

@@ -5,9 +5,8 @@ If a task leaves r of n joint directions free, the configurations that do it at 
 there (the self-motions), and a box in the tangent space near the manifold.
 
 The atlas grows from the solutions of inverse kinematics at all time samples. Wherever the edge of a chart lies in no
-other chart, the next chart is put there, until the union of the charts has no edge except at the joint limits
-(Henderson 2002, Multiple parameter continuation, Int. J. Bifurcation and Chaos 12). Connected components are covered
-completely, also at folds and bifurcations.
+other chart, the next chart is put there, until the charts have no edge except at the joint limits (Henderson 2002, Int.
+J. Bifurcation and Chaos 12). Components are covered completely, also at folds and bifurcations.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ class ChartSettings:
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """Charts of the self-motion manifolds at some time samples.
+    """Charts of the self-motion manifolds at some time samples: boxes in tangent spaces.
 
     Attributes:
         layer: Index of the time sample. Shape (N,).
@@ -84,18 +83,18 @@ class Charts:
         return len(self.layer)
 
     def select(self, chosen: Any) -> Charts:
-        """Return the charts of the given rows."""
+        """Return the charts with the given indices."""
         return Charts(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
     @property
     def spans(self) -> Array:
-        """Extent of the boxes from their centres in each joint. Shape (N, n)."""
+        """Largest distance of the charts from their centres in each joint. Shape (N, n)."""
         reach = np.maximum(np.abs(self.low), np.abs(self.high))
         return np.asarray((np.abs(self.tangents) * reach[:, None]).sum(axis=2) + self.max_deviation)
 
     @property
     def max_deviation(self) -> Array:
-        """Largest deviation of the manifold from its linear boxes in each joint. Shape (N, n)."""
+        """Largest distance, in each joint, of the manifold from the tangent boxes. Shape (N, n)."""
         return np.asarray(np.abs(self.deviations).max(axis=1, initial=0.0))
 
     def points(self, places: Array) -> Array:
@@ -103,7 +102,7 @@ class Charts:
         return np.asarray(self.centers + np.einsum("knr,kr->kn", self.tangents, places))
 
     def curvature(self) -> tuple[Array, Array]:
-        """Fit quadratic forms to the deviations of the manifold from the linear boxes by least squares.
+        """Fit quadratic forms to the distances of the manifold from the tangent boxes by least squares.
 
         Returns:
             The form, (N, n, r, r), and the residuals at the rim, (N, c, n).
@@ -128,12 +127,12 @@ def point_chart(joints: Array) -> Charts:
 
 
 def concatenate(parts: list[Charts]) -> Charts:
-    """Concatenate charts."""
+    """Return several sets of charts as one."""
     return Charts(*(np.concatenate([getattr(part, name) for part in parts]) for name in Charts.__dataclass_fields__))
 
 
 class SplitCharts(NamedTuple):
-    """Charts of half the radius.
+    """Charts of half the radius that replace others.
 
     Attributes:
         charts, owners: N charts, and the rows of the charts that they replace, (N,).
@@ -147,7 +146,7 @@ class SplitCharts(NamedTuple):
 
 
 class _Edges(NamedTuple):
-    """Points of the manifold at the edges of charts, from which it is explored further.
+    """Points of the manifold at the edges of charts, from which the search continues to cover it.
 
     Attributes:
         layer, owners: Indices of the time samples and rows of the charts. Shape (E,).
@@ -178,7 +177,8 @@ class SelfMotionManifolds:
     def __init__(
         self, space: JointSpace, equations: TaskEquations, targets: Array, settings: ChartSettings = ChartSettings()
     ) -> None:
-        """
+        """Prepare the equations of the manifolds at all time samples.
+
         Args:
             space: Joint space of a machine on a fixed base.
             equations: Equations of pose tasks.
@@ -200,7 +200,7 @@ class SelfMotionManifolds:
         return ik_branches(self.equations, self.space.lower, self.space.upper)
 
     def seeds(self, index: int, limits: Any, seed: int) -> Array:
-        """Return configurations (K, n) of a time sample within limits that lie on as many components as possible.
+        """Return configurations (K, n) of a time sample within limits, on as many manifold components as possible.
 
         A solver lists some of every branch. Iterations from random starts add others, unless all are listed.
 
@@ -224,7 +224,7 @@ class SelfMotionManifolds:
         return np.vstack([listed, *(solution.joints for solution in random)])
 
     def linearize(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
-        """Return the task errors (M, m) and their Jacobians in the scaled joints (M, m, n)."""
+        """Return the task errors (M, m) and their Jacobians by the scaled joints (M, m, n)."""
         error, jacobian = self._sampler(joints, self.targets[layer])
         m, n = error.shape[1], joints.shape[1]
         return error, jacobian.reshape(-1, n, m).transpose(0, 2, 1) / self.space.scale
@@ -265,7 +265,7 @@ class SelfMotionManifolds:
     # ---- charts ------------------------------------------------------------------------------------------------------
 
     def charts_at(self, layer: Indices, joints: Array, radii: Array, like: Array | None = None) -> tuple[Charts, Array]:
-        """Return charts at configurations, with the radii halved until the manifold is flat enough.
+        """Return charts at configurations, with radii that are halved until the manifold is flat enough.
 
         Returns:
             The charts, and the points of the manifold at their rims, nan where none was found. Shape (N, c, n).
@@ -288,7 +288,7 @@ class SelfMotionManifolds:
         return self._clip_boxes(layer, joints, tangents, radii, deviations), points
 
     def _clip_boxes(self, layer: Indices, joints: Array, tangents: Array, radii: Array, deviations: Array) -> Charts:
-        """Shrink the boxes of charts so that they end where the joint limits do."""
+        """Shrink the boxes of charts such that they end at the joint limits."""
         deviations = np.nan_to_num(deviations)
         max_deviation = np.abs(deviations).max(axis=1, initial=0.0)
         reach = np.abs(tangents) * radii[:, None, None]
@@ -305,7 +305,7 @@ class SelfMotionManifolds:
         return Charts(layer, joints, tangents, radii, -low, high, deviations)
 
     def _deviations(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
-        """Return the manifold points at the rims of boxes, nan where there are none, and their offsets."""
+        """Return the manifold points at the rims of boxes, nan where none was found, and their offsets from boxes."""
         rim = _rim(tangents.shape[2])
         tangent_points = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
         projected, converged = self.project(np.repeat(layer, len(rim)), tangent_points.reshape(-1, joints.shape[1]))
@@ -313,13 +313,13 @@ class SelfMotionManifolds:
         return projected, projected - tangent_points
 
     def within_limits(self, charts: Charts) -> NDArray[np.bool_]:
-        """Return which charts have a part within the joint limits. Shape (N,)."""
+        """Return which charts lie at least partly within the joint limits. Shape (N,)."""
         low, high = charts.centers - charts.spans, charts.centers + charts.spans
         reached = ((high >= self.space.lower) & (low <= self.space.upper)).all(axis=1)
         return np.asarray(reached & (charts.low <= charts.high).all(axis=1))
 
     def cover(self, layer: Indices, joints: Array, radius: float, max_charts: int) -> Charts:
-        """Cover all manifold components that are connected with given configurations, within or across time samples.
+        """Cover all components of the manifold that contain given configurations, within and across time samples.
 
         Args:
             layer, joints: Indices of time samples and configurations on their manifolds. Shapes (M,), (M, n).
@@ -349,7 +349,7 @@ class SelfMotionManifolds:
         return charts
 
     def _grow(self, atlas: Charts | None, layer: Indices, joints: Array, radius: float, max_charts: int) -> Charts:
-        """Extend the atlas by the components that contain given configurations, at their time samples."""
+        """Extend the atlas by the manifold components that contain given configurations."""
         first = 0 if atlas is None else len(atlas)
         charts, edges = self._new_charts(layer, joints, np.full(len(layer), radius), None, first)
         charts = charts if atlas is None else concatenate([atlas, charts])
@@ -379,7 +379,7 @@ class SelfMotionManifolds:
         return charts
 
     def split(self, charts: Charts) -> SplitCharts:
-        """Replace charts by charts of half the radius; a chart stays if its halves cannot be projected."""
+        """Replace charts by charts of half the radius; a chart is kept if its halves cannot be projected."""
         r = charts.tangents.shape[2]
         signs = np.array(list(product((-0.5, 0.5), repeat=r))).reshape(2**r, r)
         offsets = charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)
@@ -406,7 +406,7 @@ class SelfMotionManifolds:
         return SplitCharts(concatenate([halves.select(within_limits), charts.select(unsplit)]), owners, low, high)
 
     def _split_radii(self, charts: Charts, signs: Array) -> Array:
-        """Return the radii of half charts centred at signs (c, r) of the boxes. Shape (N c,).
+        """Return the radii of half-size charts, centred at `signs` (c, r) in the boxes of charts. Shape (N c,).
 
         At the centre of a half, let the manifold leave the chart with slope Ds. A shift u in the chart is then a shift
         (1 + Ds' Ds)^1/2 u in the half, whose axes are aligned as closely as possible. Added are Ds' times the quadratic
@@ -424,7 +424,7 @@ class SelfMotionManifolds:
     def is_covered(
         self, charts: Charts, layer: Indices, joints: Array, excluded: Indices | None = None
     ) -> NDArray[np.bool_]:
-        """Return which configurations lie in a chart other than the one `excluded` for each. Shape (M,)."""
+        """Return which configurations lie in any chart, or in any except that in `excluded`. Shape (M,)."""
         if not len(layer) or not len(charts):
             return np.zeros(len(layer), dtype=bool)
         r = charts.tangents.shape[2]
@@ -448,7 +448,7 @@ class SelfMotionManifolds:
         return covered
 
     def _thin_out(self, layer: Indices, joints: Array, radii: Array) -> Indices:
-        """Return the rows of configurations that are outside the radius of all earlier ones."""
+        """Return the indices of configurations that lie outside the radius of all earlier ones in the result."""
         if not len(layer):
             return np.zeros(0, dtype=np.intp)
         pairs = self.space.tree(joints, layer).query_pairs(float(radii.max()), output_type="ndarray")
@@ -464,7 +464,7 @@ class SelfMotionManifolds:
     def _new_charts(
         self, layer: Indices, joints: Array, radii: Array, like: Array | None, first: int = 0
     ) -> tuple[Charts, _Edges]:
-        """Return charts at configurations, and their edge points within limits, numbered from `first`."""
+        """Return charts at configurations, and their edge points within limits; charts are numbered from `first`."""
         if like is None:
             chosen = self._thin_out(layer, joints, radii)
             layer, joints, radii = layer[chosen], joints[chosen], radii[chosen]
@@ -484,14 +484,14 @@ class TimeSample(NamedTuple):
 
 
 def _rim(r: int) -> Array:
-    """Return the midpoints of the sides and the corners of a box of half width 1. Shape (c, r)."""
+    """Return the midpoints of sides and the corners of a box of half width 1. Shape (c, r)."""
     middles = [side * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0)] if r > 1 else []
     corners = [np.array(signs) for signs in product((-1.0, 1.0), repeat=r)] if r else []
     return np.array([*middles, *corners]).reshape(-1 if r else 0, r)
 
 
 def _solve_normal_equations(square: Array, right: Array) -> Array:
-    """Solve normal equations (K, m, m) for (K, m), regularised where they are singular."""
+    """Solve the linear systems (K, m, m) for right sides (K, m), regularised where they are singular."""
     m = square.shape[1]
     if not m:
         return right

@@ -44,7 +44,7 @@ REACH_TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class PlannerSettings:
-    """Settings of `ocp.motion.plan.plan`; where theory gives no value, the problem families of tests/sweep do.
+    """Settings of `ocp.motion.plan.plan`, derived from theory or from the problem families in tests/sweep.
 
     Attributes:
         ik_starts: Random starts of inverse kinematics.
@@ -148,7 +148,7 @@ class PlanRequest:
     whole: Machine | None = None
 
     def with_held(self, positions: Mapping[str, float]) -> PlanRequest:
-        """Return the request for the machine with further joints held at positions, rad or m."""
+        """Return the request for the machine with further joints held at given positions, rad or m."""
         if not positions:
             return self
         free = np.array([name not in positions for name in self.machine.robot.joint_names])
@@ -172,7 +172,7 @@ class PlanRequest:
 
     @property
     def ik_arguments(self) -> dict[str, Any]:
-        """Arguments of inverse kinematics at the start."""
+        """Arguments for inverse kinematics at the start."""
         own = IkOptions(base=self.base, limits=self.limits.joints)
         return {"seed": self.seed, "starts": self.settings.ik_starts, "options": own}
 
@@ -183,14 +183,14 @@ class PlanRequest:
 
     @cached_property
     def turning_joints(self) -> NDArray[np.intp]:
-        """Indices of the joints that may start in several full turns; none if the start is given."""
+        """Indices of the joints that may start in different full turns; none if the start is given."""
         if self.start is not None:
             return np.zeros(0, dtype=np.intp)
         return turning_joints(self.machine.robot, self.bounds.lower, self.bounds.upper)
 
 
 def start_configurations(request: PlanRequest) -> Array:
-    """Return joint vectors at the start: collision-free ones first, then the best conditioned. Shape (K, n)."""
+    """Return joint vectors at the start, collision-free ones first, then in order of conditioning. Shape (K, n)."""
     if request.start is not None:
         return request.start[None]
     first = [request.tasks[i] for i in request.stretches[0].tasks if request.tasks[i].is_pose]
@@ -209,7 +209,7 @@ def start_configurations(request: PlanRequest) -> Array:
 def start_collisions(
     request: PlanRequest, configurations: Array, pairs: list[int] | None = None
 ) -> list[Collision | None]:
-    """Return the closest pair of bodies in each configuration (K, n), or None if it keeps the clearance.
+    """Return the closest pair of bodies in each configuration (K, n), or None if it has the required clearance.
 
     With `pairs`, the indices of the only pairs that count.
     """
@@ -235,7 +235,7 @@ def check_clear_start(request: PlanRequest, configurations: Array) -> None:
 
 
 def count_clear_configurations(request: PlanRequest, time: float) -> int | Unreachable | None:
-    """Count collision-free configurations that satisfy the tasks at a time (s), or say why none does.
+    """Count collision-free configurations that satisfy the tasks at a time (s), or return why there are none.
 
     The result is None if it would prove nothing: no task gives a pose then, or the base may be elsewhere.
     """
@@ -250,7 +250,7 @@ def count_clear_configurations(request: PlanRequest, time: float) -> int | Unrea
 
 
 def describe_alternatives(count: int | Unreachable | None) -> list[str]:
-    """Return a sentence for an error about the result of `count_clear_configurations`, if there is one."""
+    """Return a sentence about the result of `count_clear_configurations` for an error; an empty list if it is None."""
     if count is None:
         return []
     if isinstance(count, Unreachable):
@@ -260,7 +260,7 @@ def describe_alternatives(count: int | Unreachable | None) -> list[str]:
 
 
 def local_motions_from(request: PlanRequest, configurations: Array) -> list[LocalMotion]:
-    """Track the tasks from all configurations (K, n) by resolved-rate control; return one result per stretch.
+    """Track the tasks from K configurations (K, n) by resolved-rate control; return one result per stretch.
 
     A motion is the same from all whole turns of its start. Joints that can make a turn within their limits are
     therefore tracked without limits, and the motion is shifted to the middle of them. If it does the tasks, but fits
@@ -279,7 +279,7 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
 
 
 def _track_within(request: PlanRequest, configurations: Array, lower: Array, upper: Array) -> list[LocalMotion]:
-    """Return local motions within limits, with the least damping at which one of them reaches its poses."""
+    """Return local motions within limits, with the smallest damping at which one of them reaches its poses."""
     settings, least_damped = request.settings, list[LocalMotion]()
     for damping in settings.dampings:
         motions: list[LocalMotion] = []
@@ -305,7 +305,7 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
 
 
 def _within_limits(request: PlanRequest, configurations: Array, motions: Sequence[LocalMotion]) -> list[LocalMotion]:
-    """Shift motions by full turns into the limits, or track them again; see `local_motions_from`."""
+    """Shift motions by full turns into the limits, or track them again if that fails; see `local_motions_from`."""
     turning, bounds = request.turning_joints, request.bounds
     limits = bounds.lower[turning], bounds.upper[turning]
     joints = np.concatenate([motion.joints for motion in motions], axis=1)[:, :, turning]
@@ -329,7 +329,7 @@ def _within_limits(request: PlanRequest, configurations: Array, motions: Sequenc
 def _joints_at_new_poses(
     request: PlanRequest, stretch: Stretch, base: Array, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the nearest joints (K, n) that satisfy the poses that begin in a stretch, and the earlier tasks."""
+    """Return the nearest joints (K, n) that satisfy earlier tasks and the poses that begin in a stretch."""
     before = request.stretches[request.stretches.index(stretch) - 1]
     if not any(request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)):
         return joints
@@ -349,12 +349,12 @@ def _joints_at_new_poses(
 
 
 def largest_pose_errors(motions: Sequence[LocalMotion]) -> list[float]:
-    """Return the largest pose error of each of K motions over all stretches."""
+    """Return the largest pose error over all stretches of each of K motions."""
     return np.max([motion.pose_error for motion in motions], axis=0).tolist()  # type: ignore[no-any-return]
 
 
 def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
-    """Raise Unreachable if a pose that all motions miss is out of reach; only for a fixed base."""
+    """Raise Unreachable if a pose that all motions miss cannot be reached by a machine on a fixed base."""
     if request.machine.base_size:
         return
     limits, starts, seed = request.limits.joints, request.settings.ik_starts, request.seed
@@ -401,7 +401,7 @@ REACH = ReachSettings()
 
 @dataclass
 class _Reach:
-    """IK solutions of tasks over time, each continued from the solutions at the previous time."""
+    """Inverse kinematics of tasks over time; each time starts from the solutions at the previous one."""
 
     equations: TaskEquations
     options: dict[str, Any]
@@ -438,7 +438,7 @@ def end_of_reach(
     starts: int,
     seed: int,
 ) -> Unreachable | None:
-    """Return an error that says where tasks leave the workspace of a machine on a fixed base, and why.
+    """Return an error that says when tasks leave the workspace of a machine on a fixed base, and why.
 
     The end is the first time at which no joint positions within the limits do the tasks. A joint ends the reach if it
     is at its limit there and the pose would be within reach without limits. Otherwise the tasks' Jacobian is singular.
@@ -490,7 +490,7 @@ def end_of_reach(
 
 
 def _joint_at_limit(machine: Machine, joints: Array) -> tuple[str, dict[str, Any]]:
-    """Describe the joint nearest to its limit, if limits end the reach; return words and error fields."""
+    """Describe the joint nearest to its limit where limits end the reach; return text and error fields."""
     moving = machine.robot.moving_joints
     limits = [min(joint.lower, joint.upper, key=lambda x: abs(x - q)) for joint, q in zip(moving, joints, strict=True)]
     nearest = int(np.abs(joints - limits).argmin())

@@ -36,7 +36,7 @@ NEGLIGIBLE = 1e-9
 
 
 class ObstructionKind(StrEnum):
-    """Kinds of obstructions: a position limit, a step limit, a collision, a pose out of reach, a narrow passage."""
+    """Kinds of obstructions: position limit, step limit, collision, pose out of reach, narrow passage."""
 
     LIMIT = "limit"
     STEP = "step"
@@ -46,7 +46,7 @@ class ObstructionKind(StrEnum):
 
 
 class RelaxationKind(StrEnum):
-    """Requirements that can be relaxed: the position of the tip, its orientation, the clearance."""
+    """Kinds of requirements that can be relaxed: position of the tip, its orientation, clearance."""
 
     DEVIATION = "deviation"
     ROTATION = "rotation"
@@ -54,7 +54,7 @@ class RelaxationKind(StrEnum):
 
 
 class Obstruction(NamedTuple):
-    """Constraint that prevents all motions from continuing.
+    """Constraint that prevents all motions from continuing beyond a sample.
 
     Attributes:
         kind: Position limit of a joint; largest step of a joint until the next sample; collision of two bodies; a pose
@@ -74,7 +74,7 @@ class Obstruction(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """Excess over the limit, rad or m."""
+        """Amount by which the limit is exceeded, rad or m."""
         return abs(self.value - self.limit)
 
     def __str__(self) -> str:
@@ -111,7 +111,7 @@ class Relaxation(NamedTuple):
 
 
 class DeadEnd(SolveError):
-    """Error: no motion satisfies the tasks, or the search over all motions found none.
+    """Error that no motion satisfies the tasks, or that the search over all motions found none.
 
     Attributes:
         time: Time, s, or waypoint number, from which no motion can be continued.
@@ -149,7 +149,7 @@ class DeadEnd(SolveError):
 def dead_end(
     search: AtlasSearch, unit: str = "{:.4g} s", proven: bool = True, segments: int | None = None
 ) -> DeadEnd | None:
-    """Diagnose where the motions of a search end; None if a motion reaches the last sample.
+    """Diagnose why all motions of a search end before the last sample; None if one reaches it.
 
     Args:
         unit: Format of its times.
@@ -189,7 +189,7 @@ def dead_end(
 
 
 class _Propagation:
-    """Configurations propagated from sample to sample, one for each chart that is reached.
+    """Configurations that are propagated from sample to sample, one for each chart that can be reached.
 
     Attributes:
         layers: Charts of each sample, no wider than steps, including those in collision.
@@ -217,7 +217,7 @@ class _Propagation:
 
     @property
     def last(self) -> int:
-        """Last sample that is reached with the required clearance, -1 if none."""
+        """Index of the last sample that is reached with the required clearance; -1 if none is."""
         return max((k for k, clearance in enumerate(self.clearance) if (clearance >= self.required).any()), default=-1)
 
     def path(self, k: int, chart: int) -> Array:
@@ -229,9 +229,7 @@ class _Propagation:
         return np.array(path[::-1])
 
     def _propagate(self, graph: ChartGraph, k: int) -> None:
-        """Step from a sample to the charts of the next one; try configurations with large clearance first, then near
-        ones.
-        """
+        """Step from a sample to the charts of the next one, from configurations with large clearance first."""
         space, limit, successor = self.search.space, self.search.limits[k], k + 1
         reached = np.isfinite(self.joints[k][:, 0])
         parts = [(i[reached[i]], j[reached[i]]) for i, j in graph.edges(k, successor)]
@@ -252,7 +250,7 @@ class _Propagation:
             self._record(successor, j[chosen], self.joints[k][i[chosen]] + displacement[chosen], i[chosen])
 
     def _record(self, k: int, charts: Indices, joints: Array, parents: Indices) -> None:
-        """Record configurations that satisfy the task and the limits with more clearance than the recorded ones."""
+        """Record configurations that satisfy task and limits, if their clearance exceeds that of recorded ones."""
         search = self.search
         sample, required = search.samples[k], self.required
         if k == 0 and search.start is not None:
@@ -279,7 +277,7 @@ class _Propagation:
 
 
 def _fine_charts(search: AtlasSearch) -> list[Charts]:
-    """Return charts of all configurations, split until steps can pass them or there are too many."""
+    """Return charts of all configurations, split until steps can pass through them or there are too many."""
     layers = search.atlas
     reach = search.limits.max(axis=1) / 2
     max_radius = np.minimum(np.append(reach, np.inf), np.append(np.inf, reach))
@@ -292,7 +290,7 @@ def _fine_charts(search: AtlasSearch) -> list[Charts]:
 
 
 def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruction]:
-    """Return the smallest obstruction of each kind and name at the last sample reached, sorted by size."""
+    """Return the smallest obstruction of each kind and name at the last sample that is reached, sorted by size."""
     space, scene, last = search.space, search.scene, front.last
     names, n, next_sample = search.samples[0].manifolds.equations.machine.robot.joint_names, len(space.scale), last + 1
     before, targets, converged = _continuations(search, front)
@@ -312,7 +310,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
     largest = excess[np.arange(len(worst)), worst]
 
     def obstruction_of(row: int) -> Obstruction:
-        """Return the obstruction that a row describes, by its worst column."""
+        """Return the obstruction that a row of excesses describes, by its largest entry."""
         kind, joint = divmod(int(worst[row]) - 1, n)
         current, target = before[row], targets[row]
         if worst[row] == 0:
@@ -341,7 +339,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
 
 
 def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the last reached configurations (M, n), targets at the next sample (M, n), and which meet the task (M,).
+    """Return configurations (M, n) reached last, targets (M, n) at the next sample, and which satisfy the task (M,).
 
     Targets are the projection of each configuration to the next sample, and the configurations there which keep all
     limits but are too far away.
@@ -367,7 +365,7 @@ def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Arr
 
 
 def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Array:
-    """Return a path (K, n) to the last sample reached, continued straight to the nearest chart of the final sample."""
+    """Return a path (K, n) to the last reached sample, continued straight to the nearest chart of the final one."""
     space, last, count = search.space, max(front.last, 0), len(search.times)
     distances = np.nan_to_num(space.length(front.joints[last] - blocked), nan=np.inf)
     path = front.path(last, int(distances.argmin())) if np.isfinite(distances).any() else blocked[None]
@@ -378,7 +376,7 @@ def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Ar
 
 
 def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
-    """Return the motion near a path (K, n) with the least deviation or rotation of the tips, or None."""
+    """Return the motion near a path (K, n) that deviates or rotates the tips least; None if none is found."""
     if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
     scene, pairs = search.scene, list[int]()
@@ -400,7 +398,7 @@ def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: Rela
 
 
 class _RelaxedProblem:
-    """Nonlinear program that minimises how far the tips deviate or rotate, with some pairs of bodies separated."""
+    """Nonlinear program that minimises the deviation or rotation of the tips, with some bodies kept apart."""
 
     def __init__(self, search: AtlasSearch, turning: bool, pairs: list[int]) -> None:
         self.search, self.turning = search, turning

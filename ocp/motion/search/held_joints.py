@@ -55,7 +55,7 @@ Error = TypeVar("Error", bound=Exception)
 
 
 def all_joints(robot: Robot, held: Mapping[str, float], values: Array, *, rates: bool = False) -> Array:
-    """Return values of all joints of a robot, (..., n), from those of the joints that are not held, (..., m).
+    """Return values of all joints of a robot, (..., n), from the values of those that are not held, (..., m).
 
     Args:
         robot: Robot with all its joints.
@@ -72,7 +72,7 @@ def all_joints(robot: Robot, held: Mapping[str, float], values: Array, *, rates:
 
 
 def hold_idle_joints(request: PlanRequest) -> PlanRequest:
-    """Return the request with all joints held that move no task frame: at the start, or at mid-range."""
+    """Return the request with all joints held that move no task frame, at their start or mid-range positions."""
     idle = bind(request.machine, request.tasks).idle
     if idle.all():
         return request
@@ -105,7 +105,7 @@ def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanReq
 
 
 def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations: Array) -> PlanRequest:
-    """Return the request with held joints at the nearest positions at which a configuration of (K, m) is clear.
+    """Hold idle joints at the nearest positions that make a configuration of (K, m) collision-free.
 
     If held bodies of the machine collide with each other wherever they are, that is ignored. So are configurations that
     collide wherever the held joints are, unless all do.
@@ -132,12 +132,12 @@ def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations:
 
 
 def _own_held(whole: PlanRequest, request: PlanRequest) -> dict[str, float]:
-    """Return the positions of the joints that a request holds in addition to those of the whole request, by name."""
+    """Return the positions, by name, of the joints that a request holds and the whole request does not."""
     return {name: position for name, position in request.held.items() if name not in whole.held}
 
 
 def _still_pairs(whole: PlanRequest, request: PlanRequest) -> list[int]:
-    """Return the pairs of bodies that cannot move relative to each other by the joints of a request."""
+    """Return the pairs of bodies that the joints of a request cannot move relative to each other."""
     assert whole.clearance_constraints is not None
     moving = [name not in request.held for name in whole.machine.robot.joint_names]
     levers = whole.clearance_constraints.scene.levers.joints[:, moving]
@@ -145,7 +145,7 @@ def _still_pairs(whole: PlanRequest, request: PlanRequest) -> list[int]:
 
 
 def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: Array) -> None:
-    """Check the start for collisions of bodies that the joints of the request cannot move apart.
+    """Raise an error if bodies collide at the start that the joints of the request cannot move apart.
 
     Raises:
         ProblemError: A body collides with an obstacle.
@@ -176,7 +176,7 @@ def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: 
 
 
 def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[Array, Array]:
-    """Return the joints at the start, nan where free, and the configurations with joints without effect fixed.
+    """Return the start joints (nan where free), and the configurations with ignorable joints fixed.
 
     An ignorable coordinate changes nothing but the joint itself: the last joint of an arm whose roll is free turns
     about the tool's axis. If it were free, each motion would belong to a family of equal cost. It is therefore fixed in
@@ -204,7 +204,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
 
 
 def moved_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return the request with held joints moved to where they no longer cause the reported collision.
+    """Return the request with held joints moved so that they no longer cause a reported collision.
 
     Args:
         whole: Request before joints were held.
@@ -236,7 +236,7 @@ def moved_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> 
 
 
 def released(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Release the held joints that move a body of a collision; return the request, or None if they are free already.
+    """Return the request without holding the joints that move a colliding body; None if none of them is held.
 
     Args: As in `moved_aside`.
     """
@@ -247,7 +247,7 @@ def released(whole: PlanRequest, request: PlanRequest, error: SolveError) -> Pla
 
 
 def _obstructing(whole: PlanRequest, request: PlanRequest, error: SolveError) -> list[str]:
-    """Return the held joints that move a body of the collision that an error names."""
+    """Return the held joints that move a body of the collision that an error reports."""
     if whole.clearance_constraints is None:
         return []
     scene, own = whole.clearance_constraints.scene, _own_held(whole, request)
@@ -257,7 +257,7 @@ def _obstructing(whole: PlanRequest, request: PlanRequest, error: SolveError) ->
 
 
 def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[dict[str, float]]:
-    """Return random positions of held joints within their limits, those nearest to the present ones first."""
+    """Return random positions of held joints within limits, sorted by distance from the current ones."""
     names, bounds = whole.machine.robot.joint_names, whole.bounds
     samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, seed=whole.seed)
     columns = [names.index(name) for name in held]
@@ -266,7 +266,7 @@ def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[di
 
 
 def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequest:
-    """Hold as many shared joints as necessary for a global search to cover the remaining free directions.
+    """Hold as many shared joints as necessary to make a global search over the other free directions possible.
 
     Only joints that carry a limb without a task are held, those nearest to the root first. They are held at the start
     of the motion if it is given, otherwise where the lowest-cost local motion begins that leaves them nearly still.
@@ -292,7 +292,7 @@ def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequ
 
 
 def _shared_joints(request: PlanRequest) -> list[int]:
-    """Return the joints that move several limbs with task frames; the joint nearest the root comes first.
+    """Return the joints that move several limbs with task frames, sorted from the root outwards.
 
     A gripper at the end of an arm is no such limb: it is fixed to the part that carries the frame.
     """
@@ -308,7 +308,7 @@ def _shared_joints(request: PlanRequest) -> list[int]:
 
 
 def restore_error(error: Error, request: PlanRequest) -> Error:
-    """Extend the configurations in an error by the held joints of the request, and return the error."""
+    """Add the held joints of the request to the configurations in an error, and return the error."""
     if request.whole is None:
         return error
     robot = request.whole.robot

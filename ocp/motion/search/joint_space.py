@@ -36,7 +36,7 @@ MAX_STEP = 1e6
 
 
 class JointSpace:
-    """Joint space with the metric of the weighted squared rates, in which unlimited joints are periodic.
+    """Joint space with a metric of weighted squared rates, in which joints without limits are periodic.
 
     Attributes:
         scale: Square roots of the weights; the metric is |scale * dq|. Shape (n,).
@@ -55,14 +55,14 @@ class JointSpace:
         self.upper = np.where(self.periodic, np.inf, upper)
 
     def difference(self, to: Array, start: Array) -> Array:
-        """Return end minus start, (..., n); periodic joints go the shorter way round."""
+        """Return the displacement `to` minus start, (..., n); periodic joints take the shorter way."""
         delta = to - start
         turns = delta[..., self.periodic]
         delta[..., self.periodic] = turns - FULL_TURN * np.round(turns / FULL_TURN)
         return np.asarray(delta)
 
     def length(self, displacement: Array) -> Array:
-        """Return the lengths of displacements (..., n) in the metric."""
+        """Return the lengths of joint displacements (..., n) in the metric of the space."""
         return np.asarray(np.linalg.norm(displacement * self.scale, axis=-1))
 
     def within(self, joints: Array) -> NDArray[np.bool_]:
@@ -96,7 +96,7 @@ class JointSpace:
 
 @dataclass(frozen=True, eq=False)
 class TasksWithFixedJoints(TaskEquations):
-    """Task equations with additional rows that fix some joints; their values are the last targets.
+    """Task equations with additional rows that fix some joints, whose values are the last targets.
 
     Attributes:
         fixed: Indices of the fixed joints.
@@ -131,7 +131,7 @@ class TasksWithFixedJoints(TaskEquations):
 
 
 def turning_joints(robot: Robot, lower: Array, upper: Array) -> NDArray[np.intp]:
-    """Return the indices of limited joints that can make full turns.
+    """Return the indices of joints with limits that can still make full turns.
 
     They are revolute, have no followers, and their limits are at least a whole turn apart.
 
@@ -146,13 +146,13 @@ def turning_joints(robot: Robot, lower: Array, upper: Array) -> NDArray[np.intp]
 
 
 def whole_turns_between(start: Array, end: Array, lower: Any = -np.inf, upper: Any = np.inf) -> Array:
-    """Return the full turns, within limits, that bring angles as close as possible to others, rad."""
+    """Return the full turns within limits that bring angles as close as possible to given ones, rad."""
     least, greatest = np.ceil((lower - start) / FULL_TURN), np.floor((upper - start) / FULL_TURN)
     return np.asarray(FULL_TURN * np.clip(np.round((end - start) / FULL_TURN), least, greatest))
 
 
 def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the full turns that bring motions to the middle of the limits, and for which joints they then fit.
+    """Return the full turns that shift motions towards mid-range, and which joints then stay within limits.
 
     Args:
         joints: Motions of k joints. Shape (K, M, k), rad.
@@ -171,7 +171,7 @@ def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, 
 
 
 def all_turns(joints: Array, known: Array, lower: Array, upper: Array) -> Array:
-    """Return a configuration in all combinations of full turns of its joints within the limits.
+    """Return a configuration with its joints shifted by full turns in all combinations within the limits.
 
     Args:
         joints: Angles. Shape (k,), rad.

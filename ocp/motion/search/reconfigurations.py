@@ -35,7 +35,7 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class SegmentSettings:
-    """Effort spent on the lowest-cost division into segments.
+    """Settings of the search for the lowest-cost division into segments.
 
     Attributes:
         max_iterations: Largest number of divisions that are evaluated; then the best known one is taken.
@@ -47,7 +47,7 @@ class SegmentSettings:
 
 
 class Segment(NamedTuple):
-    """Path from one time sample to another.
+    """Path from one time sample to another, without a reconfiguration.
 
     Attributes:
         first, last: Indices of the samples.
@@ -66,7 +66,7 @@ class Segment(NamedTuple):
 def fewest_segments(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
 ) -> tuple[list[Segment], float] | None:
-    """Return a division into the fewest segments, of lowest cost, and a lower bound of this cost.
+    """Return a lowest-cost division into the fewest segments, and a lower bound of its cost.
 
     Args:
         gap: Samples from the end of a segment to the start of the next one: 1, or 0 if the samples stand for a
@@ -86,7 +86,7 @@ def fewest_segments(
     segments = dict[Span, Segment | None]()
 
     def best_chain(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
-        """Return the lowest-cost chain of segments, by the costs or the lower bounds of the solved ones.
+        """Return the lowest-cost chain of solved segments, measured by their costs or by their lower bounds.
 
         Segments not solved yet count with their lower bounds if `bounded`, and are left out otherwise.
         """
@@ -106,7 +106,7 @@ def fewest_segments(
 
 
 def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
-    """Return where each of the fewest segments may begin and end; None if some sample cannot be passed.
+    """Return where each of the fewest segments may begin and end; None if a sample cannot be passed.
 
     Segments extended greedily forwards give the latest ends, those extended backwards the earliest starts.
     """
@@ -130,7 +130,7 @@ def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> 
 def segment_ends(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False
 ) -> list[int]:
-    """Return the last samples of greedy segments, each as long as possible.
+    """Return the last samples of the segments, each of which extends as far as possible.
 
     The list ends with the last sample of all, or with the one from which the motion cannot be continued.
 
@@ -151,12 +151,12 @@ def segment_ends(
 
 
 def _is_barred(span: Span, gap: int, barred: Collection[Span]) -> bool:
-    """Return whether no segment can cover a span: the span is empty, or contains one known to be infeasible."""
+    """Return whether a span is empty or contains an infeasible span, so that no segment covers it."""
     return (span[0] == span[1] and not gap) or any(span[0] <= bar[0] and bar[1] <= span[1] for bar in barred)
 
 
 def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None:
-    """Return the lowest-cost segment between two samples, or None if none was found."""
+    """Return the lowest-cost segment between two samples; None if none was found."""
     part = search.restrict(first, last)
     joints, bound = part.solve(np.inf)
     return None if joints is None else Segment(first, last, joints, part.path_cost(joints), bound)
@@ -165,7 +165,7 @@ def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None
 def _last_reachable(
     search: AtlasSearch, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
 ) -> int | None:
-    """Return the last (or first, if `back`) sample that a segment from a sample reaches; None if there is none."""
+    """Return the last sample (with `back`: the first) that a segment from a sample reaches; None if there is none."""
 
     def reaches(sample: int) -> bool:
         span = min(start, sample), max(start, sample)
@@ -190,7 +190,7 @@ def _last_reachable(
 
 
 def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: list[range]) -> dict[Span, float]:
-    """Return lower bounds of the cost of segments by their spans; spans without a path may be missing."""
+    """Return lower bounds of the cost of segments by span; spans without a path may be absent."""
     bounds = dict[Span, float]()
     for starts, ends in zip(start_ranges, end_ranges, strict=True):
         if len(ends) == 1:  # one backward sweep serves all starts
@@ -208,7 +208,7 @@ def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: 
 def _best_chain(
     start_ranges: list[range], end_ranges: list[range], gap: int, costs: dict[Span, float]
 ) -> tuple[list[Span], float]:
-    """Return the chain of segments of least cost, and this cost; empty and inf if there is none."""
+    """Return the chain of segments of least total cost, and this cost; an empty chain and inf if there is none."""
     best: dict[int, tuple[float, list[Span]]] = {start_ranges[0][0]: (0.0, [])}
     for starts, ends in zip(start_ranges, end_ranges, strict=True):
         after: dict[int, tuple[float, list[Span]]] = {}
@@ -225,7 +225,7 @@ def _best_chain(
 
 @dataclass(frozen=True)
 class SectionSettings:
-    """Settings of the sections on which self-motion manifolds are searched.
+    """Settings of the sections of self-motion manifolds, on which one joint is fixed.
 
     Attributes:
         radii: Radii of the charts for few and for many samples, rad or m.
@@ -258,10 +258,11 @@ def section_values(
 
 
 class SectionSearch(AtlasSearch):
-    """Search for paths on sections of self-motion manifolds, on which one joint has one of several values."""
+    """Search for paths on sections of self-motion manifolds, on each of which one joint has a constant value."""
 
     def __init__(self, *args: Any, joint: int, values: Array, radius: float, charts: int, **options: Any) -> None:
-        """
+        """Build the charts of all sections at all time samples.
+
         Args:
             args, options: As in `AtlasSearch`; all samples must belong to one `SelfMotionManifolds` of dimension two.
             joint: Index of the joint.
@@ -273,7 +274,7 @@ class SectionSearch(AtlasSearch):
         super().__init__(*args, **options)
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return charts of the section curves of each sample; layers are sorted by value, then sample."""
+        """Return charts of the section curves at each sample."""
         manifolds, count = self.samples[0].manifolds, len(self.samples)
         indices, value_count = [sample.row for sample in self.samples], len(self._values)
         targets = np.tile(manifolds.targets[indices], (value_count, 1))
@@ -293,7 +294,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return the best path, and the best one for each constant joint value, by rising cost; the bound is 0."""
+        """Return the best path, then the best path for each constant joint value, sorted by cost; the bound is 0."""
         count = len(self.samples)
         paths = [path for path in (self.find_path(np.inf)[1],) if path is not None]
         for value in range(len(self._values)):

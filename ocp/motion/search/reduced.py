@@ -42,7 +42,7 @@ SIMPSON_STEPS = 400
 
 
 class LimitSide(IntEnum):
-    """One of the four limits of a joint: lowest and highest position, lowest and highest rate."""
+    """Limit of a joint: lowest or highest position, lowest or highest rate."""
 
     LOW = 0
     HIGH = 1
@@ -51,7 +51,7 @@ class LimitSide(IntEnum):
 
 
 class TaskKinematics(NamedTuple):
-    """Linearised tasks at K states of n joints, with m task rows and a base of size b.
+    """Linearised tasks at K states of n joints, with m task rows and b base coordinates.
 
     Attributes:
         right, error: Required task rates, and pose errors. Shape (K, m).
@@ -74,7 +74,7 @@ class TaskKinematics(NamedTuple):
         return TaskKinematics(*(part[rows] for part in self))
 
     def task_rates(self, rates: Array) -> Array:
-        """Return the task rates (K, m) of scaled joint rates (K, n)."""
+        """Return the task rates (K, m) that scaled joint rates (K, n) cause."""
         rates_of_tasks: Array = self.lower @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None])
         return rates_of_tasks[:, :, 0]
 
@@ -91,12 +91,12 @@ class TaskKinematics(NamedTuple):
         return np.asarray(rates - projected[:, :, 0])
 
     def base_rates(self, rates: Array) -> Array:
-        """Return the rates of the base (K, b) for scaled joint rates (K, n), without the drift."""
+        """Return the rates of the base (K, b) that scaled joint rates (K, n) cause, without the drift."""
         return np.asarray((self.base @ rates[:, :, None])[:, :, 0])
 
 
 class ReducedKinematics:
-    """Kinematics of a machine under task constraints, if it has tasks.
+    """Kinematics of a machine under the equations of its tasks, if it has tasks.
 
     Attributes:
         rows: Number of task rows.
@@ -118,7 +118,7 @@ class ReducedKinematics:
         self._sampler = Sampler(symbols, parts)
 
     def at(self, base: Array, joints: Array, time: float) -> TaskKinematics:
-        """Return the linearised tasks at states (K, b), (K, n)."""
+        """Linearise the tasks at states: bases (K, b) and joints (K, n)."""
         count, n = joints.shape
         arguments = [base, joints]
         if self._targets is not None:
@@ -137,7 +137,7 @@ class ReducedKinematics:
         return TaskKinematics(right, error, base_jacobian, drift, row_space, lower, null)
 
     def speed(self, base: Array, joints: Array, time: float) -> Array:
-        """Estimate the squared scaled rates (K,) that the tasks require at a time, if not near singularities."""
+        """Estimate the squared scaled rates (K,) that the tasks require at a time, far from singularities."""
         if self.equations is None:
             return np.zeros(len(joints))
         tasks = [part.task for part in self.equations.bound]
@@ -147,7 +147,7 @@ class ReducedKinematics:
         return np.asarray(self.rows * rates_squared / (task.lower**2).sum(axis=(1, 2)))
 
     def velocity_errors(self, base: Array, joints: Array, rates: Array, time: float) -> tuple[Array, Array]:
-        """Return the speed errors of joint rates (K, n) under velocity tasks, and the required speeds. Shapes (K,)."""
+        """Return the errors of joint rates (K, n) in velocity tasks, and the required speeds. Shapes (K,)."""
         zeros = np.zeros(len(joints))
         if self.equations is None or self.equations.pose_rows.all():
             return zeros, zeros
@@ -165,7 +165,7 @@ class ReducedKinematics:
         interval: tuple[float, float],
         tolerance: float,
     ) -> tuple[Array, Array, Array]:
-        """Advance states by the midpoint rule over a time step, with the self-motions of scaled rates (K, n).
+        """Advance states over a time step by the midpoint rule, with self-motions as in scaled rates (K, n).
 
         Returns:
             Base (K, b), joints (K, n) and remaining pose errors (K,), which are corrected down to the tolerance.
@@ -181,7 +181,7 @@ class ReducedKinematics:
             return self.correct_poses(base, joints, end, tolerance)
 
         def remaining(at_end: TaskKinematics, joints: Array) -> Array:
-            """Return the missing tip displacement under velocity tasks in this step, by Simpson's rule."""
+            """Return the tip displacement that velocity tasks still require in this step, by Simpson's rule."""
             straight = (joints - start_joints) * self.root
             parts = ((1, task), (4, middle), (1, at_end))
             return np.asarray(sum(k / 6 * (duration * each.right - each.task_rates(straight)) for k, each in parts))
@@ -233,7 +233,7 @@ def _normalize(base: Array) -> Array:
 def limit_rates(
     rates: Array, null: Array, lower: Array, upper: Array, *, max_rates: Array
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Change scaled rates (K, n) along self-motions so that each joint keeps its limits.
+    """Change scaled rates (K, n) by self-motions such that each joint keeps its limits.
 
     Args:
         null: Bases of the self-motions. Shape (K, n, r).
@@ -286,7 +286,7 @@ def check_floating_reach(
     bounds: JointBounds,
     seed: int = 0,
 ) -> None:
-    """Raise Unreachable if a pose is out of reach for every attitude, by inverse kinematics from many starts.
+    """Raise Unreachable if a floating machine cannot reach a pose with any attitude, tried from many starts.
 
     Velocities in world axes are integrated to positions; orientations from velocities are ignored.
 
@@ -312,7 +312,7 @@ def check_floating_reach(
     solutions = np.zeros((0, n + attitude_size))  # solutions at the preceding time
 
     def unreachable_at(time: float) -> Unreachable | None:
-        """Return the error about a pose that is out of reach at a time."""
+        """Return the error that a pose is out of reach at a time; None if it can be reached."""
         nonlocal solutions
         poses = []
         for task in tasks:
@@ -356,7 +356,7 @@ def check_floating_reach(
 
 
 def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, *, base: Any = ()) -> TipTask | None:
-    """Return a task as a pose task at a time; None if its pose depends on the path or has a start gap to close.
+    """Return the pose task to which a task is equivalent at a time; None if the pose depends on the path.
 
     Args:
         machine, task: The machine and its task.
@@ -381,7 +381,7 @@ def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float,
 
 
 def _base_about_center_of_mass(machine: FreeFloating, base: Array, start: Array, z: Any, time: float) -> Any:
-    """Return the base that keeps the centre of mass on its line, for a time, joints and attitude z."""
+    """Return the base at which the centre of mass follows its straight line, for joints and attitude z at a time."""
     robot, frame, n = machine.robot, machine.world_from_base(ca.DM(base)), machine.joint_size
     joints, attitude = z[:n], z[n:]
     momentum = np.zeros(6)

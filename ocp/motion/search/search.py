@@ -69,7 +69,7 @@ class SearchSettings:
 
 
 def checked_bound(bound: float, cost: float) -> float | None:
-    """Return a lower bound of the cost of all motions, or None if a motion refutes it.
+    """Return the lower bound of the cost of all motions, or None if the cost of a motion lies below it.
 
     Warns:
         BoundWarning: The cost of a motion lies below the bound.
@@ -82,7 +82,7 @@ def checked_bound(bound: float, cost: float) -> float | None:
 
 
 class AtlasSearch:
-    """Search over an atlas of the self-motion manifolds at some time samples.
+    """Search for the lowest-cost path over an atlas of the self-motion manifolds at time samples.
 
     Attributes:
         atlas: Charts of each time sample.
@@ -100,7 +100,8 @@ class AtlasSearch:
         scene: CollisionScene | None = None,
         settings: SearchSettings = SearchSettings(),
     ) -> None:
-        """
+        """Build the atlas at all time samples.
+
         Args:
             space: Joint space.
             samples: Manifolds of the time samples, by rising time.
@@ -151,7 +152,7 @@ class AtlasSearch:
         return atlas
 
     def without_collisions(self, charts: Charts, k: int) -> Charts:
-        """Return the charts of a time sample without those on which every configuration is in collision."""
+        """Return the charts of a time sample except those whose configurations are all in collision."""
         return charts.select(self._collision_free(charts, k))
 
     def _collision_free(self, charts: Charts, k: int) -> NDArray[np.bool_]:
@@ -163,7 +164,7 @@ class AtlasSearch:
         return np.asarray((distances + charts.spans @ scene.levers.joints.T >= scene.clearance).all(axis=1))
 
     def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
-        """Return the graph of steps between charts, with steps that cost at most `max_costs`, one or shape (K - 1,)."""
+        """Return the graph of steps between charts that cost at most `max_costs`: one value, or shape (K - 1,)."""
         max_costs = np.broadcast_to(max_costs, len(self.times) - 1)
         return ChartGraph(self.space, layers, self._steps, max_costs)
 
@@ -184,18 +185,18 @@ class AtlasSearch:
         return part
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return paths (K, n) by increasing cost of their steps, and a lower bound of the cost of all paths."""
+        """Return paths (K, n) sorted by the cost of their steps, and a lower bound of the cost of all paths."""
         path, bound = self.solve(np.inf)
         return [] if path is None else [path], bound
 
     def path_cost(self, path: Array) -> float:
-        """Return the cost of straight steps along a path (K, n)."""
+        """Return the cost of the straight steps along a path (K, n)."""
         return float(self.cost.evaluate(np.diff(path, axis=0), np.diff(self.times)[:, None]).sum())
 
     # ---- classes of motions ------------------------------------------------------------------------------------------
 
     def class_representatives(self, max_cost: float, include_costlier: bool = False) -> list[Array]:
-        """Return the lowest-cost path (K, n) of each class of motions, by increasing cost.
+        """Return the lowest-cost path (K, n) of each class of motions, sorted by cost.
 
         A class is represented by a chart through which a motion costs less than through its neighbours. After `solve`,
         only classes are returned that its bound does not exclude.
@@ -238,7 +239,7 @@ class AtlasSearch:
         cost_to_come: list[QuadraticBounds],
         cost_to_go: list[QuadraticBounds],
     ) -> Array | None:
-        """Return the lowest-cost path through a chart; None if the path cannot be continued."""
+        """Return the lowest-cost path through a chart; None if it cannot be continued."""
         slope = cost_to_go[k].slope[chart] + (cost_to_come[k].slope[chart] if k else 0.0)
         start_chart = graph.layers[k].select([chart])
         place = np.where(slope > 0, start_chart.low[0], np.where(slope < 0, start_chart.high[0], 0.0))
@@ -266,7 +267,7 @@ class AtlasSearch:
         return np.array([path[number] for number in range(last + 1)])
 
     def project_in_box(self, k: int, box: Charts, place: Array) -> Array | None:
-        """Return the valid configuration at box coordinates (r,), or nearer to the middle; None if there is none.
+        """Return a valid configuration at box coordinates (r,) or, if there is none, nearer to the middle; else None.
 
         A box reaches beyond the joint limits by the deviation of the manifold.
         """
@@ -277,7 +278,7 @@ class AtlasSearch:
         return next((configuration for configuration in projected if configuration is not None), None)
 
     def _project(self, k: int, joints: Array) -> Array | None:
-        """Project joints onto the manifold of a sample; return None if limits or clearance are then violated."""
+        """Project joints onto the manifold of a sample; return None if that violates limits or clearance."""
         if k == 0 and self.start is not None:
             return self.start
         projected, converged = self.samples[k].manifolds.project(np.array([self.samples[k].row]), joints[None])
@@ -309,11 +310,11 @@ class AtlasSearch:
 
     @property
     def _target_share(self) -> float:
-        """Fraction of a path's cost that the lower bound must reach."""
+        """Fraction of the path's cost that the lower bound must reach before the search ends."""
         return 1 - self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
 
     def _solve(self, max_cost: float) -> tuple[Array | None, float]:
-        """Return the best path and a lower bound, as `solve`, among paths whose steps each cost at most `max_cost`."""
+        """Return the best path and a lower bound as `solve` does, with steps that each cost at most `max_cost`."""
         target = self._target_share
         layers, best_path = self.find_path(max_cost)
         if not layers:
@@ -355,7 +356,7 @@ class AtlasSearch:
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
-        """Return the charts that paths with steps of at most `max_cost` may pass, and one such path.
+        """Return the charts that paths with steps of at most `max_cost` may pass through, and one such path.
 
         The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """
@@ -383,12 +384,12 @@ class AtlasSearch:
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 
     def _can_split(self, layers: list[Charts], max_charts: int) -> bool:
-        """Return whether the charts may be halved: their number stays within `max_charts`, and none gets too small."""
+        """Return whether the charts may be halved without exceeding `max_charts` or becoming too small."""
         count = sum(2 ** charts.tangents.shape[2] * len(charts) for charts in layers)
         return count <= max_charts and max(float(charts.radii.max()) for charts in layers) >= self.settings.finest
 
     def _path_through_centers(self, graph: ChartGraph) -> Array | None:
-        """Return the lowest-cost path through chart centres; steps that are too long are penalised."""
+        """Return the lowest-cost path through chart centres, with a penalty on steps that are too long."""
         layers = graph.layers
         cost, back_pointers = np.where(self._is_clear(layers[-1].centers, len(layers) - 1), 0.0, np.inf), list[Array]()
         for k in range(len(layers) - 2, -1, -1):
@@ -414,7 +415,7 @@ class AtlasSearch:
         return np.array(path)
 
     def _is_clear(self, joints: Array, k: int) -> NDArray[np.bool_]:
-        """Return which configurations (N, n) of a sample keep limits and clearance. Shape (N,)."""
+        """Return which configurations (N, n) of a sample satisfy limits and clearance. Shape (N,)."""
         valid, scene = self.space.within(joints), self.scene
         if scene is not None:
             rows = np.flatnonzero(valid)
@@ -437,7 +438,7 @@ class AtlasSearch:
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
 
     def split_charts(self, charts: Charts, k: int) -> Charts:
-        """Return charts of half the radius that replace those of a sample."""
+        """Return charts of half the radius in place of those of a sample."""
         return self._split(charts, k).charts
 
     def _split(self, charts: Charts, k: int) -> SplitCharts:
@@ -447,7 +448,7 @@ class AtlasSearch:
         return self.samples[k].manifolds.split(numbered)
 
     def _refine(self, charts: Charts, k: int, values: QuadraticBounds) -> tuple[Charts, QuadraticBounds]:
-        """Halve charts and return the halves that are not in collision, with bounds on them."""
+        """Halve charts; return the halves that are not in collision, with bounds on them."""
         halves = self._split(charts, k)
         free = self._collision_free(halves.charts, k)
         values, low, high = values.select(halves.owners[free]), halves.low[free], halves.high[free]

@@ -29,7 +29,7 @@ MAX_CONCAVITY = 0.5
 
 
 class QuadraticBounds(NamedTuple):
-    """Lower bounds of a value function on the charts of a sample: least + slope . t + t . curve . t / 2.
+    """Lower bounds of a value function on charts, as quadratic functions least + slope . t + t . curve . t / 2.
 
     Attributes:
         least: Constant terms, infinite where no motion passes. Shape (N,).
@@ -47,7 +47,7 @@ class QuadraticBounds(NamedTuple):
 
     @classmethod
     def constant(cls, least: Array, free: int) -> QuadraticBounds:
-        """Return constant bounds on charts with `free` directions."""
+        """Return constant bounds on charts that have `free` dimensions."""
         return cls(least, np.zeros((len(least), free)), np.zeros((len(least), free, free)))
 
     def minimum(self, low: Array, high: Array) -> tuple[Array, Array]:
@@ -63,7 +63,7 @@ class QuadraticBounds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Steps between consecutive time samples, with their limits and durations.
+    """Steps between consecutive time samples: their limits, durations and cost.
 
     Attributes:
         times: Times of the samples, s. Shape (K,).
@@ -77,7 +77,7 @@ class Steps:
 
 
 class CurvedCharts(NamedTuple):
-    """Charts with the quadratic deviation of the manifold, t . bends . t / 2, and the residual of this approximation.
+    """Charts with the manifold's deviation as a quadratic form, t . bends . t / 2, and its residual.
 
     Attributes:
         charts: N charts.
@@ -95,15 +95,13 @@ class CurvedCharts(NamedTuple):
 
 
 class StepCost(ABC):
-    """Cost of a straight step between configurations, with lower bounds over charts."""
+    """Cost of a straight step between configurations, with lower bounds over charts (base class)."""
 
     @abstractmethod
     def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
     ) -> tuple[Array, Array]:
-        """Return cost (P,) and chart coordinates (P, r) of the cheapest steps into P charts at distances `delta` (P,
-        n).
-        """
+        """Return cost (P,) and chart coordinates (P, r) of the lowest-cost steps into charts at distances (P, n)."""
 
     @abstractmethod
     def lower_bounds(
@@ -117,12 +115,12 @@ class StepCost(ABC):
 
     @abstractmethod
     def reach(self, cost: float, seconds: float) -> float:
-        """Return the greatest length, in the metric of the charts, of a step that costs at most `cost`."""
+        """Return the greatest length, in the metric of the charts, of a step whose cost is at most `cost`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SquaredRates(StepCost):
-    """Cost of steps: integral of half the weighted squared rates.
+    """Cost of steps as the integral of half the weighted squared rates.
 
     A step d has a component along the chart that it enters and one across it. Along the chart, the cost is convex in
     both places, and its minimum over the place in the box is quadratic in the starting place, by the multipliers of the
@@ -188,7 +186,7 @@ class SquaredRates(StepCost):
 
 
 def _rows_last(rows: Array) -> Array:
-    """Move the axis of the steps to the end; sums over a few joints are then vectorised over all steps."""
+    """Move the axis of the steps to the end, so that sums over few joints are vectorised over all steps."""
     return np.ascontiguousarray(np.moveaxis(rows, 0, -1))
 
 
@@ -212,7 +210,7 @@ def _dot(left: Array, right: Array) -> Array:
 
 
 def _support(points: Array, direction: Array) -> Array:
-    """Return the support function of points (c, n, P) and the origin in directions (n, P). Shape (P,)."""
+    """Return the support function of points (c, n, P) and the origin, in directions (n, P). Shape (P,)."""
     support = np.zeros(direction.shape[1])
     for point in points:
         np.maximum(support, _dot(point, direction), out=support)
@@ -220,7 +218,7 @@ def _support(points: Array, direction: Array) -> Array:
 
 
 def _symmetric_support(points: Array, directions: Array) -> Array:
-    """Return the largest |component| of points (c, n, P) in directions (n, r, P). Shape (r, P)."""
+    """Return the largest absolute component of points (c, n, P) in directions (n, r, P). Shape (r, P)."""
     support = np.zeros(directions.shape[1:])
     for point in points:
         np.maximum(support, np.abs(_apply_transposed(directions, point)), out=support)
@@ -230,7 +228,7 @@ def _symmetric_support(points: Array, directions: Array) -> Array:
 def _nearest_places(
     projection: Array, rotation: Array, start_box: Array, end_box: Array, slope: Array, curve: Array, seconds: float
 ) -> tuple[Array, Array]:
-    """Return chart coordinates (2, r, P) in the boxes of both ends, between which the step costs little."""
+    """Return coordinates (2, r, P) in the boxes at both ends of each step between which the step has a low cost."""
     square, middle = curve + np.eye(len(projection))[:, :, None] / seconds, (start_box[0] + start_box[1]) / 2
     end_place = _least_in_box((projection - _apply(rotation, middle)) / seconds + slope, square, *end_box)[1]
     slope, square = -_apply_transposed(rotation, projection + end_place), _multiply_transposed(rotation, rotation)
@@ -239,7 +237,7 @@ def _nearest_places(
 
 @dataclass(frozen=True, eq=False)
 class SquaredRateBounds:
-    """Lower bounds of the cost of steps and of what follows, as functions of the start t in the box `start_box`.
+    """Lower bounds of a step's cost plus the remaining cost, as functions of the start t in its box.
 
     The bound is least + slope . t + t . level . t / 2, plus the minimum over t' in the box `end_box` of
     v . v / (2 dt) + after . t' + t' . after_curve . t' / 2. Here v = projection - rotation . t + t' is the step along
@@ -273,7 +271,7 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + _rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Return the step for t' = 0, and the minimum of the remaining cost over t' in the end box."""
+        """Return the step to the end t' = 0, the least cost that the choice of t' in its box adds, and that t'."""
         start = self.projection - _apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
@@ -287,7 +285,7 @@ class SquaredRateBounds:
         return value + _dot(places, products / 2 + self.slope), _rows_first(slope)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return chart coordinates (P, r) at which the bounds, less slope . t + t . curve . t / 2, are lower."""
+        """Return coordinates (P, r) that lower the bounds minus slope . t + t . curve . t / 2, starting at `places`."""
         end_place = self._minimize_after(_rows_last(places))[2]
         gradient = -_apply_transposed(self.rotation, self.projection + end_place) / self.seconds
         square = _multiply_transposed(self.rotation, self.rotation) / self.seconds + self.level - _rows_last(curve)
@@ -301,7 +299,7 @@ def _rows_first(columns: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Homogeneous(StepCost):
-    """Cost proportional to the length of a step, with at most one free direction; its bounds are affine.
+    """Cost proportional to the length of a step, with affine lower bounds; at most one free direction.
 
     Attributes:
         weights: Weights of the joint displacements, 0 to ignore a joint. Shape (n,).
@@ -314,7 +312,7 @@ class Homogeneous(StepCost):
         """Return the gradients of the cost at displacements (P, n)."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return lower bounds (P,) of the cost of steps into charts, gradients there (P, n), and minimisers (P, 1)."""
+        """Return lower bounds (P,) of the cost of steps into charts, their gradients (P, n), and minimisers (P, 1)."""
         count = len(delta)
         if not target.tangents.shape[2]:
             return self.evaluate(delta, 1.0) + after.least, self.gradient(delta), np.zeros((count, 0))
@@ -322,14 +320,12 @@ class Homogeneous(StepCost):
         box = target.low[:, 0], target.high[:, 0]
 
         def linearize(place: Array) -> list[Array]:
-            """Return a place, the gradient there, its value at the origin, and the slope of the total cost."""
+            """Return a place, the gradient there, the tangent's value at the origin, and the total slope."""
             gradient = self.gradient(delta + along * place[:, None])
             return [place, gradient, (gradient * delta).sum(axis=1), (gradient * along).sum(axis=1) + slope]
 
         def intersect() -> Array:
-            """Return where the tangents at both ends of the bracket intersect; an end that does not descend is the
-            minimum.
-            """
+            """Return the intersection of the tangents at the bracket's ends; an end with rising cost is the minimum."""
             with np.errstate(divide="ignore", invalid="ignore"):
                 crossing = np.clip(np.nan_to_num((first[2] - last[2]) / (last[3] - first[3])), first[0], last[0])
             return np.where(first[3] >= 0, first[0], np.where(last[3] <= 0, last[0], crossing))
@@ -364,7 +360,7 @@ class Homogeneous(StepCost):
 
 
 class PathLength(Homogeneous):
-    """Cost of steps: weighted sum of the absolute joint displacements."""
+    """Cost of steps as the weighted sum of the absolute joint displacements."""
 
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).sum(axis=-1))
@@ -377,7 +373,7 @@ class PathLength(Homogeneous):
 
 
 class LargestMotion(Homogeneous):
-    """Cost of steps: largest weighted displacement, a duration if the weights are one over the velocity limits."""
+    """Cost of steps as the largest weighted displacement; with weights 1 / velocity limit it is a duration."""
 
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).max(axis=-1))
@@ -394,7 +390,7 @@ class LargestMotion(Homogeneous):
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBounds:
-    """Bounds of steps with a homogeneous cost; arguments as of `Homogeneous.lower_bounds`."""
+    """Lower bounds of steps with a homogeneous cost; arguments are those of `Homogeneous.lower_bounds`."""
 
     cost: Homogeneous
     delta: Array
@@ -428,7 +424,7 @@ StepBounds: TypeAlias = SquaredRateBounds | HomogeneousBounds
 
 
 def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the minima (P,) of slope . t + t . square . t / 2 in boxes, and where they are, (P, r), r at most two.
+    """Return minima (P,) of slope . t + t . square . t / 2 in boxes of up to two dimensions, and minimisers (P, r).
 
     Compared are the corners, the stationary points on the sides, and the stationary point inside.
     """
@@ -437,7 +433,7 @@ def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[
 
 
 def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the minima as `least_in_box` does; the last axis numbers the functions."""
+    """Return the minima as `least_in_box` does, with the functions along the last axis."""
     r, count = slope.shape
     if not r:
         return np.zeros(count), np.zeros(slope.shape)
@@ -469,7 +465,7 @@ def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple
 
 
 def _lowest_eigenvalue(square: Array) -> Array:
-    """Return the least eigenvalues of symmetric matrices (P, r, r), r at most two. Shape (P,)."""
+    """Return the least eigenvalues of symmetric matrices (P, r, r) with r at most two. Shape (P,)."""
     if square.shape[1] < 2:
         return np.asarray(square.sum(axis=(1, 2)))
     middle, half = (square[:, 0, 0] + square[:, 1, 1]) / 2, (square[:, 0, 0] - square[:, 1, 1]) / 2
@@ -477,7 +473,7 @@ def _lowest_eigenvalue(square: Array) -> Array:
 
 
 def _raise_eigenvalues(square: Array, floor: float) -> tuple[Array, Array]:
-    """Raise the eigenvalues of symmetric matrices (r, r, P) to a floor; also return the largest increases (P,)."""
+    """Raise the eigenvalues of symmetric matrices (r, r, P) to a minimum; also return the largest increases (P,)."""
     excess = np.maximum(floor - _lowest_eigenvalue(np.moveaxis(square, -1, 0)), 0.0)
     rows = np.flatnonzero(excess > 0)
     if rows.size:

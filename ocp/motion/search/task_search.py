@@ -72,7 +72,8 @@ class TaskSearch:
     def __init__(
         self, request: PlanRequest, motions: list[LocalMotion], settings: SampleSettings = SampleSettings()
     ) -> None:
-        """
+        """Choose the time samples and search at them.
+
         Args:
             request: The request.
             motions: Local motions through its stretches; the best one determines where samples are needed.
@@ -125,7 +126,7 @@ class TaskSearch:
         self._search_at(times)
 
     def _search_at(self, times: list[Array]) -> None:
-        """Search the configurations at the given times of each stretch that has tasks."""
+        """Search over the configurations at given times of each stretch that has tasks."""
         self._build_search(times)
         self._path, bound = self._search.solve(self._known_cost)
         self.bound = max(self.bound, bound)  # the bound of fewer samples stays valid
@@ -146,7 +147,7 @@ class TaskSearch:
         self._search = AtlasSearch(self.space, samples, steps, **options)
 
     def _manifolds(self, equations: TaskEquations, times: Array) -> SelfMotionManifolds:
-        """Return the self-motion manifolds at some times."""
+        """Return the self-motion manifolds of tasks at some times."""
         targets = np.array(equations.target_function().map(len(times))(times[None, :])).T
         return SelfMotionManifolds(self.space, equations, targets)
 
@@ -155,7 +156,7 @@ class TaskSearch:
         return [stretch.equations for stretch in self.request.stretches if stretch.equations is not None]
 
     def dead_end(self) -> DeadEnd | None:
-        """Diagnose where and why motions end; None if a motion reaches the end."""
+        """Diagnose where motions end, and why; None if a motion reaches the end."""
         if self._path is not None:
             return None
         ends = segment_ends(self._search, 0)
@@ -163,7 +164,7 @@ class TaskSearch:
         return dead_end(self._search, proven=not np.isfinite(self.bound), segments=len(ends) if through else None)
 
     def segments(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
-        """Return start and end of the fewest segments of least cost, and a lower bound of their number.
+        """Return the start and end of the fewest, lowest-cost segments, and a lower bound of their number.
 
         Args:
             barred: Begin and end, s, of intervals that are known not to be done in one segment.
@@ -192,15 +193,15 @@ class TaskSearch:
 
     @property
     def _can_subdivide(self) -> NDArray[np.bool_]:
-        """Which steps between samples are long enough to be subdivided, as a mask."""
+        """Mask of the steps between samples that are long enough to be subdivided."""
         return np.asarray(np.diff(self.times) > self._settings.closest * self.request.horizon)
 
     def _with_samples(self, times: Array) -> list[Array]:
-        """Return the sample times of each stretch with additional samples."""
+        """Return the sample times of each stretch, including additional ones."""
         return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._times_by_stretch]
 
     def refine_samples(self) -> bool:
-        """Add samples where the best path is close to a limit, and search again; return whether any was added."""
+        """Add samples where the best path is near a limit, and search again; return whether samples were added."""
         if self._path is None:
             return False
         settings, bounds, path = self._settings, self.request.bounds, self._path
@@ -252,7 +253,7 @@ class TaskSearch:
 def choose_samples(
     t: Array, joints: Array, weights: Array, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Choose the fewest times of a motion (M,) for which straight steps lose at most a given fraction of its cost.
+    """Choose the fewest times of a motion (M,) with which straight steps keep its cost to a given accuracy.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.

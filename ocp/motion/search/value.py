@@ -61,7 +61,7 @@ class GraphSettings:
 
 
 class ChartGraph:
-    """Layered graph of the charts at all time samples, with the steps that a motion may take."""
+    """Layered graph of the charts at all time samples, with the possible steps between them."""
 
     def __init__(
         self,
@@ -72,7 +72,8 @@ class ChartGraph:
         *,
         settings: GraphSettings = GraphSettings(),
     ) -> None:
-        """
+        """Build the graph of charts and possible steps.
+
         Args:
             space: Joint space.
             layers: Charts of each time sample.
@@ -92,7 +93,7 @@ class ChartGraph:
     def cost_to_go(
         self, cost_to_come: list[QuadraticBounds] | None = None, max_cost: float = np.inf
     ) -> list[QuadraticBounds]:
-        """Return lower bounds of the cost-to-go on the charts of each sample.
+        """Return lower bounds of the remaining cost (cost-to-go) on the charts of each sample.
 
         Motions that cost at least `max_cost` in all, by bounds of the `cost_to_come`, are left out.
         """
@@ -101,11 +102,11 @@ class ChartGraph:
     def cost_to_come(
         self, cost_to_go: list[QuadraticBounds] | None = None, max_cost: float = np.inf
     ) -> list[QuadraticBounds]:
-        """Return lower bounds of the cost-to-come on the charts of each sample."""
+        """Return lower bounds of the previous cost (cost-to-come) on the charts of each sample."""
         return self._sweep(range(len(self.layers)), 1, cost_to_go, max_cost)
 
     def reachable(self) -> list[NDArray[np.bool_]]:
-        """Return which charts lie on a path from the first to the last sample. Shapes (N,)."""
+        """Return which charts lie on a path from the first to the last sample. Shape (N,) for each sample."""
         masks = [np.ones(len(charts), dtype=bool) for charts in self.layers]
         end = len(masks) - 1
         for order in (range(end), range(end, 0, -1)):
@@ -118,7 +119,7 @@ class ChartGraph:
         return masks
 
     def edges(self, k: int, neighbour: int) -> Iterator[tuple[Indices, Indices]]:
-        """Yield, in batches, pairs of charts of two consecutive samples between which a step is possible."""
+        """Yield batches of pairs of charts of two consecutive samples between which a step is possible."""
         source, target = self.layers[k], self.layers[neighbour]
         if not len(source) or not len(target):
             return
@@ -150,7 +151,7 @@ class ChartGraph:
     def successors(
         self, joints: Array, k: int, neighbour: int, after: QuadraticBounds
     ) -> Iterator[tuple[Charts, Array]]:
-        """Yield the charts of a neighbouring sample that a configuration (n,) can reach, the cheapest first.
+        """Yield the charts of a neighbouring sample that a configuration (n,) can reach, sorted by cost.
 
         Yields:
             A single chart, shifted by full turns to the configuration, and the place in its box, (r,).
@@ -171,7 +172,7 @@ class ChartGraph:
     def _sweep(
         self, order: range, direction: int, known_bounds: list[QuadraticBounds] | None, max_cost: float
     ) -> list[QuadraticBounds]:
-        """Propagate bounds over the samples in the given order."""
+        """Propagate bounds from sample to sample in the given order."""
         layers = self.layers
         bounds: list[Any] = [None] * len(layers)
         first = order[0]
@@ -188,7 +189,7 @@ class ChartGraph:
     def _propagate(
         self, k: int, neighbour: int, after: QuadraticBounds, known_bounds: QuadraticBounds | None, max_cost: float
     ) -> QuadraticBounds:
-        """Return bounds on the charts of a sample k from those on the charts of its neighbour, `after`.
+        """Return bounds on the charts of sample k from the bounds on the charts of its neighbour, `after`.
 
         With `known_bounds` of the rest of the motions, those that cost `max_cost` or more are left out.
         """
@@ -231,7 +232,7 @@ class ChartGraph:
 
     @staticmethod
     def _raise_to_floor(values: QuadraticBounds, charts: Charts, floor: Array) -> QuadraticBounds:
-        """Replace bounds by a constant where it exceeds the mean of their middle value and their minimum."""
+        """Replace a bound by a constant `floor` where that exceeds the mean of its middle value and its minimum."""
         least = values.minimum(charts.low, charts.high)[0]
         higher = values.at((charts.low + charts.high) / 2) + least < 2 * floor
         return QuadraticBounds(
@@ -241,7 +242,7 @@ class ChartGraph:
         )
 
     def minima(self, values: QuadraticBounds, k: int) -> Array:
-        """Return the minima of bounds on the charts of a sample. Shape (N,)."""
+        """Return the minima of bounds over the boxes of a sample's charts. Shape (N,)."""
         return values.minimum(self.layers[k].low, self.layers[k].high)[0]
 
     def cost_through(self, cost_to_come: list[QuadraticBounds], cost_to_go: list[QuadraticBounds], k: int) -> Array:
@@ -251,14 +252,14 @@ class ChartGraph:
 
 
 def _bound_with_rest(steps: StepBounds, charts: Charts, known_bounds: QuadraticBounds) -> Array:
-    """Return lower bounds of steps from charts plus bounds of the remaining motion. Shape (P,)."""
+    """Return lower bounds of steps from charts plus the remaining motion. Shape (P,)."""
     middle, curve = (charts.low + charts.high) / 2, steps.curve
     total = _tangent_bounds(middle, steps.at(middle), curve, -known_bounds.curve, -known_bounds.slope)
     return known_bounds.least + total.minimum(charts.low, charts.high)[0]
 
 
 def _least_of_groups(values: Array, groups: Indices) -> Array:
-    """Return, for each value, the least value of its contiguous group. Shape (P,)."""
+    """Return for each value the least value in its group of consecutive values. Shape (P,)."""
     starts = np.flatnonzero(np.diff(groups, prepend=-1))
     return np.repeat(np.minimum.reduceat(values, starts), np.diff(np.append(starts, len(values))))
 
@@ -266,7 +267,7 @@ def _least_of_groups(values: Array, groups: Indices) -> Array:
 def _bound_charts(
     steps: StepBounds, charts: Charts, starts: Indices, max_costs: Array, settings: GraphSettings
 ) -> QuadraticBounds:
-    """Combine the bounds of steps, contiguous from `starts`, into one lower bound for each chart.
+    """Combine the bounds of the steps from each chart, which begin at `starts`, into one lower bound per chart.
 
     Values above `max_costs`, shape (M,), need not be resolved.
     """
@@ -308,7 +309,7 @@ def _bound_charts(
 def _best_combination(
     best: QuadraticBounds, best_least: Array, tangent: QuadraticBounds, charts: Charts
 ) -> tuple[QuadraticBounds, Array]:
-    """Return the convex combinations of two bounds with the highest minimum, and this minimum.
+    """Return the convex combinations of two bounds whose minimum is highest, and this minimum.
 
     Of both, which have the same curvature, those combinations are tried that are level along an axis. `best_least` is
     the minimum of the first. Shape (P,).
@@ -339,14 +340,14 @@ def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> 
 def _tangent_bounds(
     places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
 ) -> QuadraticBounds:
-    """Return affine lower bounds of functions at given places, less tilt . t + t . common . t / 2."""
+    """Return affine lower bounds of functions at given places, minus tilt . t + t . common . t / 2."""
     value, slope = values
     at_origin = value - (places * slope).sum(axis=1) + _quadratic(curve, places)
     return QuadraticBounds(at_origin, slope - np.einsum("pab,pb->pa", curve, places) - tilt, curve - common)
 
 
 def _concavity(values: Array, half: Array, curve: Array) -> Array:
-    """Estimate the concavity of functions in boxes, (M, r, r), from values in the middle and at the ends of each axis.
+    """Estimate the concavity of functions in boxes from values in the middle and on each axis. Shape (M, r, r).
 
     The total curvature does not become negative by it.
     """
@@ -358,7 +359,7 @@ def _concavity(values: Array, half: Array, curve: Array) -> Array:
 
 
 def _secant_slopes(values: list[Array], half: Array) -> Array:
-    """Return secant slopes (M, r) of functions in boxes, from values in the middle and at the ends of each axis.
+    """Return slopes of functions in boxes, from values in the middle and at both ends of each axis. Shape (M, r).
 
     A concave function gets the slope from end to end, a convex one the flattest slope.
     """
@@ -403,7 +404,7 @@ def shorten_path(
     widths: tuple[float, float],
     settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
-    """Return a nearby path of lower cost, or one with smaller violations of limits. Shape (K, n).
+    """Return a path near the given one with a lower cost, or with smaller violations of limits. Shape (K, n).
 
     Args:
         path: Configurations that do the tasks at the samples. Shape (K, n).
@@ -459,7 +460,7 @@ def shorten_path(
 def _violation(
     candidates: Array, times: Array, bounds: tuple[Array, Array], scene: CollisionScene | None, margin: float
 ) -> Array:
-    """Return how far candidate configurations (K, s, n) violate limits and clearance, rad and m. Shape (K, s)."""
+    """Return the amount by which candidates (K, s, n) violate limits and clearance, rad and m. Shape (K, s)."""
     excess = np.maximum(np.maximum(candidates - bounds[1], bounds[0] - candidates), 0.0).sum(axis=2)
     if scene is None:
         return np.asarray(excess)

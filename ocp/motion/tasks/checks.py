@@ -51,7 +51,7 @@ CHECKS = CheckSettings()
 
 
 def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
-    """Return the horizon, s; None stands for the time at which the last task ends.
+    """Return the horizon, s; None means the time at which the last task ends.
 
     Raises:
         ProblemError: The horizon is not positive, or it is None and no task has a duration.
@@ -66,7 +66,7 @@ def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
 
 
 def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Array, Array]:
-    """Return joints (joint_size,) and base (base_size,) at the start; the machine's base_home() if the base is None.
+    """Return checked joints (joint_size,) and base (base_size,) at the start, by default the machine's base_home().
 
     Raises:
         ProblemError: Wrong sizes, a value that is not finite, or a quaternion that is not of unit length.
@@ -90,7 +90,7 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
 
 
 def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
-    """Return joints at an end of a motion, nan where free, with rounding errors beyond the limits clipped. Shape (n,).
+    """Return joints at an end of a motion, nan where free, with excesses by rounding clipped to the limits. Shape (n,).
 
     Args:
         joints, lower, upper: Joints, or their velocities, and the limits. Shape (n,).
@@ -114,7 +114,7 @@ def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, nam
 
 
 def checked_weights(weights: Any, size: int) -> Array:
-    """Return weights of the squared joint rates, ones if None; ProblemError unless all are positive. Shape (size,)."""
+    """Return weights of the squared joint rates, ones if None; raise ProblemError if one is not positive. (size,)"""
     if weights is None:
         return np.ones(size)
     array = require.array("weights", weights, (size,), meaning="one for each joint")
@@ -126,7 +126,7 @@ def checked_weights(weights: Any, size: int) -> Array:
 def checked_tasks(
     equations: TaskEquations, base: Array, joints: Array, horizon: float, *, check_start: bool = True
 ) -> None:
-    """Raise ProblemError if tasks prescribe motions that the machine cannot make, or a jump at the start.
+    """Raise ProblemError if tasks require motions that the machine cannot perform, or a jump at the start.
 
     Args:
         equations: Equations of the tasks.
@@ -178,7 +178,7 @@ def checked_tasks(
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
-    """Return the name of a task whose rows are linearly dependent, to rounding; None if there is none."""
+    """Return the name of a task whose rows are linearly dependent up to rounding; None if there is none."""
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
@@ -186,7 +186,7 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joints do not affect what tasks and base require of the joint rates. Shape (n,).
+    """Return which joints have no effect on the joint rates that tasks and base require. Shape (n,).
 
     Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
     and the cones of tool axes do not depend on such a joint.
@@ -213,7 +213,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the names of the twist rows of a single task, or the indices of the stacked rows of several."""
+    """Return the twist rows of a single task, or the indices of the stacked rows of several."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -226,13 +226,13 @@ def _frame(part: BoundTask) -> str:
 
 
 def _sampled(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
-    """Return equidistant times (count,) and the targets there, one column each."""
+    """Return `count` equidistant times, and the targets at these times, one column each."""
     times = np.linspace(0.0, horizon, count)
     return times, np.array(equations.target_function().map(count)(times[None, :]))
 
 
 def _parts(equations: TaskEquations, values: Array) -> list[tuple[BoundTask, Array]]:
-    """Pair each task with its rows of the targets."""
+    """Return each task with its rows of the targets."""
     ends = np.cumsum([target_size(part.task) for part in equations.bound])
     return list(zip(equations.bound, np.split(values, ends[:-1]), strict=True))
 
@@ -259,7 +259,7 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if a task does not return to its start, as far as that does not depend on the path.
+    """Raise ProblemError if a closed task does not return to its start, as far as targets show that.
 
     Poses are checked by their targets, velocities by their integrals.
     """
@@ -289,7 +289,7 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
-    """Raise ProblemError if a task moves at one of the times at which the joints are to be at rest; None is skipped."""
+    """Raise ProblemError if a task moves at one of the times at which joints are to be at rest; None is skipped."""
     targets = equations.target_function()
     for time in times:
         if time is None:
@@ -305,7 +305,7 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
 
 
 def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
-    """Raise ProblemError if target positions are further from the first joint than the arm is long."""
+    """Raise ProblemError if target positions are farther from the first joint than the arm is long."""
     for part in equations.bound:
         task = part.task
         if task.position is None or task.axes != "world" or task.relative_to is not None or part.tip.base_size:
@@ -324,7 +324,7 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
 
 
 def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:
-    """Raise ProblemError if a task is faster than the tip can move in any configuration at the joint rate limits.
+    """Raise ProblemError if a task is faster than the tip can move in any configuration within joint rate limits.
 
     A revolute joint moves the tip at most by its rate times the length of the links from its axis to the tip.
 
@@ -354,7 +354,7 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
 
 
 def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array) -> tuple[float, float]:
-    """Return the largest speed, m/s, and angular speed, rad/s, of the tip with joints at their rate limits (n,)."""
+    """Return the largest speed, m/s, and angular speed, rad/s, of the tip within joint rate limits (n,)."""
     linear, angular = 0.0, 0.0
     whole = machine.robot.path_to(machine.robot.tip_link)
     after = {joint.name: whole[i + 1 :] for i, joint in enumerate(whole)}
@@ -366,7 +366,7 @@ def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array
 
 
 def _task_speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
-    """Return the speed and angular speed of a task in its rows, m/s and rad/s. Shape (M,) each."""
+    """Return the speed, m/s, and angular speed, rad/s, that the rows of a task prescribe. Shape (M,) each."""
     angular_rows = [row for row in task.chosen if row in ANGULAR]
     if task.is_pose:
         angular = targets[-3:] if task.tilts else targets[-3:][angular_rows]
@@ -402,7 +402,7 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
 
 
 def _rate_rows(task: TipTask) -> list[int]:
-    """Return which entries of a pose task's targets are velocities."""
+    """Return which entries of a pose task's targets are velocities, by index."""
     tracks = [(task.position, [3, 4, 5], 6), (task.orientation, [9, 10, 11], 12), (task.direction, [3, 4, 5], 6)]
     rows, at = [], 0
     for track, entries, size in tracks:
@@ -413,14 +413,14 @@ def _rate_rows(task: TipTask) -> list[int]:
 
 
 def _integral(values: Array, step: float) -> Array:
-    """Integrate an odd number of equidistant samples by Simpson's rule. Shapes (k, samples) to (k,)."""
+    """Integrate an odd number of equidistant samples by Simpson's rule. Shape (k, samples) to (k,)."""
     weights = np.ones(CHECKS.closure_samples)
     weights[1:-1:2], weights[2:-1:2] = 4, 2
     return np.asarray(values @ weights * step / 3)
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:
-    """Return the angle, rad, of the rotation that results from an angular velocity in world axes, (3, samples)."""
+    """Return the angle, rad, of the rotation that an angular velocity in world axes, (3, samples), causes."""
     rotation = np.eye(3)
     # fourth-order Magnus expansion over two steps at a time
     for k in range(0, CHECKS.closure_samples - 1, 2):
@@ -436,7 +436,7 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities to prescribe where a motion ends at rest, nan where free. Shape (n,).
+    """Return the joint velocities to prescribe at an end at rest, nan where free. Shape (n,).
 
     A tip whose velocity or acceleration is prescribed comes to rest by itself. As many joints as the tasks have such
     rows then follow from the others, and prescribing their rest too would be redundant. The joints that move the tip

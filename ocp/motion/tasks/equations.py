@@ -49,7 +49,7 @@ __all__ = ["TaskEquations", "bind", "task_errors"]
 
 @dataclass(frozen=True, eq=False)
 class TaskEquations:
-    """Stacked equations of the tasks of a machine. Use `bind` to build them.
+    """Stacked equations of all tasks of a machine. Use `bind` to create them.
 
     Attributes:
         machine: The machine.
@@ -66,12 +66,12 @@ class TaskEquations:
 
     @property
     def pose_rows(self) -> NDArray[np.bool_]:
-        """Which rows belong to pose tasks. Shape (size,), bool."""
+        """Mask of the rows that belong to pose tasks. Shape (size,), bool."""
         return np.repeat([part.task.is_pose for part in self.bound], [part.task.size for part in self.bound])
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Which joints affect no task frame and no reference frame, by the kinematic tree. Shape (joint_size,).
+        """Mask of joints that, by the kinematic tree, move no task or reference frame. Shape (joint_size,), bool.
 
         On a floating base or a standing machine no joint is idle: each one moves the base or the balance.
         """
@@ -142,7 +142,7 @@ class TaskEquations:
 
     @on_scalars
     def jacobian(self, base: Any, joints: Any) -> Any:
-        """Return the Jacobian J of the tasks. Shape (size, joint_size)."""
+        """Return the Jacobian J of all tasks by the joint rates u. Shape (size, joint_size)."""
         rows = []
         for part in self.bound:
             columns = relative_twist(part, base, joints, part.tip.tip_jacobian(base, joints), rates=None)
@@ -152,12 +152,12 @@ class TaskEquations:
 
     @on_scalars
     def right(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return the right side b of J u = b: the task velocities minus the drift. Shape (size, 1)."""
+        """Return the right-hand side b of the task equation J u = b, task velocities minus drift. Shape (size, 1)."""
         return -self.residual(base, joints, ca.DM(self.machine.joint_size, 1), targets)
 
     @on_scalars
     def residual(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Return J u - b. Shape (size, 1)."""
+        """Return the residual J u - b of the task equation at joint rates u. Shape (size, 1)."""
         rows = []
         for part, target in self._with_targets(targets):
             twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
@@ -169,7 +169,7 @@ class TaskEquations:
 
     @on_scalars
     def twist(self, base: Any, joints: Any, rates: Any) -> Any:
-        """Return the velocities of the tips in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
+        """Return the tip velocities in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
         rows = []
         for part in self.bound:
             twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
@@ -212,14 +212,14 @@ class TaskEquations:
 
     @property
     def turning(self) -> NDArray[np.bool_]:
-        """Which rows are angular. Shape (size,), bool."""
+        """Mask of the angular rows. Shape (size,), bool."""
         angular: list[bool] = []
         for task in (part.task for part in self.bound):
             angular += [*([True, True] if task.tilts else []), *(row in ANGULAR for row in task.chosen)]
         return np.array(angular, dtype=bool)
 
     def acceleration(self, base: Any, joints: Any, rates: Any, second: Any, *, progress: Sequence[Any]) -> Any:
-        """Return J u' - c with the feedback, by differentiating `residual` along the motion. Shape (size, 1).
+        """Return the residual of the task equation at acceleration level, with pose feedback. Shape (size, 1).
 
         d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0.
 
@@ -246,7 +246,7 @@ class TaskEquations:
 
     @on_scalars
     def error(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return target pose minus pose in the rows of the tasks, m and rad; zero for velocities. Shape (size, 1)."""
+        """Return the pose errors (target minus pose) of all rows, m and rad; 0 in velocity rows. Shape (size, 1)."""
         rows = []
         for part, target in self._with_targets(targets):
             if part.task.velocity is not None:
@@ -256,13 +256,13 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Return pose minus target pose in pose rows, and `residual` in velocity rows. Shape (size, 1)."""
+        """Return pose minus target in pose rows, and `residual` in velocity rows. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         return ca.vertcat(*((-error if is_pose else residual)[i] for i, is_pose in enumerate(self.pose_rows)))
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return a column of pose deviations that, unlike `error`, does not vanish half a turn away.
+        """Return a column of pose errors that, unlike `error`, does not vanish at a rotation error of half a turn.
 
         In m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad). If all rotation is
         prescribed, these are the differences of the frame axes over sqrt 2, otherwise the rows of the half-angle
@@ -297,7 +297,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def misses(self, base: Any, joints: Any, targets: Any) -> tuple[float, float]:
-        """Return the largest position error, m, and angle error, rad, of the tips for numeric arguments."""
+        """Return the largest position error, m, and orientation error, rad, of the tips at numeric arguments."""
         distance = angle = 0.0
         for part, target in self._with_targets(ca.DM(targets)):
             task = part.task
@@ -336,7 +336,7 @@ class TaskEquations:
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def holding(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the pose error of the velocity tasks at (base, joints) against the pose at (at_base, at_joints).
+        """Return the pose error by which velocity tasks at a free start deviate from the reference configuration.
 
         For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
         """
@@ -352,7 +352,7 @@ class TaskEquations:
         return ca.vertcat(*rows)
 
     def _with_targets(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
-        """Yield each task with its targets."""
+        """Yield each task with its own targets."""
         at = 0
         for part in self.bound:
             size = target_size(part.task)
@@ -366,13 +366,13 @@ class TaskEquations:
         return np.array(self.function.map(count)(bases.T, positions.T, targets)[2]).reshape(-1, count).T
 
     def _along(self, t: Any, base: Any, joints: Any) -> tuple[Array, Array, Any]:
-        """Return base (M, base_size), joints (M, joint_size) and targets as columns, at samples of a motion."""
+        """Return base (M, base_size), joints (M, joint_size) and targets (one column each) along a motion."""
         times, positions = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
         bases = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
         return bases, positions, self.target_function().map(len(times))(times[None, :])
 
     def cone_violations(self, t: Any, base: Any, joints: Any) -> Array:
-        """Return by how much tool axes leave their cones, rad; arguments as for `errors`. Shape (M, k)."""
+        """Return the angles by which tool axes leave their cones, rad. Shape (M, k)."""
         bases, positions, targets = self._along(t, base, joints)
         if not self.cone_angles.size:
             return np.zeros((len(positions), 0))
@@ -386,7 +386,7 @@ class TaskEquations:
 
     @cached_property
     def function(self) -> Any:
-        """CasADi Function (base, joints, targets) -> (J, b, error, pose residual)."""
+        """CasADi Function (base, joints, targets) -> (J, b, pose error, pose residual)."""
         symbols = self._symbols
         rows = [of_targets(*symbols) for of_targets in (self.right, self.error, self.pose_residual)]
         return ca.Function("task", symbols, [self.jacobian(*symbols[:2]), *rows], {"cse": True})
@@ -401,7 +401,7 @@ class TaskEquations:
 
     @cached_property
     def jacobian_function(self) -> Any:
-        """CasADi Function (joints, base) -> J."""
+        """CasADi Function (joints, base) -> task Jacobian J."""
         base, joints, _ = self._symbols
         return ca.Function("jacobian", [joints, base], [self.jacobian(base, joints)], {"cse": True})
 
@@ -413,7 +413,7 @@ class TaskEquations:
         return tuple(ca.SX.sym(name, size) for name, size in sizes.items())
 
     def target_function(self) -> Any:
-        """Return the CasADi Function time -> targets, on MX symbols if a track needs them."""
+        """Return the CasADi Function from time to targets, with MX symbols if a track requires them."""
 
         def build(symbols: Any) -> Any:
             time = symbols.sym("time")
@@ -441,7 +441,7 @@ class TaskEquations:
 
 
 def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
-    """Return a position track with all three coordinates, zero where the task leaves them out. Shape (3, 1)."""
+    """Return a position target with all three coordinates; those that the task lacks are zero. Shape (3, 1)."""
     short = task.along_reference and len(task.linear) < 3
     shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
     value = track_expression(track, time, shapes, what=name, begin=task.begin)
@@ -482,7 +482,7 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
 def task_errors(
     machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, joints: Any, *, base: Any = None
 ) -> Array:
-    """Return target pose minus pose along a motion in the rows of the tasks, m and rad; zero for velocities.
+    """Return the pose errors of tasks along a motion, m and rad; 0 in velocity rows. Shape (M, size).
 
     Args:
         t: Times, s. Shape (M,).

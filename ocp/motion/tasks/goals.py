@@ -35,7 +35,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Split a start into its checked joints (n,) or None, and its base (base_size,).
+        """Return a start, its checked joints (n,) or None if they are free, and its base (base_size,).
 
         Args:
             value: A start, joints, or None.
@@ -50,7 +50,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Return a start, its checked joints (n,) and its base (base_size,).
+        """Return a start whose joints are given, its checked joints (n,), and its base (base_size,).
 
         Args:
             value: A start with joints, or joints.
@@ -64,7 +64,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Goal:
-    """End of a motion, or of one part of it: joints, or a pose of the tip.
+    """End of a motion or of a part of it, given by joints or by a pose of the tip.
 
     Attributes:
         joints: Joints, nan where free. Shape (n,), rad or m.
@@ -138,7 +138,7 @@ class Goal:
 
     @property
     def task(self) -> TipTask:
-        """Task that holds the tip at the goal, or at the centre of its region."""
+        """Task that keeps the tip at the goal, or at the centre of its region."""
         center = self.position if self.region is None else self.region.position
         return TipTask(
             position=center,
@@ -152,7 +152,7 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """Sequence of tool poses without times.
+    """Sequence of tool poses without times, to be planned as a joint path.
 
     Attributes:
         positions: Positions of the tip in world. Shape (N, 3), m.
@@ -224,13 +224,13 @@ class Cost:
         return tuple(name for name in (*self._single, *PER_JOINT) if np.any(np.asarray(getattr(self, name))))
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Cost:
-        """Return the cost with only the selected joints. Shape (n,)."""
+        """Return the cost for a subset of the joints, given as a mask (n,)."""
         names = ("effort", "acceleration", "weights")
         own: dict[str, Any] = {name: floats(getattr(self, name)) for name in names if np.ndim(getattr(self, name))}
         return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
-        """Return the weights of the joints, `velocity` included. Shape (size,).
+        """Return the weights of the squared joint rates, multiplied by `velocity`. Shape (size,).
 
         Raises:
             ProblemError: The number of weights is not the number of joints, or a weight is not positive.
@@ -270,5 +270,5 @@ class Scene:
 
     @property
     def collision_options(self) -> dict[str, Any]:
-        """Arguments of `models.CollisionScene` besides the machine and its limits, by name."""
+        """Keyword arguments of `models.CollisionScene` other than machine and limits."""
         return {name: value for name, value in vars(self).items() if name != "wrenches"}

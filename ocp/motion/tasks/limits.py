@@ -35,7 +35,7 @@ def is_finite(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class InFoot:
-    """The zero moment point stays inside the support polygon by a margin, m, zero or positive."""
+    """Rule that the zero moment point stays inside the support polygon by a margin (m) of at least 0."""
 
     margin: float = 0.0
 
@@ -56,7 +56,7 @@ class InFoot:
 
 @dataclass(frozen=True)
 class IndexAtLeast:
-    """The stability index, (5)-(6), stays at or above a value below 1 in x and y, and the point inside the support."""
+    """Rule that the stability index, (5)-(6), is at least `value` in x and y, with the point inside the support."""
 
     value: float
 
@@ -66,14 +66,14 @@ class IndexAtLeast:
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return the lower and upper corner (x, y) of the region with at least that index. Shape (2,) each, m."""
+        """Return lower and upper corner (x, y) of the region in which the index is high enough. Shape (2,) each, m."""
         radius = machine.half_widths * np.sqrt(1 - self.value)
         return machine.most_stable_point - radius, machine.most_stable_point + radius
 
 
 @dataclass(frozen=True)
 class Pinned:
-    """The zero moment point stays at (x, y), m; at the machine's most stable point if None.
+    """Rule that the zero moment point stays at (x, y), m, or at the machine's most stable point if None.
 
     This holds in the directions in which motion moves the point, see Standing.moving_directions; in the others it stays
     inside the support.
@@ -82,14 +82,14 @@ class Pinned:
     point: Any = None
 
     def place(self, machine: Standing, time: Any) -> Any:
-        """Return the point. Shape (2, 1), m."""
+        """Return the prescribed zero moment point. Shape (2, 1), m."""
         point = machine.most_stable_point if self.point is None else self.point
         return checked_point(point, "Pinned: point")
 
 
 @dataclass(frozen=True)
 class Following:
-    """The zero moment point follows a reference: a function of CasADi time (s) that returns (x, y), m.
+    """Rule that the zero moment point follows a reference, a function from CasADi time (s) to (x, y), m.
 
     This holds in the directions in which motion moves the point, as for Pinned.
     """
@@ -97,7 +97,7 @@ class Following:
     reference: Callable[[Any], Any]
 
     def place(self, machine: Standing, time: Any) -> Any:
-        """Return the point at a time. Shape (2, 1), m."""
+        """Return the reference of the zero moment point at a time. Shape (2, 1), m."""
         if not callable(self.reference):
             words = f"Following: a function of time is expected, not {self.reference!r}"
             raise ProblemError(words, name="Following", value=self.reference)
@@ -105,7 +105,7 @@ class Following:
 
 
 def checked_point(value: Any, name: str) -> Any:
-    """Return (x, y), m, as a CasADi column; ProblemError unless it is two numbers or expressions."""
+    """Return a point (x, y), m, as a CasADi column; raise ProblemError if it is no pair of numbers or expressions."""
     try:
         point = expression(value)
     except NOT_NUMBERS:
@@ -120,14 +120,14 @@ def checked_point(value: Any, name: str) -> Any:
 
 @dataclass(frozen=True)
 class Anywhere:
-    """The zero moment point is not checked: the machine may tip over."""
+    """Rule that the zero moment point is not checked, so that the machine may tip over."""
 
 
 ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges, moved inwards by a margin, that a rule does not already guarantee.
+    """Return those support edges, moved inwards by the margin, that a rule does not already guarantee.
 
     Returns:
         Inward normals n and offsets o: n . point >= o. Shapes (k, 2) and (k,).
@@ -147,7 +147,7 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the distances of the zero moment point inside those `foot_edges` that a motion can reach. Shape (k, 1), m.
+    """Return distances of the zero moment point from `foot_edges` that motion can change. Shape (k, 1), m.
 
     Args:
         machine, zmp: The machine and its rule.
@@ -174,7 +174,7 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 
 
 def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the coordinates of the zero moment point that motion can move out of the region of the index.
+    """Return the coordinates (0, 1) of the zero moment point that may violate the rule on the stability index.
 
     Args:
         machine, zmp, point, external: As for foot_rows.
@@ -196,7 +196,7 @@ def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool)
 
 
 def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
-    """Raise ProblemError if a rule has the wrong type, leaves the support, or cannot be met in it."""
+    """Raise ProblemError if a rule has the wrong type, or cannot be satisfied inside the support."""
     if not isinstance(zmp, ZmpRule):
         words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
         raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))
@@ -224,7 +224,7 @@ LIMITED = ("velocity", "acceleration", "jerk", "torque", "power")
 
 
 class JointBounds(NamedTuple):
-    """Limits of every joint, infinite where there is none. Shape (n,) each; rad or m, s, N m or N, W.
+    """Limits of every joint, infinite where there is none, in rad or m, s, N m or N, W. Shape (n,) each.
 
     Attributes:
         lower, upper: Position limits.
@@ -291,7 +291,7 @@ class Limits:
         return 0.1 * machine.weight if self.vertical_force is None else float(self.vertical_force)
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Limits:
-        """Return the limits of a subset of the joints of a machine. Shape (n,), bool."""
+        """Return the limits of a subset of a machine's joints, given as a mask (n,)."""
         values = {kind: getattr(self, kind) for kind in LIMITED}
         own: dict[str, Any] = {
             kind: _numbers(value)[chosen]
@@ -301,7 +301,7 @@ class Limits:
         return replace(self, **own)
 
     def bounds(self, machine: Machine, used: Collection[str] = ()) -> JointBounds:
-        """Return the joint limits of a machine; those that the robot description does not give are infinite.
+        """Return the joint limits of a machine; limits that the robot description lacks are infinite.
 
         Args:
             machine: The machine.
@@ -333,13 +333,13 @@ class Limits:
 
 
 def unknown_limits(robot: Robot, kind: str) -> list[str]:
-    """Return the joints whose "velocity" or "torque" limit is 0, that is unknown, in the robot description."""
+    """Return the joints whose "velocity" or "torque" limit in the robot description is 0, which means unknown."""
     attribute = {"velocity": "velocity", "torque": "effort"}.get(kind)
     return [joint.name for joint in robot.moving_joints if attribute and getattr(joint, attribute) == 0]
 
 
 def _numbers(value: Any) -> Array:
-    """Return a limit as a flat array, a single 0 if it is not numeric."""
+    """Return a limit as a flat array; a value that is not numeric becomes a single 0."""
     try:
         numbers = floats(value).ravel()
         return numbers if numbers.size else np.zeros(1)

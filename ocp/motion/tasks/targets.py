@@ -23,7 +23,7 @@ __all__ = ["Target", "required_nodes", "targets_along", "tip_poses"]
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """Settings of the choice of nodes.
+    """Settings for `required_nodes`, the choice of mesh nodes for targets.
 
     Attributes:
         points: Points of an interval of the mesh at which the targets determine the motion.
@@ -42,7 +42,7 @@ NODES = NodeSettings()
 
 
 class Target(NamedTuple):
-    """Target frame of a task at M times, nan where the task prescribes nothing.
+    """Target frame of a task at M times; entries that the task does not prescribe are nan.
 
     Attributes:
         t: Times, s. Shape (M,).
@@ -65,7 +65,7 @@ def targets_along(
     joints: Array,
     shown_times: Array | None = None,
 ) -> tuple[Target, ...]:
-    """Return the target poses of each pose task along a motion, which moves targets relative to a link.
+    """Return the target poses of all pose tasks along a motion, on which targets relative to a link depend.
 
     Args:
         machine: The machine that does the tasks.
@@ -103,7 +103,7 @@ def targets_along(
 
 
 def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
-    """Return the breaks at which a mesh needs nodes to follow the targets, including the first and the last.
+    """Return the breaks at which a mesh requires nodes to represent the targets, both ends included.
 
     Between two nodes, the interpolants of the targets at the points of an interval deviate by no more than `NODES`
     allows. Intervals with larger deviations are bisected at the break nearest to their middle. A path of many short
@@ -162,7 +162,7 @@ def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]
 
 
 def tip_poses(machine: Machine, bases: Array, joints: Array) -> Array:
-    """Return the poses of a machine's tip in world, nan if it has none: position and quaternion. Shape (M, 7).
+    """Return tip poses of a machine in world as position and quaternion; nan without a tip. Shape (M, 7).
 
     Args:
         bases, joints: Configurations. Shapes (M, base_size) and (M, n).

@@ -35,7 +35,7 @@ ANGULAR, LINEAR = (0, 1, 2), (3, 4, 5)
 
 @dataclass(frozen=True, eq=False)
 class TipTask:
-    """Task of one frame: a `velocity`, or a pose by `position` and one of `orientation` and `direction`.
+    """Task of one frame of a robot: a `velocity`, or a pose by `position`, and `orientation` or `direction`.
 
     Tracks are differentiated with respect to their time symbol; a track with a method `rate` is asked for its rate
     instead. A list of tasks stacks them: one for each arm, or one that keeps the base from rotating (rows 0, 1, 2 of
@@ -143,7 +143,7 @@ class TipTask:
         tool_axis: ArrayInput = (0.0, 0.0, 1.0),
         **others: Any,
     ) -> Self:
-        """Return the task of moving along a path, with the tool oriented as the path says.
+        """Return the task of moving along a path, with the tool orientation that the path specifies.
 
         If the path has no tool orientation, only the position is prescribed, unless `direction` or `orientation` is
         given. Duration and breaks are those of the path.
@@ -200,22 +200,22 @@ class TipTask:
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Rows of the twist that the task prescribes, without those of the tilt."""
+        """Rows of the twist that the task prescribes, apart from the two tilt rows of a direction."""
         return tuple(self.rows or ())
 
     @property
     def linear(self) -> list[int]:
-        """Coordinates 0..2 of the position that the rows prescribe, in their order."""
+        """Position coordinates 0..2 that the rows prescribe, in order."""
         return [row - 3 for row in self.chosen if row in LINEAR]
 
     @property
     def along_reference(self) -> bool:
-        """Whether the rows refer to the axes of the frame in which the pose is given."""
+        """Whether the rows refer to the axes of the frame relative to which the pose is given."""
         return self.axes == "reference" or (self.axes == "world" and self.relative_to is None)
 
     @property
     def tilts(self) -> bool:
-        """Whether the direction prescribes two tilt rows; it does not if the axis may move in a cone."""
+        """Whether the task has two tilt rows for its direction; it has none if the axis may move in a cone."""
         return self.direction is not None and self.within is None
 
     @property
@@ -230,7 +230,7 @@ class TipTask:
 
 
 def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
-    """Return a task over a path parameter as a task over time.
+    """Convert a task over a path parameter to a task over time.
 
     Args:
         task: Task whose tracks are functions of the parameter and whose velocity is per unit of it.
@@ -250,7 +250,7 @@ def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
 
 
 class BoundTask(NamedTuple):
-    """A task with the machine whose tip is the frame of the task, and one for the reference frame (None: the world)."""
+    """A task with the machine whose tip is its frame, and the machine whose tip is its reference (None: world)."""
 
     task: TipTask
     tip: Machine
@@ -258,7 +258,7 @@ class BoundTask(NamedTuple):
 
 
 def target_size(task: TipTask) -> int:
-    """Return the number of entries that a task takes in the column of targets."""
+    """Return the number of entries of a task in the column of targets."""
     if task.velocity is not None:
         return task.size
     sizes = [(task.position, 6), (task.orientation, 12), (task.direction, 6)]
@@ -266,7 +266,7 @@ def target_size(task: TipTask) -> int:
 
 
 def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
-    """Return (position, velocity) and (rotation or direction, angular velocity) of a pose task, each or None."""
+    """Split targets of a pose task: (position, velocity), (rotation or direction, angular velocity), or None each."""
     translation, at = None, 0
     if task.position is not None:
         translation, at = (targets[0:3], targets[3:6]), 6
@@ -278,12 +278,12 @@ def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
 
 
 def reference_pose(part: BoundTask, base: Any, joints: Any) -> Frame | None:
-    """Return the pose of the reference frame in the world, None if the reference is the world."""
+    """Return the pose of the reference frame in the world; None if the reference is the world."""
     return None if part.reference is None else part.reference.tip_pose(base, joints)
 
 
 def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates: Any) -> Any:
-    """Return a twist, or columns of twists, relative to the reference frame at the tip of the task, in world axes.
+    """Return a twist, or columns of twists, of the tip relative to the reference frame, in world axes.
 
     Args:
         twist: Twist of the tip, (6, 1), or the columns of its Jacobian.
@@ -302,7 +302,7 @@ def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates
 
 
 def task_rows(part: BoundTask, base: Any, joints: Any, twist: Any) -> Any:
-    """Return the rows of the task from a twist in world axes, or from several twists as columns."""
+    """Return the rows of a task for a twist, or for columns of twists, in world axes."""
     task = part.task
     angular, linear = twist[0:3, :], twist[3:6, :]
     rotation = None
@@ -346,9 +346,7 @@ def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
 
 
 def target_twist(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the twist of the target relative to the reference plus the fed-back pose error, in world axes. Shape (6,
-    1).
-    """
+    """Return the target's twist relative to the reference plus pose feedback, in world axes. Shape (6, 1)."""
     position_target, rotation_target = split_targets(part.task, targets)
     reference = reference_pose(part, base, joints)
     angular = ca.DM(3, 1) if rotation_target is None else rotation_target[1]
@@ -374,7 +372,7 @@ def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> An
 
 
 def is_holonomic(part: BoundTask) -> Array:
-    """Return which task rows integrate to a pose, independent of the path. Shape (size,), bool."""
+    """Return which task rows integrate to a pose that does not depend on the path. Shape (size,), bool."""
     task = part.task
     if task.is_pose:
         return np.ones(task.size, dtype=bool)
@@ -384,26 +382,26 @@ def is_holonomic(part: BoundTask) -> Array:
 
 
 def movable_angular_rows(part: BoundTask) -> list[int]:
-    """Return the angular rows, in world axes, that at least one joint can move."""
+    """Return the angular rows, in world axes, that joints can move."""
     base, joints = ca.SX.sym("base", part.tip.base_size), ca.SX.sym("joints", part.tip.joint_size)
     jacobian = part.tip.tip_jacobian(base, joints)
     return [row for row in ANGULAR if not all(entry.is_zero() for entry in ca.horzsplit(jacobian[row, :]))]
 
 
 def derivative(value: Any, time: Any) -> Any:
-    """Return the dense derivative of an expression by the time, zeros for a constant."""
+    """Return the dense time derivative of an expression; zeros for a constant."""
     return ca.densify(ca.jacobian(value, time)) if isinstance(value, ca.SX | ca.MX) else ca.DM.zeros(*value.shape)
 
 
 @on_scalars
 def rotation_of(quaternion: Any) -> Any:
-    """Return the rotation matrix of a quaternion, on scalar symbols."""
+    """Return the rotation matrix of a quaternion, computed on scalar symbols."""
     return rotation_from_quaternion(quaternion)
 
 
 @on_scalars
 def cross_product(a: Any, b: Any) -> Any:
-    """Return a x b, on scalar symbols."""
+    """Return the cross product a x b, computed on scalar symbols."""
     return ca.mtimes(skew(a), b)
 
 
@@ -417,7 +415,7 @@ def angular_velocity(rotation: Any, rate: Any) -> Any:
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return combinations of rows that no base motion changes while the centre of mass is fixed. Shape (m, k).
+    """Return row combinations that base motion about a fixed centre of mass does not change. Shape (m, k).
 
     Raises:
         ProblemError: The momentum moves the centre of mass, and the joints cannot return.
@@ -445,9 +443,7 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return orthonormal combinations of the first `count` rows that vanish together with any of the others. Shape
-    (count, k).
-    """
+    """Return orthonormal combinations of the first `count` rows that depend on the other rows. Shape (count, k)."""
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)

@@ -36,7 +36,7 @@ MAX_ROTATION_RAD = np.pi - 1e-3
 
 
 class PoseLine(NamedTuple):
-    """Tracks of a TipTask: `TipTask(position=line.position, orientation=line.orientation)`."""
+    """Position and orientation of a TipTask: `TipTask(position=line.position, orientation=line.orientation)`."""
 
     position: Callable[[Any], Any]
     orientation: Callable[[Any], Any]
@@ -49,7 +49,7 @@ def pose_line(
     *,
     pace: Literal["constant", "rest"] = "rest",
 ) -> PoseLine:
-    """Return the straight line between two poses, with a rotation about one fixed axis in step with it (slerp).
+    """Return the straight line between two poses, with a rotation about one fixed axis at the same pace (slerp).
 
     Args:
         first, second: (Orientation, position), the orientation as a matrix (3, 3) or a quaternion (4,); a numeric Frame
@@ -88,7 +88,7 @@ def pose_line(
 
 @dataclass(frozen=True, eq=False)
 class TrackWithRate:
-    """A track with a rate: velocity of a position or direction, angular velocity of an orientation, (3, 1), per s.
+    """A function of time with its derivative, for a target position, direction or orientation.
 
     Attributes:
         track, rate: Functions of CasADi time (s).
@@ -102,7 +102,7 @@ class TrackWithRate:
 
 
 class PathTracks(NamedTuple):
-    """Motion of a tool along a path.
+    """Functions of time for the position and orientation of a tool that moves along a path.
 
     Attributes:
         position, orientation: Tracks of the tool frame.
@@ -116,7 +116,7 @@ class PathTracks(NamedTuple):
     breaks: Array
 
     def axis(self, tool_axis: Array) -> Callable[[Any], Any]:
-        """Return the track of the direction of an axis of the tool frame, shape (3,)."""
+        """Return the function of time for the direction of an axis of the tool frame, shape (3,)."""
         rotation, angular_velocity = self.orientation, self.orientation.rate  # type: ignore[attr-defined]
 
         def direction(time: Any) -> Any:
@@ -126,7 +126,7 @@ class PathTracks(NamedTuple):
 
 
 def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
-    """Return the tracks of a motion along a path.
+    """Return the functions of time that describe the motion of a tool along a path.
 
     They need symbols=casadi.MX in builders. A mesh with nodes at `breaks` keeps its full order.
 
@@ -177,7 +177,7 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
 
 
 def reparametrized(track: Track, clock: Callable[[Any], Any]) -> Track:
-    """Return a track over a parameter as a track over time; a constant stays as it is.
+    """Convert a function of a path parameter to a function of time; constants remain unchanged.
 
     Args:
         clock: CasADi function time (s) -> parameter.
@@ -193,7 +193,7 @@ def reparametrized(track: Track, clock: Callable[[Any], Any]) -> Track:
 
 
 def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]:
-    """Return rotation (3, 3) and position (3,) of a numeric pose, checked."""
+    """Return rotation (3, 3) and position (3,) of a numeric pose after checks."""
     try:
         orientation, position = (np.array(ca.DM(expression(part))) for part in pose)
     except NOT_NUMBERS as error:
@@ -211,7 +211,7 @@ def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]
 
 
 def on_symbols(build: Callable[[Any], _Result]) -> _Result:
-    """Call `build` with SX symbols, or with MX symbols if interpolants or external functions reject SX."""
+    """Call `build` with SX symbols or, if interpolants or external functions reject these, with MX symbols."""
     try:
         return build(ca.SX)
     except (RuntimeError, NotImplementedError):
@@ -226,7 +226,7 @@ def track_expression(
     what: str = "track",
     begin: float = 0.0,
 ) -> Any:
-    """Return a constant or a function of time as a dense matrix of expressions of the symbol `time`.
+    """Return a constant, or a function of time, as a dense expression of the symbol `time`.
 
     Args:
         track: A constant, or a function: CasADi time -> CasADi matrix, array, or a list of expressions.
@@ -266,7 +266,7 @@ def track_expression(
 
 
 def _call_track(track: Callable[[Any], Any], time: Any, what: str) -> Any:
-    """Call a track; ProblemError if it fails, but for the errors of interpolants on SX symbols (see `on_symbols`)."""
+    """Call a function of time; raise ProblemError if it fails, except for interpolants on SX symbols."""
     try:
         return track(time)
     except (RuntimeError, NotImplementedError, ProblemError, ModelError):

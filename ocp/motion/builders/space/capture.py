@@ -131,7 +131,7 @@ class Grasp:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Approach, grasp and detumbling of a tumbling body by a free-floating chaser, its tip on the grasped frame.
+    """Approach, grasp and detumbling of a tumbling body by a free-floating chaser whose tip moves to the grasped frame.
 
     Attributes:
         target: Machine of one link without joints, on the same kind of base as the chaser, with its momentum. Its tip
@@ -173,7 +173,7 @@ def capture_problem(
     cost: Cost | None = None,
     clearance_constraints: ClearanceConstraints | None = None,
 ) -> Phases:
-    """Declare approach, grasp and detumbling of least total cost.
+    """Declare approach, grasp and detumbling with the least total cost.
 
     The phases "approach" and "detumble" have the states and controls of `dynamics_problem`. The configuration of the
     target is the state "target" of the first, and follows from that of the chaser in the second. Wheel angles count
@@ -222,7 +222,7 @@ def solve_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> Solution:
-    """Solve `capture_problem` and audit the solution; the limits hold between the nodes, too.
+    """Solve `capture_problem` and audit the solution, whose limits also hold between the nodes.
 
     Args:
         chaser, capture, start, limits, cost, clearance_constraints: As for `capture_problem`.
@@ -260,7 +260,7 @@ def chained_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> tuple[Solution, Solution]:
-    """Solve the approach alone, then the detumbling from its end; the joint solution of `solve_capture` costs less.
+    """Solve the approach alone, then the detumbling from its end, which costs more than `solve_capture`.
 
     Args, Raises: As for `solve_capture`.
 
@@ -292,7 +292,7 @@ def chained_capture(
 
 
 def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:
-    """Return the machines of both phases: the chaser, and the pair with the joints of the chaser.
+    """Return the machines of both phases: the chaser, and chaser and target as one machine after the grasp.
 
     Raises:
         ProblemError: As `capture_problem`.
@@ -302,7 +302,7 @@ def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFl
 
 @dataclass(frozen=True, eq=False)
 class _Capture:
-    """Checked arguments of a capture; `pair` is the machine of both bodies, with their initial momentum."""
+    """Checked arguments of a capture; `pair` is the machine of chaser and target, with their initial momentum."""
 
     chaser: FreeFloating
     capture: Capture
@@ -341,7 +341,7 @@ class _Capture:
 
     @property
     def arm(self) -> Array:
-        """Return 1 for arm joints and 0 for reaction wheels, whose angles start from zero in each phase. Shape (n,)."""
+        """Weights that are 1 for arm joints and 0 for reaction wheels, whose angles restart from zero. Shape (n,)."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
@@ -392,7 +392,7 @@ class _Capture:
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
 
     def detumbling(self, start: Mapping[str, Array] | None) -> Problem:
-        """Declare the second phase, from the end of an approach, or free to be joined to one."""
+        """Declare the second phase, from the end of an approach or, with a free start, to be joined to one."""
         pair, capture = self.pair, self.capture
         wheels, rest = find_wheels(pair.robot), capture.rest
         still = np.array([np.nan if name in wheels else 0.0 for name in pair.robot.joint_names])
@@ -428,8 +428,7 @@ class _Capture:
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base at a time from its attitude and the joints; no force acts, so the centre of mass moves
-        evenly.
+        """Return the base at a time from its attitude and the joints, since the centre of mass moves uniformly.
 
         The position of the centre of mass and the norm of the quaternion are conserved by the dynamics. Continuity of
         them would be a condition that no control influences, and would leave the second-order conditions undetermined.
@@ -450,7 +449,7 @@ class _Capture:
 
 
 def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return joints, velocities and base at the end of the guess of the approach."""
+    """Return joints, velocities and base at the end of the approach's guess."""
     end = np.array([guessed_horizon(problem)])
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)
@@ -458,7 +457,7 @@ def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
 
 
 def _of_unit_length(machine: FreeFloating, base: Any) -> Any:
-    """Return the base configuration with its quaternion normalised."""
+    """Return the base configuration with a quaternion of unit length."""
     if machine.base == "planar":
         return base
     return ca.vertcat(base[:3], base[3:] / ca.norm_2(base[3:]))

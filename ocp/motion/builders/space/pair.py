@@ -51,7 +51,7 @@ __all__ = [
 
 
 def joined(chaser: Robot, target: Robot) -> Robot:
-    """Return the chaser's robot with the target as a link on its tip, at the target's tip frame.
+    """Return the chaser's robot with the target as an additional link, whose tip frame is at the chaser's tip.
 
     Raises:
         ModelError: A robot has no tip, or links have the same name.
@@ -62,7 +62,7 @@ def joined(chaser: Robot, target: Robot) -> Robot:
 
 
 def checked_pair(chaser: Any, target: Any) -> Robot:
-    """Check a chaser and its target and return both as one robot, see `joined`.
+    """Check a chaser and its target, and return both as one robot; see `joined`.
 
     Raises:
         ProblemError: Machines of other kinds, without tips, with links of the same name, or a target with joints.
@@ -112,7 +112,7 @@ def motion_of(problem: Problem) -> tuple[Any, Any, Any]:
 
 
 def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> tuple[Any, Any]:
-    """Return force and moment about the tip that the hand applies to the target, in world axes. Shape (3, 1) each.
+    """Return the force and the moment about the tip that the hand exerts on the target, world axes. Shape (3, 1).
 
     They are the rates of the target's momentum, m c'' and (I w)' about its centre of mass.
     """
@@ -159,7 +159,7 @@ GUESS = GuessSettings()
 
 
 def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
-    """Return the configurations of a free body at evenly spaced times, by Runge-Kutta of order four.
+    """Return the configurations of a freely floating body at evenly spaced times, by Runge-Kutta of order four.
 
     Shape (M, base_size) at times (M,), s.
     """
@@ -175,7 +175,7 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
 
 
 def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:
-    """Set the guess of the approach; a free duration gets the shortest value that reaches the grasp, or the closest.
+    """Set the guess of the approach; a free duration becomes the shortest one in which the tip can reach the grasp.
 
     Args:
         start: State of the capture; free velocities are guessed as zero.
@@ -204,7 +204,7 @@ def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating,
 
 
 class _TipTracker:
-    """Moves the tip of a machine along a path, step by step."""
+    """Tracker that moves the tip of a machine along a path, step by step."""
 
     def __init__(self, problem: Problem, machine: FreeFloating, rates: Array) -> None:
         n, robot = machine.joint_size, machine.robot
@@ -222,7 +222,7 @@ class _TipTracker:
         self.fastest = constant(states["velocities"].upper)
 
     def follow(self, times: Array, path: tuple[Array, Array], joints: Array, base: Array) -> tuple[float, Guesses]:
-        """Track a path with the tip at constant wheel speeds; return the final distance, m and rad, and the guesses."""
+        """Track a path with the tip at constant wheel speeds; return the final error, m and rad, and the guesses."""
         places, turns = path
         step = times[1]
         speed = self.rates.copy()
@@ -248,7 +248,7 @@ class _TipTracker:
 
 
 def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
-    """Return rotation vector and translation from one pose to another, in world axes. Shape (6,)."""
+    """Return rotation vector and translation between two poses, in world axes. Shape (6,)."""
     return np.concatenate(
         [scipy.spatial.transform.Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()]
     )
@@ -330,19 +330,19 @@ def _stepper(machine: FreeFloating) -> Any:
 
 
 def _motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
-    """Return the guesses that sampled joints, velocities and base define."""
+    """Return guesses, as functions of time, from samples of joints, velocities and base."""
     second = np.gradient(velocities, times, axis=0)
     tables = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
     return {name: _curve(times, samples) for name, samples in tables.items()}
 
 
 def _curve(times: Array, samples: Array) -> Any:
-    """Return the linear interpolant of samples."""
+    """Return the linear interpolant of samples as a function of time."""
     return lambda t: np.column_stack([np.interp(t, times, column) for column in samples.T])
 
 
 def guessed_horizon(problem: Problem) -> float:
-    """Return the horizon, or its guess if it is free, s."""
+    """Return the horizon or, if it is free, its guess, s."""
     horizon = problem.declared.horizon
     assert horizon is not None
     return float(constant(horizon.lower)[0]) if horizon.guess is None else float(horizon.guess)
@@ -365,7 +365,7 @@ ROUNDING = 1e-9
 
 
 class State(NamedTuple):
-    """Initial state of a capture, and its longest durations.
+    """Initial state of a capture, and the longest durations of its phases.
 
     Attributes:
         base, joints, velocities: State of the chaser; nan for free velocities.
@@ -414,7 +414,7 @@ def wheel_capacity(machine: FreeFloating, bounds: JointBounds, start: State, fri
 
 
 def require_capacity(machine: FreeFloating, momentum: Array, capacity: float) -> None:
-    """Raise ProblemError if the wheels cannot hold the angular momentum in any final attitude of the base.
+    """Raise ProblemError if the wheels cannot store the angular momentum in any final attitude of the base.
 
     Args:
         momentum: Momentum of both bodies, see `pair_momentum`.
@@ -432,7 +432,7 @@ def require_capacity(machine: FreeFloating, momentum: Array, capacity: float) ->
 
 
 def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earliest: float) -> None:
-    """Raise ProblemError if the grasp is out of reach of the arm at all times.
+    """Raise ProblemError if the arm cannot reach the grasp at any time.
 
     Both centres of mass drift uniformly. The tip is never farther from the chaser's centre of mass than with the arm
     stretched.
@@ -455,7 +455,7 @@ def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earl
 
 
 def _offset(chaser: FreeFloating, target: FreeFloating, start: State) -> tuple[Array, Array]:
-    """Return the vector from the chaser's centre of mass to the target's, m, and its rate, m/s. Shape (3,) each."""
+    """Return the vector from the chaser's to the target's centre of mass, m, and its rate, m/s. Shape (3,) each."""
     centers, speeds = [], []
     for machine, base, joints in ((target, start.target_base, np.zeros(0)), (chaser, start.base, start.joints)):
         center = center_of_mass(machine.robot, ca.DM(joints), machine.world_from_base(ca.DM(base)))
@@ -466,7 +466,7 @@ def _offset(chaser: FreeFloating, target: FreeFloating, start: State) -> tuple[A
 
 
 def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
-    """Return an upper bound of the distance of both centres of mass while the tip is at the grasp, m."""
+    """Return an upper bound of the distance of the two centres of mass while the tip is at the grasp, m."""
     robot, body = chaser.robot, target.robot
     middle = sum(link.mass * _longest(robot, link.name, link.center_of_mass) for link in robot.links if link.mass)
     reach = _longest(robot, str(robot.tip_link), robot.tip_translation) + middle / robot.total_mass
@@ -474,7 +474,7 @@ def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
 
 
 def _longest(robot: Robot, link: str, point: object) -> float:
-    """Return an upper bound of a point's distance from the root, m; inf with an unlimited prismatic joint."""
+    """Return an upper bound of a point's distance from the root, m; inf if a prismatic joint has no limits."""
     length = float(np.linalg.norm(np.asarray(point, dtype=float)))
     for joint in robot.path_to(link):
         slides = max(abs(joint.lower), abs(joint.upper)) if joint.kind == "prismatic" else 0.0

@@ -48,7 +48,7 @@ COARSE_IPOPT = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
 
 @dataclass(frozen=True)
 class PaceSettings:
-    """Settings of the check whether steps are possible in their durations, on a coarse mesh.
+    """Settings of the check on a coarse mesh whether steps are possible in their durations.
 
     Attributes:
         iterations: Largest number of iterations with the requested durations; solvable cases took 31 to 51.
@@ -77,7 +77,7 @@ PACE = PaceSettings()
 def guess_in_time(
     steps: Steps, start: Any, step_options: Mapping[str, Any], options: Mapping[str, Any]
 ) -> dict[str, Any] | None:
-    """Return a guess for `steps_problem` in the requested durations from a coarse mesh; None if there is none.
+    """Return a guess for `steps_problem` with the requested durations, from a coarse mesh; None without one.
 
     Args:
         step_options: Cost and limits of steps_problem.
@@ -117,7 +117,7 @@ def guess_in_time(
 
 
 def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]) -> Phases:
-    """Declare the same steps with durations of at least `seconds`; weights are scaled to the mean duration."""
+    """Declare the steps with durations that may be longer than `seconds`; weights are scaled to the mean duration."""
     phases = [
         replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.guess * each))
         if (each := seconds.get(name)) is not None
@@ -141,7 +141,7 @@ def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], secon
 
 
 def _check_conflicts(problem: Phases, coarse: Solution) -> None:
-    """Raise SolveError with the conflicting constraints if more time does not help."""
+    """Raise SolveError with the conflicting constraints if longer durations do not resolve them."""
     try:
         solve(problem, COARSE, options={"max_iter": 0})  # searches for conflicts at once
     except SolveError as error:
@@ -161,7 +161,7 @@ def _check_conflicts(problem: Phases, coarse: Solution) -> None:
 def _too_fast(
     problem: Phases, coarse: Solution, seconds: Mapping[str, float], spans: Mapping[str, float]
 ) -> SolveError:
-    """Return the error that the steps need more time, with the phases and their active limits."""
+    """Return the error that the steps require more time, with the phases and their active limits."""
     late = sorted(seconds, key=lambda name: -spans[name] / seconds[name])
     late = [name for name in late if spans[name] > (1 + PACE.error) * seconds[name]]
     lines = [
@@ -176,7 +176,7 @@ def _too_fast(
 
 
 def _active_limits(problem: Phases, coarse: Solution, phase: str) -> str:
-    """Describe which limits are active in a phase, and for which share of it."""
+    """Describe which limits are active in a phase, and for what share of it."""
     form = Formulation.of(problem)
     at = np.linspace(0.0, 1.0, PACE.samples)
     x, u = coarse.state_interpolant(at), coarse.control_interpolant(at)
@@ -216,7 +216,7 @@ Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 @dataclass(frozen=True)
 class Attempt:
-    """Result of one solve.
+    """Result of one solve of an attempted formulation and mesh.
 
     Attributes:
         name: Formulation, mesh, and whether bounds were tightened.
@@ -245,7 +245,7 @@ def solve_standing(
     setup: StandingSetup | None = None,
     settings: SolveSettings | None = None,
 ) -> Solution:
-    """Solve `standing_problem` and audit the plan, by the formulation that works for it.
+    """Solve `standing_problem` and audit the plan; try formulations until the plan of one is accepted.
 
     The first plan is returned that passes its audit with pose errors below 1e-5 (m, rad) everywhere. Accelerations at
     the collocation points are tried first, or, if the final time is free, accelerations linear between the nodes. Jerks
@@ -333,7 +333,7 @@ def _first_accepted(
     judge: _Judge,
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
-    """Return the first accepted plan among the formulations and meshes of `solve_standing`.
+    """Return the first plan that is accepted, among the formulations and meshes of `solve_standing`.
 
     Raises:
         SolveError, ProblemError: As `solve_standing`; at once if collisions are all that is wrong with a plan.
@@ -367,7 +367,7 @@ def _first_accepted(
 
 
 def _formulations(control: str, free_time: bool, method: Collocation | None) -> list[Trial]:
-    """Return the formulations to try, each with its first mesh, the most promising first."""
+    """Return the formulations to try, each with its first mesh, in order of promise."""
     at_points: Trial = ("acceleration" if control == "acceleration" else "position", method or POINTS)
     if method is not None:
         return [("position", method) if method.control == "held" else at_points]
@@ -413,7 +413,7 @@ def _tip(level: Level | None) -> str:
 
 @dataclass(frozen=True)
 class _Judge:
-    """Runs solves, audits their results and accepts or rejects them.
+    """Audits the results of solves, and accepts or rejects them.
 
     Attributes:
         tolerances: Tolerances of the audit.
@@ -455,7 +455,7 @@ def _pose_error(
 
 
 def _is_inequality(problem: Problem, finding: str) -> bool:
-    """Return whether a finding concerns bounds, or a path constraint without equalities."""
+    """Return whether a finding is about bounds, or about a path constraint without equalities."""
     rows = problem.declared.path.get(finding)
     if rows is None:
         return finding.startswith("bounds of ")

@@ -73,7 +73,7 @@ __all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_co
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the cost, an integral over the motion plus `time` times a free final time.
+    """Weights of the cost, an integral over the motion plus `time` times the free final time.
 
     Attributes:
         acceleration, velocity, jerk: Weights of the sums of squares over the joints.
@@ -278,7 +278,7 @@ def _constrain_tips(
     tip_level: str,
     moving: bool,
 ) -> None:
-    """Constrain the tips to their tasks, by poses or by accelerations, from a start at rest or `moving`."""
+    """Constrain the tips to their tasks, by poses or by accelerations; `moving` says that the start is not at rest."""
     none, (joints, velocities, accelerations) = ca.DM(0, 1), motion
     targets = equations.targets(*progress[:2])
     if tip_level == "position":
@@ -310,7 +310,7 @@ def _motion(
     guess: Mapping[str, Any],
     setup: StandingSetup,
 ) -> tuple[tuple[Any, Any, Any], Any]:
-    """Declare joint positions, velocities and accelerations; also jerks, empty if these are no controls."""
+    """Declare joint positions, velocities and accelerations, and jerks if these are controls, else an empty column."""
     n = len(begin)
     joints = problem.state(
         "joints", n, initial=begin, terminal=setup.end, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"],
@@ -335,7 +335,7 @@ def _motion(
 
 
 def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
-    """Declare the path parameter from 0 to 1; return it with its rate and acceleration."""
+    """Declare the path parameter, which runs from 0 to 1; return it with its rate and acceleration."""
     at = problem.state("path", initial=0.0, terminal=1.0, lower=0.0, upper=1.0, guess=guess["path"])
     first, last = (0.0 if rest else None for rest in rests)
     rate = problem.state("path_rate", lower=0.0, guess=guess["path_rate"], initial=first, terminal=last, unit="1/s")
@@ -346,7 +346,7 @@ def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, An
 
 
 def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
-    """Return the cost of standing_problem for a sampled motion, by the trapezoidal rule and without jerks."""
+    """Return the cost of `standing_problem` for motion samples, by the trapezoidal rule and without jerks."""
     w = weights or Weights()
     running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
     running += w.velocity * (motion.joint_velocities**2).sum(axis=1)

@@ -35,7 +35,7 @@ SAMPLES = 101
 
 @dataclass(frozen=True, eq=False)
 class StepsMotion:
-    """Motion of a machine over its stances at M times; a time at which two phases meet occurs twice.
+    """Motion of a machine over its stances at M times; the time at which two phases meet occurs twice.
 
     The loads of all feet but the first are given, for example planned. The first foot bears the rest.
 
@@ -73,7 +73,7 @@ class StepsMotion:
     balance: Array
 
     def held(self, foot: str) -> NDArray[np.bool_]:
-        """Return at which times a foot is on the ground. Shape (M,), bool."""
+        """Return a mask of the times at which a foot is on the ground. Shape (M,), bool."""
         by_phase = np.array([foot in phase.footholds for phase in self.steps.phases], dtype=bool)
         return np.asarray(by_phase[self.phase.astype(int)], dtype=bool)
 
@@ -143,7 +143,7 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
 
 
 def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion:
-    """Return the motion of all phases, from values of `sample_stance` with "t" and "phase"."""
+    """Join the values that `sample_stance` returns for each phase to one motion."""
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def by_foot(quantity: str) -> dict[str, Array]:
@@ -156,7 +156,7 @@ def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion
 def sample_stance(
     steps: Steps, stance: Stance, motion: tuple[Array, ...], foot_loads: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Evaluate the quantities of `StepsMotion` along a motion in one stance; return them by name. Shape (M, ...) each.
+    """Return the quantities of `StepsMotion` by name along a motion in one stance. Shape (M, ...) each.
 
     Args:
         motion: q, q', q'' in the stance's order. Shape (M, n) each.
@@ -185,7 +185,7 @@ def sample_stance(
 
 
 def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
-    """Return a casadi function (q, q', q'', loads) and the names of its outputs."""
+    """Return a casadi function (q, q', q'', loads) -> quantities of `StepsMotion`, and their names."""
     n = stance.joint_size
     q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
     rows = {name: ca.SX.sym("load", len(stance.load_rows[name])) for name in stance.other_feet}
@@ -209,7 +209,7 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
 
 
 def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsMotion:
-    """Take steps with the least joint rates at every time, by local resolution; see `resolve`.
+    """Compute steps with the least joint rates at every time by local resolution, as `resolve` does.
 
     A lifted foot moves to its next foothold from rest to rest. Seen from above its path is straight; at the share s of
     the path it is raised by 64 s^3 (1 - s)^3 times the steps' clearance. A foot without a next foothold follows the
@@ -283,7 +283,7 @@ def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) 
 
 
 def _least_loads(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str, Array]:
-    """Return least-squares loads of the feet besides the first, in their held rows. Shape (M, k) each."""
+    """Return the loads of feet besides the first with the least sum of squares, as free rows. Shape (M, k) each."""
     sizes = {name: len(stance.load_rows[name]) for name in stance.other_feet}
     if not sizes:
         return {}

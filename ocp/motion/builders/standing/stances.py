@@ -67,7 +67,7 @@ class StancePhase:
 
     @property
     def seconds(self) -> float:
-        """Return the duration, or its guess if it is free, s."""
+        """Duration, or its guess if it is free, s."""
         return self.duration.guess if isinstance(self.duration, FreeTime) else float(self.duration)
 
 
@@ -149,20 +149,20 @@ class Steps:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Return the names of the phases: their number, from 1, and the feet that are held."""
+        """Names of the phases: a number from 1, and the feet on the ground."""
         return tuple(f"{k + 1} {' + '.join(phase.footholds)}" for k, phase in enumerate(self.phases))
 
     @cached_property
     def stances(self) -> tuple[Stance, ...]:
-        """Return the machine of each phase, rooted at the first of its feet."""
+        """Machine of each phase, rooted at the first of its feet."""
         return tuple(Stance.on(self.robot, self.feet, phase.footholds, self.gravity) for phase in self.phases)
 
     def order(self, stance: Stance) -> NDArray[np.intp]:
-        """Return the indices of a stance's joints among those of the robot: q_stance = q[order]. Shape (n,)."""
+        """Return the indices `order` of a stance's joints in the robot, such that q_stance = q[order]. Shape (n,)."""
         return np.array([self.robot.joint_names.index(name) for name in stance.robot.joint_names], dtype=np.intp)
 
     def swings(self, k: int) -> tuple[Swing, ...]:
-        """Return the feet in the air during phase k that were held before or land at its end."""
+        """Return the swings of phase k: feet in the air that stood before, or that land at its end."""
         swings = []
         for name in self.feet:
             if name in self.phases[k].footholds:
@@ -174,14 +174,14 @@ class Steps:
         return tuple(swings)
 
     def standing(self, k: int) -> Stance:
-        """Return the stance on all feet that are held just before or just after the start of phase k (or the end)."""
+        """Return the stance on all feet that stand just before or just after the start of phase k."""
         footholds: dict[str, Foothold] = {}
         for phase in self.phases[max(k - 1, 0) : k + 1]:
             footholds |= phase.footholds
         return Stance.on(self.robot, self.feet, footholds, self.gravity)
 
     def balanced(self, k: int) -> Array:
-        """Return a balanced position of the center of mass at the start of phase k: between the feet before and after.
+        """Return a balanced position of the center of mass at the start of phase k, over the feet that stay down.
 
         It is the mean of the centers of their soles, or of their footholds if none has a sole. Shape (2,), m.
         """
@@ -196,7 +196,7 @@ class Steps:
         return np.asarray(np.mean(points, axis=0))
 
     def in_order(self, stance: Stance, values: Array) -> Array:
-        """Reorder joint vectors of a stance to the order of the robot's joints. Shape (M, n)."""
+        """Reorder joint vectors of a stance into the order of the robot's joints. Shape (M, n)."""
         reordered = np.empty_like(values)
         reordered[:, self.order(stance)] = values
         return reordered
@@ -209,7 +209,7 @@ def walk(
     shift: float | FreeTime,
     swing: float | FreeTime,
 ) -> tuple[StancePhase, ...]:
-    """Return the phases of consecutive steps: all feet held, all but one, all held, ..., all held.
+    """Return the phases of consecutive steps, in which all feet stand and one foot moves in turn.
 
     Args:
         footholds: Footholds at the start, by foot.
@@ -258,7 +258,7 @@ CONFIGURATIONS = ConfigurationSettings()
 
 
 def foothold_equations(stance: Stance, footholds: dict[str, Foothold]) -> TaskEquations:
-    """Return equations that hold feet other than the first on footholds, in their movable directions."""
+    """Return equations that keep feet other than the first on their footholds, in directions that joints can move."""
     tasks = [foot_task(stance, name, foothold.position, foothold.rotation) for name, foothold in footholds.items()]
     return bind(stance, tasks)
 
@@ -279,7 +279,7 @@ def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **options
 
 
 def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array:
-    """Return the nearest configuration with all feet on their footholds and the center of mass over a point.
+    """Return the nearest configuration with all feet on footholds and the center of mass over a given point.
 
     Args:
         stance: Feet and their footholds.
@@ -333,7 +333,7 @@ def check_placed(stance: Stance, joints: Array) -> None:
 
 
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:
-    """Return guesses of joints, velocities and accelerations of each phase, in the orders of their stances.
+    """Return guesses of joints, velocities and accelerations of each phase, in the joint order of its stance.
 
     Args:
         start: Joints at the start, in the robot's order.
@@ -354,13 +354,13 @@ def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]
 
 
 def _configuration(steps: Steps, stance: Stance, near: Array, over: Array) -> Array:
-    """Return a balanced configuration of a stance near a given one, with the joints in the order of the robot."""
+    """Return a balanced configuration of a stance near a given one, in the joint order of the robot."""
     joints = standing_configuration(stance, near[steps.order(stance)], over)
     return np.asarray(steps.in_order(stance, joints[None])[0])
 
 
 def _raised(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
-    """Return the poses of swinging feet midway between their footholds."""
+    """Return the raised poses of swinging feet midway between their footholds."""
     raised = {}
     for swing in swings:
         if swing.lifted is None or swing.landing is None:

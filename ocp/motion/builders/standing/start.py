@@ -32,7 +32,7 @@ __all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Settings of the check of a start at rest, and of the guess.
+    """Settings of the check whether a motion can start from rest, and of the first guess.
 
     Attributes:
         violation: Relative violation of a limit that is tolerated.
@@ -53,7 +53,7 @@ STARTS = StartSettings()
 
 
 def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
-    """Return the start joints, moved onto limits that rounding has exceeded. Shape (n,).
+    """Return the start joints after moving those onto limits that exceed them by rounding. Shape (n,).
 
     Raises:
         ProblemError: A joint starts outside its limits, or has no range between them.
@@ -69,7 +69,7 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
 def check_freedom(
     machine: Standing, size: int, zmp: ZmpRule, *, along_parameter: bool, tip_level: str, ends_at_rest: bool
 ) -> None:
-    """Raise ProblemError if tasks, zero moment point and final rest require more degrees of freedom than there are.
+    """Raise ProblemError if tasks, zero moment point and final rest require more joints than the machine has.
 
     Args:
         size: Rows of all tasks.
@@ -109,7 +109,7 @@ def check_loads(
     bounds: JointBounds,
     demand: tuple[Array, Array] | None,
 ) -> None:
-    """Raise ProblemError if no joint accelerations satisfy the limits at the start, from rest.
+    """Raise ProblemError if no joint accelerations satisfy the limits at a start from rest.
 
     Torques, vertical force and zero moment point are linear in the accelerations. A linear program finds the least
     violation.
@@ -158,7 +158,7 @@ def check_loads(
 
 
 def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) -> tuple[Array, Array]:
-    """Return rows and values of the accelerations that the tasks require at their start, from rest.
+    """Return rows and values of the accelerations that the tasks require when they start from rest.
 
     Along a parameter the acceleration in the path's direction is free, and only the rows across it remain.
     """
@@ -199,7 +199,7 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 def _least_violations(
     at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """Return violations of the rows with the least sum; None if even then the tasks cannot be satisfied."""
+    """Return violations of the rows with the least sum; None if no accelerations satisfy the tasks."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):
@@ -231,7 +231,7 @@ def local_guess(
     by_parameter: bool,
     external: External | None,
 ) -> dict[str, Any]:
-    """Return guesses by name from a local motion; once it breaks down or is too fast, its last joints stay."""
+    """Return guesses by name from a local motion; after it fails or gets too fast, its last joints are kept."""
     tasks = [part.task for part in equations.bound]
     if by_parameter:
         tasks = [timed(task, lambda time: rest_to_rest(time / horizon)) for task in tasks]

@@ -45,7 +45,7 @@ GUESSED_LIFT = 1.5  # height of a foot halfway in the guess, over the clearance
 
 @dataclass(frozen=True)
 class StepWeights:
-    """Weights of the cost, an integral over the motion plus `time` times the free durations.
+    """Weights of the cost, which is an integral over the motion plus `time` times the free durations.
 
     Attributes:
         acceleration, velocity: Weights of the sums of squares over the joints.
@@ -70,7 +70,7 @@ class StepWeights:
 
 @dataclass(frozen=True)
 class _Options:
-    """Options of all phases."""
+    """Options that all phases share."""
 
     balance: str
     margin: float
@@ -82,7 +82,7 @@ class _Options:
 @remembers_request("steps")
 @interruptible
 def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, limits: Limits | None = None) -> Phases:
-    """Declare a motion through consecutive stances, from rest to rest, that minimises a cost.
+    """Declare a motion through consecutive stances, from rest to rest, with the lowest cost.
 
     The phases have the names `Steps.names`; joint vectors of a phase are in its stance's order. The states are "joints"
     and "velocities". The controls are "accelerations", and "FOOT load" of each held foot but the first, in the rows
@@ -226,7 +226,7 @@ def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
 
 
 def _load(problem: Problem, stance: Stance, name: str) -> Any:
-    """Return the load on a foot other than the first; its free rows are a control. Shape (6, 1)."""
+    """Return the load on a foot other than the first, with its free rows declared as a control. Shape (6, 1)."""
     rows = stance.load_rows[name]
     share = stance.weight / len(stance.footholds)
     guess = [share * (row == 5) for row in rows]
@@ -235,7 +235,7 @@ def _load(problem: Problem, stance: Stance, name: str) -> Any:
 
 
 def _limit_load(problem: Problem, stance: Stance, name: str, load: Any, options: _Options) -> None:
-    """Constrain a foot's load to what its sole can bear; a grip bears any load."""
+    """Constrain a foot's load to what its sole can bear; the load of a grip is not limited."""
     if stance.feet[name].sole is None:
         return
     least = 0.0 if options.limits.vertical_force is None else float(options.limits.vertical_force)
@@ -276,7 +276,7 @@ def _swing(
 
 
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the rows that differ from all earlier ones; soles of planar machines have coinciding corners."""
+    """Return the indices of distinct rows; for planar machines, corners of soles coincide."""
     rng = np.random.default_rng(0)
     others = [
         symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in ca.vertsplit(joints))
@@ -289,7 +289,7 @@ def _distinct_rows(rows: Any, joints: Any) -> list[int]:
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return the distances of the center of mass from those support edges that joints influence. Shape (k, 1), m."""
+    """Return the distances of the center of mass from the support edges that joints affect. Shape (k, 1), m."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))
