@@ -87,7 +87,7 @@ def real(value: Any) -> float:
         return np.nan
 
 
-def frozen(array: Array) -> Array:
+def freeze(array: Array) -> Array:
     """Make an array read-only and return it."""
     array.setflags(write=False)
     return array
@@ -234,17 +234,17 @@ class Checks:
         except NOT_NUMBERS as error:
             raise self._wrong(label, f"{value!r} is not numeric", value) from error
         if shape is not None and array.shape != shape:
-            array = self._shaped(label, array, shape, least, meaning)
+            array = self._check_shape(label, array, shape, least, meaning)
         if entries != "any" and not np.isfinite(array).all():
             wrong = ~np.isfinite(array) if entries == "finite" else np.isnan(array)
             if wrong.any():
-                raise self._wrong(label, f"{_shown(array, wrong)} is not finite", array)
+                raise self._wrong(label, f"{_description(array, wrong)} is not finite", array)
         if sign != "any" and (wrong := array < 0 if sign == "nonnegative" else ~(array > 0)).any():
-            words = f"{_shown(array, wrong)} {unit}".rstrip()
+            words = f"{_description(array, wrong)} {unit}".rstrip()
             raise self._wrong(
                 label, f"{words} is {'negative' if sign == 'nonnegative' else 'not positive'}", array, 0.0
             )
-        return frozen(array)
+        return freeze(array)
 
     def broadcast(
         self,
@@ -267,7 +267,7 @@ class Checks:
         if array.ndim and array.shape != (count,):
             words = f"has shape {array.shape}; give one number or one for each of the {count} {items}"
             raise self._wrong(label, words, array, (count,))
-        return frozen(np.array(np.broadcast_to(array, (count,))))
+        return freeze(np.array(np.broadcast_to(array, (count,))))
 
     def indices(self, label: str, value: Any, count: int) -> NDArray[np.intp]:
         """Return an array of indices after checking that each is an integer from 0 to `count` - 1."""
@@ -290,13 +290,13 @@ class Checks:
             raise self._wrong(label, words, matrix)
         if error > 1e-12:
             left, _, right = np.linalg.svd(matrix)
-            matrix = frozen(left @ right)
+            matrix = freeze(left @ right)
         return matrix
 
     def _wrong(self, label: str, words: str, value: Any, limit: Any = None) -> DetailedError:
         return self.error(f"{label} {words}", name=argument_of(label), value=value, limit=limit)
 
-    def _shaped(self, label: str, array: Array, shape: tuple[int | str, ...], least: int, meaning: str) -> Array:
+    def _check_shape(self, label: str, array: Array, shape: tuple[int | str, ...], least: int, meaning: str) -> Array:
         """Return the array after checking that it has a shape in which some dimensions are free."""
         if len(shape) == 1 and ((array.ndim == 0 and isinstance(shape[0], str)) or array.shape[1:] == (1,)):
             array = array.reshape(-1)
@@ -319,7 +319,7 @@ def _in(unit: str) -> str:
     return f" (in {unit})" if unit else ""
 
 
-def _shown(array: Array, wrong: Any) -> str:
+def _description(array: Array, wrong: Any) -> str:
     """Return the text that describes an invalid array in an error message: all of it if short, else its first fault."""
     if array.ndim < 2 and array.size <= MAX_LISTED:
         return f"{array.tolist()}"

@@ -24,7 +24,7 @@ class DetailedError(Exception):
 
     def __reduce__(self) -> Any:
         """Pickle all fields; a field that cannot be pickled, such as an expression, is replaced by its `repr`."""
-        return type(self), self.args, {key: _pickled(value) for key, value in self.__dict__.items()}
+        return type(self), self.args, {key: _picklable(value) for key, value in self.__dict__.items()}
 
 
 class ModelError(DetailedError, ValueError):
@@ -35,7 +35,7 @@ class ModelWarning(DetailedError, UserWarning):
     """Warning about a suspicious but usable description of a machine; the message says where."""
 
 
-def _pickled(value: Any) -> Any:
+def _picklable(value: Any) -> Any:
     """Return a value that can be pickled: the value itself, or its `repr`."""
     try:
         pickle.dumps(value)

@@ -38,10 +38,16 @@ class SolveError(DetailedError, RuntimeError):
             (:class:`ocp.motion.result.candidate.Candidate`).
     """
 
-    def __init__(self, message: str = "", solution: Any = None, conflicts: Sequence[Any] = (), **details: Any) -> None:
+    def __init__(
+        self,
+        message: str = "",
+        solution: Any = None,
+        conflicts: Sequence[Any] = (),
+        candidates: Sequence[Any] = (),
+        **details: Any,
+    ) -> None:
         super().__init__(message, **details)
-        self.solution, self.conflicts = solution, tuple(conflicts)
-        self.candidates: tuple[Any, ...] = ()
+        self.solution, self.conflicts, self.candidates = solution, tuple(conflicts), tuple(candidates)
 
 
 class Interrupted(KeyboardInterrupt):

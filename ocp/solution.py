@@ -253,7 +253,7 @@ class Solution:
         declared = {} if self.problem is None else self.problem.declared.phases
         if not declared:
             return {}
-        times = self._sampled(
+        times = self._sample(
             [part for phase in declared.values() for part in (phase.begin, phase.duration)], np.ones(1)
         )
         begins, lengths = (np.ravel(times[k::2]) for k in (0, 1))
@@ -280,9 +280,9 @@ class Solution:
         grid = np.union1d(self.state_interpolant.breaks, self.control_interpolant.breaks)
         places, weights = np.polynomial.legendre.leggauss(8)
         at = (grid[:-1, None] + np.diff(grid)[:, None] * (places + 1) / 2).ravel()
-        density = self._sampled([phase.running], at)[0].reshape(-1, len(places))
+        density = self._sample([phase.running], at)[0].reshape(-1, len(places))
         cost = float(density @ weights @ np.diff(grid)) / 2 + float(
-            self._sampled([phase.terminal], np.ones(1))[0].item()
+            self._sample([phase.terminal], np.ones(1))[0].item()
         )
         return replace(
             self,
@@ -301,7 +301,7 @@ class Solution:
             tightening_cost=0.0,
         )
 
-    def _sampled(self, expressions: list[Any], fractions: np.ndarray) -> list[np.ndarray]:
+    def _sample(self, expressions: list[Any], fractions: np.ndarray) -> list[np.ndarray]:
         """Return expressions of the declared symbols at fractions (M,) of the horizon. Shape (M, n) each."""
         form = Formulation.of(self.problem)
         plan = match_order(form, self)

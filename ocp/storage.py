@@ -232,15 +232,15 @@ FORMULA = re.compile(r"^[=+\-@\t\r%]")
 
 def column_name(name: str) -> str:
     """Encode a joint name for a table header; special characters become %XX of their UTF-8 bytes."""
-    return ESCAPED.sub(_quoted, name)
+    return ESCAPED.sub(_quote, name)
 
 
 def cell(value: Any) -> Any:
     """Return the text of a CSV cell; the first character of text that looks like a formula becomes %XX."""
-    return FORMULA.sub(_quoted, value) if isinstance(value, str) else value
+    return FORMULA.sub(_quote, value) if isinstance(value, str) else value
 
 
-def _quoted(match: re.Match[str]) -> str:
+def _quote(match: re.Match[str]) -> str:
     return "".join(f"%{byte:02X}" for byte in match[0].encode(errors="surrogatepass"))
 
 

@@ -310,9 +310,8 @@ class CollisionScene:
         indices, rounding = self._checked_request(pairs, rounding)
         groups = [self.cover_pairs.get(pair, (tuple(self.pairs[pair, :2].tolist()),)) for pair in indices]
         softness = rounding / 4 + MIN_SOFTNESS_M
-        return distance_gradients(
-            self.machine, self.bodies, self._carriers, self._moving, groups=groups, rounding=rounding, softness=softness
-        )
+        options: dict[str, Any] = {"groups": groups, "rounding": rounding, "softness": softness}
+        return distance_gradients(self.machine, self.bodies, self._carriers, self._obstacle_frames, **options)
 
     def _checked_request(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
         """Check the pairs and the rounding that a caller requests; return the indices of the pairs and the rounding."""
@@ -353,9 +352,9 @@ class CollisionScene:
     def _frames(self, base: Expression, q: Expression, time: Expression) -> list[Frame]:
         machine = self.machine
         frames = link_frames(machine.robot, q, machine.world_from_base(base))
-        return [*(frames[link] for link in self._carriers), *self._moving(time)]
+        return [*(frames[link] for link in self._carriers), *self._obstacle_frames(time)]
 
-    def _moving(self, time: Expression) -> list[Frame]:
+    def _obstacle_frames(self, time: Expression) -> list[Frame]:
         """Return the frames of the moving obstacles at a time."""
         return [obstacle.frame(time) for obstacle in self.obstacles if isinstance(obstacle, MovingObstacle)]
 

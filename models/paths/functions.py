@@ -182,7 +182,7 @@ def _predictor_corrector(degree: int, corrections: int) -> Any:
     state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
     start_rate = rate(u)
-    guess = _predicted(state, steps, start_rate)
+    guess = _predict(state, steps, start_rate)
     for _ in range(corrections):
         guess = u + 2 * step / (start_rate + rate(guess))
     return ca.Function("predictor_corrector", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
@@ -206,7 +206,7 @@ def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
 def _gauss_newton(degree: int, nodes: tuple[int, ...]) -> Any:
     state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
-    guess = _predicted(state, steps, rate(u))
+    guess = _predict(state, steps, rate(u))
     for number in nodes:
         width = guess - u
         mean = sum(float(w) * rate(u + float(x) * width) for x, w in zip(*gauss_rule(number), strict=True))
@@ -248,7 +248,7 @@ def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
     return state, coefficients, steps, lambda u: ca.norm_2(_horner(derivative, u))
 
 
-def _predicted(state: Any, steps: Any, rate: Any) -> Any:
+def _predict(state: Any, steps: Any, rate: Any) -> Any:
     return state[0] + (steps[0] + steps[1]) / rate  # eq. (15)
 
 

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from models.checks import Array, ArrayInput, frozen, require
+from models.checks import Array, ArrayInput, freeze, require
 from models.errors import ModelError
 from models.spatial import FULL_TURN
 
@@ -351,7 +351,7 @@ def unit_quaternion(value: ArrayInput, what: str) -> Array:
     if abs(norm - 1) > 1e-6:
         message = f"{what}: quaternion {quaternion.tolist()} has the norm {norm:g}; give a unit quaternion"
         raise ModelError(message, name=what, value=quaternion, limit=1.0)
-    return frozen(quaternion / norm)
+    return freeze(quaternion / norm)
 
 
 def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orientation") -> Array:

@@ -11,7 +11,7 @@ from typing import Literal, Self, TypeAlias, get_args
 import casadi as ca
 import numpy as np
 
-from models.checks import Array, ArrayInput, frozen, require, warn_of_degrees, warn_of_millimetres
+from models.checks import Array, ArrayInput, freeze, require, warn_of_degrees, warn_of_millimetres
 from models.errors import ModelError
 from models.spatial import rotation
 
@@ -138,7 +138,7 @@ class Link:
         object.__setattr__(self, "mass", mass)
         object.__setattr__(self, "center_of_mass", require.array(f"{owner}: center_of_mass", self.center_of_mass, (3,)))
         warn_of_millimetres(f"{owner}: center_of_mass", self.center_of_mass, self.name)
-        object.__setattr__(self, "inertia", frozen((inertia + inertia.T) / 2))
+        object.__setattr__(self, "inertia", freeze((inertia + inertia.T) / 2))
         object.__setattr__(self, "collisions", require.each(f"{owner}: collisions", self.collisions, CollisionShape))
         object.__setattr__(self, "visuals", require.each(f"{owner}: visuals", self.visuals, VisualShape))
 
@@ -220,7 +220,7 @@ class Joint:
         length = float(np.linalg.norm(axis))
         if not length > 0:
             raise ModelError(f"{owner}: axis {axis.tolist()} has no direction", name="axis", value=axis)
-        object.__setattr__(self, "axis", frozen(axis / length))
+        object.__setattr__(self, "axis", freeze(axis / length))
         object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
         object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
         for name in ("lower", "upper", "velocity", "effort"):

@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.checks import ROUNDING, Array, frozen
+from models.checks import ROUNDING, Array, freeze
 from models.errors import ModelError
 
 __all__ = ["gap_along", "is_box", "nearest_directions"]
@@ -99,7 +99,7 @@ def _convex_hull(points: Array) -> Hull:
     np.maximum.at(offsets, same, heights)
     normals = outwards[first]
     offsets = size * (offsets + 1e-12) + normals @ middle  # by more than qhull leaves points outside
-    return Hull(frozen(points[corners]), faces, frozen(normals), frozen(offsets))
+    return Hull(freeze(points[corners]), faces, freeze(normals), freeze(offsets))
 
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -143,7 +143,7 @@ def checked_pairs(
     count = require.count(f"{owner}: samples", samples)
     margin = require.nonnegative(f"{owner}: clearance", clearance, unit="m") + MARGIN_M
     rng = np.random.default_rng(require.count(f"{owner}: seed", seed, least=0, most=2**63))
-    named = dict.fromkeys([] if srdf is None else _disabled(robot, srdf), SRDF)
+    named = dict.fromkeys([] if srdf is None else _disabled_pairs(robot, srdf), SRDF)
     named |= dict.fromkeys(_ignored_pairs(robot, ignored), IGNORED)
 
     key = _key(robot, bodies, named, low, high, margin, count, seed)
@@ -207,7 +207,7 @@ def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
     return names
 
 
-def _disabled(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[str]]:
+def _disabled_pairs(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[str]]:
     """Return the pairs of <disable_collisions> whose links exist."""
     known = {link.name for link in robot.links}
     elements = parse_urdf(source).findall("disable_collisions")
@@ -313,7 +313,7 @@ class _PairClassifier:
             q = self.configurations[: SETTINGS.first_configurations]
             step = self.parts.step.get(part)
             origin = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
-            self._poses[part] = origin if step is None else _moved(self.robot, self._pose(step.above), step, q)
+            self._poses[part] = origin if step is None else _poses_behind(self.robot, self._pose(step.above), step, q)
         return self._poses[part]
 
 
@@ -403,9 +403,9 @@ class _BodyPair:
         """Return the poses of the second body's rigid part in the first body's."""
         first = second = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
         for step in self.up[::-1]:
-            first = _moved(self.robot, first, step, q)
+            first = _poses_behind(self.robot, first, step, q)
         for step in self.down:
-            second = _moved(self.robot, second, step, q)
+            second = _poses_behind(self.robot, second, step, q)
         return _relative_poses(first, second)
 
     def _proves_apart(self, low: Array, high: Array, margin: float) -> bool:
@@ -474,7 +474,7 @@ def _axis_rotations(axis: Array, angle: Array) -> Array:
     return np.asarray(np.eye(3) + sine * cross + rest * (cross @ cross))
 
 
-def _moved(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
+def _poses_behind(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
     """Return the poses of the part behind a joint from the poses of the part before it."""
     (turn, shift), (column, ratio, offset) = above, robot.couplings[step.joint.name]
     position = ratio * q[:, column] + offset

@@ -18,7 +18,7 @@ from typing import Any, Self, TypeAlias, cast
 import casadi as ca
 import numpy as np
 
-from models.checks import Array, ArrayInput, frozen, require
+from models.checks import Array, ArrayInput, freeze, require
 from models.errors import ModelError
 from models.shapes.hull import Hull, convex_hull
 from models.spatial import Expression, Frame, expand_tables, expression
@@ -55,8 +55,8 @@ class _Posed(_SweptCore):
         """Return the shape in another frame, given rotation (3, 3) and position (3,) of its present frame in it, m."""
         turn, shift = _motion(rotation, translation)
         own: Any = copy(self)  # shares the hull, which is costly to compute
-        object.__setattr__(own, "position", frozen(turn @ own.position + shift))
-        object.__setattr__(own, "rotation", frozen(turn @ own.rotation))
+        object.__setattr__(own, "position", freeze(turn @ own.position + shift))
+        object.__setattr__(own, "rotation", freeze(turn @ own.rotation))
         return cast(Self, own)
 
 
@@ -241,7 +241,7 @@ class HalfSpace(_SweptCore):
         length = float(np.linalg.norm(normal))
         if not 0 < length < np.inf:
             raise ModelError(f"half-space: normal {normal.tolist()} has no direction", name="normal", value=normal)
-        object.__setattr__(self, "normal", frozen(np.asarray(normal / length)))
+        object.__setattr__(self, "normal", freeze(np.asarray(normal / length)))
         object.__setattr__(self, "point", _place(self.point, "half-space", "point"))
 
     @property

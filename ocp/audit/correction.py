@@ -118,7 +118,7 @@ class _Newton:
         places = np.append(np.add.outer(np.arange(panels), POINTS[:-1]).ravel() / panels, 1.0)
         inner = plan_at(along.solution, places[1::2])
         self.x, self.u, self.t = (
-            _interleaved(part.reshape(n, cells + 1, size), between.reshape(n, cells, size))
+            _interleave(part.reshape(n, cells + 1, size), between.reshape(n, cells, size))
             for part, between, size in zip((grid.states, grid.controls, grid.t), inner, (nx, form.nu, 1), strict=True)
         )
         self.unit = np.append(along.sizes.state, along.sizes.cost)
@@ -180,7 +180,7 @@ class _Newton:
         for _ in range(SETTINGS.corrections):
             if integral is None or error is None:
                 break
-            change = error + self._propagated(error[:, -1], x) if chained else error
+            change = error + self._propagate(error[:, -1], x) if chained else error
             size = float(np.abs(change).reshape(-1, nx).max(axis=0) @ (1 / self.unit[:nx]))
             if not size < SETTINGS.contraction * last:
                 break
@@ -210,7 +210,7 @@ class _Newton:
         fed = np.einsum("kjab,kjb->kja", self.feed_at_samples, error)
         return np.asarray(defect + self._cumulative(_panels(fed), fed.shape))
 
-    def _propagated(self, ends: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def _propagate(self, ends: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Propagate errors at the interval ends (N, nx) of states x, and the jumps between intervals, onwards."""
         start = np.zeros(ends.shape)
         jumps = ends[:-1] + x[:-1, -1] - x[1:, 0]
@@ -226,7 +226,7 @@ def _panels(values: np.ndarray) -> np.ndarray:
     return windows[:, ::LENGTH].reshape(-1, LENGTH + 1)
 
 
-def _interleaved(ends: np.ndarray, inside: np.ndarray) -> np.ndarray:
+def _interleave(ends: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Interleave values at the ends of cells (N, cells + 1, n) with values inside them (N, cells, n)."""
     values = np.empty((len(ends), ends.shape[1] + inside.shape[1], ends.shape[2]))
     values[:, ::2], values[:, 1::2] = ends, inside

@@ -102,7 +102,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
     control_multipliers, across = find_control_multipliers(along, costate, curved)
     for _ in range(3):  # alternate between the multipliers of the controls and of the states
         before = control_multipliers != 0
-        back = Backwards(along, control_multipliers, across)
+        back = BackwardIntegration(along, control_multipliers, across)
         for k in limited.tolist():
             inside[k], atoms[k] = _forces(back, k, first[k], last[k], cost)
         costate, start = back.integrate(last, inside, atoms)
@@ -119,7 +119,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
     force = np.abs(np.einsum("kjm,kjmi->kji", inside, along.state_limits_x[..., :-1].reshape(n, q, m, -1))) @ size
     for e, nodes in ((0, slice(0, n)), (1, slice(1, n + 1))):
         force[:, 0] += np.abs(np.einsum("km,kmi->ki", atoms[:, e], along.node_limits_x[nodes, :, :-1])) @ size
-    propagated = back.chained(first - start)
+    propagated = back.accumulate(first - start)
     total = min(float(np.abs(first - start).sum(axis=0) @ size), float((np.abs(propagated) @ size).max()))
     return Adjoint(
         along.mesh * along.solution.horizon,
@@ -128,7 +128,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
         state_multipliers.reshape(n * q, m),
         np.abs(first - start) @ size,
         total,
-        np.maximum(_between(along, costate, last) - force.sum(axis=1), 0.0),
+        np.maximum(_inside_errors(along, costate, last) - force.sum(axis=1), 0.0),
         charge.sum(axis=(1, 2)) + atom_charges[0] + atom_charges[1],
         _node_shifts(along, control_multipliers, inside, atoms if shifts is None else None),
         _ends(along, costate, control_multipliers, inside, atoms, cost, last[-1]),
@@ -165,7 +165,7 @@ def interval_end_costates(along: Linearisation) -> tuple[np.ndarray, np.ndarray]
     return values[:-1], values[1:]
 
 
-class Backwards:
+class BackwardIntegration:
     """Backward integration of the costate equation over every interval, with the control multipliers as feedback."""
 
     def __init__(self, along: Linearisation, multipliers: np.ndarray, across: np.ndarray) -> None:
@@ -218,7 +218,7 @@ class Backwards:
         start = end + np.einsum("k,j,kja->ka", along.width, along.weight, flow) + force.sum(axis=1)
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
-    def chained(self, errors: np.ndarray) -> np.ndarray:
+    def accumulate(self, errors: np.ndarray) -> np.ndarray:
         """Accumulate the costate errors of the intervals (N, nx) backwards; return the sum at the start of each."""
         (n, q), nx = self.along.shape, self.along.form.nx
         points = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
@@ -232,7 +232,9 @@ class Backwards:
         return np.where(np.isfinite(total), total, np.inf)
 
 
-def _forces(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
+def _forces(
+    back: BackwardIntegration, k: int, first: np.ndarray, last: np.ndarray, cost: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return state limit multipliers of interval k that fit its costates: (q, m), and impulses (2, m) at its ends."""
     along = back.along
     q, nx, m = along.shape[1], along.form.nx, along.state_limits.lower.shape[1]
@@ -286,7 +288,7 @@ def _forces(back: Backwards, k: int, first: np.ndarray, last: np.ndarray, cost: 
     return inside, atoms
 
 
-def _between(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
+def _inside_errors(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Return the errors of the reported costates inside the intervals, in units of cost. Shape (N,)."""
     (n, q), nx = along.shape, along.form.nx
     fractions = along.solution.t / along.solution.horizon

@@ -140,17 +140,17 @@ def _sweep(
         weak: Whether active limits without multipliers are held too.
         tolerances: Which constraints count as dependent.
     """
-    reduced = _reduced(accessory, stages, weak, tolerances)
+    reduced = _reduce_stages(accessory, stages, weak, tolerances)
     if not accessory.linear_controls.any():
-        sweep = _swept(accessory, stages, reduced, tolerances, upwards=True)
+        sweep = _sweep_stages(accessory, stages, reduced, tolerances, upwards=True)
         if sweep is not None:
             return sweep
-    sweep = _swept(accessory, stages, reduced, tolerances, upwards=False)
+    sweep = _sweep_stages(accessory, stages, reduced, tolerances, upwards=False)
     assert sweep is not None
     return sweep
 
 
-def _swept(
+def _sweep_stages(
     accessory: AccessoryProblem, sweep: _Linearised, stages: list[_Stage], tolerances: RankTolerances, upwards: bool
 ) -> _Swept | None:
     """Sweep backwards over all stages. With ``upwards``, return None as soon as a stage is not convex.
@@ -171,7 +171,7 @@ def _swept(
         total = stage_cost + move.T @ (cost @ move)
         if len(rows):
             later_rows = unit_rows(rows @ move[:nz], tolerances.size)
-            ((_, (inner,), (passed_on,)),) = _eliminated(later_rows[None], m, tolerances)
+            ((_, (inner,), (passed_on,)),) = _eliminate_controls(later_rows[None], m, tolerances)
             total, lift = inner.T @ total @ inner, lift @ inner
             remaining = np.vstack([remaining, passed_on])
         rows = unit_rows(remaining, tolerances.size)[:, :nz] if len(remaining) else remaining[:, :nz]
@@ -193,7 +193,7 @@ def _swept(
                     reason = _singular(accessory, k, worst)
                     if reason:
                         return _Swept(least, time, reason, None)
-                    return _confirmed(least, time, _variation(accessory, sweep, k, worst, gains), scale)
+                    return _confirm_negative(least, time, _variation(accessory, sweep, k, worst, gains), scale)
                 curved = values > FLAT_SHARE * scale
                 if not curved.all() and not inconclusive:
                     label = _label(accessory.along.form, lift[m:, m:] @ vectors[:, 0], nu)
@@ -219,7 +219,8 @@ def _swept(
         if values[0] / scale < least:
             least, time = float(values[0] / scale), 0.0
         if values[0] < -FLAT_SHARE * scale:
-            return _confirmed(least, time, _variation(accessory, sweep, 0, None, gains, basis @ vectors[:, 0]), scale)
+            variation = _variation(accessory, sweep, 0, None, gains, basis @ vectors[:, 0])
+            return _confirm_negative(least, time, variation, scale)
         if values[0] <= FLAT_SHARE * scale:
             inconclusive = inconclusive or "the cost does not curve along a variation of the start"
         starts = basis @ vectors, np.where(values > FLAT_SHARE * scale, values, 0.0)
@@ -304,7 +305,9 @@ class _Stage(NamedTuple):
     rows: np.ndarray
 
 
-def _reduced(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolerances: RankTolerances) -> list[_Stage]:
+def _reduce_stages(
+    accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolerances: RankTolerances
+) -> list[_Stage]:
     """Reduce each stage by its own constraints; stages with the same active constraints are treated together."""
     n, q = accessory.along.shape
     nz, nu = accessory.nz, accessory.nu
@@ -325,14 +328,14 @@ def _reduced(accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolera
         rows.append(accessory.node_normals[members + 1][:, at_end] @ sweep.step[members, :nz])
         for i in np.flatnonzero(switches):  # a shifted switch is a single variation, of the mean
             rows.append(whole[:, 1:, nz + i] - whole[:, :1, nz + i])
-        for part, lifts, remaining in _eliminated(np.concatenate(rows, axis=1), nz + 1, tolerances):
+        for part, lifts, remaining in _eliminate_controls(np.concatenate(rows, axis=1), nz + 1, tolerances):
             k = members[part]
             cost = np.swapaxes(lifts, 1, 2) @ sweep.stage[k] @ lifts
             reduced |= zip(k.tolist(), map(_Stage, lifts, sweep.step[k] @ lifts, cost, remaining), strict=True)
     return [reduced[k] for k in range(n)]
 
 
-def _eliminated(
+def _eliminate_controls(
     rows: np.ndarray, nz: int, tolerances: RankTolerances
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Eliminate the controls that constraint rows (K, r, nz + m) determine, at K stages with m controls each.
@@ -437,7 +440,7 @@ def _variation(
     return _Variation(*unscaled, cost / length, max(violations) / size)
 
 
-def _confirmed(least: float, at: float | None, variation: _Variation, scale: float) -> _Swept:
+def _confirm_negative(least: float, at: float | None, variation: _Variation, scale: float) -> _Swept:
     """Return a negative curvature only if a variation lowers the cost and keeps the constraints.
 
     End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no

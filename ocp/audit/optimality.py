@@ -362,7 +362,7 @@ def optimality(
     """
     along = along or Linearisation(form, solution, p, bounds, sizes=sizes(form, solution, p, bounds))
     if not (along.finite and np.isfinite(solution.cost)):
-        return undefined(along, hamiltonian(form, solution, p))
+        return undefined_result(along, hamiltonian(form, solution, p))
     cost = abs(solution.cost) or along.slope_size or 1.0
     curved = _control_curvature(along)
     first = adjoint(along, curved, cost)
@@ -442,7 +442,7 @@ def _control_curvature(along: Linearisation) -> np.ndarray | None:
     return np.asarray(curved.reshape(-1, form.nu, form.nu))
 
 
-def undefined(along: Linearisation, values: Hamiltonian) -> Optimality:
+def undefined_result(along: Linearisation, values: Hamiltonian) -> Optimality:
     """Return the result for a plan on which the problem is not finite; all its checks fail."""
     (n, _), m, form = along.shape, len(along.s), along.form
     infinite, t = np.full(n, np.inf), along.mesh * along.solution.horizon

@@ -138,7 +138,7 @@ class Steps(NamedTuple):
         return cls(cell, (cell % each) / each, np.full(cells, 1.0 / each))
 
     @classmethod
-    def merged(cls, parts: list[Steps]) -> Steps:
+    def merge(cls, parts: list[Steps]) -> Steps:
         """Merge steps and put them in order."""
         cell, place, width = (np.concatenate(values) for values in zip(*parts, strict=True))
         order = np.lexsort((place, cell))
@@ -199,7 +199,7 @@ class Flow:
             number = np.arange(len(cell)) - np.repeat(np.cumsum(parts) - parts, parts)
             width = width / np.repeat(parts, parts)
             place = place + number * width
-        return values, Steps.merged([*accepted, Steps(cell, place, width)])
+        return values, Steps.merge([*accepted, Steps(cell, place, width)])
 
     def _run(
         self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray
@@ -305,11 +305,11 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
         else:
             starts = (form.x0, initial[0]), (form.u0, initial[1])
             g = form.sampled([rows.expression], x, u, t, horizon, p, *starts, cache_as=(kind, "from the start"))[0]
-        excess = excess_over(_integrated(form, kind, g, t), lower[rows.bounds], upper[rows.bounds])
+        excess = excess_over(_with_integrals(form, kind, g, t), lower[rows.bounds], upper[rows.bounds])
         limited = np.isfinite(rows.tolerance)
         if kind in sampled and limited.any():
             g_reported = form.sampled(outputs, motion.plan, *point[1:], cache_as="rows along a plan")[kind == "watch"]
-            g_reported = _integrated(form, kind, g_reported, t)
+            g_reported = _with_integrals(form, kind, g_reported, t)
             reported_excess = excess_over(g_reported, lower[rows.bounds], upper[rows.bounds])
             excess = np.where(limited, np.maximum(excess, reported_excess), excess)
         size = np.tile(size, (len(t), 1))
@@ -328,7 +328,7 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
     return results
 
 
-def _integrated(form: Formulation, kind: str, g: np.ndarray, t: np.ndarray) -> np.ndarray:
+def _with_integrals(form: Formulation, kind: str, g: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Return row values (K, m), with the rows that are watched as integrals replaced by their time integrals."""
     return np.where(form.watch_integral, integral(g, t), g) if kind == "watch" else g
 

@@ -146,9 +146,9 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndar
     integral_of_cost = float(np.sum(np.diff(grid.t) * (absolute[:-1] + absolute[1:]) / 2))
     by_variables = [
         _change_by_variables(form, kind, grid, at, horizon, p, entries)[0][0]
-        for kind, at in zip(COSTS, (spaced(grid), spaced(grid)[-1:]), strict=True)
+        for kind, at in zip(COSTS, (evenly_spaced(grid), evenly_spaced(grid)[-1:]), strict=True)
     ]
-    watch = _watched(
+    watch = _watched_row_sizes(
         form,
         _rows_of(form, "watch", grid, horizon, p, bounds, _alike(form, entries)),
         horizon,
@@ -158,7 +158,7 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndar
     return Sizes(state, control, path, start, end, watch, max(integral_of_cost, floor))
 
 
-def spaced(grid: FineGrid) -> np.ndarray:
+def evenly_spaced(grid: FineGrid) -> np.ndarray:
     """Return the indices of evenly spaced samples of a grid, including the first and the last."""
     last = len(grid.t) - 1
     return np.linspace(0, last, min(N_SAMPLES, last + 1)).astype(int)
@@ -198,7 +198,9 @@ def _sizes_of(
     nonzero = np.zeros(spread.shape, dtype=bool)
     for end in ends:
         nonzero |= np.abs(np.nan_to_num(end)) > STANDSTILL
-    return _floored(np.maximum(spread, SOLVER_SHARE * largest), nonzero, np.minimum(1.0, nearest_bound(declared)))
+    return _raise_to_floor(
+        np.maximum(spread, SOLVER_SHARE * largest), nonzero, np.minimum(1.0, nearest_bound(declared))
+    )
 
 
 def nearest_bound(declared: Bounds) -> np.ndarray:
@@ -207,7 +209,7 @@ def nearest_bound(declared: Bounds) -> np.ndarray:
     return np.asarray(np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0, initial=np.inf))
 
 
-def _floored(
+def _raise_to_floor(
     size: np.ndarray, nonzero: np.ndarray, least: np.ndarray, still: Any = STANDSTILL
 ) -> tuple[np.ndarray, np.ndarray]:
     """Raise the sizes of entries that stay at zero to a floor; also return flags of those that do not."""
@@ -243,7 +245,7 @@ def _rows_of(
     rows: Rows = getattr(form, kind)
     if len(rows) == 0:
         return np.zeros(0)
-    chosen = spaced(grid)
+    chosen = evenly_spaced(grid)
     samples = chosen[:1] if kind == "start" else chosen[-1:] if kind == "end" else chosen
     change, moves, spread, largest = _change_by_variables(form, kind, grid, samples, horizon, p, entries)
     if values is not None:
@@ -254,7 +256,9 @@ def _rows_of(
     threshold, is_constant = np.where(moves, 0.0, STANDSTILL), ~moves & (largest > STANDSTILL)
     for name in rows.names:
         own_rows = rows.of(name)
-        size[own_rows] = _floored(size[own_rows], is_constant[own_rows], nearest[own_rows], threshold[own_rows])[0]
+        size[own_rows] = _raise_to_floor(size[own_rows], is_constant[own_rows], nearest[own_rows], threshold[own_rows])[
+            0
+        ]
     return np.asarray(size)
 
 
@@ -270,7 +274,9 @@ def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[n
     return size, np.ones_like(entries[1])
 
 
-def _watched(form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray) -> np.ndarray:
+def _watched_row_sizes(
+    form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray
+) -> np.ndarray:
     """Return the sizes of watched rows: the longest path of rows of one name, or their change with the variables.
 
     Args:

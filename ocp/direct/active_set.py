@@ -61,8 +61,8 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     a, b, c = scales.variables, scales.rows, scales.cost
     slope, jacobian = program.numbers.first(v, p)
-    slope, jacobian = slope * a / c, scaled(jacobian, 1 / b, a)
-    half = scaled(program.numbers.second(v, p, 1.0, lam), a / c, a)
+    slope, jacobian = slope * a / c, scale_matrix(jacobian, 1 / b, a)
+    half = scale_matrix(program.numbers.second(v, p, 1.0, lam), a / c, a)
     hessian = half + scipy.sparse.triu(half, 1).T
     of_rows = lam * b / c
     of_bounds = -(slope + jacobian.T @ of_rows)
@@ -134,7 +134,7 @@ def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, multiplier
     return np.asarray((lower == upper) | below | above)
 
 
-def scaled(matrix: scipy.sparse.csc_array, rows: np.ndarray, columns: np.ndarray) -> scipy.sparse.csc_array:
+def scale_matrix(matrix: scipy.sparse.csc_array, rows: np.ndarray, columns: np.ndarray) -> scipy.sparse.csc_array:
     """Return a matrix with its rows and columns multiplied by factors."""
     factors = rows[matrix.indices] * np.repeat(columns, np.diff(matrix.indptr))
     return scipy.sparse.csc_array((matrix.data * factors, matrix.indices, matrix.indptr), shape=matrix.shape)

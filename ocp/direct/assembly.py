@@ -348,19 +348,19 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
         for block, function in zip(blocks, functions, strict=True)
     ]
 
-    outputs = [mapped(function.value, block, call) for block, function, call in calls]
+    outputs = [evaluate_block(function.value, block, call) for block, function, call in calls]
     f = sum((ca.sum2(out[0]) for out in outputs), ca.MX(0))
     nonlinear = scatter([block.rows.ravel(order="F") for block in blocks], [ca.densify(out[1]) for out in outputs], m)
     g = nonlinear + ca.mtimes(sparse(*transcription.linear, (m, n)), x)
 
-    parts = [mapped(function.gradient, block, call)[0] for block, function, call in calls]
+    parts = [evaluate_block(function.gradient, block, call)[0] for block, function, call in calls]
     entries = [places_of(function.gradient.sparsity_out(0)) for _, function, _ in calls]
     places = [block.variables[column].ravel(order="F") for block, (_, column) in zip(blocks, entries, strict=True)]
     gradient = scatter(places, parts, n)
     inner = [i for i, block in enumerate(blocks) if not block.ends]
     inside = scatter([places[i] for i in inner], [parts[i] for i in inner], n)
 
-    parts = [mapped(function.jacobian, block, call)[0] for block, function, call in calls]
+    parts = [evaluate_block(function.jacobian, block, call)[0] for block, function, call in calls]
     entries = [places_of(function.jacobian.sparsity_out(0)) for _, function, _ in calls]
     entries = [
         (block.rows[row].ravel(order="F"), block.variables[column].ravel(order="F"))
@@ -371,14 +371,16 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
     parts = []
     for block, function, call in calls:
         weights = ca.repmat(sigma, 1, block.variables.shape[1]), gather(lam, block.rows)
-        parts += mapped(function.hessian, block, [*call, *weights])
+        parts += evaluate_block(function.hessian, block, [*call, *weights])
     no_constants = (np.zeros(0, int), np.zeros(0, int), np.zeros(0))
     upper = [hessian_at(function.hessian.sparsity_out(0), block) for block, function, _ in calls]
     hess = _scatter_matrix([at for at, _ in upper], parts, no_constants, (n, n), [factors for _, factors in upper])
 
     slope = ca.MX.zeros(parameters)
     if parameters:
-        slope += sum(ca.sum2(mapped(function.slope, b, [*call, gather(lam, b.rows)])[0]) for b, function, call in calls)
+        slope += sum(
+            ca.sum2(evaluate_block(function.slope, b, [*call, gather(lam, b.rows)])[0]) for b, function, call in calls
+        )
     return Program(
         nlp={"x": x, "p": p, "f": f, "g": g},
         gradient=ca.Function("nlp_grad_f", [x, p], [f, gradient], ["x", "p"], ["f", "grad_f_x"]),
@@ -442,7 +444,7 @@ def gather(vector: Any, index: np.ndarray) -> Any:
     return ca.reshape(vector[index.ravel(order="F").tolist()], *index.shape)
 
 
-def mapped(function: Any, block: Block, arguments: list[Any]) -> Any:
+def evaluate_block(function: Any, block: Block, arguments: list[Any]) -> Any:
     """Evaluate a block function for every column of arguments; all share the parameters (argument 2)."""
     check_time()
     count = block.variables.shape[1]

@@ -319,17 +319,17 @@ def problem_header(form: Formulation, transcription: Transcription) -> str:
         "CONTROL_PIECES": len(curves.mesh) - 1,
         "CONTROL_NODES": len(curves.control_nodes),
     }
-    lines = [f"/* {quoted(form.name).replace('*/', '* /')} */"]
+    lines = [f"/* {c_string(form.name).replace('*/', '* /')} */"]
     lines += [f"#define PLAN_{name} {size}" for name, size in sizes.items()]
     tables = {"breaks": curves.breaks, "nodes": curves.nodes, "mesh": curves.mesh, "samples": curves.control_nodes}
     for name, values in tables.items():
         lines.append(f"static const double plan_{name}[] = {{{', '.join(f'{value:.17g}' for value in values)}}};")
     for name, words in (("parameters", form.parameter_labels), ("columns", [*form.state_labels, *form.control_labels])):
-        lines.append(f"static const char *const plan_{name}[] = {{{', '.join([*map(quoted, words), '0'])}}};")
+        lines.append(f"static const char *const plan_{name}[] = {{{', '.join([*map(c_string, words), '0'])}}};")
     return "\n".join([*lines, ""])
 
 
-def quoted(text: str) -> str:
+def c_string(text: str) -> str:
     """Return a text as a C string literal, with the UTF-8 bytes of non-ASCII characters escaped."""
     plain = "".join(
         chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}" for byte in text.encode()
@@ -481,11 +481,11 @@ def block_derivatives(transcription: Transcription, compiled: bool) -> list[Deri
         if text not in by_text:
             is_short = block.function.is_a("SXFunction") and block.function.n_instructions() <= SIZES.called
             is_compiled = compiled and text.startswith(SERIALISED) and not is_short
-            by_text[text] = _compiled(block.function, text) if is_compiled else derivatives(block.function)
+            by_text[text] = _compile_derivatives(block.function, text) if is_compiled else derivatives(block.function)
     return [by_text[text] for text in texts]
 
 
-def _compiled(function: Any, text: str) -> Derivatives:
+def _compile_derivatives(function: Any, text: str) -> Derivatives:
     """Return the derivatives of a function from a compiled library, or interpreted if compilation fails."""
     try:
         path = build_library(

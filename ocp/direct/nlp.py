@@ -208,7 +208,7 @@ def call_solver(solver: Any, progress: IterationMonitor | FatropMonitor, argumen
     except RuntimeError as error:
         text = str(error).lower()
         if progress.stopped or name == "sleqp":  # SLEQP's interface raises wherever it fails
-            return stopped(solver, progress, arguments, began)
+            return interrupted_iterate(solver, progress, arguments, began)
         if "option not supported" in text or "type mismatch" in text:  # fatrop checks its options only now
             raise ProblemError(f"fatrop does not take this option: {last_line(error)}", name="options") from error
         raise
@@ -231,10 +231,10 @@ def call_solver(solver: Any, progress: IterationMonitor | FatropMonitor, argumen
     cost, message = float(values["f"][0]), word if status is SolverStatus.FAILED else status.message
     log_line(f"solved {progress.title!r}: {status}, cost {cost:.6g}, {iterations} iterations, {seconds:.3g} s")
     result_values = values["x"], cost, values["g"], values["lam_g"]
-    return Outcome(*result_values, status, message, iterations, seconds, regularised(stats), name)
+    return Outcome(*result_values, status, message, iterations, seconds, has_regularised_hessian(stats), name)
 
 
-def stopped(
+def interrupted_iterate(
     solver: Any, progress: IterationMonitor | FatropMonitor, arguments: dict[str, np.ndarray], began: float
 ) -> Outcome:
     """Return the last iterate of a solver that was stopped or failed; its multipliers are unknown."""
@@ -253,7 +253,7 @@ def log_line(words: str) -> None:
         LOG.info(words)
 
 
-def regularised(stats: dict[str, Any]) -> bool:
+def has_regularised_hessian(stats: dict[str, Any]) -> bool:
     """Return whether ipopt modified the Hessian in its last step or made no step; unknown for fatrop."""
     sizes = stats.get("iterations", {}).get("regularization_size", ())
     return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)

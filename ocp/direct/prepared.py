@@ -32,7 +32,7 @@ from ocp.direct.nlp import (
 )
 from ocp.direct.scaling import (
     Pattern,
-    Predetermined,
+    PredeterminedVariables,
     Scales,
     compute_scales,
     scaled_program,
@@ -111,7 +111,7 @@ class Prepared:
         self._solver, self._progress = self._built_solver(own)
         check_time()
         self._pattern = Pattern(self.formulation, self.transcription, self.program)
-        self._known = Predetermined(self.formulation, self.transcription, self.program)
+        self._known = PredeterminedVariables(self.formulation, self.transcription, self.program)
         self._max_iterations = iteration_limit(self.solver_name, own)
         self._arguments, self._compiled = (problem, method, solver, options), compiled
         self._lock = threading.RLock()  # casadi functions are not reentrant

@@ -31,7 +31,7 @@ from ocp.problem.formulation import Bounds, Formulation
 __all__ = [
     "SCALING",
     "Pattern",
-    "Predetermined",
+    "PredeterminedVariables",
     "Scales",
     "compute_scales",
     "scaled_program",
@@ -312,7 +312,7 @@ def _evaluate(function: Callable[..., Any], point: np.ndarray, p: np.ndarray) ->
         return None
 
 
-class Predetermined:
+class PredeterminedVariables:
     """Variables of a program that the start alone determines, and the limits on them.
 
     Variables that are joined to a fixed variable, as the end of the last interval is to a fixed end, are known too.

@@ -384,7 +384,7 @@ class MeshedMethod(ABC):
         """Return the method on another mesh (N + 1,)."""
         return dataclasses.replace(self, intervals=len(mesh) - 1, mesh=tuple(mesh.tolist()))  # type: ignore[type-var]
 
-    def halved(self) -> Self:
+    def halve(self) -> Self:
         """Return the method with every interval halved."""
         if self.mesh is None:
             return dataclasses.replace(self, intervals=2 * self.intervals)  # type: ignore[type-var]

@@ -194,7 +194,7 @@ def read_unknowns(
     horizon = seed.horizon if form.horizon_is_free else float(form.horizon_at(p))
     times = arcs.times(horizon)
     fractions = times / horizon
-    x, lam, _ = sampled(form, seed, fractions)
+    x, lam, _ = sample_seed(form, seed, fractions)
     places = form.bounds.places
     ends = []
     for end in ("initial", "terminal"):
@@ -209,7 +209,7 @@ def read_unknowns(
     return np.concatenate([np.hstack([x, lam]).ravel(), arcs.switches * horizon, free, multipliers]), data
 
 
-def sampled(form: Formulation, seed: Solution, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sample_seed(form: Formulation, seed: Solution, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return states (K, nx), costates (K, nx) and controls (K, nu) of a seed at fractions of its horizon."""
     sample = seed.at_fraction(fractions)
     reported = np.hstack([seed.costates[name] for name in form.states])
@@ -226,7 +226,7 @@ def control_guess(
     With bounds, the control equations cannot be solved from distant multipliers: all controls would be at bounds.
     """
     form, count = ham.form, len(fractions)
-    x, lam, control = sampled(form, seed, fractions)
+    x, lam, control = sample_seed(form, seed, fractions)
     mu = np.zeros((count, len(form.path)))
     if len(form.path):
         low, high = (bound[form.bounds.places["control"]] for bound in bounds)

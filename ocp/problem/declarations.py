@@ -20,7 +20,7 @@ from ocp.problem.values import (
     identity,
     is_symbolic,
     numeric,
-    stacked,
+    stack_column,
 )
 
 __all__ = [
@@ -344,7 +344,7 @@ class ExpressionReader:
         if value is None or isinstance(value, str):
             raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
         if is_symbolic(value):
-            expression = stacked(what, value)
+            expression = stack_column(what, value)
             if not isinstance(expression, self.symbols):
                 own, expected = type(expression).__name__, self.symbols.__name__
                 raise ProblemError(f"{what} is made of {own} symbols, the problem of {expected} symbols")
@@ -440,7 +440,7 @@ def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> 
     if size is not None:
         return require.count(f"{what}: size", size)
     labelled = {f"{what}: {k}": v for k, v in values.items() if v is not None and not callable(v)}
-    lengths = {k: stacked(k, v).numel() if is_symbolic(v) else numeric(k, v).size for k, v in labelled.items()}
+    lengths = {k: stack_column(k, v).numel() if is_symbolic(v) else numeric(k, v).size for k, v in labelled.items()}
     for label, n in lengths.items():
         if n == 0:
             raise ProblemError(f"{label} is empty")

@@ -27,7 +27,7 @@ import numpy as np
 
 from ocp.errors import ProblemError
 from ocp.problem.hulls import WORLD, CoveredPairs, Separation
-from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided, evaluate, multiple_of
+from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided_masks, evaluate, multiple_of
 from ocp.problem.values import identity
 
 __all__ = ["Enclosure", "Enclosures", "PrescribedMotion"]
@@ -172,7 +172,7 @@ def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
 
 
 def _if_else_zero(code: int, test: _Jet, x: _Jet) -> _Jet:
-    holds, fails = decided(test.value)
+    holds, fails = decided_masks(test.value)
     slope = Interval(np.where(holds, x.slope.low, 0.0), np.where(holds, x.slope.high, 0.0))
     return _Jet(RULES[code](test.value, x.value), _where(holds | fails, slope))
 

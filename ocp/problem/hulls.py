@@ -113,7 +113,7 @@ class HullPairs:
         self.has[members] = True
         self.row = np.cumsum(self.has) - 1
         self._cores = [
-            np.array([_padded(pair[side].core, kind or 8) for pair in chosen]) for side, kind in enumerate(kinds)
+            np.array([_pad_points(pair[side].core, kind or 8) for pair in chosen]) for side, kind in enumerate(kinds)
         ]
         self._boxes = kinds[0] == 0, kinds[1] == 0
         self._frames = [np.array([pair[side].frame for pair in chosen]) for side in (0, 1)]
@@ -343,7 +343,7 @@ def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
     return [HullPairs(hulls, pairs, members, kind) for kind, members in kinds.items()]
 
 
-def _padded(core: np.ndarray, count: int) -> np.ndarray:
+def _pad_points(core: np.ndarray, count: int) -> np.ndarray:
     """Repeat the last point until there are `count` points."""
     return np.concatenate([core, np.repeat(core[-1:], count - len(core), axis=0)])
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ocp.errors import ProblemError
 
-__all__ = ["NAMES", "RULES", "Interval", "check_instructions", "constant", "decided", "evaluate", "multiple_of"]
+__all__ = ["NAMES", "RULES", "Interval", "check_instructions", "constant", "decided_masks", "evaluate", "multiple_of"]
 
 Array: TypeAlias = np.ndarray
 
@@ -116,13 +116,13 @@ def _opposite(first: Interval, second: Interval) -> bool:
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
     """Return the range of if_else: that of `yes` where the test holds, of `no` where it fails, else of both."""
-    holds, fails = decided(test)
+    holds, fails = decided_masks(test)
     low = np.where(holds, yes.low, np.where(fails, no.low, np.minimum(yes.low, no.low)))
     high = np.where(holds, yes.high, np.where(fails, no.high, np.maximum(yes.high, no.high)))
     return Interval(low, high)
 
 
-def decided(test: Interval) -> tuple[Any, Any]:
+def decided_masks(test: Interval) -> tuple[Any, Any]:
     """Return masks of the intervals in which a test always holds, and in which it always fails. Shape (M,) each."""
     return (test.low > 0) | (test.high < 0), (test.low == 0) & (test.high == 0)
 
@@ -167,15 +167,15 @@ def _power(x: Interval, y: Interval) -> Interval:
             return _inverse(_power(x, constant(-exponent, x.low)))
         if exponent % 2 == 0:
             base = _absolute(x)
-            return _clamped(_out(base.low**exponent, base.high**exponent), low=0.0)
+            return _clamp(_out(base.low**exponent, base.high**exponent), low=0.0)
         return _out(x.low**exponent, x.high**exponent)
-    base = _clamped(x, low=0.0)
+    base = _clamp(x, low=0.0)
     powers = _range_of([a**b for a, b in product((base.low, base.high), (y.low, y.high))])
     unknown = (x.high < 0) | ((x.low < 0) & ~fixed)  # y may contain an integer exponent
     return Interval(np.where(unknown, -np.inf, powers.low), np.where(unknown, np.inf, powers.high))
 
 
-def _clamped(x: Interval, low: float = -np.inf, high: float = np.inf) -> Interval:
+def _clamp(x: Interval, low: float = -np.inf, high: float = np.inf) -> Interval:
     return Interval(np.clip(x.low, low, high), np.clip(x.high, low, high))
 
 
@@ -183,11 +183,13 @@ def _absolute(x: Interval) -> Interval:
     return Interval(np.maximum(0.0, np.maximum(x.low, -x.high)), np.maximum(np.abs(x.low), np.abs(x.high)))
 
 
-def _rising(function: Callable[[Any], Any], low: float = -np.inf, high: float = np.inf) -> Callable[..., Interval]:
+def _increasing_rule(
+    function: Callable[[Any], Any], low: float = -np.inf, high: float = np.inf
+) -> Callable[..., Interval]:
     """Return the interval rule of an increasing function whose domain is low to high."""
 
     def rule(x: Interval) -> Interval:
-        inside = _clamped(x, low, high)
+        inside = _clamp(x, low, high)
         result = _out(function(inside.low), function(inside.high))
         undefined = (x.high < low) | (x.low > high)
         return Interval(np.where(undefined, -np.inf, result.low), np.where(undefined, np.inf, result.high))
@@ -195,9 +197,9 @@ def _rising(function: Callable[[Any], Any], low: float = -np.inf, high: float = 
     return rule
 
 
-def _falling(function: Callable[[Any], Any], low: float, high: float) -> Callable[..., Interval]:
+def _decreasing_rule(function: Callable[[Any], Any], low: float, high: float) -> Callable[..., Interval]:
     """Return the interval rule of a decreasing function whose domain is low to high."""
-    rising = _rising(lambda x: -function(x), low, high)
+    rising = _increasing_rule(lambda x: -function(x), low, high)
 
     return lambda x: _negative(rising(x))
 
@@ -243,7 +245,7 @@ def _angle(y: Interval, x: Interval) -> Interval:
 
 def _hypot(x: Interval, y: Interval) -> Interval:
     first, second = _absolute(x), _absolute(y)
-    return _clamped(_out(np.hypot(first.low, second.low), np.hypot(first.high, second.high)), low=0.0)
+    return _clamp(_out(np.hypot(first.low, second.low), np.hypot(first.high, second.high)), low=0.0)
 
 
 def _copysign(x: Interval, y: Interval) -> Interval:
@@ -296,17 +298,17 @@ def _equal(x: Interval, y: Interval) -> Interval:
 
 
 def _not(x: Interval) -> Interval:
-    holds, fails = decided(x)
+    holds, fails = decided_masks(x)
     return Interval(np.where(fails, 1.0, 0.0), np.where(holds, 0.0, 1.0), negates=x)
 
 
 def _and(x: Interval, y: Interval) -> Interval:
-    (first, first_fails), (second, second_fails) = decided(x), decided(y)
+    (first, first_fails), (second, second_fails) = decided_masks(x), decided_masks(y)
     return Interval(np.where(first & second, 1.0, 0.0), np.where(first_fails | second_fails, 0.0, 1.0))
 
 
 def _or(x: Interval, y: Interval) -> Interval:
-    (first, first_fails), (second, second_fails) = decided(x), decided(y)
+    (first, first_fails), (second, second_fails) = decided_masks(x), decided_masks(y)
     return Interval(np.where(first | second, 1.0, 0.0), np.where(first_fails & second_fails, 0.0, 1.0))
 
 
@@ -325,26 +327,26 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "INV": _inverse,
     "TWICE": lambda x: _out(2 * x.low, 2 * x.high),
     "SQ": _square,
-    "SQRT": _rising(np.sqrt, low=0.0),
+    "SQRT": _increasing_rule(np.sqrt, low=0.0),
     "POW": _power,
     "CONSTPOW": _power,
-    "EXP": _rising(np.exp),
-    "EXPM1": _rising(np.expm1),
-    "LOG": _rising(np.log, low=0.0),
-    "LOG1P": _rising(np.log1p, low=-1.0),
+    "EXP": _increasing_rule(np.exp),
+    "EXPM1": _increasing_rule(np.expm1),
+    "LOG": _increasing_rule(np.log, low=0.0),
+    "LOG1P": _increasing_rule(np.log1p, low=-1.0),
     "SIN": _sinusoid_rule(np.sin, tau / 4),
     "COS": _sinusoid_rule(np.cos, 0.0),
     "TAN": _tangent,
-    "ASIN": _rising(np.arcsin, -1.0, 1.0),
-    "ACOS": _falling(np.arccos, -1.0, 1.0),
-    "ATAN": _rising(np.arctan),
+    "ASIN": _increasing_rule(np.arcsin, -1.0, 1.0),
+    "ACOS": _decreasing_rule(np.arccos, -1.0, 1.0),
+    "ATAN": _increasing_rule(np.arctan),
     "ATAN2": _angle,
-    "SINH": _rising(np.sinh),
-    "COSH": lambda x: _rising(np.cosh)(_absolute(x)),
-    "TANH": _rising(np.tanh),
-    "ASINH": _rising(np.arcsinh),
-    "ACOSH": _rising(np.arccosh, low=1.0),
-    "ATANH": _rising(np.arctanh, -1.0, 1.0),
+    "SINH": _increasing_rule(np.sinh),
+    "COSH": lambda x: _increasing_rule(np.cosh)(_absolute(x)),
+    "TANH": _increasing_rule(np.tanh),
+    "ASINH": _increasing_rule(np.arcsinh),
+    "ACOSH": _increasing_rule(np.arccosh, low=1.0),
+    "ATANH": _increasing_rule(np.arctanh, -1.0, 1.0),
     "HYPOT": _hypot,
     "FABS": _absolute,
     "FMIN": lambda x, y: Interval(np.minimum(x.low, y.low), np.minimum(x.high, y.high)),

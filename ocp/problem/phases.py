@@ -206,31 +206,31 @@ class _PhaseInserter:
             if length is None:
                 words = f"phase {self.name!r}: signal {signal.name!r} needs a horizon that is a number"
                 raise ProblemError(words, name=signal.name)
-            track = _stretched(signal.function, length)
-            self._replace(signal.symbol, whole.signal(self._prefixed(signal.name), track))
+            track = _of_fraction(signal.function, length)
+            self._replace(signal.symbol, whole.signal(self._prefix(signal.name), track))
         for name, symbol in declared.at_start.items():
-            self._replace(symbol, whole.at_start(self._prefixed(name)))
+            self._replace(symbol, whole.at_start(self._prefix(name)))
         for name, rate in declared.dynamics.items():
-            whole.declared.dynamics[self._prefixed(name)] = duration * self._substituted(rate)
+            whole.declared.dynamics[self._prefix(name)] = duration * self._substitute(rate)
         for kind in ("path", "start", "end", "watch"):
             pool = getattr(whole.declared, kind)
             for name, constraint in getattr(declared, kind).items():
-                pool[self._prefixed(name)] = self._constraint(constraint, duration)
+                pool[self._prefix(name)] = self._constraint(constraint, duration)
         for name, separation in declared.apart.items():
-            whole.declared.apart[self._prefixed(name)] = self._separation(separation, length)
+            whole.declared.apart[self._prefix(name)] = self._separation(separation, length)
         costs = (0 if cost is None else cost for cost in (declared.running, declared.terminal))
-        running, terminal = (self._substituted(self.problem.symbols(cost)) for cost in costs)
+        running, terminal = (self._substitute(self.problem.symbols(cost)) for cost in costs)
         terminal = ca.substitute([terminal], [whole.time], [whole.symbols(1.0)])[0]
         return PhaseTimes(self.name, begin, duration, duration * running, terminal)
 
-    def _prefixed(self, name: str) -> str:
+    def _prefix(self, name: str) -> str:
         return f"{self.name}.{name}"
 
     def _replace(self, old: Any, new: Any) -> None:
         self.old.append(old)
         self.new.append(new)
 
-    def _substituted(self, expression: Any) -> Any:
+    def _substitute(self, expression: Any) -> Any:
         """Return an expression of the phase in the symbols of the whole problem."""
         used = {identity(symbol) for symbol in ca.symvar(expression)}
         pairs = [
@@ -248,7 +248,7 @@ class _PhaseInserter:
         entries = ca.vertsplit(values)
         numbers = [not ca.symvar(entry) for entry in entries]
         placed = [
-            self.whole.symbols(ca.DM(constant(entry)[0])) if is_number else self._substituted(entry)
+            self.whole.symbols(ca.DM(constant(entry)[0])) if is_number else self._substitute(entry)
             for entry, is_number in zip(entries, numbers, strict=True)
         ]
         return ca.vertcat(*placed)
@@ -277,7 +277,7 @@ class _PhaseInserter:
             low, high = (float(constant(bound)[0]) for bound in bounds.values())
             within = np.clip(1.0, low, high) if np.isinf(high) else 0.5 * (low + high)
             self.guess_duration = None if np.isnan(within) else float(within)
-        name = self._prefixed(DURATION)
+        name = self._prefix(DURATION)
         duration = self.whole.free_parameter(name, 1, **bounds, guess=self.guess_duration, unit="s")
         self._replace(horizon.symbol, duration)
         return duration, None
@@ -288,24 +288,19 @@ class _PhaseInserter:
             values |= {"initial": self._column(variable.initial), "terminal": self._column(variable.terminal)}
         guess = variable.guess
         if callable(guess):
-            guess = None if self.guess_duration is None else _stretched(guess, self.guess_duration)
+            guess = None if self.guess_duration is None else _of_fraction(guess, self.guess_duration)
         declare = self.whole.state if kind == "state" else self.whole.control
         return declare(
-            self._prefixed(variable.name),
-            variable.size,
-            **values,
-            guess=guess,
-            unit=variable.unit,
-            scale=variable.scale,
+            self._prefix(variable.name), variable.size, **values, guess=guess, unit=variable.unit, scale=variable.scale
         )
 
     def _constraint(self, constraint: Constraint, duration: Any) -> Constraint:
         parts = {part: self._column(getattr(constraint, part)) for part in ("lower", "upper")}
-        parts["expression"] = self._substituted(constraint.expression)
-        way = None if constraint.way is None else duration * self._substituted(constraint.way)
+        parts["expression"] = self._substitute(constraint.expression)
+        way = None if constraint.way is None else duration * self._substitute(constraint.way)
         if constraint.integral:
             parts["expression"] = duration * parts["expression"]
-        return replace(constraint, name=self._prefixed(constraint.name), way=way, **parts)
+        return replace(constraint, name=self._prefix(constraint.name), way=way, **parts)
 
     def _separation(self, separation: Separation, length: float | None) -> Separation:
         if length is None and ca.depends_on(separation.placements, self.problem.time):
@@ -315,9 +310,9 @@ class _PhaseInserter:
             raise ProblemError(words, name=separation.name)
         return replace(
             separation,
-            name=self._prefixed(separation.name),
-            placements=self._substituted(separation.placements),
-            movers={self._prefixed(name): size for name, size in separation.movers.items()},
+            name=self._prefix(separation.name),
+            placements=self._substitute(separation.placements),
+            movers={self._prefix(name): size for name, size in separation.movers.items()},
         )
 
 
@@ -333,6 +328,6 @@ def _by_name(what: str, value: Any) -> Mapping[str, Any]:
     return value
 
 
-def _stretched(function: Callable[[Any], Any], length: float) -> Callable[[Any], Any]:
+def _of_fraction(function: Callable[[Any], Any], length: float) -> Callable[[Any], Any]:
     """Convert a function of a phase's time to a function of its time fraction."""
     return lambda fraction: function(fraction * length)

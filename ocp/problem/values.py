@@ -19,7 +19,7 @@ def is_symbolic(value: Any) -> bool:
     return isinstance(value, ca.SX | ca.MX)
 
 
-def stacked(what: str, value: Any) -> Any:
+def stack_column(what: str, value: Any) -> Any:
     """Return an expression, or a list or tuple of expressions, as one column."""
     try:
         return ca.densify(ca.vec(ca.vertcat(*value) if isinstance(value, list | tuple) else value))

@@ -20,7 +20,7 @@ from models import FreeFloating, Link, Robot, VisualShape, with_wheels
 from models.checks import Array
 from ocp import Audit, Capture, Cone, Cost, DynamicsSetup, FreeTime, Grasp, Limits, Solution, dynamics_problem
 from ocp.app.view.appearance import Frames, frames_along
-from ocp.motion.builders.space.pair import grasp_wrench, joined, motion_of, pair_momentum
+from ocp.motion.builders.space.pair import grasp_wrench, join_target, motion_of, pair_momentum
 from scripts.drawing import COLORS, DASHES
 from scripts.robots import capture_family
 from scripts.robots.capture_family import SPINS, Member
@@ -169,7 +169,7 @@ def together(example: CaptureExample) -> FreeFloating:
     one, other = example.chaser, example.capture.target
     start = {"base": one.base_home(), "target_base": example.capture.target_base, "joints": example.options["start"]}
     carried = np.array(ca.DM(pair_momentum(one, other, **start))).ravel()
-    return FreeFloating(joined(one.robot, other.robot), conserved_momentum=carried)
+    return FreeFloating(join_target(one.robot, other.robot), conserved_momentum=carried)
 
 
 def scenes_of(example: CaptureExample, count: int = 161) -> list[Scene]:

@@ -33,7 +33,7 @@ from ocp import (
 from ocp.app.view.appearance import frames_along
 from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
 from ocp.motion.tasks.limits import InFoot, Limits
-from ocp.motion.tasks.tip_task import timed
+from ocp.motion.tasks.tip_task import retime_task
 from scripts.drawing import COLORS, DASHES
 from scripts.robots.drawing import Scene, page
 
@@ -131,7 +131,7 @@ def circle(machine: Standing) -> TipTask:
 
 def from_rest(task: TipTask, seconds: float = SECONDS) -> TipTask:
     """The same over the time, s, from rest to rest."""
-    return timed(task, lambda time: rest_to_rest(time / seconds))
+    return retime_task(task, lambda time: rest_to_rest(time / seconds))
 
 
 def problem(

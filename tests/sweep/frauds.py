@@ -189,7 +189,7 @@ def subject(kind: str) -> Subject:
     plan = solve(problem, method, **report)
     if not plan.audit().passed:
         raise ValueError(f"the plan {kind} does not pass as it is: {plan.audit()}")
-    best = solve(problem, method.halved(), guess=plan, **report).cost
+    best = solve(problem, method.halve(), guess=plan, **report).cost
     narrower = tuple(solve(make(other), method, guess=plan, **report) for other in others)
     places = np.linspace(0.0, 1.0, 2001)
     x, u = plan.state_interpolant(places), plan.control_interpolant(places)

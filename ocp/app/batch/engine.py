@@ -41,7 +41,7 @@ __all__ = [
     "attempts",
     "cached",
     "checked_cluster",
-    "failed",
+    "failure_payload",
 ]
 
 Function = Callable[..., Any]
@@ -93,7 +93,7 @@ def attempt(function: Function, task: str, with_guess: bool, guess: Payload | No
             except BaseException as error:  # of any kind, so that the other tasks continue
                 if isinstance(error, OSError) and error.errno in DISK_ERRORS:
                     raise
-                result = failed("failed", type(error).__name__, message_of(error))
+                result = failure_payload("failed", type(error).__name__, message_of(error))
             else:
                 result = Payload({"status": "done", "error": "", "message": "", **result.record}, result.files)
         except OSError as error:
@@ -102,7 +102,7 @@ def attempt(function: Function, task: str, with_guess: bool, guess: Payload | No
         return Payload({**result.record, **timing}, result.files)
 
 
-def failed(status: str, error: str, message: str) -> Payload:
+def failure_payload(status: str, error: str, message: str) -> Payload:
     """Return the payload of a task that ended without a result, with the reason."""
     empty: dict[str, Any] = {"value": None, "files": [], "cost": None, "verdict": None, "seconds": 0.0}
     empty["inputs"] = {"kept": {}}
@@ -331,7 +331,7 @@ class Engine:
         """Whether no job is running."""
         return not self._running
 
-    def room(self) -> int:
+    def free_slots(self) -> int:
         """Return the number of chunks of jobs that may be sent now: one for each idle thread of the workers.
 
         No more are sent, because a worker that ends loses all its jobs, running or not.

@@ -257,7 +257,7 @@ class ResultStore:
             words = f"{link} is a link and may lead out of the folder; link the whole folder instead"
             raise ProblemError(words, name="folder", value=str(link))
         try:
-            head = loaded(path / HEAD)
+            head = load_json(path / HEAD)
             store = cls(path, str(head["function"]), str(head["version"]))
             if head["format"] != FORMAT:
                 words = f"{path} has batch format {head['format']}, not {FORMAT}; use another folder"
@@ -321,7 +321,7 @@ class ResultStore:
 
     def _has_result(self) -> bool:
         """Return whether the store has a result."""
-        records = (self.read(key) for key in self.recorded())
+        records = (self.read(key) for key in self.stored_keys())
         return any(record and record["status"] == "done" for record in records)
 
     @contextmanager
@@ -354,7 +354,7 @@ class ResultStore:
         """Return the record of a key, or None if it is missing or incomplete; links are not followed."""
         try:
             path = self._place(key)
-            record: Any = None if path.parent.is_symlink() else loaded(path)
+            record: Any = None if path.parent.is_symlink() else load_json(path)
             is_valid = record.keys() == RECORD_FIELDS.keys() and record["key"] == key == key_of(
                 canonical_text(record["task"], "task")
             )
@@ -406,7 +406,7 @@ class ResultStore:
         """Return the function's result that a record stores."""
         return unpack_result(self.payload(record))
 
-    def recorded(self) -> Iterator[str]:
+    def stored_keys(self) -> Iterator[str]:
         """Yield the keys of all stored records in order."""
         shards: list[str] = []
         with suppress(FileNotFoundError):
@@ -421,7 +421,7 @@ class ResultStore:
         return Path(f"{self.folder}/results/{key[:2]}/{key}.json")
 
 
-def loaded(path: Path) -> Any:
+def load_json(path: Path) -> Any:
     """Read a JSON file; raise ValueError if a number is not finite."""
     with open_unlinked(path) as stream:
         return json.loads(stream.read(), parse_float=finite, parse_constant=finite)

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from models.checks import NOT_NUMBERS, Array, check_entries, floats
 from models.files import INPUT_LIMITS
-from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failed
+from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failure_payload
 from ocp.app.batch.result_store import STATUSES, Payload, ResultStore, canonical_text, digest_of, key_of
 from ocp.app.batch.table import Batch, Result, row_of
 from ocp.errors import ProblemError, require
@@ -107,7 +107,7 @@ def run_batch(
         return record["status"] == "done" or (unchanged and record["status"] not in statuses)
 
     def recorded(keys: Iterable[str]) -> dict[str, Result]:
-        recorded_keys = set(store.recorded())
+        recorded_keys = set(store.stored_keys())
         candidates = (store.read(key) for key in keys if key in recorded_keys)
         records = [record for record in candidates if record and is_current(record)]
         return {record["key"]: row_of(record, store) for record in records}
@@ -184,20 +184,20 @@ class _PendingTasks:
         """Mark a task that ran when a worker died, to run alone; give it up after too many dead workers."""
         self.deaths[key] += deaths
         if key == self.isolated and self.deaths[key] >= max_deaths:
-            self._end(key, failed("killed", "", f"it ended {self.deaths[key]} workers"))
+            self._end(key, failure_payload("killed", "", f"it ended {self.deaths[key]} workers"))
         else:
             self.suspects.append(key)
 
     def _submit(self, engine: Engine) -> None:
         """Send as many tasks as the workers can take; a task that may have killed a worker runs alone."""
         if self.suspects or self.isolated:
-            if not engine.is_idle or not engine.room():
+            if not engine.is_idle or not engine.free_slots():
                 return
             self.isolated = self.suspects.popleft() if self.suspects else ""
             if self.isolated:
                 engine.submit([Job(self.isolated, self.texts[self.isolated], self._guess(self.isolated))])
                 return
-        for _ in range(engine.room()):
+        for _ in range(engine.free_slots()):
             keys = [self.ready.popleft() for _ in range(min(engine.share(len(self.ready)), len(self.ready)))]
             if not keys:
                 break

@@ -225,7 +225,7 @@ def read_batch(folder: str | os.PathLike[str]) -> Batch:
         ProblemError: The folder is not that of a batch.
     """
     store = ResultStore.at(folder)
-    records = (store.read(key) for key in store.recorded())
+    records = (store.read(key) for key in store.stored_keys())
     return Batch(store, tuple(row_of(record, store) for record in records if record is not None))
 
 

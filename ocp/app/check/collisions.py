@@ -78,7 +78,7 @@ def clearance_rows(scene: CollisionScene, motion: Motion, bases: Array | None) -
         none = Row("clearance", np.inf, scene.clearance, "m", None, RowVerdict.INFO, "no pairs that can collide")
         return [none, *ignored], []
     if bases is not None:
-        rows, faults = _sampled(scene, motion, bases)
+        rows, faults = _sampled_rows(scene, motion, bases)
         return [*rows, *ignored], faults
     pairs = prove_clearance(scene, motion).pairs
     start = float(motion.t[0])
@@ -132,7 +132,7 @@ def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault])
     return dated_faults
 
 
-def _sampled(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
+def _sampled_rows(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
     """Check the distances at the samples and midway between them; return table rows and faults."""
     middles = (motion.t[1:] + motion.t[:-1]) / 2
     times = np.concatenate([motion.t, middles])
@@ -182,7 +182,7 @@ def path_rows(
     times = np.append(motion.t[interval] + fraction * np.diff(motion.t)[interval], motion.t[-1])
 
     def tips(at: Array) -> list[Array]:
-        places = np.zeros((len(at), 0)) if bases is None else _between(motion.t, bases, at)
+        places = np.zeros((len(at), 0)) if bases is None else _interpolate(motion.t, bases, at)
         return sampler(places, motion.position.at(at))
 
     corners = path.positions
@@ -238,7 +238,7 @@ def _axes(path: Waypoints, parameter: Array) -> Array:
     return np.asarray(axes / np.maximum(np.linalg.norm(axes, axis=1), 1e-12)[:, None])
 
 
-def _between(t: Array, values: Array, times: Array) -> Array:
+def _interpolate(t: Array, values: Array, times: Array) -> Array:
     """Interpolate samples linearly in time; quaternions are normalised. Shape (K, n)."""
     interpolated = np.column_stack([np.interp(times, t, column) for column in values.T])
     if values.shape[1] == 7:

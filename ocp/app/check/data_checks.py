@@ -173,7 +173,7 @@ def clean_trajectory(
         t = np.array([t[0], t[0] + 1.0])
         q = np.repeat(q, 2, axis=0)
         v, a, efforts, base = (None if x is None else np.repeat(x, 2, axis=0) for x in (v, a, efforts, base))
-    q, wrapped = _unwrapped(t, q, names, kinds, limits, notes)
+    q, wrapped = _unwrap(t, q, names, kinds, limits, notes)
     faults += [] if unwrap else wrapped
     notes += [f"{fault.name} {fault.text}" for fault in wrapped] if unwrap else []
     t = _time_by_velocities(t, q, v, names, faults)
@@ -357,7 +357,7 @@ def _worst_in_degrees(
     return max(wild, key=lambda k: largest[k]) if suspected else None
 
 
-def _unwrapped(
+def _unwrap(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], limits: tuple[Array, ...], notes: list[str]
 ) -> tuple[Array, list[Fault]]:
     """Remove jumps by full turns from the positions; return them, with a fault for each limited joint that jumped.

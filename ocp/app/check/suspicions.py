@@ -65,7 +65,7 @@ def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool =
         if current[[*p]].max() > 0.5 and not current[~np.isin(identity, p)].any() and not outside[p] + outside[p[::-1]]
     ]
     if len(repairs) == 1:
-        return [_exchanged(names, repairs[0], "all joints are inside their limits")]
+        return [_exchange_fault(names, repairs[0], "all joints are inside their limits")]
     rows = np.unique(np.linspace(0, len(motion.t) - 1, THRESHOLDS.tip_samples).astype(int))
     joints = motion.q[rows]
     reach = np.ptp(joints, axis=0)
@@ -92,10 +92,10 @@ def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool =
     best, criterion = divmod(int(measure.argmin()), 2)
     if measure[best, criterion] > min(1.0, measure[0, criterion] / 20) or measure[0].min() < 3:
         return []
-    return [_exchanged(names, pairs[best - 1], ("the tip goes straight", "the tip keeps its speed")[criterion])]
+    return [_exchange_fault(names, pairs[best - 1], ("the tip goes straight", "the tip keeps its speed")[criterion])]
 
 
-def _exchanged(names: list[str], pair: tuple[int, int], evidence: str) -> Fault:
+def _exchange_fault(names: list[str], pair: tuple[int, int], evidence: str) -> Fault:
     """Return the suspicion that two columns of the file are exchanged."""
     both = " and ".join(names[k] for k in pair)
     text = f"the columns of {both} look exchanged: then {evidence}, which is far from true as written"

@@ -334,7 +334,7 @@ def check_trajectory(
         tuple(rows),
         tuple(faults),
         tuple(suspicions),
-        _unlimited(rows),
+        _unlimited_quantities(rows),
         tuple(unchecked),
         (*cleaned.notes, *notes),
         cleaned,
@@ -348,7 +348,7 @@ def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
     return [f"clearance of {', '.join(dict.fromkeys(names))}, whose meshes are missing"] if names else []
 
 
-def _unlimited(rows: Sequence[Row]) -> tuple[str, ...]:
+def _unlimited_quantities(rows: Sequence[Row]) -> tuple[str, ...]:
     """Name the quantities that have no limit, with the joints of one kind in one entry."""
     joints: dict[str, list[str]] = {}
     counts: dict[str, int] = {}

@@ -113,12 +113,12 @@ def arcs_about_center(
         )
         raise ArcError(why, difference, allowed)
     sweep = _sweep(first - center, last - center, clockwise)
-    moved = _moved(center, first, last)
+    moved = _equidistant_center(center, first, last)
     # displacement of the arc's far side by moving the centre
     if np.hypot(*(moved - center)) * (1 - np.cos(sweep / 2)) <= max(2 * difference, gap):
         if (first != last).any():
             sweep = _sweep(first - moved, last - moved, clockwise)
-        return [_turned(start, end, moved, clockwise, sweep + FULL_TURN * (turns - 1), plane)]
+        return [_arc_of_sweep(start, end, moved, clockwise, sweep + FULL_TURN * (turns - 1), plane)]
     half = (-sweep if clockwise else sweep) / 2
     cosine, sine = np.cos(half), np.sin(half)
     out = (first - center) * (radii[0] + radii[1]) / (2 * radii[0])
@@ -128,20 +128,20 @@ def arcs_about_center(
     middle[normal] += (end[normal] - start[normal]) * sweep / 2 / total
     halves = []
     for begin, stop, extra in ((start, middle, 0.0), (middle, end, total - sweep)):
-        own_center = _moved(center, begin[in_plane], stop[in_plane])
+        own_center = _equidistant_center(center, begin[in_plane], stop[in_plane])
         turn = _sweep(begin[in_plane] - own_center, stop[in_plane] - own_center, clockwise)
-        halves.append(_turned(begin, stop, own_center, clockwise, turn + extra, plane))
+        halves.append(_arc_of_sweep(begin, stop, own_center, clockwise, turn + extra, plane))
     return halves
 
 
-def _moved(center: Array, first: Array, last: Array) -> Array:
+def _equidistant_center(center: Array, first: Array, last: Array) -> Array:
     """Return the point equidistant from two points that is nearest to `center`. Shape (2,) each."""
     chord = last - first
     square = float(chord @ chord)
     return center if square == 0 else np.asarray(center - ((center - (first + last) / 2) @ chord) / square * chord)
 
 
-def _turned(
+def _arc_of_sweep(
     start: Array, end: Array, center: Array, clockwise: bool, sweep: float, plane: tuple[int, int, int]
 ) -> Arc | Helix:
     """Return the arc from `start` that turns by `sweep`; it is a helix if it rises or exceeds a full turn."""

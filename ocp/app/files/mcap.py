@@ -185,10 +185,10 @@ def _records(stream: IO[bytes]) -> Iterator[Any]:
         if record.uncompressed_size > largest or remaining < 0:
             raise ValueError(f"it unpacks to more than {INPUT_LIMITS.log_bytes} bytes, or a record to {largest}")
         with suppress(EndOfFile):
-            yield from StreamReader(io.BytesIO(_unpacked(record)), skip_magic=True).records
+            yield from StreamReader(io.BytesIO(_decompress(record)), skip_magic=True).records
 
 
-def _unpacked(chunk: Any) -> bytes:
+def _decompress(chunk: Any) -> bytes:
     """Return the decompressed contents of a chunk, limited to its declared size."""
     data, size = chunk.data, chunk.uncompressed_size
     if chunk.compression == "zstd":

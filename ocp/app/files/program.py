@@ -26,7 +26,7 @@ __all__ = [
     "Section",
     "TimedProgram",
     "checked_reversal",
-    "smoothed",
+    "smooth_path",
 ]
 
 DEFAULT_TOLERANCE_M = 5e-5
@@ -76,7 +76,7 @@ class Cut:
         deviation = np.fmin(self.tolerances[:-1], self.tolerances[1:])
         if tolerance is not None:
             deviation = np.fmin(deviation, require.positive("tolerance", tolerance))
-        return smoothed(self.path, np.where(np.isnan(deviation), DEFAULT_TOLERANCE_M, deviation), options)
+        return smooth_path(self.path, np.where(np.isnan(deviation), DEFAULT_TOLERANCE_M, deviation), options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,7 @@ class Program:
         return sum(path.length for path in self.paths)
 
     def __str__(self) -> str:
-        counts = _counted(len(self.paths), "path"), _counted(len(self.rapids), "rapid")
+        counts = _count_text(len(self.paths), "path"), _count_text(len(self.rapids), "rapid")
         head = f"{counts[0]} of {1e3 * self.length:.6g} mm in all, {counts[1]}"
         return "\n".join([head, *(str(note) for note in self.notes)])
 
@@ -172,7 +172,7 @@ class Program:
             ModelError: The position is invalid, or the orientation is not a unit quaternion.
         """
         ends = [self.start, *(end for each in self.rapids for end in (each.start, each.end))]
-        moved = iter(_moved(np.array(ends), position, orientation))
+        moved = iter(_transform(np.array(ends), position, orientation))
         start = next(moved)
         sections: list[Section] = []
         for each in self.sections:
@@ -237,12 +237,12 @@ def checked_reversal(owner: str, value: Any) -> Reversal:
     return float(require.positive(f"{owner}: reversal", value))
 
 
-def _counted(number: int, noun: str) -> str:
+def _count_text(number: int, noun: str) -> str:
     """Return a number with its noun, in the plural if necessary."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _moved(points: Array, position: ArrayInput, orientation: ArrayInput) -> Array:
+def _transform(points: Array, position: ArrayInput, orientation: ArrayInput) -> Array:
     # lines from the origin along the axes check the pose and give its rotation
     """Transform points (k, 3) by a pose."""
     frame = [Path.through([(0, 0, 0), axis]).placed(position, orientation).segments[0] for axis in np.eye(3)]
@@ -250,7 +250,7 @@ def _moved(points: Array, position: ArrayInput, orientation: ArrayInput) -> Arra
     return np.asarray(origin + points @ np.array([np.asarray(line.end) - origin for line in frame]))
 
 
-def smoothed(path: Path, deviation: ArrayInput, options: dict[str, Any]) -> SmoothPath:
+def smooth_path(path: Path, deviation: ArrayInput, options: dict[str, Any]) -> SmoothPath:
     """Round the corners of a path within a deviation by models.smooth; raise its errors as ProblemError."""
     known = {"kind", "shape", "overlap"}
     if unknown := [name for name in options if name not in known]:

@@ -29,7 +29,7 @@ from models.checks import ROUNDING, Array, warn_of_degrees, warn_of_millimetres
 from models.paths import Line, split_at_reversals
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT, product, rotation_vector
-from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smoothed
+from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smooth_path
 from ocp.app.files.safe_files import FileName, is_number, line_error, read_lines, split_cells
 from ocp.errors import ProblemError, require
 
@@ -150,7 +150,7 @@ class Waypoints:
         Raises:
             ProblemError: As `path`; the tolerance is not positive; an option is unknown.
         """
-        return smoothed(self.path(reversal=reversal), require.positive("tolerance", tolerance), options)
+        return smooth_path(self.path(reversal=reversal), require.positive("tolerance", tolerance), options)
 
     def _check_still(self, last: int, i: int) -> None:
         """Raise ProblemError if the tool turns on the spot, without a change of position."""
@@ -209,12 +209,12 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
     axes = _axes(file, parts[AXIS], lines, row_texts) if AXIS in parts else None
     orientations = None
     if QUATERNION in parts:
-        orientations = _aligned(_quaternions(file, parts[QUATERNION], lines, row_texts))
+        orientations = _align_signs(_quaternions(file, parts[QUATERNION], lines, row_texts))
     elif VECTOR in parts:
         warn_of_degrees(f"{file!s}: an angle of the waypoints of", parts[VECTOR], "rx, ry, rz")
-        orientations = _aligned(_from_vectors(parts[VECTOR]))
+        orientations = _align_signs(_from_vectors(parts[VECTOR]))
     elif axes is not None:
-        orientations = _aligned(_least_roll(file, axes, lines, row_texts))
+        orientations = _align_signs(_least_roll(file, axes, lines, row_texts))
     if QUATERNION in parts or VECTOR in parts:
         axes = None
     used_names = tuple(name for name in names if any(name in kind for kind in parts))
@@ -366,7 +366,7 @@ def _from_vectors(vectors: Array) -> Array:
     return np.concatenate([np.cos(angle / 2), np.sinc(angle / 2 / np.pi) / 2 * vectors], axis=1)
 
 
-def _aligned(quaternions: Array) -> Array:
+def _align_signs(quaternions: Array) -> Array:
     """Choose the sign of each quaternion that makes it nearer to its predecessor."""
     signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(quaternions * np.cumprod(np.concatenate([[1.0], signs]))[:, None])

@@ -293,7 +293,7 @@ def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
         "cost": plan.cost,
         "targets": plan.targets,
     }
-    details |= _audited([part[0] for part in parts], lambda: verdict_of(plan, sample, name, **settings))
+    details |= _audit_verdict([part[0] for part in parts], lambda: verdict_of(plan, sample, name, **settings))
     base_rates = np.gradient(base, times, axis=0, edge_order=2) if base.shape[1] else base
     samples = MotionSamples(times, sample.joints, sample.rates, sample.accelerations, base, base_rates)
     return _animation(name, plan.machine, samples, own_curves, **details)
@@ -342,7 +342,7 @@ def animate_solution(
     base_path = states[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
     base_rates = slopes[:, columns[base]] if machine.base_size else np.zeros((len(times), 0))
     details: dict[str, Any] = {"cost": solution.cost, "obstacles": tuple(obstacles_of([(solution, "", times)]))}
-    details |= _audited([solution], lambda: solution.audit(**settings))
+    details |= _audit_verdict([solution], lambda: solution.audit(**settings))
     times_of_pairs = np.linspace(0.0, solution.horizon, PAGE_SETTINGS.pair_samples)
     details["closest"] = _closest_pairs([(solution, "", times_of_pairs)], solution.horizon)
     smooth = _torque_like(solution, joints)
@@ -375,13 +375,13 @@ def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> 
             assert isinstance(machine, FreeFloating)
             base_path = integrate_base(machine, motion)[0]  # by conservation of momentum
         else:
-            base_rates = _between(begin + times, motion.t, np.gradient(base_path, motion.t, axis=0))
-        base = _between(begin + times, motion.t, base_path)
+            base_rates = _interpolate(begin + times, motion.t, np.gradient(base_path, motion.t, axis=0))
+        base = _interpolate(begin + times, motion.t, base_path)
     samples = MotionSamples(times, joints, rates, accelerations, base, base_rates)
     return _animation(name or raw.file, machine, samples, [])
 
 
-def _between(times: Array, t: Array, values: Array) -> Array:
+def _interpolate(times: Array, t: Array, values: Array) -> Array:
     """Return samples interpolated linearly. Shape (K, n)."""
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
@@ -424,7 +424,7 @@ def _torque_like(solution: Solution, joints: str) -> bool:
     )
 
 
-def _audited(solutions: Sequence[Solution], judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
+def _audit_verdict(solutions: Sequence[Solution], judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
     """Return the verdict's sentence, result and rows of the audit; without a problem only a sentence."""
     lost = next((solution.problem_lost for solution in solutions if solution.problem is None), None)
     if lost is not None:

@@ -132,17 +132,17 @@ def appearance_of(
     has_visuals = any(link.visuals for link in robot.links)
     surfaces: list[tuple[str, Triangles]] = []
     for link in robot.links:
-        triangles_of_link = _triangulated(link.visuals, folders, meshes, missing)
+        triangles_of_link = _triangulate(link.visuals, folders, meshes, missing)
         if not triangles_of_link:  # a link without visuals among others with visuals is a zone rather than a body
             color = SURFACE_STYLE.zone if has_visuals and not link.visuals else SURFACE_STYLE.grey
-            triangles_of_link = _triangulated(link.collisions, folders, meshes, missing, color)
+            triangles_of_link = _triangulate(link.collisions, folders, meshes, missing, color)
         surfaces += [(link.name, triangles) for triangles in triangles_of_link]
     shown = {name for name, _ in surfaces}
     surfaces += [(name, triangles) for name, triangles in _rods(robot, shown)]
     return Appearance(tuple(_parts(_few(surfaces, most))), missing)
 
 
-def _triangulated(
+def _triangulate(
     shapes: Sequence[CollisionShape],
     folders: Sequence[Any],
     meshes: bool,
@@ -183,15 +183,15 @@ def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
         return without_colors(signs * size, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
     if shape.kind == "cylinder":
         half = size[1] / 2
-        return _turned(np.array([[0.0, -half], [size[0], -half], [size[0], half], [0.0, half]]))
+        return _revolution_surface(np.array([[0.0, -half], [size[0], -half], [size[0], half], [0.0, half]]))
     half = size[1] / 2 if shape.kind == "capsule" else 0.0
     angles = np.linspace(-np.pi / 2, 0, SURFACE_STYLE.sides // 4 + 1)
     cap = np.column_stack([np.cos(angles), np.sin(angles)]) * size[0]
     upper = cap[::-1] * [1, -1] + [0, half]
-    return _turned(np.concatenate([cap - [0, half], upper if half else upper[1:]]))
+    return _revolution_surface(np.concatenate([cap - [0, half], upper if half else upper[1:]]))
 
 
-def _turned(profile: Array) -> Triangles:
+def _revolution_surface(profile: Array) -> Triangles:
     """Return the surface of revolution about z of a profile of points (radius, z). Shape (k, 2)."""
     sides = SURFACE_STYLE.sides
     angle = np.arange(sides) * (2 * np.pi / sides)
@@ -215,7 +215,7 @@ def rod(start: Array, end: Array, radius: float) -> Triangles:
     rotation = np.column_stack([first, np.cross(axis, first), axis])
     half = length / 2
     profile = np.array([[0.0, -half], [radius, -half], [radius, half], [0.0, half]])
-    vertices, faces, _ = _turned(profile)
+    vertices, faces, _ = _revolution_surface(profile)
     return Triangles(vertices @ rotation.T + (start + end) / 2, faces, np.tile(SURFACE_STYLE.rod, (len(faces), 1)))
 
 

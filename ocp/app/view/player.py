@@ -297,7 +297,7 @@ class PageServer:
         Raises:
             ProblemError: No port is free, or the number is invalid.
         """
-        self._server = _listening(text.encode(), port)
+        self._server = _start_server(text.encode(), port)
         self.address = f"http://{HOST}:{self._server.server_address[1]}"
         self._thread = Thread(target=self._server.serve_forever, name="page", daemon=True)
 
@@ -319,7 +319,7 @@ class PageServer:
             return
 
 
-def _listening(page: bytes, port: int) -> ThreadingHTTPServer:
+def _start_server(page: bytes, port: int) -> ThreadingHTTPServer:
     """Return a server for a page on the first free port."""
 
     class Answer(BaseHTTPRequestHandler):

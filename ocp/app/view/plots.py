@@ -181,7 +181,7 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
         ProblemError: A motion cannot be compared, or has other joints.
     """
     names = plan.names
-    others = {name: _compared(name, one, names) for name, one in _named(against).items()}
+    others = {name: _comparison(name, one, names) for name, one in _motions_by_name(against).items()}
     motions = {"plan": _motion_of(plan), **{name: motion for name, (motion, _) in others.items()}}
     target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.15 * len(names)))
     robot = plan.machine.robot
@@ -211,7 +211,7 @@ def _motion_of(plan: Plan) -> Motion:
     return Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
 
 
-def _compared(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
+def _comparison(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
     """Return a motion that is compared with a plan, and its cost if it is known."""
     cost: float | None = None
     if isinstance(other, Plan):
@@ -256,7 +256,7 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
     Raises:
         ProblemError: A motion cannot be compared, or has other states and controls.
     """
-    others = _named(against)
+    others = _motions_by_name(against)
     own_widths = _widths(solution)
     for name, other in others.items():
         widths = _widths(other) if isinstance(other, Solution) else _local_widths(name, other)
@@ -358,7 +358,7 @@ def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
     return bounds, form.units
 
 
-def _named(against: Any) -> dict[str, Any]:
+def _motions_by_name(against: Any) -> dict[str, Any]:
     """Return the motions to compare a plan with, by name."""
     if against is None:
         return {}

@@ -221,22 +221,22 @@ def render(
     solid = _Mesh.of([part for layer in layers if layer.opacity >= 1 for part in layer.parts if part.color[3] >= 1])
     sun = _Sun.on(solid, camera) if len(solid.faces) else None
     picture = np.ones((fine.size[0] * fine.size[1], 3), dtype=np.float32)
-    nearness, faces = _nearest(*_projected(fine, solid), fine.size)
+    nearness, faces = _nearest(*_project(fine, solid), fine.size)
     if floor is not None:
         _lay(picture, floor, fine, sun)
     first = sum(len(part.faces) for part in layers[0].parts if part.color[3] >= 1) if layers else 0
     nearness = np.where((faces >= 0) & (faces < first), np.inf, nearness)
     cells = np.flatnonzero(faces >= 0)
-    picture[cells] = _shaded(solid, faces[cells], fine.rays(cells), fine, sun)
+    picture[cells] = _shade(solid, faces[cells], fine.rays(cells), fine, sun)
     for layer in layers:
         for opacity in sorted({part.color[3] for part in layer.parts}, reverse=True):
             if opacity >= 1 and layer.opacity >= 1:
                 continue
             veil = _Mesh.of([part for part in layer.parts if part.color[3] == opacity], layer.tint)
-            near, faces = _nearest(*_projected(fine, veil), fine.size)
+            near, faces = _nearest(*_project(fine, veil), fine.size)
             cells = np.flatnonzero((faces >= 0) & (near > (1 + PICTURE_STYLE.behind) * nearness))
             alpha = np.float32(layer.opacity * opacity)
-            lit = _shaded(veil, faces[cells], fine.rays(cells), fine, None)
+            lit = _shade(veil, faces[cells], fine.rays(cells), fine, None)
             picture[cells] = (1 - alpha) * picture[cells] + alpha * lit
     pixels = picture.reshape(height, side_samples, width, side_samples, 3).mean(axis=(1, 3))
     return np.asarray(np.round(255 * np.clip(pixels, 0.0, 1.0)), dtype=np.uint8)
@@ -263,7 +263,7 @@ class _Mesh:
         return cls(corners, normals, np.concatenate(faces), np.concatenate(colors))
 
 
-def _projected(camera: Camera, mesh: _Mesh) -> tuple[Array, Array]:
+def _project(camera: Camera, mesh: _Mesh) -> tuple[Array, Array]:
     """Project the corners of all triangles: return their picture positions (f, 3, 2) and inverse depths (f, 3)."""
     positions, depths = camera.seen(mesh.corners)
     return positions[mesh.faces], (1.0 / depths)[mesh.faces]
@@ -289,7 +289,7 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
     second = np.column_stack([two[:, 1], -two[:, 0]]) / area[valid, None]
     third = np.column_stack([-one[:, 1], one[:, 0]]) / area[valid, None]
     slope = (near[valid, 1] - near[valid, 0])[:, None] * second + (near[valid, 2] - near[valid, 0])[:, None] * third
-    which, step = _counted(rows)
+    which, step = _repeat_numbers(rows)
     row = top[valid][which] + step
     dy = row + 0.5 - start[which, 1]
     least, most = np.full(len(which), -0.5), np.full(len(which), width - 0.5)
@@ -304,7 +304,7 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
     value = near[valid[which], 0] + slope[which, 1] * dy + slope[which, 0] * (first + 0.5 - start[which, 0])
     rise, cell, which = slope[which, 0], row * width + first, valid[which]
     for begin, end in _batches(lengths):
-        own, step = _counted(lengths[begin:end])
+        own, step = _repeat_numbers(lengths[begin:end])
         own += begin
         cells, values = cell[own] + step, value[own] + rise[own] * step
         np.maximum.at(depth, cells, values)
@@ -313,7 +313,7 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
     return depth, number
 
 
-def _counted(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+def _repeat_numbers(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     """Return the numbers 0, 1, ..., each repeated `counts` times, and the index of each repetition."""
     which = np.repeat(np.arange(len(counts)), counts)
     return which, np.arange(len(which)) - (np.cumsum(counts) - counts)[which]
@@ -386,7 +386,7 @@ def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun |
     picture[below[near]] = (1 - fade * (1 - tone))[:, None]
 
 
-def _shaded(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun: _Sun | None) -> Array:
+def _shade(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun: _Sun | None) -> Array:
     """Return the colours of triangles (k,) where rays (k, 3) from the camera hit them. Shape (k, 3)."""
     a, b, c = (mesh.corners[mesh.faces[:, k]] for k in range(3))
     one, two, to = b - a, c - a, camera.eye - a

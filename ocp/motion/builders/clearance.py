@@ -41,7 +41,7 @@ __all__ = [
     "collision_error",
     "is_clearance",
     "solve_with_clearance",
-    "widened",
+    "widen_margins",
 ]  # fmt: skip
 
 CLEARANCE, APART = "clearance", "apart"
@@ -84,11 +84,11 @@ class ClearanceConstraints:
                 words = f"clearance_constraints: there is no pair {pair!r}; the scene has {len(self.scene.pairs)}"
                 raise ProblemError(words, name="margins", value=pair, limit=len(self.scene.pairs))
 
-    def holding(self, pairs: Sequence[int]) -> ClearanceConstraints:
+    def with_pairs(self, pairs: Sequence[int]) -> ClearanceConstraints:
         """Return the constraints with further pairs of bodies separated."""
         return replace(self, margins={**{int(pair): MARGIN for pair in pairs}, **self.margins})
 
-    def separating(self, collisions: Sequence[Collision]) -> ClearanceConstraints:
+    def with_collisions(self, collisions: Sequence[Collision]) -> ClearanceConstraints:
         """Return the constraints with the pairs of bodies of these collisions separated.
 
         Two hulls of meshes are separated by their covers, which protrude and may overlap in every configuration. The
@@ -99,7 +99,7 @@ class ClearanceConstraints:
 
     def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
         """Return constraints in which the separation margin of each violating pair is larger by its violation."""
-        return replace(self, margins=widened(self.margins, self.scene.labels, proofs))
+        return replace(self, margins=widen_margins(self.margins, self.scene.labels, proofs))
 
     def declare(
         self,
@@ -143,7 +143,7 @@ class ClearanceConstraints:
         at = states[base].symbol if isinstance(base, str) else base, states[joints].symbol, time
         problem.separate(
             f"{CLEARANCE}{suffix}",
-            _evaluated(scene.placements, *at),
+            _evaluate(scene.placements, *at),
             scene_hulls(scene),
             scene.pairs,
             least=np.full(len(scene.pairs), scene.clearance),
@@ -154,7 +154,7 @@ class ClearanceConstraints:
         )
         if self.margins:
             pairs = sorted(self.margins)
-            distances = _evaluated(partial(scene.distances, pairs=pairs, rounding=ROUNDING), *at)
+            distances = _evaluate(partial(scene.distances, pairs=pairs, rounding=ROUNDING), *at)
             least = [scene.clearance + self.margins[pair] for pair in pairs]
             problem.path(f"{APART}{suffix}", distances, lower=least, unit="m")
 
@@ -170,7 +170,7 @@ class Separating(Protocol):
         """Return constraints in which the separation margin of each violating pair is larger by its violation."""
 
 
-def widened(
+def widen_margins(
     margins: Mapping[int, float], labels: Sequence[tuple[str, str]], proofs: Sequence[Clearance]
 ) -> dict[int, float]:
     """Return the margins of pairs, m, each increased by the violation of the pair.
@@ -288,7 +288,7 @@ def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
     return SolveError(words, solution, name=finding.name, value=finding.value, limit=finding.limit, time=finding.time)
 
 
-def _evaluated(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
+def _evaluate(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
     """Evaluate an expression of base, joints and time; with MX arguments it becomes the call of an SX function."""
     arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
     if not any(isinstance(value, ca.MX) for value in arguments):

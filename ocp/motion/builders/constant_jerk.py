@@ -225,7 +225,7 @@ class TorqueLimits:
         """Return the torques of the limited joints at samples (M, n). Shape (M, L)."""
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
-    def linearised(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
+    def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
         """Return the torques (M, L), and their derivatives by joints, rates and accelerations. Shape (M, L, n) each."""
         torques, *slopes = self._sampler(True)(joints, rates, accelerations)
         size = joints.shape[1]
@@ -239,7 +239,7 @@ class TorqueLimits:
             self._samplers[linearised] = Sampler(symbols, outputs)
         return self._samplers[linearised]
 
-    def slowed(self, motion: ConstantJerkMotion) -> ConstantJerkMotion:
+    def slow_down(self, motion: ConstantJerkMotion) -> ConstantJerkMotion:
         """Return the motion slowed down by the smallest factor with which the torque limits hold at samples.
 
         Raises:
@@ -288,7 +288,7 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
     """
     moves = np.append(np.diff(path, axis=0).any(axis=1), True)
     corners = path[moves] if moves.sum() > 1 else path[[0, -1]]
-    parts = [torques.slowed(_straight(first, last - first, bounds)) for first, last in pairwise(corners)]
+    parts = [torques.slow_down(_straight(first, last - first, bounds)) for first, last in pairwise(corners)]
     return ConstantJerkMotion(*(np.concatenate(values) for values in zip(*map(_columns, parts), strict=True)))
 
 

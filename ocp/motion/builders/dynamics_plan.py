@@ -444,13 +444,13 @@ def _attempts(
     except SolveError as error:
         yield "", error
         return
-    yield "", _tightened(problem, mesh, plan, warm)
+    yield "", _tighten_limits(problem, mesh, plan, warm)
     switched = solve_at_switches(problem, mesh, plan, options=settings)
     if switched is not plan:
-        yield ", with nodes at its switches", _tightened(problem, mesh, switched, warm)
+        yield ", with nodes at its switches", _tighten_limits(problem, mesh, switched, warm)
 
 
-def _tightened(
+def _tighten_limits(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
     """Tighten the limits so that they hold between the nodes; return the plan if it costs hardly more, or an error."""
@@ -470,7 +470,7 @@ def _tightened(
 def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocation:
     """Return the next mesh: refined where limits were tightened if only the cost failed, otherwise halved."""
     if plan.bound_tightening is None or failure.solution is not plan or failure.name != "cost":
-        return mesh.halved()
+        return mesh.halve()
     nodes, amounts = plan.control_interpolant.breaks, plan.bound_tightening.max(axis=(0, 2))
     parts = np.where(amounts > 0, HOLDING.splits, 1)
     return mesh.with_mesh(split(nodes, parts, amounts, HOLDING.splits * len(amounts)))

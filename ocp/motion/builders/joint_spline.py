@@ -113,7 +113,7 @@ class PlannedJoints:
         Raises:
             ProblemError: A distance is nan, or off the path by more than rounding.
         """
-        return _Along(*self.curves(self._checked(distance)))
+        return _Along(*self.curves(self._check_distance(distance)))
 
     def torques(self, distance: Any) -> _Torques:
         """Return the coefficients of the joint torques at distances from the start. Shape (M,), m.
@@ -127,7 +127,7 @@ class PlannedJoints:
         along = self.at(distance)
         return _Torques(*self.forces(along.position, along.first, along.second))
 
-    def _checked(self, distance: Any) -> Array:
+    def _check_distance(self, distance: Any) -> Array:
         """Return distances clipped to the path; raise ProblemError if they exceed it by more than rounding."""
         try:
             s = np.atleast_1d(floats(distance))

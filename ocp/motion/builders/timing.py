@@ -238,11 +238,11 @@ def minimum_time_problem(
         motion = reference.at(theta)
         return np.column_stack([motion.speed, path_columns(path, limits, limited, motion.distance)])
 
-    problem = _declared(path, limits, limited, reference, span, units, table(columns, breaks))
+    problem = _declare(path, limits, limited, reference, span, units, table(columns, breaks))
     return TimingProblem(problem, tuple(mesh.tolist()), units, reference, span)  # type: ignore[arg-type]
 
 
-def _declared(
+def _declare(
     path: PathLike,
     limits: LineLimits,
     joints: JointPath | None,

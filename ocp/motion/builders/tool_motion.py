@@ -408,7 +408,7 @@ def _closure(motion: _Motion) -> Any:
         words = "a cyclic motion of several stretches must end without a task, so that the joints can return"
         raise ProblemError(words, name="cyclic", value=len(stretches))
     check_closed(equations, stretches[-1].end)
-    directions = equations.closing(motion.setup.base, motion.setup.reference)
+    directions = equations.cyclic_rows(motion.setup.base, motion.setup.reference)
     if not directions.shape[1]:
         return 0
     slack = problem.state("closure", directions.shape[1], guess=0.0, unit=equations.unit())
@@ -471,7 +471,9 @@ def _declare_tasks(
         return
     error = equations.error(base, joints, targets)[np.flatnonzero(begins & equations.pose_rows).tolist()]
     # a velocity task has no pose: at the start of the motion its tip is where the reference has it
-    fixed = [] if stretch.begin else [equations.holding(base, joints, motion.setup.base, motion.setup.reference)]
+    fixed = (
+        [] if stretch.begin else [equations.reference_error(base, joints, motion.setup.base, motion.setup.reference)]
+    )
     if (condition := ca.vertcat(error, *fixed)).numel():
         if motion.setup.relaxed:
             start_errors = problem.free_parameter(f"{START_ERRORS}{suffix}", condition.numel(), guess=0.0)
@@ -487,7 +489,7 @@ def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
     equations: Any = stretch.equations
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))
     error = equations.error(b, q, equations.target_function()(stretch.begin))
-    fixed, at, rows = equations.holding(b, q, base, reference), 0, []
+    fixed, at, rows = equations.reference_error(b, q, base, reference), 0, []
     for i, posed in enumerate(equations.pose_rows):
         rows.append(error[i] if posed else fixed[at])
         at += not posed

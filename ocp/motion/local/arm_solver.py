@@ -182,7 +182,7 @@ def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = No
             (k, 3).
     """
     virtual = np.zeros((0, 3)) if axes is None else axes
-    extended = chain.extended(virtual, np.tile(chain.position, (len(virtual), 1)))
+    extended = chain.extend(virtual, np.tile(chain.position, (len(virtual), 1)))
     count, joints = len(extended.order), tuple(chain.order)
     if not 0 < count <= SIX + min(ARM.max_samples, len(joints)):
         return None
@@ -193,7 +193,7 @@ def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = No
         rng = np.random.default_rng(ARM.seed)
         directions = rng.normal(size=(len(auxiliary), 3))
         directions /= np.linalg.norm(directions, axis=1)[:, None]
-        extended = extended.extended(directions, chain.position + chain.size * rng.uniform(-1, 1, directions.shape))
+        extended = extended.extend(directions, chain.position + chain.size * rng.uniform(-1, 1, directions.shape))
     solvers: list[PoseSolver] = list(closed_forms(extended, joints))
     conditions = _conditions(extended, [solver.redundant for solver in solvers])
     solvers = [solvers[k] for k in np.argsort(-conditions, kind="stable")[: ARM.max_solvers[0]]]

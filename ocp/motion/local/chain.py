@@ -193,7 +193,7 @@ class Chain:
         size = max(float(np.linalg.norm(points[list(order)] - position, axis=1).max(initial=0.0)), 1e-3)
         return cls(axes, points, revolute, position, np.array(ca.DM(pose.rotation)), order, size)
 
-    def extended(self, axes: Array, points: Array) -> Chain:
+    def extend(self, axes: Array, points: Array) -> Chain:
         """Return the chain with added revolute joints between the last joint and the tip. Shapes (k, 3), (k, 3)."""
         n, count = len(self.axes), len(axes)
         return replace(

@@ -130,7 +130,7 @@ class Axis(NamedTuple):
         return Motion(turn, self.point - (turn @ self.point[:, :, None])[:, :, 0])
 
 
-class Opening(NamedTuple):
+class LoopOpening(NamedTuple):
     """Choice of the joint at which the kinematic loop is opened, and of the joints for the roles x, y, z, a, b, c.
 
     Attributes:
@@ -178,7 +178,7 @@ class Elimination(PoseSolver):
         openings: Openings of the loop that have regular problems, the best first.
     """
 
-    openings: tuple[Opening, ...]
+    openings: tuple[LoopOpening, ...]
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
         """Return solutions at M poses; at regular poses these are all solutions, see `PoseSolver.solve_regular`.
@@ -241,7 +241,7 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
     positions, rotations = chain.poses(joints)
     prescribed, tips = solver.prescribe(joints[:, list(redundant)]), Motion(rotations, positions)
     axes, goal = solver.loop(prescribed, tips)
-    conditions = list[tuple[float, Opening]]()
+    conditions = list[tuple[float, LoopOpening]]()
     for first in range(SIX):
         if axes[first - 1].revolute:
             singular_vectors, ranks, remaining = _split(_open(axes, goal, chain.size, first))
@@ -249,9 +249,9 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
             for z, a, b in permutations(range(3)):
                 matrices = _matrices(singular_vectors[:, :, rank:], remaining, (z, a, b))
                 condition = float(np.median(_companions(matrices)[2]))
-                conditions.append((condition, Opening(first, rank, (z, a, b))))
+                conditions.append((condition, LoopOpening(first, rank, (z, a, b))))
     regular = sorted(each for each in conditions if each[0] > ELIMINATION.regular)[::-1]
-    kept, most = list[Opening](), (0, 0)
+    kept, most = list[LoopOpening](), (0, 0)
     for _, opening in regular:
         rough = solve_opening(axes, goal, chain.size, opening)
         solutions = solver.refine(rough.pose, rough.free, prescribed, tips)
@@ -285,12 +285,12 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
     local = [axis._replace(point=(axis.point - center) / size) for axis in loop.joints]
     remaining = _coefficients(local[4:1:-1], local[5].point, c.direction)
     point, direction = (goal.at(c.point) - center) / size, goal.rotate(c.direction)
-    eliminated = _coefficients([_reversed(local[0]), _reversed(local[1])], point, direction)
+    eliminated = _coefficients([_reverse_axis(local[0]), _reverse_axis(local[1])], point, direction)
     left, values, _ = np.linalg.svd(eliminated.reshape(len(point), 15, 9))
     return left, (values > ELIMINATION.rank * values[:, :1]).sum(axis=1), remaining
 
 
-def _reversed(axis: Axis) -> Axis:
+def _reverse_axis(axis: Axis) -> Axis:
     """Return the axis with opposite direction, for the inverse motion of its joint."""
     return axis._replace(direction=-axis.direction)
 
@@ -381,7 +381,7 @@ def _inverses(matrices: Array) -> Array:
         return np.asarray(np.where(singular[..., None, None], np.inf, inverses))
 
 
-def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: Opening) -> _Candidates:
+def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpening) -> _Candidates:
     """Return candidate solutions from the real eigenvalues, single or double, of one opening of the loop."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)

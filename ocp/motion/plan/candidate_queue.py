@@ -50,6 +50,10 @@ class Solver:
         """Return whether two solutions have the same path and so are the same motion."""
         return False
 
+    def reaches_limits(self, solution: Solution) -> bool:
+        """Return whether joints of a solution reach their limits, so that full turns of joints may change its cost."""
+        return True
+
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
         """Return the error that no candidate passes its audit, with the reasons, the most frequent first."""
         reasons = Counter(str(candidate.reason) for candidate in candidates).most_common()
@@ -61,11 +65,8 @@ class Solver:
         details: dict[str, Any] = {key: getattr(fault, key, None) for key in ("name", "value", "limit", "time")}
         details["name"] = details["name"] or "plan"
         if cause is None:
-            error = SolveError(words, last, **details)
-        else:
-            error = SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, **details)
-        error.candidates = tuple(candidates)
-        return error
+            return SolveError(words, last, candidates=candidates, **details)
+        return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, candidates, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the first candidate as the plan, which also lists the other candidates."""
@@ -124,6 +125,9 @@ class CandidateQueue:
     def run(self, seeds: Iterable[Candidate], include_costlier: bool = False) -> None:
         """Advance the candidates of a batch until none of them can cost less than the best one that passed.
 
+        Seeds that differ by full turns of joints lead to motions that differ by the same turns, unless joint limits
+        intervene: only the first of them is solved then.
+
         Args:
             seeds: Seeds in the order of their first solve.
             include_costlier: Whether costlier motions are completed as well, as far as their number and cost are
@@ -133,24 +137,31 @@ class CandidateQueue:
         self._motions: list[_Motion] = []
         self._pushed = self._failures = self._audits = 0
         self._least, self._coarse_error, self._include_costlier = np.inf, 0.0, include_costlier or self._always_costlier
+        self._turned: dict[int, list[Candidate]] = {}
+        leaders = list[Candidate]()
         for seed in seeds:
-            self._push(seed)
+            leader = next((each for each in leaders if each.seed.is_turned(seed.seed)), None)
+            if leader is None:
+                leaders.append(seed)
+                self._push(seed)
+            else:
+                self._turned.setdefault(id(leader.seed), []).append(seed)
         while self._heap:
             candidate = heappop(self._heap)[-1]
             report(self._state)
             if self.exhausted:
                 words = f"{len(self.candidates)} candidates failed in {self.settings.refusal_time:g} s before it"
-                self.candidates.append(candidate.rejected(Reason(Rejection.NOT_TRIED, words)))
+                self.candidates.append(candidate.with_rejection(Reason(Rejection.NOT_TRIED, words)))
             elif (motion := self._find_motion(candidate)) is not None:
                 motion.waiting.append(candidate)
             elif (reason := self._prune(candidate)) is not None:
-                self.candidates.append(candidate.rejected(reason))
+                self.candidates.append(candidate.with_rejection(reason))
             else:
                 self._audits += candidate.stage is Stage.REFINED
                 for advanced in self.solver.advance(candidate):
                     self._take(candidate, advanced)
-        duplicate = Reason(Rejection.DUPLICATE)
-        self.candidates += [candidate.rejected(duplicate) for motion in self._motions for candidate in motion.waiting]
+        waiting = [*(motion.waiting for motion in self._motions), *self._turned.values()]
+        self.candidates += [each.with_rejection(Reason(Rejection.DUPLICATE)) for batch in waiting for each in batch]
 
     def plan(self) -> SolvedPlan:
         """Return the plan of the best candidate that passed; it also lists the rejected ones with their reasons.
@@ -234,20 +245,28 @@ class CandidateQueue:
                 self._replace(advanced)
         elif advanced.stage >= self.solver.last:
             repeated = self._has_passed(advanced)
-            self.candidates.append(advanced.rejected(Reason(Rejection.DUPLICATE)) if repeated else advanced)
+            self.candidates.append(advanced.with_rejection(Reason(Rejection.DUPLICATE)) if repeated else advanced)
         else:
             if previous.stage is Stage.SEED:
                 self._least = min(self._least, advanced.cost)
+                if advanced.solution is None or self.solver.reaches_limits(advanced.solution):
+                    self._push_turned(previous)
             elif previous.stage < Stage.FINE <= advanced.stage:
                 self._learn_error(previous, advanced)
             self._push(advanced)
 
     def _replace(self, rejected: Candidate) -> None:
         """Resume the duplicates that waited for a candidate which was rejected."""
+        self._push_turned(rejected)
         for motion in [motion for motion in self._motions if motion.first.seed is rejected.seed]:
             self._motions.remove(motion)
             for candidate in motion.waiting:
                 self._push(candidate)
+
+    def _push_turned(self, candidate: Candidate) -> None:
+        """Push the seeds that differ from the seed of a candidate by full turns of joints."""
+        for turned in self._turned.pop(id(candidate.seed), []):
+            self._push(turned)
 
     def _learn_error(self, coarse: Candidate, fine: Candidate) -> None:
         """Update the estimated cost error of the coarse mesh, unless the candidate converged to another motion."""

@@ -92,8 +92,8 @@ class CandidateSolver(Solver):
             failed = replace(candidate, cost=np.nan, solution=error.solution, stage=max(candidate.stage, Stage.FINE))
             if candidate.stage is Stage.AUDITED:
                 self.error = error
-                return [failed.rejected(Reason.of_error(Rejection.ACTUATORS, error))]
-            advanced = failed.rejected(self._failure_reason(failed, str(error)))
+                return [failed.with_rejection(Reason.of_error(Rejection.ACTUATORS, error))]
+            advanced = failed.with_rejection(self._failure_reason(failed, str(error)))
         if self._may_relax(advanced):
             return [Candidate(candidate.start, candidate.seed.cost, seed=replace(candidate.seed, relaxed=True))]
         if not advanced.passed and candidate.seed.relaxed and np.isnan(self._start(candidate)).any():
@@ -153,8 +153,8 @@ class CandidateSolver(Solver):
         return None
 
     def _motion_samples(self, solution: Solution) -> list[MotionSample]:
-        fractions, samples = self._samples(solution), list[MotionSample]()
-        values = solution.at_fraction(fractions)
+        fractions = self._samples(solution)
+        samples, values = list[MotionSample](), solution.at_fraction(fractions)
         for stretch in self.motion.stretches:
             base = values[f"base{stretch.suffix}"] if self.request.machine.base_size else np.zeros((len(fractions), 0))
             rates = values[SLOPES if self.request.time_cost is not None else f"rates{stretch.suffix}"]
@@ -177,7 +177,7 @@ class CandidateSolver(Solver):
             return self._solve(candidate, Stage.FINE, candidate.solution)
         if isinstance(unreachable := self._count_clear_at(collisions[0].time), Unreachable):
             remedy = f"at {collisions[0].time:.4g} s {unreachable}"
-            return candidate.rejected(self._collision_reason(collisions[0], remedy))
+            return candidate.with_rejection(self._collision_reason(collisions[0], remedy))
         return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
@@ -187,14 +187,14 @@ class CandidateSolver(Solver):
         motion, mesh, _ = self.prepared(candidate, fine=True)
         assert candidate.solution is not None
         if (reason := self._turned_over(candidate.solution)) is not None:
-            return candidate.rejected(reason)
+            return candidate.with_rejection(reason)
         solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if (deviation := self._deviations(motion, solution).max()) > self.settings.max_deviation:
             words = (
                 f"tips deviate, or joints exceed their limits, by {deviation:.2g} (m or rad) on finer meshes as well"
             )
             limit = self.settings.tip_tolerance
-            return candidate.rejected(Reason(Rejection.UNTRACKED, words, "task", float(deviation), limit))
+            return candidate.with_rejection(Reason(Rejection.UNTRACKED, words, "task", float(deviation), limit))
         return replace(candidate, stage=Stage.REFINED, cost=solution.cost, solution=solution)
 
     def _audit(self, candidate: Candidate) -> Candidate:
@@ -227,14 +227,16 @@ class CandidateSolver(Solver):
         if audit.passed:
             return replace(candidate, stage=Stage.AUDITED, audit=audit)
         if not audit.failures:
-            return candidate.rejected(Reason(Rejection.UNDETERMINED, audit.undecided))
+            return candidate.with_rejection(Reason(Rejection.UNDETERMINED, audit.undecided))
         worst = audit.failures[0]
         if candidate.seed.relaxed and not audit.feasible:
             samples = self._motion_samples(solution)
             reason = limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
-            return candidate.rejected(replace(reason, kind=Rejection.AUDIT))
+            return candidate.with_rejection(replace(reason, kind=Rejection.AUDIT))
         words = f"{worst.name} {worst.value:.2g}"
-        return candidate.rejected(Reason(Rejection.AUDIT, words, worst.name, worst.value, worst.limit, worst.time))
+        return candidate.with_rejection(
+            Reason(Rejection.AUDIT, words, worst.name, worst.value, worst.limit, worst.time)
+        )
 
     def _limit_actuators(self, candidate: Candidate) -> Candidate:
         """Solve a candidate again within the actuator limits."""
@@ -247,7 +249,7 @@ class CandidateSolver(Solver):
             return []
         constraints = self.request.clearance_constraints
         if constraints is not None:
-            constraints = constraints.separating(self.local_collisions(candidate.seed))
+            constraints = constraints.with_collisions(self.local_collisions(candidate.seed))
         seed = Seed(candidate.solution, local=candidate.seed.local, direct=True)
         return [Candidate(candidate.start, seed=seed, constraints=constraints)]
 
@@ -260,19 +262,18 @@ class CandidateSolver(Solver):
         if solution.success:
             return solved
         reason = self._failure_reason(solved, str(solution.status))
-        return replace(candidate, cost=np.nan, solution=None).rejected(reason)
+        return replace(candidate, cost=np.nan, solution=None).with_rejection(reason)
 
     def _separate_pairs(self, candidate: Candidate, stage: Stage, collisions: list[Collision]) -> Candidate:
         """Solve a candidate again, with separation constraints for the pairs that collide."""
         assert candidate.constraints is not None
-        constraints = candidate.constraints.separating(collisions)
-        reason = self._collision_reason(collisions[0])
-        return self._solve_again(replace(candidate, constraints=constraints), stage, reason)
+        separated = replace(candidate, constraints=candidate.constraints.with_collisions(collisions))
+        return self._solve_again(separated, stage, self._collision_reason(collisions[0]))
 
     def _solve_again(self, candidate: Candidate, stage: Stage, reason: Reason) -> Candidate:
         count = candidate.separations + 1
         if count > self.settings.max_separations:
-            return replace(candidate, separated=None).rejected(reason)
+            return replace(candidate, separated=None).with_rejection(reason)
         return self._solve(replace(candidate, separations=count, separated=reason), stage, candidate.solution)
 
     def prepared(
@@ -299,9 +300,8 @@ class CandidateSolver(Solver):
         return self._prepared[key]
 
     def _declare(self, candidate: Candidate, start: Array, reference: Array) -> ToolMotion:
-        constraints, relaxed = candidate.constraints, candidate.seed.relaxed
-        options: dict[str, Any] = {"start": start, "reference": reference, "constraints": constraints}
-        return declared_motion(self.request, **options, relaxed=relaxed)
+        options: dict[str, Any] = {"start": start, "reference": reference, "constraints": candidate.constraints}
+        return declared_motion(self.request, **options, relaxed=candidate.seed.relaxed)
 
     def _start(self, candidate: Candidate) -> Array:
         """Return the joints at the start, nan where free; joints that move separated bodies stay free."""
@@ -310,8 +310,7 @@ class CandidateSolver(Solver):
         constraints = candidate.constraints
         if constraints is None or not constraints.margins or self.request.start is not None:
             return self.start
-        affecting = constraints.scene.levers.joints[sorted(constraints.margins)].any(axis=0)
-        return np.where(affecting, np.nan, self.start)
+        return np.where(constraints.scene.levers.joints[sorted(constraints.margins)].any(axis=0), np.nan, self.start)
 
     def _options(
         self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
@@ -405,12 +404,19 @@ class CandidateSolver(Solver):
 
     def same_path(self, solution: Solution, reference: Solution) -> bool:
         """Return whether two motions have the same path, apart from mesh errors and full turns of joints."""
-        samples = np.linspace(0.0, 1.0, self.settings.compared_samples)
-        names = [f"joints{stretch.suffix}" for stretch in self.motion.stretches]
-        paths = [np.hstack([each.at_fraction(samples)[name] for name in names]) for each in (solution, reference)]
-        difference = paths[0] - paths[1]
-        turns = 2 * np.pi * np.round(difference[0] / (2 * np.pi))
+        difference = np.subtract(self._joints_along(solution), self._joints_along(reference))
+        turns = 2 * np.pi * np.round(difference[0, 0] / (2 * np.pi))
         return bool(np.abs(difference - turns).max() <= self.settings.same_path)
+
+    def reaches_limits(self, solution: Solution) -> bool:
+        """Return whether joints of a solution come close to their limits."""
+        joints, bounds = self._joints_along(solution), self.request.bounds
+        return bool(np.minimum(joints - bounds.lower, bounds.upper - joints).min() <= self.settings.same_path)
+
+    def _joints_along(self, solution: Solution) -> Array:
+        """Return joints at samples of all S stretches of time. Shape (S, M, n)."""
+        values = solution.at_fraction(np.linspace(0.0, 1.0, self.settings.compared_samples))
+        return np.array([values[f"joints{stretch.suffix}"] for stretch in self.motion.stretches])
 
     # ---- collisions --------------------------------------------------------------------------------------------------
 
@@ -420,13 +426,9 @@ class CandidateSolver(Solver):
         if constraints is None or solution is None:
             return []
         if self._collisions[0] is not solution:
-            fractions = self._samples(solution)
-            sample, collisions = solution.at_fraction(fractions), []
-            for stretch in self.motion.stretches:
-                has_base = self.request.machine.base_size > 0
-                base = sample[f"base{stretch.suffix}"] if has_base else np.zeros((len(fractions), 0))
-                times = stretch.begin + fractions * stretch.duration
-                collisions += constraints.find_collisions(base, sample[f"joints{stretch.suffix}"], times)
+            collisions = list[Collision]()
+            for sample in self._motion_samples(solution):
+                collisions += constraints.find_collisions(sample.base, sample.joints, sample.t)
             worst: dict[int, Collision] = {}
             for collision in sorted(collisions, key=lambda collision: collision.distance):
                 worst.setdefault(collision.pair, collision)
@@ -466,17 +468,15 @@ class CandidateSolver(Solver):
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
         """Return the error that no candidate passes; if bodies collide, it describes the lowest-cost candidate."""
         error = super().failure(candidates)
-        reasons = ((candidate, candidate.reason) for candidate in candidates)
-        colliding = [c for c, reason in reasons if reason is not None and reason.kind is Rejection.COLLISION]
+        colliding = [c for c in candidates if c.reason is not None and c.reason.kind is Rejection.COLLISION]
         if not colliding:
             return error
         worst = min(colliding, key=lambda candidate: np.inf if np.isnan(candidate.cost) else candidate.cost).reason
         assert worst is not None
-        assert worst.time is not None
-        alternatives = describe_alternatives(self._count_clear_at(worst.time))
+        alternatives = () if worst.time is None else describe_alternatives(self._count_clear_at(worst.time))
         words = "; ".join([f"{error}\nthe lowest-cost candidate in collision: {worst.detail}", *alternatives])
-        details = {"name": worst.name, "value": worst.value, "limit": worst.limit, "time": worst.time}
-        return SolveError(words, error.solution, error.conflicts, **details)
+        details = {key: getattr(worst, key) for key in ("name", "value", "limit", "time")}
+        return SolveError(words, error.solution, error.conflicts, candidates, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the first candidate as the plan, which also lists the other candidates."""

@@ -109,7 +109,7 @@ def plan_sequence(
     limited = {name: (each, own_limits) for name, each in zip(phase_names(resolved), machines, strict=True)}
     mesh = replace(POINTS, intervals=min(POINTS.intervals, -(-PHASE_INTERVALS // len(resolved))))
     solution = within_limits(declare, constraints, limited, settings=SolveSettings(mesh))
-    return _phased(motors, solution, joints)
+    return _plan_of_phases(motors, solution, joints)
 
 
 def plan_goal(
@@ -190,7 +190,7 @@ def plan_steps(
     if joints is None:
         raise ProblemError("start is missing; standing_configuration finds joints for a stance", name="start")
     begin = steps.in_order(stance, joints[None])[0]
-    return _phased(stance, solve_steps(steps, start=begin, cost=cost, limits=limits), joints)
+    return _plan_of_phases(stance, solve_steps(steps, start=begin, cost=cost, limits=limits), joints)
 
 
 def plan_capture(
@@ -211,7 +211,7 @@ def plan_capture(
     chaser = require.instance("machine", machine, FreeFloating)
     options: dict[str, Any] = {"cost": cost, "limits": limits, "clearance_constraints": constraints}
     solution = solve_capture(chaser, capture, start=start, **options)
-    return _phased(chaser, solution, np.asarray(Start.of(start, chaser)[1]))
+    return _plan_of_phases(chaser, solution, np.asarray(Start.of(start, chaser)[1]))
 
 
 def with_joints(goal: Goal, joints: Array) -> Goal:
@@ -220,7 +220,7 @@ def with_joints(goal: Goal, joints: Array) -> Goal:
     return replace(goal, joints=joints, **no_pose)
 
 
-def _phased(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
+def _plan_of_phases(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
     """Return the plan whose motion is a solution with phases."""
     candidate = Candidate(start, solution.cost, None, Stage.AUDITED, solution)
     return PhasedPlan(machine, solution, parts_of_phases(solution), (candidate,))
@@ -372,7 +372,7 @@ class _StandingSolver(Solver):
         except (ProblemError, SolveError) as error:
             if self.start_is_fixed or isinstance(error.__cause__, KeyboardInterrupt):
                 raise
-            return [candidate.rejected(Reason.of_error(Rejection.INFEASIBLE, error))]
+            return [candidate.with_rejection(Reason.of_error(Rejection.INFEASIBLE, error))]
         return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:

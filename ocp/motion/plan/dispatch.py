@@ -220,7 +220,7 @@ def plan_problem(
     """Declare the problem that `plan` solves, without a search over start configurations.
 
     The clearance of the scene is proven by the audit of a solution, but no pair of bodies is separated yet, see
-    `ClearanceConstraints.holding`. Poses of goals need joints here. Limits of actuators beside tip tasks, and a free
+    `ClearanceConstraints.with_pairs`. Poses of goals need joints here. Limits of actuators beside tip tasks, and a free
     horizon for them, belong to `plan`.
 
     Args:

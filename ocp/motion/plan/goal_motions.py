@@ -188,7 +188,7 @@ def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate
         options |= {"limits": request.limits, "clearance_constraints": request.clearance_constraints}
         problem = joint_motion_problem(request.machine, horizon, weights=task.scale**2, **options)
         solution = motion_along(problem, path.joints, task.scale, horizon, length=task.length)
-        candidates.append(_audited(task, solution, path))
+        candidates.append(_audit_candidate(task, solution, path))
     return candidates
 
 
@@ -210,7 +210,7 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
             break
         motion = synchronised_motion(task.start, task.goals[goal], task.bounds)
         with suppress(SolveError):
-            motion = task.torques.slowed(motion)
+            motion = task.torques.slow_down(motion)
             samples = motion.sampled(np.linspace(0.0, 1.0, task.request.settings.phase_samples))[0]
             samples = samples.reshape(-1, len(task.start))
             if task.motions.are_clear(samples[:-1], samples[1:]).all():
@@ -259,7 +259,7 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
     shortest = min((motion.duration for _, motion in motions), default=0.0)
     fixed = settings.spare * shortest if request.horizon is None else float(request.horizon)
     problems = [_PathProblem(task, path, motion, None if is_free else fixed) for path, motion in motions]
-    stopping = [(problem, problem.stopping()) for problem in problems]
+    stopping = [(problem, problem.stopping_motion()) for problem in problems]
     for problem, candidate in sorted(stopping, key=lambda pair: (not pair[1].passed, pair[1].cost)):
         enough = attains_bound(task, candidate) or (candidate.passed and (problem.path.length == 0 or task.is_fastest))
         best = candidate if enough else min(candidate, problem.smooth(), key=lambda c: (not c.passed, c.cost))
@@ -314,7 +314,7 @@ class _PathProblem:
         limits, cost = task.request.limits, task.request.cost
         return dynamics_problem(task.request.machine, (), horizon, **ends, limits=limits, cost=cost, setup=setup)
 
-    def stopping(self) -> Candidate:
+    def stopping_motion(self) -> Candidate:
         """Return the motion that stops at corners, slowed down to the horizon if that is fixed, with its audit."""
         task, factor = self.task, self.horizon_guess / self.motion.duration
         if task.request.cost.energy or np.isfinite(task.bounds.power).any() or task.moves:
@@ -330,7 +330,7 @@ class _PathProblem:
     def candidate(self, method: str) -> Candidate:
         """Audit the motion and return it as a candidate; `method` says how it was computed."""
         problem = self.declare(self.task.request.clearance_constraints)
-        return _audited(self.task, self.motion.solution(problem, method), self.path)
+        return _audit_candidate(self.task, self.motion.solution(problem, method), self.path)
 
     def smooth(self) -> Candidate:
         """Solve for a motion without stops, guessed from the path, and return it with its audit."""
@@ -342,7 +342,7 @@ class _PathProblem:
         guess = {"joints": Samples(times, places), "velocities": Samples(times, velocities), "horizon": duration}
         constraints = task.request.clearance_constraints
         if constraints is not None:
-            constraints = constraints.holding(np.unique(task.motions.near_pairs(places, settings.near)[1]).tolist())
+            constraints = constraints.with_pairs(np.unique(task.motions.near_pairs(places, settings.near)[1]).tolist())
         machines = {"": (task.request.machine, task.request.limits)}
         try:
             solution = within_limits(self.declare, constraints, machines, guess=guess)
@@ -350,25 +350,25 @@ class _PathProblem:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise
             return Candidate(joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
-        return _audited(task, solution, self.path)
+        return _audit_candidate(task, solution, self.path)
 
 
-def _audited(task: GoalTask, solution: Solution, path: JointPath) -> Candidate:
+def _audit_candidate(task: GoalTask, solution: Solution, path: JointPath) -> Candidate:
     """Return a solution as a candidate, rejected if it is not feasible or could not be audited in time."""
     candidate = Candidate(path.joints[0], solution.cost, None, Stage.FINE, solution)
     task.report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
     try:
         audit = solution.audit()
     except TimeLimitReached:
-        return candidate.rejected(Reason(Rejection.NOT_TRIED, "the time limit passed in its audit", "time_limit"))
+        return candidate.with_rejection(Reason(Rejection.NOT_TRIED, "the time limit passed in its audit", "time_limit"))
     if audit.feasible:
         return replace(candidate, stage=Stage.AUDITED)
     collision = next((row for row in audit.failures if row.name in audit.clearances), None)
     if collision is not None:
         words = f"{audit.clearances[collision.name].worst}"
         reason = Reason(Rejection.COLLISION, words, collision.name, collision.value, collision.limit, collision.time)
-        return candidate.rejected(reason)
-    return candidate.rejected(Reason.of_error(Rejection.AUDIT, audit_error(audit, solution)))
+        return candidate.with_rejection(reason)
+    return candidate.with_rejection(Reason.of_error(Rejection.AUDIT, audit_error(audit, solution)))
 
 
 def cost_bound(task: GoalTask, horizon: float) -> float | None:

@@ -47,7 +47,7 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
             bodies and their distance.
         SolveError: No motion was found within the time limit, which does not prove that there is none.
     """
-    task = _checked(request)
+    task = _check_request(request)
     seconds = request.settings.time_limit if request.time_limit is None else request.time_limit
     with time_limited(require.positive("time_limit", seconds)):
         candidates = synchronised_candidates(task) if task.is_fastest else []
@@ -63,7 +63,7 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
     return _best(task, candidates)
 
 
-def _checked(request: GoalRequest) -> GoalTask:
+def _check_request(request: GoalRequest) -> GoalTask:
     """Return the checked request, with goals of unlimited joints shifted by full turns to be near the start.
 
     Raises:
@@ -192,7 +192,7 @@ def _best(task: GoalTask, candidates: list[Candidate]) -> SolvedPlan:
         words = f"none of the {len(candidates)} collision-free paths led to a motion that passes its audit:\n{reasons}"
         raise SolveError(words, candidates[0].solution, (), **details)
     best = passed[0]
-    costlier = [c.rejected(Reason(Rejection.COSTLIER, value=c.cost, limit=best.cost)) for c in passed[1:]]
+    costlier = [c.with_rejection(Reason(Rejection.COSTLIER, value=c.cost, limit=best.cost)) for c in passed[1:]]
     failed = [candidate for candidate in candidates if not candidate.passed]
     assert best.solution is not None
     listed = tuple(candidate.finished() for candidate in (best, *costlier, *failed))

@@ -44,9 +44,9 @@ from ocp.motion.search.dead_end import DeadEnd
 from ocp.motion.search.held_joints import (
     fix_ignorable_joints,
     hold_idle_joints,
-    moved_aside,
+    move_aside,
     place_held_joints,
-    released,
+    release_obstructing,
     restore_error,
 )
 from ocp.motion.search.search import checked_bound
@@ -86,32 +86,32 @@ def plan_from_configurations(
     if request.search == "start" or (request.search == "configurations" and single):
         _try_one_by_one(queue, solver, configurations, thorough=single and not floating)
         if queue.passed or queue.exhausted or (single and not floating):
-            return _finished(queue, solver), None
+            return _final_plan(queue, solver), None
     report(f"local motions from {len(configurations)} starts")
     motions = local_motions_from(request, configurations)
     if floating and (request.search == "global" or single):
         _search_cells(queue, solver, motions, configurations)
-        return _finished(queue, solver), None
+        return _final_plan(queue, solver), None
     if request.search == "global":
         report("global search")
     search = TaskSearch(request, motions) if request.search == "global" else None
     if search is not None:
         _search_globally(queue, solver, search)
         if queue.passed:
-            return _finished(queue, solver), search.bound
+            return _final_plan(queue, solver), search.bound
     seeds = candidates_from(solver, motions)
     queue.run(seeds)
     if not queue.passed:
         _repair(queue, solver, motions, configurations, seeds)
     try:
-        return _finished(queue, solver), None if search is None else search.bound
+        return _final_plan(queue, solver), None if search is None else search.bound
     except SolveError as error:
         if search is not None and (dead_end := search.dead_end()) is not None:
             raise dead_end from error
         raise
 
 
-def _finished(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
+def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
     """Return the plan of the lowest-cost candidate, as measured by the cost of the request.
 
     If the request has another cost than the squared rates, all motions that passed are solved again at that cost, in
@@ -251,7 +251,7 @@ def _search_cells(
                 return
     reason = Reason(Rejection.NOT_TRIED, f"the {settings.max_failures} lowest-cost motions of its search fail")
     rest = [seed for batch in batches for seed in batch[settings.max_failures :]]
-    queue.candidates += [seed.rejected(reason) for seed in rest]
+    queue.candidates += [seed.with_rejection(reason) for seed in rest]
 
 
 def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
@@ -270,7 +270,7 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
         finished = finished_by_seed[id(seed.seed)]
         colliding = solver.collisions(finished)
         if finished.constraints is not None and (colliding or finished.constraints.margins):
-            constraints = finished.constraints.separating([*colliding, *local[id(seed)]])
+            constraints = finished.constraints.with_collisions([*colliding, *local[id(seed)]])
             rerouted.append((distances[id(seed)], replace(seed, constraints=constraints)))
     alternatives = sorted(rerouted, key=lambda entry: -entry[0])[:max_tries]
     if request.start is None:
@@ -294,7 +294,7 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
     Raises:
         ProblemError, SolveError: As in `plan`.
     """
-    attempt, changes = hold_idle_joints(request), [moved_aside, released]
+    attempt, changes = hold_idle_joints(request), [move_aside, release_obstructing]
     while True:
         try:
             return _plan_attempt(request, attempt)

@@ -40,7 +40,7 @@ from ocp.motion.tasks.checks import check_rest
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start
 from ocp.motion.tasks.limits import Limits
-from ocp.motion.tasks.tip_task import TipTask, timed
+from ocp.motion.tasks.tip_task import TipTask, retime_task
 
 __all__ = ["SequenceRequest", "plan_consecutive", "plan_in_segments"]
 
@@ -134,15 +134,15 @@ class _Sequence:
             if isinstance(part, Goal):
                 name = part.name or f"goal {number}"
                 if following is not None and not isinstance(following, Goal) and not self.machine.base_size:
-                    with _named(f"task {number + 1}"):
+                    with _naming_part(f"task {number + 1}"):
                         led = self._plan_tasks(following, self._joints_near(part))
                     part = _led_to(self.machine, part, led, self.request.smooth)
-                with _named(name):
+                with _naming_part(name):
                     self._append(self._plan_goal(part), name)
                 continue
-            with _named(f"task {number}"):
+            with _naming_part(f"task {number}"):
                 plan = led or self._plan_tasks(part, self.state.joints)
-            with _named(f"approach to task {number}"):
+            with _naming_part(f"approach to task {number}"):
                 plan = self._approach(plan, part, f"approach to task {number}")
             self._append(plan, f"task {number}")
             led = None
@@ -274,7 +274,7 @@ def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:
 
 
 @contextmanager
-def _named(part: str) -> Iterator[None]:
+def _naming_part(part: str) -> Iterator[None]:
     """Add the name of a part of a sequence to the errors that its planner raises."""
     try:
         yield
@@ -375,7 +375,9 @@ def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
         return None
     shift, breaks = first - task.begin, np.asarray(task.breaks)
     inside = breaks[(breaks > shift) & (breaks < last - task.begin)] - shift
-    shifted = replace(task, breaks=()) if shift == 0 else timed(replace(task, breaks=()), lambda time: time + shift)
+    shifted = (
+        replace(task, breaks=()) if shift == 0 else retime_task(replace(task, breaks=()), lambda time: time + shift)
+    )
     return replace(shifted, begin=first - begin, duration=last - first, breaks=inside)
 
 

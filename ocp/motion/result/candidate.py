@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from models.checks import Array
+from models.checks import ROUNDING, Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import ClosestPair
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -121,6 +121,16 @@ class Seed:
     thorough: bool = False
     relaxed: bool = False
 
+    def is_turned(self, other: Seed) -> bool:
+        """Return whether the local motions of two seeds are equal apart from full turns of joints."""
+        pairs = list(zip(self.local, other.local, strict=False))
+        if not pairs or (self.direct, self.fixed, self.relaxed) != (other.direct, other.fixed, other.relaxed):
+            return False
+        turns = 2 * np.pi * np.round((pairs[0][0].joints - pairs[0][1].joints)[0, 0] / (2 * np.pi))
+        differences = [np.abs(one.joints - two.joints - turns).max() for one, two in pairs]
+        differences += [np.abs(one.base - two.base).max(initial=0.0) for one, two in pairs]
+        return bool(max(differences) <= ROUNDING)
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -180,7 +190,7 @@ class Candidate:
         """Whether the candidate has not been rejected."""
         return self.reason is None
 
-    def rejected(self, reason: Reason) -> Candidate:
+    def with_rejection(self, reason: Reason) -> Candidate:
         """Return the candidate as rejected, for this reason or for an earlier collision that it led to."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")

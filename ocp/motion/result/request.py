@@ -286,10 +286,10 @@ def _scene_fields(scene: CollisionScene) -> dict[str, Any]:
 def _put_track(name: str, track: Callable[[Any], Any], writer: FunctionWriter) -> dict[str, Any]:
     """Return the record of a function of time and, if it has one, of its rate."""
     parts = {"track": track, "rate": getattr(track, "rate", None)}
-    return {role: writer.write(_traced(name, part)) for role, part in parts.items() if part is not None}
+    return {role: writer.write(_trace(name, part)) for role, part in parts.items() if part is not None}
 
 
-def _traced(name: str, track: Callable[[Any], Any]) -> Any:
+def _trace(name: str, track: Callable[[Any], Any]) -> Any:
     """Convert a function of time to a CasADi function by calling it with a symbol."""
     for symbols in (ca.SX, ca.MX):
         time = symbols.sym("time")
@@ -351,7 +351,7 @@ def _read(value: Any, functions: list[Any], machines: tuple[Machine, Machine] | 
     if value["kind"] == "CollisionScene" and machines is not None:
         whole, own = machines
         options = {name: fields[name] for name in ("obstacles", "clearance", "ignored", "limits")}
-        scene = CollisionScene(whole, **options, covered=_covered(fields["covered"]))
+        scene = CollisionScene(whole, **options, covered=_mesh_covers(fields["covered"]))
         return scene if own is whole else scene.with_locked(own)
     if fields.get("file") is not None and value["kind"] == "Mesh":
         raise ValueError("a mesh names a file, which is not read")
@@ -364,7 +364,7 @@ def _of_time(function: Any) -> Any:
     return function
 
 
-def _covered(written: Mapping[str, Any]) -> dict[tuple[str, int], tuple[Body, ...]]:
+def _mesh_covers(written: Mapping[str, Any]) -> dict[tuple[str, int], tuple[Body, ...]]:
     """Return the bodies that cover each mesh, by the link and the index of the mesh among its collision shapes."""
     bodies = {}
     for place, (points, shapes) in written.items():

@@ -24,8 +24,7 @@ from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
-import scipy.sparse as sp
-from scipy.interpolate import BSpline
+import scipy
 
 from models.checks import Array
 from ocp.console import TimeLimitReached, check_time
@@ -139,7 +138,7 @@ def fastest_motion_near(
         state = search.evaluate(state.points, state.duration)
     motion = search.motion(state)
     rests = not (np.any(limits.start_velocity) or np.any(limits.end_velocity))
-    return limits.torques.slowed(motion) if rests else motion
+    return limits.torques.slow_down(motion) if rests else motion
 
 
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
@@ -227,17 +226,19 @@ class _Search:
         self.breaks = self._breaks(path)
         self.knots = np.concatenate([np.zeros(self.degree), self.breaks, np.ones(self.degree)])
         self.count = len(self.breaks) - 1 + self.degree
-        self.derivatives = [sp.eye_array(self.count, format="csr")]
+        self.derivatives = [scipy.sparse.eye_array(self.count, format="csr")]
         for order in range(1, self.degree + 1):
             last = self.derivatives[-1]
             first, ahead = np.arange(order, order + last.shape[0] - 1), self.degree + 1 - order
             width = self.knots[first + ahead] - self.knots[first]
-            self.derivatives.append(sp.csr_array(sp.diags_array(ahead / width) @ (last[1:] - last[:-1])))
+            self.derivatives.append(
+                scipy.sparse.csr_array(scipy.sparse.diags_array(ahead / width) @ (last[1:] - last[:-1]))
+            )
         self.places = np.linspace(0.0, 1.0, 2 * settings.intervals + 2)[1:-1]
         both = self.degree == 2  # the acceleration jumps at knots
         sides = [self.breaks[:-1], (self.breaks[:-1] + self.breaks[1:]) / 2, self.breaks[1:]]
         at = np.concatenate(sides) if both else np.unique(np.concatenate(sides))
-        second = sp.vstack([self.derivatives[2]] * len(sides)) if both else self._values(at, 2)
+        second = scipy.sparse.vstack([self.derivatives[2]] * len(sides)) if both else self._values(at, 2)
         self.at_torques = self._values(at, 0), self._values(at, 1), second
         self._fix_ends()
 
@@ -261,7 +262,7 @@ class _Search:
     def _values(self, places: Array, order: int) -> Any:
         """Return the matrix that maps control points to values of a derivative at fractions (M,). Shape (M, K)."""
         knots = self.knots[order : len(self.knots) - order]
-        return BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
+        return scipy.interpolate.BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
 
     def _fix_ends(self) -> None:
         """Set the control points that the end conditions determine to `fixed` + T `moving`; the others are free.
@@ -308,9 +309,9 @@ class _Search:
         if len(self.limits.torques.limited):
             parts += self._torque_rows(points, duration)
         rows, by_time, usages, tolerances = zip(*parts, strict=True)
-        matrix = sp.vstack(rows).tocsc()
+        matrix = scipy.sparse.vstack(rows).tocsc()
         by_duration = np.concatenate(by_time) + matrix @ (duration * self.moving).ravel()
-        matrix = sp.hstack([matrix[:, self.free], sp.csc_array(by_duration[:, None])])
+        matrix = scipy.sparse.hstack([matrix[:, self.free], scipy.sparse.csc_array(by_duration[:, None])])
         allowed = np.concatenate(
             [np.full(len(usage), 1 + most) for usage, most in zip(usages, tolerances, strict=True)]
         )
@@ -324,8 +325,8 @@ class _Search:
                 continue
             derivative = self.derivatives[order]
             scale = 1 / (self.largest[order - 1][limited] * duration**order)
-            pick = sp.csr_array((scale, (np.arange(len(limited)), limited)), shape=(len(limited), self.size))
-            matrix, usages = sp.kron(derivative, pick), ((derivative @ points)[:, limited] * scale).ravel()
+            pick = scipy.sparse.csr_array((scale, (np.arange(len(limited)), limited)), shape=(len(limited), self.size))
+            matrix, usages = scipy.sparse.kron(derivative, pick), ((derivative @ points)[:, limited] * scale).ravel()
             by_duration = np.full(len(usages), -float(order))
             for sign in (1.0, -1.0):
                 yield sign * matrix, by_duration, sign * usages, LIMIT_TOLERANCE
@@ -341,7 +342,7 @@ class _Search:
         """Yield the constraint rows of the torques at the knots, in both directions."""
         torques, share = self.limits.torques, self.settings.torque_share
         first, second = self.at_torques[1] @ points / duration, self.at_torques[2] @ points / duration**2
-        values, slopes = torques.linearised(self.at_torques[0] @ points, first, second)
+        values, slopes = torques.linearise(self.at_torques[0] @ points, first, second)
         scale = 1 / (share * torques.largest)
         at = np.repeat(np.arange(len(values)), len(scale))
         matrix: Any = 0.0
@@ -354,11 +355,11 @@ class _Search:
 
     def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
         """Return constraint rows for the control points, from basis values (R, K) and derivatives by joints (R, n)."""
-        weights = sp.coo_array(basis)
+        weights = scipy.sparse.coo_array(basis)
         row = np.repeat(weights.row, self.size)
         column = (weights.col[:, None] * self.size + np.arange(self.size)).ravel()
         values = (weights.data[:, None] * by_joint[weights.row]).ravel()
-        return sp.csr_array((values, (row, column)), shape=(len(by_joint), self.count * self.size))
+        return scipy.sparse.csr_array((values, (row, column)), shape=(len(by_joint), self.count * self.size))
 
     def step(self, state: _State, region: float) -> _State | None:
         """Return the motion after a step within a trust region; None if the linear program has no solution."""
@@ -371,7 +372,7 @@ class _Search:
         reachable = state.usages + abs(state.rows) @ np.maximum(-lower, upper)[:-1]
         kept = np.flatnonzero(reachable > 1)
         excess = np.maximum(state.usages[kept] - 1, 0.0)
-        matrix = ca.DM(sp.hstack([state.rows[kept], sp.csr_array(-excess[:, None])]).tocsc())
+        matrix = ca.DM(scipy.sparse.hstack([state.rows[kept], scipy.sparse.csr_array(-excess[:, None])]).tocsc())
         cost = np.concatenate([np.zeros(count), [1.0, settings.violation]])
         shape = {"h": ca.Sparsity(count + 2, count + 2), "a": matrix.sparsity()}
         solver = ca.conic("step", "highs", shape, SOLVER)

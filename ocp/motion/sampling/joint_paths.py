@@ -388,7 +388,7 @@ def optimise_length(
         return path
     length = path_length(path, scale)
     count = int(np.clip(np.ceil(length / settings.motion), settings.fewest, settings.most))
-    chain = _resampled(motions, path, scale, count)
+    chain = _resample(motions, path, scale, count)
     best, best_length, inertia, idle = path, length, settings.inertia, 0
     for _ in range(settings.most_steps):
         check_time()
@@ -403,11 +403,11 @@ def optimise_length(
         idle = idle + 1 if gain < settings.least_gain else 0
         if idle > settings.patience or inertia > settings.most_inertia:
             break
-        chain = _resampled(motions, best, scale, count)
+        chain = _resample(motions, best, scale, count)
     return best
 
 
-def _resampled(motions: StraightMotions, path: Array, scale: Array, count: int) -> Array:
+def _resample(motions: StraightMotions, path: Array, scale: Array, count: int) -> Array:
     """Divide the path into motions of similar length that are proven collision-free; keep corners if necessary.
 
     It is the old path if the motions cannot be proven, since halves of a proven motion need not be.

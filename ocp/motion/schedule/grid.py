@@ -148,7 +148,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     sample_distances = path.sample_distances(SETTINGS.cells, max(1, SETTINGS.segments // len(bounds)))
     first = _separate(np.concatenate([sample_distances, nodes]), nodes)
     parts = [
-        _halved(path, limits, joints, first[begin : begin + BLOCK_SIZE + 1], (bounds, requested))
+        _halve_intervals(path, limits, joints, first[begin : begin + BLOCK_SIZE + 1], (bounds, requested))
         for begin in range(0, len(first) - 1, BLOCK_SIZE)
     ]
     cells = _Cells(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
@@ -160,7 +160,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)
 
 
-def _halved(
+def _halve_intervals(
     path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, requested: tuple[Array, Array]
 ) -> _Cells:
     """Halve the intervals between positions on the path until their limit rows vary almost linearly.
@@ -176,7 +176,9 @@ def _halved(
     for _ in range(SETTINGS.halvings):
         middle = (s[new] + s[new + 1]) / 2
         middle_rows = limit_rows(path, limits, joints, middle)
-        uneven = _uneven(rows.take(new), middle_rows, rows.take(new + 1), _steady_speeds(rows, s, *requested)[new])
+        uneven = _uneven_intervals(
+            rows.take(new), middle_rows, rows.take(new + 1), _steady_speeds(rows, s, *requested)[new]
+        )
         uneven &= s[new + 1] - s[new] > SETTINGS.shortest * path.length
         if not uneven.any():
             break
@@ -231,7 +233,7 @@ def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Arr
     return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), here))
 
 
-def _uneven(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
+def _uneven_intervals(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
     """Return which intervals have limit rows that are not linear enough, at the fastest steady speed. Shape (N,)."""
     sides = left, middle, right
     kinds = (

@@ -92,7 +92,9 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
     for begin in range(0, len(of_pieces), BLOCK_SIZE):
         ends = bounds[begin : begin + BLOCK_SIZE + 1]
         low, high = np.searchsorted(first, ends[[0, -1]])
-        parts.append(_refined(path, limits, first[low : high + 1], ends, of_pieces[begin : begin + BLOCK_SIZE]))
+        parts.append(
+            _refine_distances(path, limits, first[low : high + 1], ends, of_pieces[begin : begin + BLOCK_SIZE])
+        )
     s = np.concatenate([part[0][:-1] for part in parts] + [first[-1:]])
     permitted = np.concatenate([part[1][:-1] for part in parts] + [parts[-1][1][-1:]])
     # where two parts meet, both sides count
@@ -101,7 +103,7 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
     return s, permitted * (1 - SETTINGS.speed_error), np.concatenate([part[2] for part in parts])
 
 
-def _refined(
+def _refine_distances(
     path: PathLike, limits: LineLimits, s: Array, bounds: Array, of_pieces: Array
 ) -> tuple[Array, Array, Array]:
     """Refine the distances for `_velocity_curve` over some pieces of the path until they resolve it."""
@@ -117,7 +119,7 @@ def _refined(
     permitted[at] = np.minimum(permitted_at(before), permitted[at])
     for _ in range(SETTINGS.curve_halvings):
         requested = of_pieces[segment_index(bounds, (s[:-1] + s[1:]) / 2)]
-        coarse = np.flatnonzero(_unresolved(path.length, s, permitted, requested, limits.acceleration))
+        coarse = np.flatnonzero(_unresolved_intervals(path.length, s, permitted, requested, limits.acceleration))
         if not coarse.size:
             break
         middle = (s[coarse] + s[coarse + 1]) / 2
@@ -125,7 +127,9 @@ def _refined(
     return s, permitted, np.asarray(of_pieces[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
 
 
-def _unresolved(length: float, s: Array, permitted: Array, requested: Array, acceleration: float) -> NDArray[np.bool_]:
+def _unresolved_intervals(
+    length: float, s: Array, permitted: Array, requested: Array, acceleration: float
+) -> NDArray[np.bool_]:
     """Return which intervals are too coarse to resolve the permitted speed where it limits the motion.
 
     It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.

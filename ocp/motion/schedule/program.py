@@ -309,7 +309,7 @@ class _Constraints:
         """Return the changes of all constraints for a change of the coefficients. Shape (M,)."""
         return self._all_values(change, _weighted_sum(self.gradients, self._coefficients(change)))
 
-    def gathered(self, values: Array) -> Array:
+    def weighted_gradients(self, values: Array) -> Array:
         """Return the gradients of all constraints, weighted by values and summed. Shape (N + 2,)."""
         out = self._spread(self.gradients * values[self.alone :])
         out[1:-1] -= values[: self.count]
@@ -419,7 +419,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
             break
         complementary = mean * len(gap) < max(INTERIOR.accepted, accuracy) * time
         if complementary and worst < max(INTERIOR.missed, INTERIOR.missed_by_accuracy * accuracy**2):
-            stationarity = slope + constraints.gathered(multiplier)
+            stationarity = slope + constraints.weighted_gradients(multiplier)
             ends.reduce(stationarity)
             if float(np.abs(stationarity * b).sum()) < max(INTERIOR.accepted, accuracy) * time:
                 accepted = b
@@ -435,7 +435,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
             equations = _BandSolver(ends.band(*(own + more for own, more in zip(curvature, squares, strict=True))))
         except np.linalg.LinAlgError:
             break
-        gradient = slope + constraints.gathered(weight * residual)
+        gradient = slope + constraints.weighted_gradients(weight * residual)
 
         # the relative rates of the multipliers are those of the slacks, mirrored about -1/2
         change = solve(-gradient)
@@ -447,7 +447,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         sigma = np.maximum(min((after / mean) ** 3, 1.0), remaining * remaining * remaining)
         target = (mean * sigma).take(constraints.interval) + affine * affine * product * rates * (1 + rates)
         target_multiplier = target * per_slack
-        change = solve(-(gradient + constraints.gathered(target_multiplier)))
+        change = solve(-(gradient + constraints.weighted_gradients(target_multiplier)))
         slack_change = -(residual + constraints.change_of(change))
         multiplier_change = target_multiplier - multiplier - weight * slack_change
         lengths = [

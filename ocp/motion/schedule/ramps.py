@@ -201,10 +201,10 @@ def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
     count = len(lengths)
     for i in range(count):
         if ends[i + 1] > ends[i]:
-            ends[i + 1] = _limited(ends[i + 1], ends[i], lengths[i], limits[i])
+            ends[i + 1] = _limit_speed(ends[i + 1], ends[i], lengths[i], limits[i])
     for i in reversed(range(count)):
         if ends[i] > ends[i + 1]:
-            ends[i] = _limited(ends[i], ends[i + 1], lengths[i], limits[i])
+            ends[i] = _limit_speed(ends[i], ends[i + 1], lengths[i], limits[i])
 
     motions: list[Phases] = []
     for largest, length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
@@ -240,7 +240,7 @@ def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
     return SpeedProfile(np.concatenate([[0.0], np.cumsum(durations)]), s, v, a, jerks)
 
 
-def _limited(speed: float, other_end: float, length: float, limits: tuple[float, float, float]) -> float:
+def _limit_speed(speed: float, other_end: float, length: float, limits: tuple[float, float, float]) -> float:
     """Return the greater speed at the ends of a zone, lowered to what can be reached from the other end."""
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 

@@ -43,9 +43,9 @@ __all__ = [
     "all_joints",
     "fix_ignorable_joints",
     "hold_idle_joints",
-    "moved_aside",
+    "move_aside",
     "place_held_joints",
-    "released",
+    "release_obstructing",
     "restore_error",
 ]
 
@@ -78,7 +78,7 @@ def hold_idle_joints(request: PlanRequest) -> PlanRequest:
         return request
     bounds, start = request.bounds, request.start
     positions = idle_positions(bounds.lower, bounds.upper) if start is None else start
-    return request.with_held(_named(request.machine, positions, np.flatnonzero(idle).tolist()))
+    return request.with_held(_positions_by_name(request.machine, positions, np.flatnonzero(idle).tolist()))
 
 
 def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanRequest, Array]:
@@ -203,7 +203,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
     return start, np.where(ignorable, start, configurations)
 
 
-def moved_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
+def move_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
     """Return the request with held joints moved so that they no longer cause a reported collision.
 
     Args:
@@ -214,7 +214,7 @@ def moved_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> 
     Returns:
         The request with the nearest such positions; None if the start is given, or there are none.
     """
-    names = _obstructing(whole, request, error)
+    names = _obstructing_joints(whole, request, error)
     if not names or whole.start is not None:
         return None
     assert whole.clearance_constraints is not None
@@ -235,18 +235,18 @@ def moved_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> 
     return None if best is None else whole.with_held(best)
 
 
-def released(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
+def release_obstructing(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
     """Return the request without holding the joints that move a colliding body; None if none of them is held.
 
-    Args: As in `moved_aside`.
+    Args: As in `move_aside`.
     """
-    names = _obstructing(whole, request, error)
+    names = _obstructing_joints(whole, request, error)
     if not names or request.search == "global":
         return None
     return whole.with_held({name: place for name, place in _own_held(whole, request).items() if name not in names})
 
 
-def _obstructing(whole: PlanRequest, request: PlanRequest, error: SolveError) -> list[str]:
+def _obstructing_joints(whole: PlanRequest, request: PlanRequest, error: SolveError) -> list[str]:
     """Return the held joints that move a body of the collision that an error reports."""
     if whole.clearance_constraints is None:
         return []
@@ -262,7 +262,7 @@ def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[di
     samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, seed=whole.seed)
     columns = [names.index(name) for name in held]
     order = np.argsort(np.abs(samples[:, columns] - np.array([*held.values()])).max(axis=1), kind="stable")
-    return [_named(whole.machine, sample, columns) for sample in samples[order]]
+    return [_positions_by_name(whole.machine, sample, columns) for sample in samples[order]]
 
 
 def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequest:
@@ -281,14 +281,14 @@ def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequ
     if request.search != "global" or request.machine.base_size or excess <= 0 or len(columns) < excess:
         return request
     if request.start is not None:
-        return request.with_held(_named(request.machine, request.start, columns))
+        return request.with_held(_positions_by_name(request.machine, request.start, columns))
     weights = request.weights.copy()
     weights[columns] *= STIFFNESS
     motions = local_motions_from(replace(request, weights=weights), configurations)
     costs = np.sum([motion.cost for motion in motions], axis=0)
     tracked = np.array(largest_pose_errors(motions)) <= REACH_TOLERANCE
     best = int(np.where(tracked | ~tracked.any(), costs, np.inf).argmin())
-    return request.with_held(_named(request.machine, motions[0].joints[best, 0], columns))
+    return request.with_held(_positions_by_name(request.machine, motions[0].joints[best, 0], columns))
 
 
 def _shared_joints(request: PlanRequest) -> list[int]:
@@ -326,5 +326,5 @@ def restore_error(error: Error, request: PlanRequest) -> Error:
     return error
 
 
-def _named(machine: Machine, joints: Array, columns: list[int]) -> dict[str, float]:
+def _positions_by_name(machine: Machine, joints: Array, columns: list[int]) -> dict[str, float]:
     return {machine.robot.joint_names[column]: float(joints[column]) for column in columns}

@@ -155,7 +155,7 @@ def checked_tasks(
         raise ProblemError(words, name="rows", value=rows)
     if not any(part.task.is_pose for part in equations.bound):
         return
-    times, values = _sampled(equations, horizon, CHECKS.track_samples)
+    times, values = _sample_targets(equations, horizon, CHECKS.track_samples)
     if not (finite := np.isfinite(values).all(axis=0)).all():
         first = float(times[~finite][0])
         words = f"the task's targets are not finite at {first:g} s"
@@ -225,7 +225,7 @@ def _frame(part: BoundTask) -> str:
     return part.task.link or part.tip.robot.tip_link
 
 
-def _sampled(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
+def _sample_targets(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
     """Return `count` equidistant times, and the targets at these times, one column each."""
     times = np.linspace(0.0, horizon, count)
     return times, np.array(equations.target_function().map(count)(times[None, :]))
@@ -263,7 +263,7 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
     Poses are checked by their targets, velocities by their integrals.
     """
-    times, values = _sampled(equations, horizon, CHECKS.closure_samples)
+    times, values = _sample_targets(equations, horizon, CHECKS.closure_samples)
     for part, targets in _parts(equations, values):
         task = part.task
         if task.is_pose:
@@ -310,7 +310,7 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
         task = part.task
         if task.position is None or task.axes != "world" or task.relative_to is not None or part.tip.base_size:
             continue
-        times, values = _sampled(TaskEquations(equations.machine, (part,)), horizon, CHECKS.track_samples)
+        times, values = _sample_targets(TaskEquations(equations.machine, (part,)), horizon, CHECKS.track_samples)
         positions = values[task.linear].T
         shoulder, reach = _shoulder_and_reach(part.tip, base)
         far = np.linalg.norm(positions - shoulder[task.linear], axis=1)

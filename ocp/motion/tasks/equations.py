@@ -335,7 +335,7 @@ class TaskEquations:
         goal = direction[0] if reference is None else ca.mtimes(reference.rotation, direction[0])
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
-    def holding(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
+    def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
         """Return the pose error by which velocity tasks at a free start deviate from the reference configuration.
 
         For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
@@ -421,7 +421,7 @@ class TaskEquations:
 
         return on_symbols(build)
 
-    def closing(self, base: Array, joints: Array) -> Array:
+    def cyclic_rows(self, base: Array, joints: Array) -> Array:
         """Return the combinations of task rows whose integral vanishes in a cyclic motion. Shape (size, k).
 
         If the joints return to their start, part of the closure conditions follows from the task: all of its rows on a

@@ -20,10 +20,10 @@ from models.checks import Array, ArrayInput
 from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, rotation_from_quaternion, skew
 from ocp.errors import ProblemError, require
-from ocp.motion.tasks.tracks import Track, path_tracks, reparametrized
+from ocp.motion.tasks.tracks import Track, path_tracks, reparametrize
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
-__all__ = ["Axes", "Roll", "TipTask", "Velocity", "timed"]
+__all__ = ["Axes", "Roll", "TipTask", "Velocity", "retime_task"]
 
 Velocity: TypeAlias = Any
 """A track with one entry for each row of the task."""
@@ -229,7 +229,7 @@ class TipTask:
         return np.inf if self.duration is None else float(self.begin + self.duration)
 
 
-def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
+def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
     """Convert a task over a path parameter to a task over time.
 
     Args:
@@ -243,7 +243,7 @@ def timed(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
         return ca.jacobian(parameter, time) * expression(rate)
 
     poses = ("position", "orientation", "direction")
-    tracks: dict[str, Any] = {name: reparametrized(getattr(task, name), clock) for name in poses}
+    tracks: dict[str, Any] = {name: reparametrize(getattr(task, name), clock) for name in poses}
     if task.velocity is not None:
         tracks["velocity"] = velocity
     return replace(task, **tracks)

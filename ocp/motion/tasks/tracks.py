@@ -22,7 +22,7 @@ from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError, require
 
 __all__ = [
-    "PathTracks", "PoseLine", "Track", "TrackWithRate", "on_symbols", "path_tracks", "pose_line", "reparametrized",
+    "PathTracks", "PoseLine", "Track", "TrackWithRate", "on_symbols", "path_tracks", "pose_line", "reparametrize",
     "track_expression",
 ]  # fmt: skip
 
@@ -176,7 +176,7 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
     return PathTracks(position, orientation, duration, np.asarray(breaks, dtype=float))
 
 
-def reparametrized(track: Track, clock: Callable[[Any], Any]) -> Track:
+def reparametrize(track: Track, clock: Callable[[Any], Any]) -> Track:
     """Convert a function of a path parameter to a function of time; constants remain unchanged.
 
     Args:

@@ -194,7 +194,7 @@ def capture_problem(
             reach of the arm, m.
     """
     own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
-    first, second = own.approach(), own.detumbling(None)
+    first, second = own.approach(), own.declare_second_phase(None)
     own.guess_approach(first)
     guess_braking(second, own.pair, _end_of(first))
     problem = Phases("capture", {APPROACH: first, DETUMBLE: second})
@@ -202,7 +202,7 @@ def capture_problem(
     end = {name: before.at_end(name) for name in ("base", "target", "joints")}
     base, joints, rates = (after.at_start(name) for name in ("base", "joints", "velocities"))
     initial = {
-        "joints": ca.DM(own.arm) * end["joints"], "velocities": before.at_end("velocities"),
+        "joints": ca.DM(own.arm_weights) * end["joints"], "velocities": before.at_end("velocities"),
         "base": own.base_after(end["base"], end["joints"], before.duration),
     }  # fmt: skip
     problem.join(APPROACH, DETUMBLE, initial)
@@ -269,7 +269,7 @@ def chained_capture(
     """
     mesh = POINTS if method is None else require.instance("method", method, Collocation)
     own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
-    own.detumbling(None)  # raises before the approach is solved
+    own.declare_second_phase(None)  # raises before the approach is solved
 
     def declare_approach(constraints: ClearanceConstraints | None) -> Problem:
         problem = replace(own, clearance_constraints=constraints).approach()
@@ -280,11 +280,11 @@ def chained_capture(
     settings = SolveSettings(mesh, tolerances=tolerances)
     first = within_limits(declare_approach, clearance_constraints, {"": (chaser, limits)}, settings=settings)
     end = dict(first.at_fraction(1.0))
-    end["joints"] = own.arm * end["joints"]
+    end["joints"] = own.arm_weights * end["joints"]
     end["base"] = np.array(ca.DM(_of_unit_length(chaser, end["base"]))).ravel()
 
     def declare_detumbling(_: ClearanceConstraints | None) -> Problem:
-        problem = own.detumbling(end)
+        problem = own.declare_second_phase(end)
         guess_braking(problem, own.pair, (end["joints"], end["velocities"], end["base"]))
         return problem
 
@@ -340,7 +340,7 @@ class _Capture:
         return cls(chaser, capture, pair, state, shared, clearance_constraints)
 
     @property
-    def arm(self) -> Array:
+    def arm_weights(self) -> Array:
         """Weights that are 1 for arm joints and 0 for reaction wheels, whose angles restart from zero. Shape (n,)."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
@@ -391,7 +391,7 @@ class _Capture:
             )
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
 
-    def detumbling(self, start: Mapping[str, Array] | None) -> Problem:
+    def declare_second_phase(self, start: Mapping[str, Array] | None) -> Problem:
         """Declare the second phase, from the end of an approach or, with a free start, to be joined to one."""
         pair, capture = self.pair, self.capture
         wheels, rest = find_wheels(pair.robot), capture.rest

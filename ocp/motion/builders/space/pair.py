@@ -41,7 +41,7 @@ __all__ = [
     "guess_approach",
     "guess_braking",
     "guessed_horizon",
-    "joined",
+    "join_target",
     "motion_of",
     "pair_momentum",
     "require_capacity",
@@ -50,7 +50,7 @@ __all__ = [
 ]
 
 
-def joined(chaser: Robot, target: Robot) -> Robot:
+def join_target(chaser: Robot, target: Robot) -> Robot:
     """Return the chaser's robot with the target as an additional link, whose tip frame is at the chaser's tip.
 
     Raises:
@@ -79,7 +79,7 @@ def checked_pair(chaser: Any, target: Any) -> Robot:
     if not chaser.joint_size:
         raise ProblemError("capture: the chaser has no joints to reach with", name="chaser", value=chaser)
     try:
-        return joined(chaser.robot, target.robot)
+        return join_target(chaser.robot, target.robot)
     except ModelError as error:
         raise ProblemError(f"capture: {error}", name="target", value=error.value) from error
 

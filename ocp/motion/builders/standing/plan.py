@@ -404,7 +404,7 @@ def _attempts(
         if attempt.exceeded:
             tightened = partial(tighten, problem, mesh, options=settings, guess=guess)
             yield judge(f"{name}, tightened", problem, tightened)
-        mesh = mesh.halved()
+        mesh = mesh.halve()
 
 
 def _tip(level: Level | None) -> str:

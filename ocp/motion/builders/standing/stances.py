@@ -345,11 +345,11 @@ def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]
     for k, phase in enumerate(steps.phases):
         order = steps.order(steps.stances[k])
         configurations = [ends[k], ends[k + 1]]
-        if raised := _raised(steps.swings(k), lift):
+        if raised := _raised_poses(steps.swings(k), lift):
             middle = Stance.on(steps.robot, steps.feet, {**phase.footholds, **raised}, steps.gravity)
             over = (steps.balanced(k) + steps.balanced(k + 1)) / 2
             configurations.insert(1, _configuration(steps, middle, (ends[k] + ends[k + 1]) / 2, over))
-        guesses.append(_interpolated(np.array(configurations)[:, order], phase.seconds))
+        guesses.append(_interpolate(np.array(configurations)[:, order], phase.seconds))
     return guesses
 
 
@@ -359,7 +359,7 @@ def _configuration(steps: Steps, stance: Stance, near: Array, over: Array) -> Ar
     return np.asarray(steps.in_order(stance, joints[None])[0])
 
 
-def _raised(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
+def _raised_poses(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
     """Return the raised poses of swinging feet midway between their footholds."""
     raised = {}
     for swing in swings:
@@ -371,7 +371,7 @@ def _raised(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
     return raised
 
 
-def _interpolated(configurations: Array, seconds: float) -> dict[str, Any]:
+def _interpolate(configurations: Array, seconds: float) -> dict[str, Any]:
     """Return a quintic rest-to-rest motion through 2 or 3 configurations."""
     share = np.linspace(0.0, 1.0, CONFIGURATIONS.steps + 1)
     first, last = configurations[0], configurations[-1]

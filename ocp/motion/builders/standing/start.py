@@ -24,7 +24,7 @@ from ocp.motion.local.accelerations import AccelerationOptions, resolve_accelera
 from ocp.motion.tasks.checks import clip_to_limits
 from ocp.motion.tasks.equations import TaskEquations
 from ocp.motion.tasks.limits import Following, IndexAtLeast, JointBounds, Pinned, ZmpRule, foot_edges
-from ocp.motion.tasks.tip_task import timed
+from ocp.motion.tasks.tip_task import retime_task
 from ocp.motion.tasks.tracks import on_symbols
 
 __all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_inside", "task_demand"]
@@ -234,7 +234,7 @@ def local_guess(
     """Return guesses by name from a local motion; after it fails or gets too fast, its last joints are kept."""
     tasks = [part.task for part in equations.bound]
     if by_parameter:
-        tasks = [timed(task, lambda time: rest_to_rest(time / horizon)) for task in tasks]
+        tasks = [retime_task(task, lambda time: rest_to_rest(time / horizon)) for task in tasks]
     times, still = np.zeros(1), np.zeros((1, joints.size))
     parts = [joints[None, :], still, still]
     try:

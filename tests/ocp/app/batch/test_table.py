@@ -16,7 +16,7 @@ from pyarrow import parquet
 
 from ocp import Collocation, Problem, Solution, solve
 from ocp.app.batch import Batch, read_batch
-from ocp.app.batch.engine import failed
+from ocp.app.batch.engine import failure_payload
 from ocp.app.batch.result_store import ResultStore, as_data, canonical_text, key_of, pack_result, unpack_result
 from ocp.app.batch.run import neighbours, source_version
 
@@ -26,7 +26,7 @@ def written(folder: Path, results: list[tuple[Any, Any]]) -> Batch:
     store = ResultStore.of(folder, "m:f", "1", True)
     for task, value in results:
         if isinstance(value, Exception):
-            record, files = failed("failed", type(value).__name__, str(value))
+            record, files = failure_payload("failed", type(value).__name__, str(value))
         else:
             result = pack_result(value)
             record, files = (

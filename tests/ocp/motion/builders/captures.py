@@ -13,7 +13,7 @@ import numpy as np
 from models import FreeFloating, Joint, Link, Robot, planar_chain, with_wheels
 from models.spatial import quaternion_about
 from ocp import Capture, Cone, Cost, FreeTime, Grasp, Solution
-from ocp.motion.builders.space.pair import joined, pair_momentum
+from ocp.motion.builders.space.pair import join_target, pair_momentum
 from tests.models.robot.oracles import mujoco_model
 from tests.models.robot.trees import Array
 
@@ -107,7 +107,7 @@ def replayed_momentum(request: dict[str, Any], plan: Solution, samples: int = 41
     begin, after = (plan.phase(name).at_fraction(np.linspace(0, 1, samples)) for name in ("approach", "detumble"))
     base, target, joints = (begin[name][0] for name in ("base", "target", "joints"))
     carried = np.array(ca.DM(pair_momentum(one, other, base=base, target_base=target, joints=joints))).ravel()
-    pair = FreeFloating(joined(one.robot, other.robot), one.base, conserved_momentum=carried)
+    pair = FreeFloating(join_target(one.robot, other.robot), one.base, conserved_momentum=carried)
     nothing = np.zeros((samples, 0))
     parts = [
         _momenta(one, begin["base"], begin["joints"], begin["velocities"]),

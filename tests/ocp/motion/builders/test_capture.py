@@ -28,7 +28,14 @@ from ocp import (
     dynamics_problem,
 )
 from ocp.motion.builders.space.capture import solve_capture
-from ocp.motion.builders.space.pair import State, grasp_wrench, joined, pair_momentum, require_reach, wheel_capacity
+from ocp.motion.builders.space.pair import (
+    State,
+    grasp_wrench,
+    join_target,
+    pair_momentum,
+    require_reach,
+    wheel_capacity,
+)
 from tests.models.robot.trees import Array
 from tests.ocp.motion.builders.captures import (
     CONE,
@@ -148,7 +155,7 @@ def test_loads_of_the_hand_change_the_momentum_of_the_target() -> None:
     """Its integral over the detumbling, force and moment about the centre of mass, within the limits of the hand."""
     request, after = planar_capture(), planar().phase("detumble")
     other = request["target"]
-    pair = FreeFloating(joined(request["chaser"].robot, other.robot), "planar", conserved_momentum=[0.45, 0, 0])
+    pair = FreeFloating(join_target(request["chaser"].robot, other.robot), "planar", conserved_momentum=[0.45, 0, 0])
     problem = dynamics_problem(
         pair,
         (),
@@ -391,7 +398,7 @@ def test_a_drifting_target_is_captured_and_drifts_on_with_the_arm() -> None:
     base = after.at_fraction(times)["base"]
     drift = np.array([0.9 + 30 * 0.02, -0.6 - 30 * 0.01]) / 98.2
     own = request["chaser"].robot
-    pair = joined(own, request["target"].robot)
+    pair = join_target(own, request["target"].robot)
     assert pair.total_mass == pytest.approx(98.2)
     machine = FreeFloating(pair, "planar")
     joints = after.at_fraction(times)["joints"]

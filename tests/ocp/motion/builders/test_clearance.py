@@ -52,19 +52,20 @@ def test_covers_gain_what_hulls_lack() -> None:
     """Covers that protrude by 0.3 m keep the distance at which the hulls that overlap by 1 mm are apart."""
     scene = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5))])
     collisions = [Collision(0, scene.labels[0], -1e-3, 0.2, 0.3), Collision(1, scene.labels[1], -2e-3, 0.7)]
-    margins = ClearanceConstraints(scene, {2: 0.1}).separating(collisions).margins
+    margins = ClearanceConstraints(scene, {2: 0.1}).with_collisions(collisions).margins
     assert margins == {0: MARGIN - 0.3, 1: MARGIN, 2: 0.1}
     assert (
-        ClearanceConstraints(scene, margins).separating([Collision(0, scene.labels[0], -1e-3, 0.2)]).margins == margins
+        ClearanceConstraints(scene, margins).with_collisions([Collision(0, scene.labels[0], -1e-3, 0.2)]).margins
+        == margins
     )
 
 
 def test_colliding_pairs_get_constraints_enlarged_by_their_deficit() -> None:
     around = CollisionScene(ARM, [Sphere(0.1, (0.5, 0, 0.5)), Sphere(0.1, (0, 0.5, 0.5))], clearance=0.02)
     assert 0 < MARGIN < 1e-4  # m: what is held apart is not visibly farther than it has to be
-    clearance_constraints = ClearanceConstraints(around).holding([0, 1])
+    clearance_constraints = ClearanceConstraints(around).with_pairs([0, 1])
     assert clearance_constraints.margins == {0: MARGIN, 1: MARGIN}
-    assert ClearanceConstraints(around, {0: 0.5}).holding([0, 1]).margins == {0: 0.5, 1: MARGIN}
+    assert ClearanceConstraints(around, {0: 0.5}).with_pairs([0, 1]).margins == {0: 0.5, 1: MARGIN}
     near = [nearest(around, pair, least) for pair, least in ((0, 0.012), (1, 0.02), (2, 0.019), (3, 0.5))]
     wider = clearance_constraints.widened([Clearance("clearance", tuple(near), True, 4)])
     assert wider.margins == pytest.approx({0: MARGIN + 1.5 * 0.008 + MARGIN, 1: MARGIN, 2: MARGIN})

@@ -18,7 +18,7 @@ from ocp.motion.builders.standing.plan import solve_standing
 from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, standing_problem
 from ocp.motion.tasks.equations import task_errors
 from ocp.motion.tasks.limits import IndexAtLeast, InFoot, Limits, Pinned, ZmpRule
-from ocp.motion.tasks.tip_task import timed
+from ocp.motion.tasks.tip_task import retime_task
 from ocp.motion.tasks.tracks import pose_line
 from tests.models.machines.standing_machines import planar_machine
 from tests.ocp.motion.builders.standing_replay import assert_stands
@@ -179,7 +179,7 @@ def test_a_rotating_hand_costs_less_with_a_free_time_law() -> None:
     goal = turned((1, 0, 0), 0.4) @ first, place + np.array([0, 0.25, -0.3])
     line = pose_line((first, place), goal, 1.0, pace="constant")
     task = TipTask(position=line.position, orientation=line.orientation, rows=(0, 4, 5))
-    options = timed(task, lambda t: rest_to_rest(t / PLANAR_HORIZON))
+    options = retime_task(task, lambda t: rest_to_rest(t / PLANAR_HORIZON))
     cost = {}
     for along, what in (("time", options), ("parameter", task)):
         setup = StandingSetup(along=along)  # type: ignore[arg-type]

@@ -26,12 +26,13 @@ class Known(Solver):
     def __init__(self, coarse: list[float], fine: list[float], passes: list[bool]) -> None:
         self.coarse, self.fine, self.passes = coarse, fine, passes
         self.done: list[tuple[int, Stage]] = []
+        self.limited = False
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
         number = int(candidate.start[0])
         self.done.append((number, candidate.stage))
         if candidate.stage is Stage.REFINED:
-            return [replace(candidate, stage=Stage.AUDITED) if self.passes[number] else candidate.rejected(FAILS)]
+            return [replace(candidate, stage=Stage.AUDITED) if self.passes[number] else candidate.with_rejection(FAILS)]
         if candidate.stage is Stage.FINE:
             return [replace(candidate, stage=Stage.REFINED)]
         cost = (self.coarse if candidate.stage is Stage.SEED else self.fine)[number]
@@ -41,6 +42,9 @@ class Known(Solver):
 
     def same_path(self, one: Any, other: Any) -> bool:
         return bool(one.number == other.number)
+
+    def reaches_limits(self, solution: Any) -> bool:
+        return self.limited
 
     def plan(self, candidates: Any) -> Any:
         return candidates
@@ -208,3 +212,35 @@ def test_a_reason_is_read_as_it_was_written_and_not_where_it_is_damaged() -> Non
     for name in FAILS.record():
         with pytest.raises(KeyError):
             Reason.of_record({key: value for key, value in FAILS.record().items() if key != name})
+
+
+def turned(number: int, turns: tuple[int, int], shift: float = 0.0) -> Candidate:
+    """Candidate of a motion with its joints shifted by full turns."""
+    joints = np.linspace([0.1, -0.4], [0.7, 0.2], 5)[None] + number + shift + 2 * np.pi * np.array(turns)
+    local: Any = SimpleNamespace(joints=joints, base=np.zeros((1, 5, 0)))
+    return Candidate(np.array([number]), seed=Seed(cost=1.0, local=[local]))
+
+
+@pytest.mark.parametrize(("passes", "limited", "solved"), [(True, False, 1), (True, True, 3), (False, False, 3)])
+def test_seeds_that_differ_by_full_turns_are_solved_if_limits_intervene_or_the_first_fails(
+    passes: bool, limited: bool, solved: int
+) -> None:
+    known = Known([1.0], [1.2], [passes])
+    known.limited = limited
+    queue = CandidateQueue(known, replace(SETTINGS, max_failures=9))
+    queue.run([turned(0, turns) for turns in ((0, 0), (1, 0), (-1, 1))])
+    assert known.done.count((0, Stage.SEED)) == solved
+    assert len(queue.candidates) == 3
+    assert queue.passed == passes
+    kinds = [each.reason.kind for each in queue.candidates if each.reason is not None]
+    assert kinds == ([Rejection.DUPLICATE] * 2 if passes else [Rejection.AUDIT] * 3)
+
+
+def test_seeds_are_turned_by_full_turns_alone() -> None:
+    first = turned(0, (0, 0)).seed
+    assert first.is_turned(turned(0, (2, -1)).seed)
+    assert first.is_turned(first)
+    assert not first.is_turned(turned(0, (1, 0), shift=1e-6).seed)
+    assert not first.is_turned(turned(1, (0, 0)).seed)
+    assert not first.is_turned(replace(first, fixed=True))
+    assert not first.is_turned(Seed())

@@ -201,7 +201,7 @@ def test_held_apart_the_barrier_begins_worth_no_more_than_the_motion() -> None:
     solver = CandidateSolver(replace(required, clearance_constraints=ClearanceConstraints(around)), START, START)
     pair = around.labels.index(("link6", "obstacle 0"))
     cost = 0.25
-    separated = Candidate(START, constraints=ClearanceConstraints(around).holding([pair]))
+    separated = Candidate(START, constraints=ClearanceConstraints(around).with_pairs([pair]))
     prepared = solver.prepared(separated, fine=False, cost=cost)[2]
     bounds = prepared.formulation.bound_values(np.zeros(0))
     places = [getattr(prepared.transcription, f"{take}_bounds") for take in ("variable", "row")]

@@ -71,7 +71,7 @@ def test_where_the_lowest_cost_classes_fail_all_others_are_solved(monkeypatch: p
         if request[-1]:
             return advance(solver, candidate)
         failed.append(candidate)
-        return [candidate.rejected(Reason(Rejection.AUDIT, "fails"))]
+        return [candidate.with_rejection(Reason(Rejection.AUDIT, "fails"))]
 
     motions, advance = AtlasSearch.class_representatives, CandidateSolver.advance
     monkeypatch.setattr(AtlasSearch, "class_representatives", followed)

@@ -13,7 +13,7 @@ import pytest
 from models import Path, smooth
 from ocp import Cost, Limits, TipTask
 from ocp.motion.plan import Plan
-from ocp.motion.tasks.tip_task import timed
+from ocp.motion.tasks.tip_task import retime_task
 from tests.families import some
 from tests.models.robot.trees import Array
 from tests.ocp.motion.plan.motions import DOWN, angled_ur5, angled_ur5_arm, plan_bare
@@ -148,7 +148,9 @@ def test_at_the_pace_that_was_found_the_plan_of_a_fixed_horizon_costs_as_much() 
     kinks = result.solution.at_fraction(task.breaks / task.duration)["clock"][:, 0]
     again = plan_bare(
         angled_ur5(),
-        timed(TipTask(position=task.position, direction=task.direction, duration=result.horizon, breaks=kinks), run),
+        retime_task(
+            TipTask(position=task.position, direction=task.direction, duration=result.horizon, breaks=kinks), run
+        ),
         start=first(),
         search="start",
         limits=UNLIMITED,

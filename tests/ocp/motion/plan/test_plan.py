@@ -107,6 +107,7 @@ def test_a_closed_contour_of_an_arm_that_floats_turns_its_base() -> None:
     assert np.abs(result["base"][-1] - result["base"][0]).max() > 1e-4
 
 
+@pytest.mark.long
 @pytest.mark.xdist_group("plan two_arms")
 def test_the_hand_that_holds_stays_while_the_other_moves() -> None:
     result = planned("two_arms")

@@ -111,7 +111,7 @@ def test_torques_of_an_arm_are_at_their_limits_and_not_beyond() -> None:
     torques, rest = TorqueLimits(machine, bounds), np.zeros(6)
     limits = MotionLimits(StraightMotions(None), bounds, torques, rest, rest)
     motion = fastest_motion_near(limits, path)
-    straight = torques.slowed(stopping_motion(path, bounds, torques))
+    straight = torques.slow_down(stopping_motion(path, bounds, torques))
     assert motion.duration < 0.95 * straight.duration
     samples = (each.reshape(-1, 6) for each in motion.sampled(np.linspace(0.0, 1.0, 33)))
     usage = np.abs(torques.torques(*samples)) / torques.largest

@@ -45,7 +45,7 @@ def test_rows_are_those_of_a_matrix(seed: int, count: int) -> None:
     gap, _ = every.evaluate(b)
     matrix = np.array([every.change_of(column) for column in np.eye(len(b))]).T
     values = np.random.default_rng(seed).uniform(0.1, 1.0, len(gap))
-    assert every.gathered(values) == pytest.approx(matrix.T @ values, abs=1e-9)
+    assert every.weighted_gradients(values) == pytest.approx(matrix.T @ values, abs=1e-9)
     normal = matrix.T @ (values[:, None] * matrix)
     for k, diagonal in enumerate(every.squares(values)):
         assert diagonal == pytest.approx(np.diag(normal, k), abs=1e-9)

@@ -164,7 +164,7 @@ def test_of_failing_motions_a_few_of_each_search_are_tried_and_the_others_report
 
     def fails(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:
         tried.append(solver.settings.max_refinements)
-        return [candidate.rejected(Reason(Rejection.AUDIT, "fails"))]
+        return [candidate.with_rejection(Reason(Rejection.AUDIT, "fails"))]
 
     monkeypatch.setattr(CandidateSolver, "advance", fails)
     with pytest.raises(SolveError, match="fails") as caught:

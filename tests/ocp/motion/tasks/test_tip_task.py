@@ -11,7 +11,7 @@ from models import FixedBase, Machine, Path, planar_chain, smooth
 from models.machines.machine import with_tip
 from ocp import ProblemError, RateOptions, Start, TipTask, resolve
 from ocp.motion.tasks.equations import bind, task_errors
-from ocp.motion.tasks.tip_task import timed
+from ocp.motion.tasks.tip_task import retime_task
 from ocp.motion.tasks.tracks import path_tracks, pose_line
 from tests.models.machines.standing_machines import standing_arm
 from tests.models.robot.trees import Array, numeric
@@ -340,12 +340,12 @@ def test_equations_of_accelerations_are_those_of_velocities_differentiated(name:
 
 @pytest.mark.parametrize("name", [*TASKS, "path"])
 def test_a_task_of_a_path_parameter_run_by_a_clock_is_the_timed_task(name: str) -> None:
-    """The chain rule at both levels: pace and change of pace of the parameter on one side, `timed` on the other."""
+    """The chain rule at both levels: pace of the parameter and its change on one side, `retime_task` on the other."""
     machine, symbols = standing_arm(), ca.MX if name == "path" else ca.SX
     path = smooth(Path.through([(0.0, 0, 0), (0.5, 0.0, 0), (0.5, 0.6, 0)]), deviation=0.02)
     task = TASKS[name] if name != "path" else TipTask(position=path_tracks(path, 0.4).position)
     equations, n = bind(machine, task), machine.joint_size
-    both = bind(machine, timed(task, lambda t: 0.3 * t + 0.2 * t**2))
+    both = bind(machine, retime_task(task, lambda t: 0.3 * t + 0.2 * t**2))
     q, u, second, time, pace, change = (
         symbols.sym(what, size) for what, size in zip(("q", "u", "s", "t", "p", "c"), (n, n, n, 1, 1, 1), strict=True)
     )

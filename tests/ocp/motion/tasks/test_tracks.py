@@ -16,7 +16,7 @@ from models import Arc, Line, Path, SmoothPath, smooth
 from ocp import TipTask
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.tasks.equations import bind
-from ocp.motion.tasks.tip_task import timed
+from ocp.motion.tasks.tip_task import retime_task
 from ocp.motion.tasks.tracks import PathTracks, path_tracks
 from tests.models.robot.trees import Array
 from tests.ocp.motion.tasks.space_tasks import panda
@@ -115,7 +115,7 @@ def test_a_task_run_by_a_clock_moves_at_the_clocks_pace() -> None:
     task = TipTask.along(PATH, SPEED, roll="given")
     free = TipTask.along(PATH, SPEED, tool_axis=AXIS)
     for one in (task, free):
-        ran = timed(one, lambda t: t**2)
+        ran = retime_task(one, lambda t: t**2)
         times = np.array([0.3, 0.7, 0.9])
         slow, fast = bind(panda(), one).target_function(), bind(panda(), ran).target_function()
         for time in times:
