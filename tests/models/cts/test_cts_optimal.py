@@ -233,6 +233,7 @@ def test_joint_limits_are_the_reason_where_reach_is_not() -> None:
     assert set(table.status) == {"joint limits"}
 
 
+@pytest.mark.long
 def test_the_best_of_several_branches_is_taken() -> None:
     rig = reference_rig(lower=(0.5, -9, -2.0, -9, -9, -9), upper=(1.4, 9, 2.2, 9, 9, 9))
     tunnel = reference_tunnel()

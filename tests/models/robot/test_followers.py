@@ -53,6 +53,7 @@ sizes = st.integers(2, 8)
 NEAR: Any = {"rtol": 1e-11, "atol": 1e-11}
 
 
+@pytest.mark.long
 @few
 @given(seeds, sizes)
 def test_a_robot_with_followers_is_the_free_one_restricted_to_the_ties(seed: int, size: int) -> None:

@@ -196,6 +196,7 @@ def test_a_reference_that_is_wrong_fails_all_the_same() -> None:
     assert "Collocation, MultipleShooting differ" in result.verdict
 
 
+@pytest.mark.long
 def test_an_extremal_of_another_branch_is_detected_though_it_passes_its_audit() -> None:
     """J = 1.7351 and J = 1.7467 both satisfy the minimum principle of the paper's example."""
     problem = paper_problem()

@@ -489,6 +489,7 @@ def stiff(shove: float) -> Problem:
     return problem
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shooting", ["multiple", "backward"])
 def test_newton_from_a_bad_guess_reports_failure_with_its_last_iterate(
     shooting: str, capfd: pytest.CaptureFixture[str]

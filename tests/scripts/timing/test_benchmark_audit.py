@@ -36,6 +36,7 @@ def test_every_case_is_timed_on_every_number_of_intervals(measured_audit: tuple[
         assert row["audit_ms_an_interval"] == pytest.approx(1e3 * row["audit_s"] / row["intervals"])
 
 
+@pytest.mark.long
 def test_the_worst_ratio_and_growth_stand_beside_their_goals(measured_audit: tuple[Path, dict[str, Any]]) -> None:
     _, numbers = measured_audit
     assert numbers["worst_ratio"] == max(row["audit_over_solve"] for row in numbers["rows"])

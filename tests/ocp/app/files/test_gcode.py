@@ -454,6 +454,7 @@ def test_ten_thousand_lines_are_read_in_seconds(program: Callable[..., Program])
         (b"M99", "subroutines"),
         (b"G21 F9 G1 X1 P2", "belongs to no code"),
     ],
+    ids=lambda value: str(value[:20]),
 )
 def test_bytes_that_are_no_program_are_refused_by_name(tmp_path: File, raw: bytes, words: str) -> None:
     (tmp_path / "bad.nc").write_bytes(raw)

@@ -151,6 +151,7 @@ def test_the_wheel_takes_the_momentum_of_the_target() -> None:
     assert request["target"].base_size == 3
 
 
+@pytest.mark.long
 def test_loads_of_the_hand_change_the_momentum_of_the_target() -> None:
     """Its integral over the detumbling, force and moment about the centre of mass, within the limits of the hand."""
     request, after = planar_capture(), planar().phase("detumble")

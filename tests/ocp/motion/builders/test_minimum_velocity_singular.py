@@ -76,6 +76,7 @@ def test_a_line_past_a_singularity_is_planned_and_a_finer_mesh_agrees(size: int,
     check(*grazing(size, seed), intervals=50)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pose", [pytest.param(True, marks=pytest.mark.long), False])
 def test_a_floating_arm_plans_around_the_singular_passage_and_a_finer_mesh_agrees(pose: bool) -> None:
     plan, local = check(*floating(pose), intervals=25)

@@ -97,6 +97,7 @@ def test_the_rates_are_those_of_the_damped_pseudo_inverse(seed: int, damping: fl
     np.testing.assert_allclose(local.joints[0], start)
 
 
+@pytest.mark.long
 def test_the_motion_agrees_with_another_integrator_and_improves_with_the_tolerance() -> None:
     machine = paper_example()
 

@@ -62,6 +62,7 @@ def panda_seam() -> TipTask:
     return TipTask(position=lambda t: ca.DM(first) + t * ca.DM([0, 0.06, 0]), direction=axis, duration=DURATION)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("search", some(["configurations", "global"], ["configurations"]))
 def test_a_gripper_that_is_locked_by_hand_gives_the_same_plan(search: Any) -> None:
     whole = whole_panda()

@@ -62,6 +62,7 @@ def cost(first: float, last: float, reach: float, elbow: int) -> float:
     return float((np.diff(configuration(times, reach, elbow), axis=0) ** 2).sum() / 2 / (times[1] - times[0]))
 
 
+@pytest.mark.long
 def test_two_links_have_the_branches_as_segments_that_meet_at_least_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     searches, reach, machine = list[TaskSearch](), 0.45, arm()
 

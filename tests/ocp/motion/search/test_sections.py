@@ -150,6 +150,7 @@ def test_obstacles_are_named_with_the_waypoint() -> None:
     assert "obstacle 0" in str(refused.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", some([2, 5], [2]))
 def test_a_handful_of_waypoints_may_be_as_far_apart_as_one_likes(count: int) -> None:
     places, turns = (rows[:count] for rows in task(40))
