@@ -18,7 +18,7 @@ REPLACED = {
 """Words that no name contains: participles and riddles in place of the noun of what is named."""
 VERBS = {"bent", "drawn", "found", "given", "made"}
 """Words that the name of a test, which is a sentence, may use as verbs: `test_known_extremals_are_found`."""
-FOLDERS = ("models", "ocp", "scripts/papers", "scripts/timing", "tests")
+FOLDERS = ("models", "ocp", "scripts", "tests")
 FILES = sorted(file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py") if file != Path(__file__))
 
 

@@ -156,11 +156,11 @@ def bearing(example: CaptureExample, along: dict[str, Array]) -> tuple[Array, Ar
     )
     second = problem.declared.controls["accelerations"].symbol
     base, joints, rates = motion_of(problem)
-    found = ca.Function(
+    result = ca.Function(
         "bearing", [base, joints, rates, second], list(grasp_wrench(pair, example.capture.target, problem))
     )
     names = ("base", "joints", "velocities", "accelerations")
-    force, moment = found.map(len(along["base"]))(*(along[name].T for name in names))
+    force, moment = result.map(len(along["base"]))(*(along[name].T for name in names))
     return np.array(force).T, np.array(moment).T
 
 
@@ -174,7 +174,7 @@ def together(example: CaptureExample) -> FreeFloating:
 
 def scenes_of(example: CaptureExample, count: int = 161) -> list[Scene]:
     """Both phases, chaser and target in both."""
-    pair, found, begin = together(example), [], 0.0
+    pair, result, begin = together(example), [], 0.0
     for phase, title, color in (("approach", "approach", "orange"), ("detumble", "grasped", "blue")):
         along, duration = example.samples(phase, count), example.plan.phase(phase).horizon
         frames = frames_along(pair, along["joints"], along["base"])
@@ -185,9 +185,9 @@ def scenes_of(example: CaptureExample, count: int = 161) -> list[Scene]:
                 {**frames.positions, "target": own.positions["target"]},
             )
         times = begin + np.linspace(0.0, duration, count)
-        found.append(Scene(f"{title}: {begin:.0f} to {times[-1]:.0f} s", pair.robot, frames, times, color, view=VIEW))
+        result.append(Scene(f"{title}: {begin:.0f} to {times[-1]:.0f} s", pair.robot, frames, times, color, view=VIEW))
         begin = times[-1]
-    return found
+    return result
 
 
 def draw(example: CaptureExample, folder: Path, *, animation: bool = True) -> None:

@@ -115,25 +115,25 @@ class Scene:
     def still(self) -> list[Part]:
         """What does not move: the way of the tip, what is worked on, what the robot stands on."""
         radius, level = LINE * self.size, (self.floor or 0.0) + 1e-3
-        found = [tube(self.frames.tip, radius, to_rgb(COLORS["green"])), *self.solids]
+        result = [tube(self.frames.tip, radius, to_rgb(COLORS["green"])), *self.solids]
         if self.surface is not None:
-            found.append(_plate(*self.surface))
+            result.append(_plate(*self.surface))
         if self.footprint is not None:
             corners = np.column_stack([self.footprint, np.full(len(self.footprint), level)])
             for one, other in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-                found.append(tube([one, other], radius, to_rgb(COLORS["grey"])))
+                result.append(tube([one, other], radius, to_rgb(COLORS["grey"])))
         if self.nearest_points is not None:
-            found.append(tube(self.nearest_points, 1.6 * radius, to_rgb(COLORS["purple"])))
-        return found
+            result.append(tube(self.nearest_points, 1.6 * radius, to_rgb(COLORS["purple"])))
+        return result
 
     def at(self, k: int) -> list[Part]:
         """The robot at sample k, and its mark."""
-        found = parts_in_world(self.looks, self.frames, k)
+        result = parts_in_world(self.looks, self.frames, k)
         if self.mark is not None:
             foot = np.append(self.mark[k], (self.floor or 0.0) + 1e-3)
             spot = rod(foot, foot + np.array([0.0, 0.0, 0.012]) * self.size, 0.014 * self.size)
-            found.append(part_of("", spot.vertices, spot.faces, (*to_rgb(COLORS[self.color]), 1.0)))
-        return found
+            result.append(part_of("", spot.vertices, spot.faces, (*to_rgb(COLORS[self.color]), 1.0)))
+        return result
 
 
 def camera_of(scenes: Sequence[Scene], size: tuple[int, int]) -> Camera:
@@ -142,17 +142,17 @@ def camera_of(scenes: Sequence[Scene], size: tuple[int, int]) -> Camera:
 
 
 def draw_scene(
-    ax: Any, scene: Scene, instants: int | Sequence[float], size: tuple[int, int], beside: Sequence[Scene] = ()
+    ax: Any, scene: Scene, moments: int | Sequence[float], size: tuple[int, int], beside: Sequence[Scene] = ()
 ) -> None:
     """The robot with its meshes at some times into axes: at the last one solid, before that pale, newer ones denser.
 
     Args:
         ax: Axes of matplotlib, which show nothing else then.
-        instants: Number of times from begin to end, or times, s.
+        moments: Number of times from begin to end, or times, s.
         size: Width and height of the picture, pixels.
         beside: Other scenes, which are to be seen from the same place.
     """
-    times = np.linspace(scene.t[0], scene.t[-1], instants) if isinstance(instants, int) else np.asarray(instants)
+    times = np.linspace(scene.t[0], scene.t[-1], moments) if isinstance(moments, int) else np.asarray(moments)
     numbers = [scene.nearest(time) for time in times]
     layers = [Layer(scene.at(numbers[-1])), Layer(scene.still)]
     for k, opacity in zip(numbers[:-1], np.linspace(*GHOSTS, max(len(numbers) - 1, 1)), strict=False):
@@ -168,7 +168,7 @@ def draw_scene(
 def page(
     path: Path,
     scenes: Sequence[Scene],
-    instants: int | Sequence[float],
+    moments: int | Sequence[float],
     *,
     height: float,
     share: float,
@@ -179,7 +179,7 @@ def page(
 
     Args:
         path: PNG file, saved when the block ends, with what `sheet` puts beside it.
-        instants: Number of instants, or times, s; see draw_scene.
+        moments: Number of instants, or times, s; see draw_scene.
         height: Of the figure, inches. share: Height of the scenes over that of the diagrams.
         note: What is assumed; its first sentence stands below the figure.
         title: What the figure shows, a sentence.
@@ -192,7 +192,7 @@ def page(
         tall = (height - 1.5) * share / (1 + share)
         size = round(SHARPER * 150 * wide), round(SHARPER * 150 * tall)
         for scene, place in zip(scenes, (slice(0, 3), slice(3, 6)), strict=True):
-            draw_scene(figure.add_subplot(grid[0, place]), scene, instants, size, scenes)
+            draw_scene(figure.add_subplot(grid[0, place]), scene, moments, size, scenes)
         first, second, third = (figure.add_subplot(grid[1, place : place + 2]) for place in (0, 2, 4))
         yield first, second, third
 

@@ -43,59 +43,59 @@ class StandingExample:
 
     def summary(self) -> dict[str, Any]:
         """A row of the summary."""
-        found = self.results
-        motion = found.motion
+        result = self.results
+        motion = result.motion
         nearest = self.nearest
-        errors = task_errors(found.machine, self.task, motion.t, motion.joints)
+        errors = task_errors(result.machine, self.task, motion.t, motion.joints)
         return {
             "robot": self.name,
-            "dof": found.robot.dof,
+            "dof": result.robot.dof,
             "task_rows": len(standing.ROWS),
-            "duration_s": found.solution.horizon,
+            "duration_s": result.solution.horizon,
             "cost_local": None,
-            "cost_optimal": float(found.solution.cost),
+            "cost_optimal": float(result.solution.cost),
             "tip_error": float(np.abs(errors).max()),
             "momentum_drift_relative": None,
-            "joint_return_rad": joint_return(found.solution),
+            "joint_return_rad": joint_return(result.solution),
             "audit_passed": self.audit.passed,
             "audit_tolerances": dict(self.tolerances),
             "clearance_m": nearest.distance,
             "clearance_pair": list(nearest.bodies),
-            "zmp_margin_local_m": float(found.local.foot_margin.min()),
+            "zmp_margin_local_m": float(result.local.foot_margin.min()),
             "zmp_margin_optimal_m": float(motion.foot_margin.min()),
         }
 
 
 def plan(coarse: bool = False) -> StandingExample:
     """The plan and its audit; it has one mesh only, `coarse` or not."""
-    found = standing.plan()
-    audit = found.solution.audit(tolerances=standing.TOLERANCES)
-    task = standing.from_rest(standing.circle(found.machine))
-    return StandingExample("TIAGo with a load in its hand", found, task, audit, standing.TOLERANCES)
+    result = standing.plan()
+    audit = result.solution.audit(tolerances=standing.TOLERANCES)
+    task = standing.from_rest(standing.circle(result.machine))
+    return StandingExample("TIAGo with a load in its hand", result, task, audit, standing.TOLERANCES)
 
 
 def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> None:
     """mobile_manipulator.png, .gif and .npz."""
-    found, nearest = example.results, example.nearest
+    result, nearest = example.results, example.nearest
     note = (
-        f"TIAGo of {found.robot.total_mass:.0f} kg leads {standing.LOAD:g} kg round a circle in {standing.SECONDS:g} s "
-        f"while a rope pulls its hand forward with {standing.PULL:g} N; earlier postures pale, disc: zero moment "
+        f"TIAGo of {result.robot.total_mass:.0f} kg leads {standing.LOAD:g} kg round a circle in {standing.SECONDS:g} "
+        f"s while a rope pulls its hand forward with {standing.PULL:g} N; earlier postures pale, disc: zero moment "
         "point. Footprint, inertias and limits from its URDF (example-robot-data); both motions have the same hand "
         f"path and force. Plan: zero moment point {1000 * standing.MARGIN:g} mm inside, {100 * standing.SHARE:g} % of "
         f"the limits of velocity and torque; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
         f"{1000 * nearest.distance:.1f} mm (in the animation: purple)."
     )
     title = "Resolved instant by instant the robot tips over; planned as a whole it stands, within all limits"
-    standing.figure(folder / "mobile_manipulator.png", found, note=note, title=title)
+    standing.figure(folder / "mobile_manipulator.png", result, note=note, title=title)
     save(folder / "mobile_manipulator.npz", example)
     if animation:
-        scenes = standing.scenes_of(found, (14.0, -50.0), nearest.points)
+        scenes = standing.scenes_of(result, (14.0, -50.0), nearest.points)
         animate(folder / "mobile_manipulator.gif", scenes, frames=40, seconds=0.1, note=note)
 
 
 def save(path: Path, example: StandingExample) -> None:
     """Both motions: the plan, and beside it the one instant by instant as NAME.local.csv."""
-    found, local = example.results, example.results.local
-    save_plan(path, found.machine, found.solution, [example.task])
-    names = found.machine.robot.joint_names
+    result, local = example.results, example.results.local
+    save_plan(path, result.machine, result.solution, [example.task])
+    names = result.machine.robot.joint_names
     save_motion(path.with_suffix(".local.csv"), names, local.t, local.joints, local.joint_velocities)

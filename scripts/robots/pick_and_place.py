@@ -134,26 +134,26 @@ def carried() -> FixedBase:
 
 
 @cache
-def postures() -> dict[str, Array]:
+def configurations() -> dict[str, Array]:
     """Joints at the points of the way, by name, rad: the hand points down, one finger inwards."""
-    found = {"home": np.array(HOME)}
+    result = {"home": np.array(HOME)}
     for name, (far, direction, height) in (("load", PICK), ("place", PLACE)):
         near = np.array(HOME)
         for which, above in ((f"over the {name}", ABOVE), (f"at the {name}", 0.0)):
             goal = ca.DM([far, 0.0, height + above])
             task = TipTask(position=lambda t, at=goal: at, orientation=lambda t: ca.DM(np.diag([1.0, -1.0, -1.0])))
             near = inverse_kinematics(arm(), task, near=near, starts=0)[0].joints
-            found[which] = near + direction * np.eye(len(near))[0]
-    return found
+            result[which] = near + direction * np.eye(len(near))[0]
+    return result
 
 
 def legs(known: bool) -> list[Goal]:
     """Of the way, with the load where it is known and in hand."""
-    found = []
+    result = []
     for k, (name, end, horizon) in enumerate(ROUTE):
         machine = carried() if known and name == HANDED[0] else arm() if k == 0 or name == "let go" else None
-        found.append(Goal(joints=postures()[end], duration=horizon, machine=machine, name=name))
-    return found
+        result.append(Goal(joints=configurations()[end], duration=horizon, machine=machine, name=name))
+    return result
 
 
 def plan(coarse: bool = False) -> PickAndPlace:

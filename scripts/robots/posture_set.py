@@ -38,7 +38,7 @@ BOW = 0.1  # m, of the seam to the side
 TILT = np.radians(40.0)  # of the tool, leaning back along the seam
 COSTS = ListedColormap(VIRIDIS(np.linspace(0.95, 0.25, 256)))
 """The cheapest brightest."""
-INSTANTS = 33
+SAMPLE_COUNT = 33
 STARTS = 24
 """Of inverse kinematics at each instant."""
 MOST = 3.0
@@ -69,7 +69,7 @@ def plan(coarse: bool = False) -> Example:
         near = planned(machine, task, search="start")
     except SolveError:
         near = None
-    charts, cost, family = landscape(machine, task, 9 if coarse else INSTANTS, best.cost)
+    charts, cost, family = landscape(machine, task, 9 if coarse else SAMPLE_COUNT, best.cost)
     facts = {
         "bound": best.bound,
         "cost_from_the_best_conditioned_start": None if near is None else near.cost,
@@ -93,13 +93,13 @@ def landscape(machine: FixedBase, task: TipTask, count: int, known: float) -> tu
     sets = SelfMotionManifolds(space, equations, np.array(equations.target_function().map(count)(times[None])).T)
 
     def seeds(k: int) -> Array:
-        found = inverse_kinematics(machine, task, time=float(times[k]), seed=k, starts=STARTS)
-        return np.array([one.joints for one in found])
+        result = inverse_kinematics(machine, task, time=float(times[k]), seed=k, starts=STARTS)
+        return np.array([one.joints for one in result])
 
     limits = bounds.velocity * np.diff(times)[:, None]
-    told: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
-    instants = [TimeSample(sets, k) for k in range(count)]
-    search = AtlasSearch(space, instants, Steps(times, SquaredRates(np.ones(robot.dof)), limits), **told)
+    options: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
+    time_samples = [TimeSample(sets, k) for k in range(count)]
+    search = AtlasSearch(space, time_samples, Steps(times, SquaredRates(np.ones(robot.dof)), limits), **options)
     layers = search.layers
     for _ in range(HALVINGS):
         layers = [search.without_collisions(search.split_charts(charts, k), k) for k, charts in enumerate(layers)]
@@ -150,8 +150,8 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         f"{f'; {left} dearer families are left out' if left else ''}. Costs: integral of half the "
         f"squared joint rates, rad²/s; no motion costs less than {best.bound:.4g}."
     )
-    dearer = 100 * (ways[-2][3] / best.cost - 1)
-    title = f"The best motion from where the arm is best conditioned is {dearer:.0f} % dearer than another family's"
+    excess = 100 * (ways[-2][3] / best.cost - 1)
+    title = f"The best motion from where the arm is best conditioned is {excess:.0f} % dearer than another family's"
     size = (3.0 * len(shown) + 1.2, 4.2)
     with sheet(folder / "posture_set.png", (1, len(shown)), size, note, title=title) as (figure, axes):
         for ax, number in zip(np.ravel(axes), shown, strict=True):
@@ -163,11 +163,11 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
                 for x, y, z in zip(times[charts.layer[own]] - width / 2, low[own], high[own], strict=True)
             ]
             share = np.minimum(through[own] / best.cost, MOST)
-            made = PolyCollection(
+            collection = PolyCollection(
                 bars, array=share, cmap=COSTS, norm=Normalize(1.0, MOST), linewidths=0.3, edgecolors="face"
             )
-            made.set_rasterized(True)  # thousands of them, 10 MB of SVG
-            ax.add_collection(made)
+            collection.set_rasterized(True)  # thousands of them, 10 MB of SVG
+            ax.add_collection(collection)
             for (name, joints, color, cost), home in zip(ways, homes, strict=True):
                 if number in home:
                     angles = rolls_of(robot, joints)
@@ -180,7 +180,7 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
             if ax.get_legend_handles_labels()[0]:
                 ax.legend(loc="lower left", fontsize=7)
         np.ravel(axes)[0].set_ylabel("roll of the tool, deg")
-        figure.colorbar(made, ax=axes, label="cost of the best motion through, of the plan's", pad=0.01)
+        figure.colorbar(collection, ax=axes, label="cost of the best motion through, of the plan's", pad=0.01)
     example.save(folder / "posture_set.npz")
 
 
@@ -191,5 +191,5 @@ def rolls_of(robot: Robot, joints: Array) -> Array:
 
 def _nearest(space: JointSpace, charts: Charts, joints: Array, layers: Any) -> Array:
     """Which charts joints (M, n) at some instants lie in. Shape (M,)."""
-    _, found = space.tree(charts.centers, charts.layer).query(space.tree_points(joints, np.array(layers)))
-    return np.asarray(found)
+    _, result = space.tree(charts.centers, charts.layer).query(space.tree_points(joints, np.array(layers)))
+    return np.asarray(result)

@@ -109,17 +109,17 @@ def plan(coarse: bool = False) -> StandingExample:
     options: dict[str, Any] = {"limits": LIMITS, "scene": Scene(wrenches=pressed)}
     solution = ocp.plan(machine, task(machine), SECONDS, start=START, **options).solution
     motion = standing.sampled(machine, solution, pressed)
-    found = standing.Results(ANYMAL.path, machine, ground, solution, motion, local, pressed)
-    return StandingExample(ANYMAL.name, found, task(machine), solution.audit())
+    result = standing.Results(ANYMAL.path, machine, ground, solution, motion, local, pressed)
+    return StandingExample(ANYMAL.name, result, task(machine), solution.audit())
 
 
 def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> None:
     """pushing.png, pushing.gif and pushing.npz."""
-    found, nearest = example.results, example.nearest
+    result, nearest = example.results, example.nearest
     force = float(np.linalg.norm(PUSH))
     note = (
-        f"ANYmal of {found.robot.total_mass - LOAD:.0f} kg, legs locked, pushes to its right (-y) with {force:g} N and "
-        f"{LOAD:g} kg in its hand; earlier postures pale, disc: zero moment point. The reaction on its hand acts "
+        f"ANYmal of {result.robot.total_mass - LOAD:.0f} kg, legs locked, pushes to its right (-y) with {force:g} N "
+        f"and {LOAD:g} kg in its hand; earlier postures pale, disc: zero moment point. The reaction on its hand acts "
         f"to its left, where the hand gives way by {STEP[1]:g} m in {SECONDS:g} s. Feet, inertias and limits from its "
         "URDF (example-robot-data); both motions have the same path and force. Plan: zero moment point "
         f"{1000 * MARGIN:g} mm inside; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
@@ -127,8 +127,8 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
     )
     title = "Resolved instant by instant the push lifts the robot off its feet; planned as a whole it stays on them"
     look: dict[str, Any] = {"view": VIEW, "prefix": "j2s6s200_", "inset": (0.36, 0.1, 0.5, 0.5)}
-    standing.figure(folder / "pushing.png", found, note=note, title=title, **look)
+    standing.figure(folder / "pushing.png", result, note=note, title=title, **look)
     save(folder / "pushing.npz", example)
     if animation:
-        scenes = standing.scenes_of(found, VIEW, nearest.points)
+        scenes = standing.scenes_of(result, VIEW, nearest.points)
         animate(folder / "pushing.gif", scenes, frames=40, seconds=0.1, note=note)

@@ -38,13 +38,13 @@ from scripts.drawing import COLORS, DASHES, sheet
 from scripts.robots.drawing import Scene, animate, draw_scene
 from scripts.robots.robots import PANDA
 
-__all__ = ["Reached", "draw", "plan", "postures", "ring"]
+__all__ = ["Reached", "draw", "plan", "configurations", "ring"]
 
 RADIUS, HEIGHT = 0.6, 0.2  # m, of the ring about the first joint's axis
 DURATION = 12.0  # s
 DOWN = np.diag([1.0, -1.0, -1.0])
 """The hand, with one heading all along."""
-INSTANTS, COARSE = 97, 25
+SAMPLE_COUNT, COARSE = 97, 25
 """Times at which all postures are shown."""
 STARTS = 24
 """Of inverse kinematics at each of them."""
@@ -80,19 +80,21 @@ class InPieces:
     """A task in pieces, and all postures that do it.
 
     Attributes:
-        machine, task: What moves, and what it does. made: Its pieces and the ways between them. reached: All postures.
+        machine, task: What moves, and what it does.
+        segmented: Its segments and the motions between them.
+        reached: All configurations.
     """
 
     machine: FixedBase
     task: TipTask
-    made: SegmentedPlan
+    segmented: SegmentedPlan
     reached: Reached
 
     @property
     def audits(self) -> list[Audit]:
         """Of the pieces, and of the ways between them."""
-        ways = [one.motion for one in self.made.reconfigurations if one.motion is not None]
-        return [motion.audit() for motion in (*self.made.segments, *ways)]
+        ways = [one.motion for one in self.segmented.reconfigurations if one.motion is not None]
+        return [motion.audit() for motion in (*self.segmented.segments, *ways)]
 
     @property
     def audit(self) -> Audit:
@@ -101,25 +103,25 @@ class InPieces:
 
     def summary(self) -> dict[str, Any]:
         """A row of the summary."""
-        made = self.made
+        segmented = self.segmented
         return {
             "robot": PANDA.name,
             "dof": self.machine.joint_size,
             "task_rows": self.task.size,
-            "duration_s": made.horizon,
+            "duration_s": segmented.horizon,
             "cost_local": None,
-            "cost_optimal": made.cost,
-            "tip_error": max(self._tip_error(number) for number in range(len(made.segments))),
+            "cost_optimal": segmented.cost,
+            "tip_error": max(self._tip_error(number) for number in range(len(segmented.segments))),
             "joint_return_rad": None,
             "audit_passed": all(audit.passed for audit in self.audits),
-            "reconfigurations": len(made.reconfigurations),
-            "fewest_reconfigurations": made.fewest,
-            "reconfigured_at_s": [one.time for one in made.reconfigurations],
-            "reconfigured_in_s": [one.duration for one in made.reconfigurations],
+            "reconfigurations": len(segmented.reconfigurations),
+            "fewest_reconfigurations": segmented.fewest,
+            "reconfigured_at_s": [one.time for one in segmented.reconfigurations],
+            "reconfigured_in_s": [one.duration for one in segmented.reconfigurations],
         }
 
     def _tip_error(self, number: int) -> float:
-        piece, begin = self.made.segments[number], self.made.start_times[number]
+        piece, begin = self.segmented.segments[number], self.segmented.start_times[number]
         times = np.linspace(0.0, piece.horizon, FINE)
         errors = task_errors(self.machine, self.task, begin + times, piece.at(times)["joints"])
         return float(np.abs(errors).max())
@@ -138,12 +140,12 @@ def ring() -> TipTask:
 def plan(coarse: bool = False) -> InPieces:
     """The task in the fewest pieces, and all postures that do it; `coarse` at fewer times."""
     machine, task = FixedBase(PANDA.read()), ring()
-    made = ocp.plan(machine, task, search="segments")
-    assert isinstance(made, SegmentedPlan)
-    return InPieces(machine, task, made, postures(machine, task, COARSE if coarse else INSTANTS))
+    segmented = ocp.plan(machine, task, search="segments")
+    assert isinstance(segmented, SegmentedPlan)
+    return InPieces(machine, task, segmented, configurations(machine, task, COARSE if coarse else SAMPLE_COUNT))
 
 
-def postures(machine: FixedBase, task: TipTask, count: int) -> Reached:
+def configurations(machine: FixedBase, task: TipTask, count: int) -> Reached:
     """All postures at so many times."""
     n, times = machine.joint_size, np.linspace(0.0, DURATION, count)
     bounds, equations = Limits().bounds(machine), bind(machine, task)
@@ -151,13 +153,13 @@ def postures(machine: FixedBase, task: TipTask, count: int) -> Reached:
     sets = SelfMotionManifolds(space, equations, np.array(equations.target_function().map(count)(times[None])).T)
 
     def seeds(k: int) -> Array:
-        found = inverse_kinematics(machine, task, time=float(times[k]), seed=k, starts=STARTS)
-        return np.array([one.joints for one in found])
+        result = inverse_kinematics(machine, task, time=float(times[k]), seed=k, starts=STARTS)
+        return np.array([one.joints for one in result])
 
     limits = bounds.velocity * np.diff(times)[:, None]
-    told: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
+    options: dict[str, Any] = {"seeds": seeds, "scene": CollisionScene(machine)}
     search = AtlasSearch(
-        space, [TimeSample(sets, k) for k in range(count)], Steps(times, SquaredRates(np.ones(n)), limits), **told
+        space, [TimeSample(sets, k) for k in range(count)], Steps(times, SquaredRates(np.ones(n)), limits), **options
     )
     layers = [search.without_collisions(search.split_charts(charts, k), k) for k, charts in enumerate(search.layers)]
     graph = search.graph(layers, np.full(count - 1, np.inf))
@@ -168,17 +170,17 @@ def postures(machine: FixedBase, task: TipTask, count: int) -> Reached:
 
 def _led(graph: ChartGraph, order: range) -> NDArray[np.bool_]:
     """Which charts steps lead to from those of the first instant of an order. Shape (N,)."""
-    found = [np.full(len(charts), k == order[0]) for k, charts in enumerate(graph.layers)]
+    result = [np.full(len(charts), k == order[0]) for k, charts in enumerate(graph.layers)]
     for k, other in pairwise(order):
         for i, j in graph.edges(k, other):
-            found[other][j[found[k][i]]] = True
-    return np.concatenate(found)
+            result[other][j[result[k][i]]] = True
+    return np.concatenate(result)
 
 
 def draw(example: InPieces, folder: Path, *, animation: bool = True) -> None:
     """reconfiguration.png and .gif."""
-    made, machine = example.made, example.machine
-    change = made.reconfigurations[0]
+    segmented, machine = example.segmented, example.machine
+    change = segmented.reconfigurations[0]
     joint = int(np.abs(change.after - change.before).argmax())
     far = np.degrees(abs(change.after[joint] - change.before[joint]))
     note = (
@@ -186,7 +188,7 @@ def draw(example: InPieces, folder: Path, *, animation: bool = True) -> None:
         f"pointing down with one heading: at each time a column, one direction being free. Blue: those that motions "
         "from the beginning reach; green: those from which motions lead to the end; grey: neither. Joints within their "
         "limits of position and velocity, links clear of each other. The pieces, of which no plan has fewer, are the "
-        f"cheapest where one gives way to the other at {change.time:.3g} s: {made.cost:.3f} rad²/s together, the "
+        f"cheapest where one gives way to the other at {change.time:.3g} s: {segmented.cost:.3f} rad²/s together, the "
         "integral of half the squared joint rates, the way between them not counted."
     )
     title = f"No one motion does the ring: {machine.robot.joint_names[joint]} turns back by {far:.0f}° on the way"
@@ -205,14 +207,14 @@ def draw(example: InPieces, folder: Path, *, animation: bool = True) -> None:
             draw_scene(figure.add_subplot(grid[0, place]), scene, 1, (790, 560), scenes)
         _landscape(figure.add_subplot(grid[1, :]), example, change, joint)
     if animation:
-        scene = _scene(example, f"a ring in {len(made.segments)} pieces", "blue", *_motion(made))
-        told = f"The ring waits at {change.time:.2f} s, for {change.duration:.2g} s, while the arm reconfigures"
-        animate(folder / "reconfiguration.gif", [scene], frames=FRAMES, seconds=PACE, note=told)
+        scene = _scene(example, f"a ring in {len(segmented.segments)} pieces", "blue", *_motion(segmented))
+        options = f"The ring waits at {change.time:.2f} s, for {change.duration:.2g} s, while the arm reconfigures"
+        animate(folder / "reconfiguration.gif", [scene], frames=FRAMES, seconds=PACE, note=options)
 
 
 def _landscape(ax: Any, example: InPieces, change: Reconfiguration, joint: int) -> None:
     """The postures by one of their joints over time, the pieces, and where one gives way to the other."""
-    made, reached, robot = example.made, example.reached, example.machine.robot
+    segmented, reached, robot = example.segmented, example.reached, example.machine.robot
     charts, times = reached.charts, reached.times[reached.charts.layer]
     ends = [charts.centers[:, joint] + charts.tangents[:, joint, 0] * end[:, 0] for end in (charts.low, charts.high)]
     bars = np.stack([np.column_stack([times, np.degrees(end)]) for end in ends], axis=1)
@@ -222,8 +224,8 @@ def _landscape(ax: Any, example: InPieces, change: Reconfiguration, joint: int) 
         lines.set_rasterized(True)  # thousands of them
         ax.add_collection(lines)
     for name, color, piece, begin in (
-        ("first piece", FROM_THE_BEGINNING, made.segments[0], made.start_times[0]),
-        ("last piece", TO_THE_END, made.segments[-1], made.start_times[-1]),
+        ("first piece", FROM_THE_BEGINNING, segmented.segments[0], segmented.start_times[0]),
+        ("last piece", TO_THE_END, segmented.segments[-1], segmented.start_times[-1]),
     ):
         t = np.linspace(0.0, piece.horizon, FINE)
         angle = np.degrees(piece.at(t)["joints"][:, joint])
@@ -260,7 +262,7 @@ def _scene(example: InPieces, title: str, color: str, joints: Array, t: Array | 
     )
 
 
-def _motion(made: SegmentedPlan) -> tuple[Array, Array]:
+def _motion(segmented: SegmentedPlan) -> tuple[Array, Array]:
     """All joints from the beginning to the end, the ways between the pieces too, and their times, s."""
-    times = np.linspace(0.0, made.horizon, FINE * len(made.pieces))
-    return made.at(times)["joints"], times
+    times = np.linspace(0.0, segmented.horizon, FINE * len(segmented.pieces))
+    return segmented.at(times)["joints"], times

@@ -23,10 +23,10 @@ def packaged(package: str, ending: str) -> Path:
         owner = distribution(package)
     except PackageNotFoundError:
         raise FileNotFoundError(f"{ending} comes with the package {package!r}: pip install {package}") from None
-    found = [file for file in owner.files or [] if f"/{file.as_posix()}".endswith(f"/{ending}")]
-    if not found:
+    result = [file for file in owner.files or [] if f"/{file.as_posix()}".endswith(f"/{ending}")]
+    if not result:
         raise FileNotFoundError(f"the installed package {package!r} has no file {ending}: pip install -U {package}")
-    return Path(str(owner.locate_file(found[0])))
+    return Path(str(owner.locate_file(result[0])))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ START = (0.3, 0.9, 0.2, -1.6, 0.3, 0.9, 0.4)  # rad
 SHIFT = (0.5, 1.5, -0.5)  # m
 TURN = (0.4, 0.3, 0.8)  # roll, pitch, yaw in the axes of the tip, rad
 DURATION = 20.0  # s
-INSTANTS = 4
+SNAPSHOTS = 4
 VIEW = (24.0, -48.0)  # deg
 
 
@@ -66,7 +66,7 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         f"A free-flying arm turns a part by {100 * saved:.0f} % less effort than by the pseudo-inverse, and its base "
         f"turns by {calmer['base_turn_optimal_deg']:.0f}° instead of {calmer['base_turn_local_deg']:.0f}°"
     )
-    with page(path, scenes, INSTANTS, height=6.0, share=1.5, note=note, title=title) as (turn, rates, best):
+    with page(path, scenes, SNAPSHOTS, height=6.0, share=1.5, note=note, title=title) as (turn, rates, best):
         for scene, poses, dash in zip(scenes, (local.base, at["base"]), DASHES, strict=False):
             angle = np.degrees(turning_angle(poses))
             turn.plot(local.t, angle, color=COLORS[scene.color], ls=dash, label=scene.title)

@@ -91,10 +91,10 @@ def robot_file(ending: str = FILE, package: str = PACKAGE) -> Path:
             f"the robots of the gallery come from the package {package}, which is not installed: pip install {package} "
             "(or all of them: pip install 'selfmotion[gallery]')"
         ) from None
-    found = [file for file in owner.files or [] if file.as_posix().endswith("/" + ending)]
-    if not found:
+    result = [file for file in owner.files or [] if file.as_posix().endswith("/" + ending)]
+    if not result:
         raise FileNotFoundError(f"the package {package} {owner.version} has no file {ending}")
-    return Path(str(owner.locate_file(found[0])))
+    return Path(str(owner.locate_file(result[0])))
 
 
 def tiago(load: float = LOAD) -> tuple[Standing, Footprint]:
@@ -192,14 +192,14 @@ def scenes_of(results: Results, view: tuple[float, float], nearest_points: Array
     Args:
         nearest_points: Of the two bodies that come nearest along the plan. Shape (2, 3), m.
     """
-    found = []
+    result = []
     feet = np.asarray(results.footprint.support.vertices)
     for title, motion, color in (("instant by instant", results.local, "orange"), ("plan", results.motion, "blue")):
         frames = frames_along(results.machine, motion.joints)
         about: dict[str, Any] = {"view": view, "floor": 0.0, "footprint": feet, "mark": motion.zero_moment_point}
         points = nearest_points if motion is results.motion else None
-        found.append(Scene(title, results.robot, frames, motion.t, color, nearest_points=points, **about))
-    return found
+        result.append(Scene(title, results.robot, frames, motion.t, color, nearest_points=points, **about))
+    return result
 
 
 def figure(

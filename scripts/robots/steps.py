@@ -27,8 +27,8 @@ from scripts.drawing import COLORS
 from scripts.robots.drawing import Scene, animate, page
 
 __all__ = [
-    "FRICTION", "SIDES", "Walks", "alternating", "bent", "draw", "plan", "planar_biped", "planar_feet", "planar_steps",
-    "scenes_of", "walks_of",
+    "FRICTION", "SIDES", "Walks", "alternating", "crouched", "draw", "plan", "planar_biped", "planar_feet",
+    "planar_steps", "scenes_of", "walks_of",
 ]  # fmt: skip
 
 SIDES = ("left", "right")
@@ -166,35 +166,37 @@ def alternating(
     return walk(start, steps, shift=shift, swing=swing)
 
 
-def bent(steps: Steps, knee: float = 0.8) -> Array:
+def crouched(steps: Steps, knee: float = 0.8) -> Array:
     """A start on both feet with knees bent (rad), in balance, in the robot's order."""
     near = np.zeros(steps.robot.dof)
     pitches = [i for i, joint in enumerate(steps.robot.moving_joints) if abs(joint.axis[1]) > 0.5]
     near[pitches] = np.tile([-knee / 2, knee, -knee / 2], 2)
     stance = steps.stances[0]
-    found = standing_configuration(stance, near[steps.order(stance)], steps.balanced(0))
-    return np.asarray(steps.in_order(stance, found[None])[0])
+    result = standing_configuration(stance, near[steps.order(stance)], steps.balanced(0))
+    return np.asarray(steps.in_order(stance, result[None])[0])
 
 
 def plan(coarse: bool = False) -> StepsExample:
     """Both walks, audited; on one mesh only, `coarse` or not."""
     walks = walks_of(planar_steps, KINDS, CLEARANCE)
     steps = walks.motions["as a whole"].steps
-    return StepsExample(**vars(walks), local=resolve_steps(steps, start=bent(steps)))
+    return StepsExample(**vars(walks), local=resolve_steps(steps, start=crouched(steps)))
 
 
-def walks_of(made: Callable[..., Steps], kinds: dict[str, dict[str, Any]], clearance: float) -> Walks:
+def walks_of(make_steps: Callable[..., Steps], kinds: dict[str, dict[str, Any]], clearance: float) -> Walks:
     """Two steps as each of some kinds asks for them, planned and audited.
 
     Args:
-        made: Steps of a robot, as `planar_steps`.
+        make_steps: Steps of a robot, as `planar_steps`.
         kinds: As KINDS.
         clearance: Of a sole in the middle of its way, m.
     """
     plans, motions = {}, {}
     for name, kind in kinds.items():
-        steps = replace(made(2, *kind["times"]), balance=kind["balance"], margin=kind["margin"], clearance=clearance)
-        start = bent(steps)[steps.order(steps.stances[0])]
+        steps = replace(
+            make_steps(2, *kind["times"]), balance=kind["balance"], margin=kind["margin"], clearance=clearance
+        )
+        start = crouched(steps)[steps.order(steps.stances[0])]
         plans[name] = ocp.plan(steps.stances[0], steps, start=start, limits=Limits(friction=FRICTION)).solution
         motions[name] = steps_motion(steps, plans[name])
     return Walks(plans, motions, {name: plan.audit() for name, plan in plans.items()})
@@ -207,18 +209,18 @@ def scenes_of(walks: Walks, view: tuple[float, float], footprint: Array | None =
         view: Elevation and azimuth, deg.
         footprint: Corners (4, 2) of what is marked on the ground, m.
     """
-    found = []
+    result = []
     for name, motion in walks.motions.items():
         turn = Rotation.from_matrix(motion.root_rotation).as_quat(scalar_first=True)
         machine = FreeFloating(motion.steps.robot)
         frames = frames_along(machine, motion.joints, np.column_stack([motion.root_position, turn]))
-        found.append(
+        result.append(
             Scene(
                 f"{name}: {motion.t[-1]:.1f} s", motion.steps.robot, frames, motion.t, KINDS[name]["color"], view=view,
                 floor=0.0, footprint=footprint, mark=motion.zero_moment_point,
             )
         )  # fmt: skip
-    return found
+    return result
 
 
 def draw(example: StepsExample, folder: Path, *, animation: bool = True) -> None:

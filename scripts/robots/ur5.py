@@ -79,13 +79,13 @@ def plan(coarse: bool = False) -> Example:
     method = Collocation(intervals=70 if coarse else 80, degree=5)
     tried: list[tuple[LocalSolution, Solution | None, Solution | None]] = []
     rows: list[dict[str, Any]] = []
-    for posture in starts(machine, task)[: 1 if coarse else BRANCHES]:
-        local = resolve(machine, task, DURATION, start=posture.joints, samples=FINE)
-        same, free = (_planned(machine, task, posture, method, free_start) for free_start in (False, True))
+    for configuration in starts(machine, task)[: 1 if coarse else BRANCHES]:
+        local = resolve(machine, task, DURATION, start=configuration.joints, samples=FINE)
+        same, free = (_planned(machine, task, configuration, method, free_start) for free_start in (False, True))
         tried.append((local, same, free))
         rows.append(
             {
-                "start_rad": posture.joints,
+                "start_rad": configuration.joints,
                 "cost_local": float(local.cost[-1]),
                 "local_arrives": local.stopped is None,
                 "cost_optimal_same_start": None if same is None else float(same.cost),
@@ -95,10 +95,14 @@ def plan(coarse: bool = False) -> Example:
     plans = [free for _, _, free in tried if free is not None]
     if not plans:
         raise SolveError("no start of the raster leads to an audited plan")
-    solution = min(plans, key=lambda found: found.cost)
+    solution = min(plans, key=lambda result: result.cost)
     arrived = [local for local, _, _ in tried if local.stopped is None] or [local for local, _, _ in tried]
-    local = min(arrived, key=lambda found: float(found.cost[-1]))
-    motions = [(CONDITIONED, *_told(tried[0][0])), (BEST, *_told(local)), (PLANNED, *_motion(solution))]
+    local = min(arrived, key=lambda result: float(result.cost[-1]))
+    motions = [
+        (CONDITIONED, *_local_samples(tried[0][0])),
+        (BEST, *_local_samples(local)),
+        (PLANNED, *_motion(solution)),
+    ]
     rolls = [roll(frames_along(machine, joints)) for _, _, joints, _ in motions]
     facts = {
         "starts": rows,
@@ -110,11 +114,13 @@ def plan(coarse: bool = False) -> Example:
 
 def starts(machine: Machine, task: TipTask) -> list[IkSolution]:
     """Postures at the start of the task with elbow and wrist above the panel, the best conditioned first."""
-    found = inverse_kinematics(machine, task)
-    frames = frames_along(machine, [posture.joints for posture in found])
+    result = inverse_kinematics(machine, task)
+    frames = frames_along(machine, [configuration.joints for configuration in result])
     height = np.min([frames.positions[link][:, 2] for link in OVERHEAD], axis=0)
-    clearance_constraints = [posture for posture, low in zip(found, height, strict=True) if low > CENTER[1] + CLEARANCE]
-    return clearance_constraints or found
+    clearance_constraints = [
+        configuration for configuration, low in zip(result, height, strict=True) if low > CENTER[1] + CLEARANCE
+    ]
+    return clearance_constraints or result
 
 
 def _planned(
@@ -122,10 +128,10 @@ def _planned(
 ) -> Solution | None:
     begin: dict[str, Any] = {"setup": VelocitySetup(near=start.joints)} if free_start else {"start": start.joints}
     try:
-        found = solve(minimum_velocity_problem(machine, task, horizon=DURATION, **begin), method)
+        result = solve(minimum_velocity_problem(machine, task, horizon=DURATION, **begin), method)
     except SolveError:
         return None
-    return found if found.audit().feasible else None
+    return result if result.audit().feasible else None
 
 
 def roll(frames: Frames) -> Array:
@@ -192,7 +198,7 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         animate(folder / "ur5.gif", scenes, frames=50, seconds=0.1, note=note)
 
 
-def _told(local: LocalSolution) -> tuple[Array, Array, Array]:
+def _local_samples(local: LocalSolution) -> tuple[Array, Array, Array]:
     """Times, joints and the cost up to each time of a motion by the pseudo-inverse."""
     return local.t, local.joints, local.cost
 

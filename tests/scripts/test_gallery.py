@@ -117,7 +117,7 @@ def test_the_lowest_cost_start_lies_in_another_family_than_the_best_conditioned_
 
 def test_no_configuration_of_the_ring_connects_its_start_and_end(tmp_path: Path) -> None:
     example = reconfiguration.plan(coarse=True)
-    result, reached = example.made, example.reached
+    result, reached = example.segmented, example.reached
     assert all(audit.feasible for audit in example.audits)
     assert all(segment.audit().passed for segment in result.segments)
     assert (len(result.reconfigurations), result.fewest) == (1, 1)

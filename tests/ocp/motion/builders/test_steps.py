@@ -20,7 +20,7 @@ from ocp.motion.builders.standing.resolved import StepsMotion, motion_of, resolv
 from ocp.motion.builders.standing.stances import StancePhase, Steps, standing_configuration, walk
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.problem.formulation import Formulation
-from scripts.robots.steps import SIDES, bent, planar_biped, planar_feet, planar_steps
+from scripts.robots.steps import SIDES, crouched, planar_biped, planar_feet, planar_steps
 from scripts.robots.talos import talos_steps
 from tests.models.robot.trees import numeric, numeric_poses
 from tests.ocp.motion.builders.bipeds import FRICTION, mirrored, resized
@@ -36,7 +36,7 @@ GROUND: dict[str, Any] = {"limits": Limits(friction=FRICTION)}
 
 def planned(steps: Steps, method: Collocation | None = None, **request: Any) -> tuple[Solution, StepsMotion]:
     steps = with_margin(steps, **request)
-    plan = solve_steps(steps, start=bent(steps), method=method, **GROUND)
+    plan = solve_steps(steps, start=crouched(steps), method=method, **GROUND)
     return plan, steps_motion(steps, plan)
 
 
@@ -130,7 +130,7 @@ def test_a_step_of_the_other_foot_is_the_mirrored_step() -> None:
     coarse = Collocation(4, degree=3, scheme="legendre")
     plans = []
     for steps in (planar_steps(1, 0.8, 0.8), mirrored(planar_steps(1, 0.8, 0.8))):
-        plan = solve(steps_problem(with_margin(steps), start=bent(steps), **GROUND), coarse)
+        plan = solve(steps_problem(with_margin(steps), start=crouched(steps), **GROUND), coarse)
         plans.append((plan.cost, steps_motion(steps, plan, 11)))
     (cost, right), (again, left) = plans
     assert again == pytest.approx(cost, rel=1e-7)
@@ -142,7 +142,7 @@ def test_a_step_of_the_other_foot_is_the_mirrored_step() -> None:
 def test_a_machine_of_another_size_takes_the_same_steps_at_the_same_cost() -> None:
     """Lengths times s, masses s^3, torques s^4, times sqrt(s): all that is asked scales, and so does the motion."""
     steps, coarse = planar_steps(1, 0.6, 0.7), Collocation(4, degree=3, scheme="legendre")
-    start, plans = bent(steps), []
+    start, plans = crouched(steps), []
     for size in (1.0, 3.0):
         unit = np.sqrt(size)
         weights = StepWeights(acceleration=0.01 * unit**3, velocity=0.01 * unit, joint_limits=1 / unit, load=0.0)
@@ -198,7 +198,7 @@ def test_the_pseudo_inverse_keeps_the_feet_on_their_paths_and_falls(robot: str) 
     """The zero moment point leaves the soles, and the contact simulation falls soon after it did."""
     steps = planar_steps(2, 0.5, 0.6) if robot == "planar" else talos_steps(2, 0.8, 0.8)
     clearance = 0.03
-    motion = resolve_steps(replace(steps, clearance=clearance), start=bent(steps))
+    motion = resolve_steps(replace(steps, clearance=clearance), start=crouched(steps))
     for name in steps.feet:
         for k, phase in enumerate(steps.phases):
             if name in phase.footholds:
@@ -215,7 +215,7 @@ def test_the_pseudo_inverse_keeps_the_feet_on_their_paths_and_falls(robot: str) 
 def test_the_walk_of_the_pseudo_inverse_has_the_least_rates_and_loads() -> None:
     """Of all rates that move the foot as it goes, and of all loads that sum up to what the motion takes."""
     steps = planar_steps(1, 0.5, 0.6)
-    motion = resolve_steps(steps, start=bent(steps))
+    motion = resolve_steps(steps, start=crouched(steps))
     stance, inside = steps.stances[1], motion.phase == 1
     order = steps.order(stance)
     for q, rates in zip(motion.joints[inside][::25, order], motion.joint_velocities[inside][::25, order], strict=True):
@@ -237,7 +237,7 @@ def test_the_walk_of_the_pseudo_inverse_has_the_least_rates_and_loads() -> None:
 def test_the_pseudo_inverse_says_in_which_phase_a_leg_is_stretched() -> None:
     steps = planar_steps(1, 0.5, 0.6, length=2.0)
     with pytest.raises(SolveError, match="'2 left': the pseudo-inverse breaks down at"):
-        resolve_steps(steps, start=bent(steps))
+        resolve_steps(steps, start=crouched(steps))
 
 
 @pytest.mark.parametrize("height", [0.05, 0.0, -0.05])
@@ -246,10 +246,10 @@ def test_a_sole_may_rest_where_it_lifts_and_lands_on_other_ground(height: float)
     feet = {side: Foothold.level(0, 0) for side in SIDES}
     phases = walk(feet, [("right", Foothold.level(0.2, 0, height=height))], shift=0.5, swing=0.8)
     steps = Steps(planar_biped(), planar_feet(), phases)
-    form = Formulation.of(steps_problem(steps, start=bent(steps)))
-    lands = standing_configuration(steps.standing(2), bent(steps)[steps.order(steps.stances[1])])
+    form = Formulation.of(steps_problem(steps, start=crouched(steps)))
+    lands = standing_configuration(steps.standing(2), crouched(steps)[steps.order(steps.stances[1])])
     states, controls = np.zeros((3, form.nx)), np.zeros((3, form.nu))
-    states[:, form.states["2 left.joints"]] = bent(steps)[steps.order(steps.stances[1])]
+    states[:, form.states["2 left.joints"]] = crouched(steps)[steps.order(steps.stances[1])]
     states[2, form.states["2 left.joints"]] = lands
     share = np.array([0.02, 0.5, 0.98])
     rows = form.sampled([form.path.expression], states, controls, share, 1.0, form.parameter_vector({}))[0]
@@ -263,7 +263,7 @@ def on_the_corner_of_a_sole(steps: Steps, margin: float, seconds: float) -> Step
     stance = steps.stances[1]
     assert stance.support is not None
     over = np.asarray(stance.support.vertices).min(axis=0) + margin
-    configuration = standing_configuration(stance, bent(steps)[steps.order(stance)], over)[None].repeat(2, axis=0)
+    configuration = standing_configuration(stance, crouched(steps)[steps.order(stance)], over)[None].repeat(2, axis=0)
     still = np.zeros_like(configuration)
     one = Steps(steps.robot, steps.feet, [StancePhase(steps.phases[1].footholds, seconds)])
     result = sample_stance(one, one.stances[0], (configuration, still, still), {})
@@ -285,7 +285,7 @@ def test_soft_ground_reduces_the_margin_at_the_corner_of_a_sole() -> None:
 
 def test_steps_that_cannot_be_are_refused_by_name(step: tuple[Steps, Solution, StepsMotion]) -> None:
     steps, plan, _ = step
-    start = bent(steps)
+    start = crouched(steps)
     robot, feet = planar_biped(), planar_feet()
     here, there = Foothold.level(0, 0), Foothold.level(0.2, 0)
     refusals: list[tuple[Callable[[], Any], str]] = [
@@ -319,14 +319,14 @@ def test_a_step_that_is_too_fast_is_refused_with_the_time_that_it_takes() -> Non
     """Given that time, it can be taken."""
     fast = planar_steps(1, 0.05, 0.06)
     with pytest.raises(SolveError, match="too fast") as refusal:
-        solve_steps(with_margin(fast), start=bent(fast), **GROUND)
+        solve_steps(with_margin(fast), start=crouched(fast), **GROUND)
     error = refusal.value
     assert (error.name, error.limit) == ("2 left", 0.06)
     assert re.search(
         r"phase '2 left': 0\.\d+ s, 0\.06 s are requested; at their limits .*(torques|velocities)", str(error)
     )
     assert error.value > 1.3 * 0.06
-    assert guess_in_time(with_margin(planar_steps(1, 0.05, 1.05 * error.value)), bent(fast), GROUND, {}) is not None
+    assert guess_in_time(with_margin(planar_steps(1, 0.05, 1.05 * error.value)), crouched(fast), GROUND, {}) is not None
 
 
 @pytest.mark.long
@@ -335,7 +335,7 @@ def test_infeasible_steps_are_refused_with_the_constraint_to_relax() -> None:
     joints = tuple(replace(joint, effort=3.0) for joint in steps.robot.joints)
     weak = replace(steps, robot=replace(steps.robot, joints=joints))
     with pytest.raises(SolveError, match="no steps were found, however long they may take") as refusal:
-        solve_steps(with_margin(weak), start=bent(weak), options={"max_iter": 100}, **GROUND)
+        solve_steps(with_margin(weak), start=crouched(weak), options={"max_iter": 100}, **GROUND)
     error = refusal.value
     assert error.conflicts
     assert error.conflicts[0].label == error.name
@@ -346,7 +346,7 @@ def test_infeasible_steps_are_refused_with_the_constraint_to_relax() -> None:
 def test_steps_of_talos_that_are_too_fast_are_refused() -> None:
     fast = talos_steps(2, 0.05, 0.08)
     with pytest.raises(SolveError, match="too fast") as refusal:
-        solve_steps(with_margin(fast, clearance=0.04), start=bent(fast), **GROUND)
+        solve_steps(with_margin(fast, clearance=0.04), start=crouched(fast), **GROUND)
     assert refusal.value.name == "4 right"
 
 
@@ -355,11 +355,11 @@ def test_steps_near_the_quickest_are_planned_in_the_time_that_they_may_have() ->
     """From the guess of a plan slower than they are, no plan is found within 300 iterations."""
     steps = planar_steps(2, 0.1, 0.2)
     coarse = Collocation(12, degree=3, scheme="legendre")
-    problem = steps_problem(with_margin(steps), start=bent(steps), **GROUND)
-    guess = guess_in_time(with_margin(steps), bent(steps), GROUND, {})
+    problem = steps_problem(with_margin(steps), start=crouched(steps), **GROUND)
+    guess = guess_in_time(with_margin(steps), crouched(steps), GROUND, {})
     assert solve(problem, coarse, guess=guess, options={"max_iter": 300}, check=False).success
     with pytest.raises(SolveError, match="12 intervals"):
-        solve_steps(with_margin(steps), start=bent(steps), time_limit=2.0, **GROUND)
+        solve_steps(with_margin(steps), start=crouched(steps), time_limit=2.0, **GROUND)
 
 
 # ---- two steps -------------------------------------------------------------------------------------------------------

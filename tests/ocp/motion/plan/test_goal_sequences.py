@@ -14,7 +14,7 @@ from models import FixedBase, Machine, planar_chain, with_load
 from ocp import Cost, FreeTime, Goal, Limits, Plan, ProblemError, TipTask, Unreachable, Waypoints, plan
 from ocp.motion.builders.space.capture import Capture
 from ocp.motion.result.solved_plan import PhasedPlan
-from scripts.robots.steps import bent, planar_steps
+from scripts.robots.steps import crouched, planar_steps
 from tests.ocp.motion.builders.bipeds import FRICTION
 from tests.ocp.motion.builders.captures import planar_capture
 
@@ -110,7 +110,7 @@ def test_a_load_is_carried_in_its_own_phase(tmp_path: Path) -> None:
 def test_steps_are_planned_and_read_again_with_their_stances(tmp_path: Path) -> None:
     steps = replace(planar_steps(1, 0.8, 0.8), margin=0.01)
     stance = steps.stances[0]
-    start = bent(steps)[steps.order(stance)]
+    start = crouched(steps)[steps.order(stance)]
     planned = plan(stance, steps, start=start, limits=Limits(friction=FRICTION))
     assert planned.audit().feasible
     assert isinstance(planned, PhasedPlan)
@@ -128,7 +128,7 @@ def test_steps_are_planned_and_read_again_with_their_stances(tmp_path: Path) -> 
 def test_joints_of_all_stances_are_continuous_in_one_order() -> None:
     """The stances are rooted at different feet; in the order of the first one no joint jumps."""
     steps = replace(planar_steps(1, 0.8, 0.8), margin=0.01)
-    start = bent(steps)[steps.order(steps.stances[0])]
+    start = crouched(steps)[steps.order(steps.stances[0])]
     planned = plan(steps.stances[0], steps, start=start, limits=Limits(friction=FRICTION))
     assert isinstance(planned, PhasedPlan)
     for part in planned.parts[:-1]:
