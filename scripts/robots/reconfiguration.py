@@ -38,7 +38,7 @@ from scripts.drawing import COLORS, DASHES, sheet
 from scripts.robots.drawing import Scene, animate, draw_scene
 from scripts.robots.robots import PANDA
 
-__all__ = ["Reached", "draw", "plan", "configurations", "ring"]
+__all__ = ["Reached", "configurations", "draw", "plan", "ring"]
 
 RADIUS, HEIGHT = 0.6, 0.2  # m, of the ring about the first joint's axis
 DURATION = 12.0  # s
