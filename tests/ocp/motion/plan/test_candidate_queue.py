@@ -244,3 +244,22 @@ def test_seeds_are_turned_by_full_turns_alone() -> None:
     assert not first.is_turned(turned(1, (0, 0)).seed)
     assert not first.is_turned(replace(first, fixed=True))
     assert not first.is_turned(Seed())
+
+
+@pytest.mark.parametrize("seconds", [0.0, 1.0])
+def test_after_the_refusal_time_the_rest_is_not_tried(seconds: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [1000.0]
+    monkeypatch.setattr("ocp.motion.plan.candidate_queue.time.thread_time", lambda: clock[0])
+
+    class Slow(Known):
+        def advance(self, candidate: Candidate) -> list[Candidate]:
+            clock[0] += seconds
+            return super().advance(candidate)
+
+    slow = Slow([1.0, 1.1, 1.2, 1.3], [2.0] * 4, [False] * 4)
+    queue = CandidateQueue(slow, replace(SETTINGS, max_failures=9, refusal_time=8.5))
+    queue.run(seeds(range(4)))
+    kinds = [each.reason.kind for each in queue.candidates if each.reason is not None]
+    assert len(kinds) == 4
+    assert Rejection.AUDIT in kinds
+    assert (Rejection.NOT_TRIED in kinds) == (seconds > 0)
