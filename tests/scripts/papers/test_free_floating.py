@@ -192,7 +192,7 @@ def test_plan_passes_its_audit_and_the_script_succeeds(run: Run[Results]) -> Non
     assert run.summary["optimal"]["audit_passed"] is True
     assert run.status == 0
     table = (run.folder / "audit.txt").read_text(encoding="utf-8")
-    assert table.splitlines()[0] == "Audit of 'minimum velocity, rates': passed"
+    assert table.splitlines()[0] == "Audit of 'tool motion': passed"
 
 
 # ---- the instruments
