@@ -126,6 +126,8 @@ class Seed:
         pairs = list(zip(self.local, other.local, strict=False))
         if not pairs or (self.direct, self.fixed, self.relaxed) != (other.direct, other.fixed, other.relaxed):
             return False
+        if not all(np.array_equal(one.t, two.t) for one, two in pairs):
+            return False
         turns = 2 * np.pi * np.round((pairs[0][0].joints - pairs[0][1].joints)[0, 0] / (2 * np.pi))
         differences = [np.abs(one.joints - two.joints - turns).max() for one, two in pairs]
         differences += [np.abs(one.base - two.base).max(initial=0.0) for one, two in pairs]

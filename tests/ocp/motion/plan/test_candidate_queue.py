@@ -217,7 +217,7 @@ def test_a_reason_is_read_as_it_was_written_and_not_where_it_is_damaged() -> Non
 def turned(number: int, turns: tuple[int, int], shift: float = 0.0) -> Candidate:
     """Candidate of a motion with its joints shifted by full turns."""
     joints = np.linspace([0.1, -0.4], [0.7, 0.2], 5)[None] + number + shift + 2 * np.pi * np.array(turns)
-    local: Any = SimpleNamespace(joints=joints, base=np.zeros((1, 5, 0)))
+    local: Any = SimpleNamespace(t=np.arange(5.0), joints=joints, base=np.zeros((1, 5, 0)))
     return Candidate(np.array([number]), seed=Seed(cost=1.0, local=[local]))
 
 
@@ -244,6 +244,8 @@ def test_seeds_are_turned_by_full_turns_alone() -> None:
     assert not first.is_turned(turned(1, (0, 0)).seed)
     assert not first.is_turned(replace(first, fixed=True))
     assert not first.is_turned(Seed())
+    fewer: Any = SimpleNamespace(t=np.arange(3.0), joints=np.zeros((1, 3, 2)), base=np.zeros((1, 3, 0)))
+    assert not first.is_turned(Seed(local=[fewer]))
 
 
 @pytest.mark.parametrize("seconds", [0.0, 1.0])
