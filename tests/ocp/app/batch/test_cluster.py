@@ -45,7 +45,7 @@ def test_a_cluster_equals_processes_and_loses_no_result_when_it_is_killed(
         assert two.value["plan"].cost == one.cost
     assert [(result.status, result.error) for result in ends] == [("failed", "ProblemError")] * 2 + [("done", "")]
     assert [result.status for result in dead] == ["done", "killed", "done"]
-    assert dead[1].message == "it ended 4 workers"
+    assert dead[1].message in ("it ended 4 workers", "it ended 8 workers")  # alone, or among others and then alone
     assert len(log.read_text().split()) == 4
     with pytest.raises(ProblemError, match="no scheduler answers") as caught:
         run_batch(functions.square, [{"x": 1.0}], tmp_path / "b", cluster=address)
