@@ -63,6 +63,7 @@ def test_tool_rotation_is_yaw_pitch_roll_of_the_pose(sizes: list[float], seed: i
     np.testing.assert_allclose(numeric(dh_frames(rig, q)[-1].rotation), turn_z @ turn_y @ turn_x, atol=1e-12)
 
 
+@pytest.mark.long
 def test_inverse_of_forward_holds_the_joints_among_its_branches() -> None:
     """To 1e-10 wherever the pose, rounded to double, says so; near a stretched link it does not.
 

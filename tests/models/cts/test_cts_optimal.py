@@ -301,6 +301,7 @@ def true_angles(a: Array, b: Array) -> Array:
     return np.asarray(np.angle(z[np.abs(np.abs(z) - 1) < 1e-9]))
 
 
+@pytest.mark.long
 @given(st.lists(coefficient, min_size=5, max_size=5))
 def test_roots_are_among_the_four_points(values: list[float]) -> None:
     a0, a1, b1, a2, b2 = values

@@ -182,6 +182,7 @@ def test_the_mass_matrix_is_symmetric_and_gives_the_torques_of_accelerations_fro
     np.testing.assert_allclose(inertia @ qdd, torques, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.long
 @settings(max_examples=10)
 @given(seeds)
 def test_mx_and_sx_symbols_give_the_same(seed: int) -> None:

@@ -88,6 +88,7 @@ def test_pinocchio_reads_a_written_robot_with_equal_kinematics(seed: int, size: 
     np.testing.assert_allclose(whole, expected, atol=1e-11 * np.abs(expected).max())
 
 
+@pytest.mark.long
 @given(seeds, st.integers(1, 8))
 @few
 def test_a_robot_that_is_written_is_read_again_with_the_same_functions(seed: int, size: int) -> None:

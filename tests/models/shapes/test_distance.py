@@ -87,6 +87,7 @@ def special_poses(rng: np.random.Generator) -> tuple[Any, Any]:
     return Capsule(0.125, start, end), Box(rng.choice([0.5, 1.0], 3), rng.choice(grid, 3), turn)
 
 
+@pytest.mark.long
 def test_aligned_adjacent_and_crossing_shapes_have_exact_distances() -> None:
     rng = np.random.default_rng(3)
     cases = [special_poses(rng) for _ in range(1500)]
@@ -419,6 +420,7 @@ def test_second_derivatives_of_an_aligned_capsule_are_those_of_one_nearly_aligne
         np.testing.assert_allclose(straight, tilted, atol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rounding", some([0.0, 0.05], [0.05]))
 def test_no_derivative_is_ever_spoilt(rounding: float) -> None:
     """Coincident points, parallel, crossing and bare-point capsules, boxes one in the other, symmetric poses."""

@@ -99,6 +99,7 @@ def test_outputs_go_to_the_folder_that_the_user_names(tmp_path: Path, capsys: An
     assert run(capsys, "plan", file, "-o", tmp_path / "out" / "seam.npz", "--quiet")[0] == 0  # the user's own pointing
 
 
+@pytest.mark.long
 def test_a_task_in_segments_writes_one_file_and_no_other(tmp_path: Path, capsys: Any) -> None:
     """A link may lie in wait under a number."""
     own = victim(tmp_path / "home" / "a.csv")

@@ -252,6 +252,7 @@ def test_a_fault_between_bars_and_between_nodes_is_found() -> None:
         assert not result.worst.missed or result.worst.time == pytest.approx(0.45, abs=0.05)
 
 
+@pytest.mark.long
 @given(st.integers(0, 10**6))
 @example(3289)  # the hull says how far they are apart at one end of an interval, what covers it at the other
 @settings(max_examples=10, deadline=None)

@@ -304,6 +304,7 @@ def indefinite(rng: np.random.Generator) -> tuple[Problem, float]:
     return problem, least
 
 
+@pytest.mark.long
 def test_of_random_indefinite_problems_no_non_minimum_passes_and_the_minima_do() -> None:
     rng = np.random.default_rng(20)
     counts = {True: 0, False: 0}

@@ -149,6 +149,7 @@ def test_a_coarse_seed_is_enough_for_the_paper_example(shooting: str, seed: Coll
     assert solution.iterations <= 10
 
 
+@pytest.mark.long
 def test_rate_limits_of_the_paper_example_hold_exactly_beside_its_task() -> None:
     """Bounds and a path equality on one control: the free optimum has 1.36 rad/s, here all of 1.25 is used."""
     base = paper_example()
@@ -287,6 +288,7 @@ def test_a_free_horizon_meets_its_condition_with_the_horizon_in_every_place() ->
     assert (ahead - behind) / 0.02 == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.long
 def test_backward_shooting_meets_multiple_shooting() -> None:
     """At the corners of saturated controls the integrator's error is some hundred times its tolerance of 1e-12."""
     for name in ("fixed horizon", "saturated", "coupled"):

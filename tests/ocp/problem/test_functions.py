@@ -250,6 +250,7 @@ def test_a_crafted_record_is_refused(what: str) -> None:
         FunctionReader(deepcopy(CRAFTED[what]))
 
 
+@pytest.mark.long
 def test_calls_that_multiply_are_refused_before_they_are_worked_out() -> None:
     doubled = record_of(
         (INPUT, 0, 0), (CALL, 0, 0), (RESULT, 1, 0), (CALL, 0, 1), (RESULT, 3, 0),

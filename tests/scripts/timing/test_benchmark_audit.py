@@ -45,6 +45,7 @@ def test_the_worst_ratio_and_growth_stand_beside_their_goals(measured_audit: tup
     assert "audit over solve, worst" in benchmark_audit.report(numbers)
 
 
+@pytest.mark.long
 def test_tables_and_the_picture_are_written(measured_audit: tuple[Path, dict[str, Any]]) -> None:
     folder, numbers = measured_audit
     assert "audit" in benchmark.PARTS

@@ -237,6 +237,7 @@ def test_a_script_runs_its_own_function_under_its_guard(end: str, says: str, tmp
         assert json.loads((tmp_path / "b" / "batch.json").read_text())["function"] == "script:double"
 
 
+@pytest.mark.long
 def test_a_folder_of_another_function_version_or_program_is_refused(tmp_path: Path) -> None:
     ResultStore.of(tmp_path / "b", "tests.ocp.app.batch.functions:square", source_version(functions.square), False)
     run_batch(functions.square, X[:1], tmp_path / "b")

@@ -182,6 +182,7 @@ def test_loads_of_the_hand_change_the_momentum_of_the_target() -> None:
     assert np.linalg.norm(values[:, :3], axis=1).max() <= GRASP.force * (1 + 1e-6)
 
 
+@pytest.mark.long
 def test_the_tip_comes_along_the_axis_of_the_cone() -> None:
     request, begin = planar_capture(), planar().phase("approach")
     states = begin.at_fraction(np.linspace(0, 1, 201))

@@ -105,6 +105,7 @@ def test_a_plan_of_least_time_is_bang_bang_and_holds_its_limits(fastest: Solutio
     assert (shares.min(axis=1) > 0.999).mean() > 0.95
 
 
+@pytest.mark.long
 def test_a_free_path_is_faster_than_any_fixed_path(fastest: Solution) -> None:
     """The straight path takes longer even in its own least time; along its own path the plan is as fast as can be."""
     s = np.linspace(0, 1, 2001)
@@ -132,6 +133,7 @@ def test_a_path_that_is_free_is_faster_than_toppra_along_the_straight_one(fastes
     assert fastest.horizon < 0.97 * result.duration
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("mesh", "most"), [((2, 2), np.inf), ((1, 3), 2.5)])
 def test_limits_that_no_mesh_meets_are_tightened_at_their_cost(
     mesh: tuple[int, int], most: float, tmp_path: Path

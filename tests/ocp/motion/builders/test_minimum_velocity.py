@@ -135,6 +135,7 @@ def test_an_arm_on_a_fixed_base_does_better_than_instantly() -> None:
     np.testing.assert_allclose(solution.costate("joints")[-1], 0, atol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("rows", "horizon"), [((3, 4, 5), 3.0), ((0, 1, 2, 3, 4, 5), 1.0)])
 def test_a_spatial_seven_joint_arm_on_a_floating_base_is_planned(rows: tuple[int, ...], horizon: float) -> None:
     machine = FreeFloating(seven_joint_arm(), "spatial")

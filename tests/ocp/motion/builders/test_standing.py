@@ -123,6 +123,7 @@ def test_plans_of_table_2_against_the_spring_have_the_published_cost(zmp: Any, c
     np.testing.assert_allclose(motion.external_force[:, 1], -150 * stretch, atol=1e-9)
 
 
+@pytest.mark.long
 def test_held_plans_converge_to_the_one_of_collocation_points() -> None:
     """Two transcriptions and two ways to hold the tip on its path; of first order, for the region binds at nodes."""
     best = points(table_plan(1, IN_RANGE, tip_level="acceleration"), 20).cost
@@ -243,6 +244,7 @@ def test_jerk_as_control_keeps_the_accelerations_continuous() -> None:
     assert steps < 1.1 * np.abs(solution["jerks"]).max() * HORIZON / 600
 
 
+@pytest.mark.long
 def test_free_ends_cost_less_than_rest_and_a_fixed_end_configuration_more() -> None:
     rest = points(table_plan(1, IN_RANGE, tip_level="acceleration"), 12)
     free = points(table_plan(1, IN_RANGE, tip_level="acceleration", end_velocity="free"), 12)
@@ -459,6 +461,7 @@ def test_joints_that_are_too_weak_are_named() -> None:
     assert 0 <= result[0][2] <= HORIZON
 
 
+@pytest.mark.long
 def test_a_tip_that_cannot_come_to_its_path_is_named() -> None:
     """Within the arm's length, but the joints cannot fold so far: they, or the tip, have to give way."""
     result = misses(lean(3.0, -0.6, -1.2, zmp=Anywhere()), MultipleShooting(20))

@@ -185,6 +185,7 @@ def triangles(machine: FixedBase, link: str) -> Any:
     return model
 
 
+@pytest.mark.long
 def test_meshes_are_no_nearer_than_their_hulls_and_covers_say() -> None:
     """Beside their triangles by coal: both are bounds from below, the larger is told, and what is held is told."""
     seen, hollow = np.sum([beside_triangles(machine) for machine in (ur5(), panda())], axis=0)

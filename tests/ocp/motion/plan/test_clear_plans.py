@@ -342,6 +342,7 @@ def test_a_colliding_start_names_the_pair_and_the_depth() -> None:
     assert re.search(r"; \d+ other configurations? (is|are) collision-free then", str(caught.value))
 
 
+@pytest.mark.long
 def test_a_target_inside_an_obstacle_names_the_pair_the_time_and_the_depth() -> None:
     with pytest.raises(SolveError, match=r"link6 and obstacle 0 overlap by 0\.\d+ m at [12]\.?\d* s") as caught:
         plan(

@@ -128,6 +128,7 @@ def test_a_seam_is_planned_with_the_file_as_it_is(name: str, search: Any) -> Non
         assert 0.5 * result.cost < result.bound <= result.cost
 
 
+@pytest.mark.long
 def test_an_arm_on_a_gantry_plans_and_the_error_about_freedom_names_its_slides() -> None:
     """Three slides and six joints leave four directions free, one more than the slides: the roll of the tool."""
     machine = on_rail(ur5(), 3)

@@ -49,6 +49,7 @@ def test_from_a_fixed_start_the_bound_is_that_of_motions_from_there() -> None:
     assert result["joints"][0] == pytest.approx(PANDA_START, abs=1e-9)
 
 
+@pytest.mark.long
 def test_the_bound_follows_weights_and_pace() -> None:
     machine, start = planar(np.array([0.5, 0.4, 0.3])), np.array([0.5, 1.2, -1.4])
     task = moved(machine, start, "place")

@@ -51,6 +51,7 @@ def line(first: Array, way: Array, **options: Any) -> TipTask:
     return TipTask(position=position, direction=(0.0, 0.0, -1.0), duration=DURATION, **options)
 
 
+@pytest.mark.long
 def test_a_task_on_a_locked_table_is_the_same_task_in_the_world() -> None:
     robot, first, path = with_table(), np.array([0.0, -0.1, 0.2]), np.array([0.1, 0.2, 0.0])
     angle, place = 0.4, np.array([0.5, 0.0, 0.1])

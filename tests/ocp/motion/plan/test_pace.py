@@ -111,6 +111,7 @@ def test_without_limits_the_effort_equals_the_time_cost_at_all_times(time_cost: 
     assert effort(result, time_cost) == pytest.approx(time_cost * result.horizon, rel=1e-6)
 
 
+@pytest.mark.long
 def test_a_time_cost_four_times_as_high_halves_the_time_and_keeps_the_path() -> None:
     one, other = free(0.1), free(0.4)
     assert other.horizon == pytest.approx(one.horizon / 2, rel=1e-6)

@@ -91,6 +91,7 @@ def starts_of(planned: Plan) -> list[Any]:
     return [candidate for candidate in planned.candidates if candidate.solution is not None]
 
 
+@pytest.mark.long
 def test_a_global_search_bounds_a_cost_by_its_squared_rates() -> None:
     least = plan(THREE, UNIFORM, scene=False, search="global")
     planned = plan(THREE, UNIFORM, scene=False, search="global", cost=Cost(effort=1.0, acceleration=0.05))

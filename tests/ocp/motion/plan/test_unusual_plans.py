@@ -174,6 +174,7 @@ def moved_by_a_pose() -> TipTask:
     return TipTask(position=lambda t: ca.DM(at) + t * ca.DM([0.05, 0.05, 0.0]), duration=2.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("first", [moved_by_a_velocity, pytest.param(moved_by_a_pose, marks=pytest.mark.long)])
 @pytest.mark.parametrize("rows", [(3, 4, 5), (3,), ()], ids=["the place", "one coordinate", "nothing"])
 def test_holding_the_goal_costs_zero(first: Callable[[], TipTask], rows: tuple[int, ...]) -> None:

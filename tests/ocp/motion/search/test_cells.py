@@ -98,6 +98,7 @@ def test_limits_that_stop_a_motion_are_named() -> None:
     assert 0 < lost.value.time < 5.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("momentum", [None, (30.0, 5.0, -5.0)], ids=["at rest", "with momentum"])
 @pytest.mark.parametrize("report", some(["velocity", "place"], ["velocity"]))
 def test_every_motion_does_its_task_within_limits_and_conserves_momentum(report: str, momentum: Any) -> None:

@@ -107,6 +107,7 @@ def test_a_tool_that_turns_too_fast_may_lean_instead(seed: int) -> None:
         assert (np.abs(np.diff(give.joints, axis=0)) <= 2.0 * np.diff(give.times)[:, None] + 1e-7).all()
 
 
+@pytest.mark.long
 def test_failing_waypoints_are_reported_with_their_bodies() -> None:
     places, turns = poses(panda(), PANDA_START, 21)
     with pytest.raises(DeadEnd) as refused:
