@@ -42,7 +42,7 @@ class Result:
         key: Its name in the folder.
         task: The task.
         status: ``done``; ``failed``: the function raised an exception, or returned nan or something that is not data;
-            ``killed``: it ended three workers.
+            ``killed``: it ended at least three workers.
         cost, verdict: As given by the function, or of the plan that it returned; otherwise None.
         seconds: Wall time of the call.
         error, message: Name and text of the exception; "" if done.

@@ -121,7 +121,8 @@ def plan_goal(
         machine: Arm on a fixed or floating base.
         goal: The goal.
         horizon: s, "free", or None for the duration of the goal.
-        options, constraints: As in `plan_sequence`; the horizon is least without a cost if it is free.
+        options, constraints: As in `plan_sequence`. A goal that is only a target has another default cost: the squared
+            joint velocities, and also the time if the horizon is free.
 
     Raises:
         ProblemError, SolveError: As `plan_to_goal` or `plan_sequence`.

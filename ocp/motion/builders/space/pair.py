@@ -62,7 +62,7 @@ def join_target(chaser: Robot, target: Robot) -> Robot:
 
 
 def checked_pair(chaser: Any, target: Any) -> Robot:
-    """Check a chaser and its target, and return both as one robot; see `joined`.
+    """Check a chaser and its target, and return both as one robot; see `join_target`.
 
     Raises:
         ProblemError: Machines of other kinds, without tips, with links of the same name, or a target with joints.
