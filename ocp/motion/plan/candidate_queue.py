@@ -16,6 +16,7 @@ from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ocp.console import report
 from ocp.errors import SolveError
@@ -32,10 +33,12 @@ class Solver:
 
     Attributes:
         last: Stage that a plan must reach.
+        turning: Joints whose full turns move no body, as indices.
         error: Last error of a solve.
     """
 
     last = Stage.AUDITED
+    turning: Sequence[int] | NDArray[np.intp] = ()
     error: SolveError | None = None
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
@@ -140,7 +143,7 @@ class CandidateQueue:
         self._turned: dict[int, list[Candidate]] = {}
         leaders = list[Candidate]()
         for seed in seeds:
-            leader = next((each for each in leaders if each.seed.is_turned(seed.seed)), None)
+            leader = next((each for each in leaders if each.seed.is_turned(seed.seed, self.solver.turning)), None)
             if leader is None:
                 leaders.append(seed)
                 self._push(seed)

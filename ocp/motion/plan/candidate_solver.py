@@ -62,10 +62,10 @@ class CandidateSolver(Solver):
         """Prepare the solver for the candidates of a request.
 
         Args:
-            request: The request.
             start, reference: As in `tool_motion_problem`.
         """
         self.request, self.settings, self.start, self.reference = request, request.settings, start, reference
+        self.turning = request.turning_joints
         constraints = request.clearance_constraints
         self.motion = declared_motion(request, start=start, reference=reference, constraints=constraints)
         actuated = request.cost is None and (request.actuator_limits is not None or any(request.rests))

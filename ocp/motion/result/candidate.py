@@ -8,6 +8,7 @@ from enum import Enum, IntEnum
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models.checks import ROUNDING, Array
 from ocp.audit.audit import Audit
@@ -121,14 +122,15 @@ class Seed:
     thorough: bool = False
     relaxed: bool = False
 
-    def is_turned(self, other: Seed) -> bool:
-        """Return whether the local motions of two seeds are equal apart from full turns of joints."""
+    def is_turned(self, other: Seed, turning: Sequence[int] | NDArray[np.intp]) -> bool:
+        """Return whether the local motions of two seeds are equal apart from full turns of the joints `turning`."""
         pairs = list(zip(self.local, other.local, strict=False))
         if not pairs or (self.direct, self.fixed, self.relaxed) != (other.direct, other.fixed, other.relaxed):
             return False
         if not all(np.array_equal(one.t, two.t) for one, two in pairs):
             return False
         turns = 2 * np.pi * np.round((pairs[0][0].joints - pairs[0][1].joints)[0, 0] / (2 * np.pi))
+        turns[[joint not in turning for joint in range(len(turns))]] = 0.0
         differences = [np.abs(one.joints - two.joints - turns).max() for one, two in pairs]
         differences += [np.abs(one.base - two.base).max(initial=0.0) for one, two in pairs]
         return bool(max(differences) <= ROUNDING)

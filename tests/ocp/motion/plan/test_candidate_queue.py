@@ -26,7 +26,7 @@ class Known(Solver):
     def __init__(self, coarse: list[float], fine: list[float], passes: list[bool]) -> None:
         self.coarse, self.fine, self.passes = coarse, fine, passes
         self.done: list[tuple[int, Stage]] = []
-        self.limited = False
+        self.limited, self.turning = False, (0, 1)
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
         number = int(candidate.start[0])
@@ -236,16 +236,17 @@ def test_seeds_that_differ_by_full_turns_are_solved_if_limits_intervene_or_the_f
     assert kinds == ([Rejection.DUPLICATE] * 2 if passes else [Rejection.AUDIT] * 3)
 
 
-def test_seeds_are_turned_by_full_turns_alone() -> None:
+def test_seeds_are_turned_by_full_turns_of_turning_joints_alone() -> None:
     first = turned(0, (0, 0)).seed
-    assert first.is_turned(turned(0, (2, -1)).seed)
-    assert first.is_turned(first)
-    assert not first.is_turned(turned(0, (1, 0), shift=1e-6).seed)
-    assert not first.is_turned(turned(1, (0, 0)).seed)
-    assert not first.is_turned(replace(first, fixed=True))
-    assert not first.is_turned(Seed())
+    assert first.is_turned(turned(0, (2, -1)).seed, (0, 1))
+    assert first.is_turned(first, (0, 1))
+    assert not first.is_turned(turned(0, (1, 0), shift=1e-6).seed, (0, 1))
+    assert not first.is_turned(turned(1, (0, 0)).seed, (0, 1))
+    assert not first.is_turned(replace(first, fixed=True), (0, 1))
+    assert not first.is_turned(Seed(), (0, 1))
     fewer: Any = SimpleNamespace(t=np.arange(3.0), joints=np.zeros((1, 3, 2)), base=np.zeros((1, 3, 0)))
-    assert not first.is_turned(Seed(local=[fewer]))
+    assert not first.is_turned(Seed(local=[fewer]), (0, 1))
+    assert not first.is_turned(turned(0, (2, -1)).seed, (0,))  # joint 1 has a follower, say
 
 
 @pytest.mark.parametrize("seconds", [0.0, 1.0])
