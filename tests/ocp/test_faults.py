@@ -154,7 +154,10 @@ interrupted("plan", lambda: ocp.plan(arm, task, 1.0, start=start, search='start'
 """
 
 
-DEAF = "signal.signal(signal.SIGINT, signal.SIG_IGN)  # while Python ends, a late Ctrl-C would be its exit status"
+DEAF = """
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # while Python ends, a late Ctrl-C would be its exit status,
+exec("")  # and so would one that was caught after it ended an exec of Python's own, in an import or a dataclass
+"""
 
 
 def lines(code: str) -> list[list[str]]:
