@@ -77,7 +77,7 @@ def floats(value: Any) -> Array:
 
 
 def real(value: Any) -> float:
-    """Return a real number, or an array without dimensions, as a float; nan for any other value."""
+    """Return a real number, or a zero-dimensional array, as a float; return nan for any other value."""
     value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
         return np.nan
@@ -100,7 +100,7 @@ def argument_of(label: str) -> str:
 
 @dataclass(frozen=True)
 class Checks:
-    """Checks of arguments that raise the exception of one package.
+    """Checks of arguments that raise the exception class of one package.
 
     The first argument of each check, `label`, is the name of the argument, behind its owner if that helps: "count" or
     "box: size". Messages state the label, the requirement and the value; the fields of the exception are `name`, the
@@ -113,13 +113,13 @@ class Checks:
     error: type[DetailedError]
 
     def invalid(self, label: str, requirement: str, value: Any, limit: Any = None) -> DetailedError:
-        """Return the error of an argument that violates a requirement."""
+        """Return the exception for an argument that violates a requirement."""
         value = value.item() if isinstance(value, np.generic) else value
         words = f"{label} must be {requirement}, not {value!r}"
         return self.error(words, name=argument_of(label), value=value, limit=limit)
 
     def unknown(self, kind: str, name: object, known: Iterable[str]) -> DetailedError:
-        """Return the error for a name that does not exist; it lists similar known names, or all if none is similar."""
+        """Return the exception for an unknown name; its message lists similar known names, or else all."""
         names = [str(item) for item in known]
         by_case = {item.casefold(): item for item in reversed(names)}
         similar = [by_case[item] for item in get_close_matches(str(name).casefold(), by_case, n=3, cutoff=0.5)]
@@ -192,7 +192,7 @@ class Checks:
         return value
 
     def each(self, label: str, values: Any, kind: type[_Kind]) -> tuple[_Kind, ...]:
-        """Return a list as a tuple; raise an error unless all entries are instances of a class."""
+        """Return a list as a tuple after checking that all entries are instances of the class `kind`."""
         try:
             check_entries(values)
             items = tuple(values)
@@ -218,7 +218,7 @@ class Checks:
         unit: str = "",
         meaning: str = "",
     ) -> Array:
-        """Return a read-only array of floats.
+        """Return a value as a read-only array of floats after checking its shape and its entries.
 
         Args:
             value: Anything that NumPy reads as floats.
@@ -257,7 +257,7 @@ class Checks:
         sign: Sign = "any",
         unit: str = "",
     ) -> Array:
-        """Return one float for each of `count` items, from one number for all or one for each. Shape (count,).
+        """Return an array of one number per item, given such an array or one number for all items. Shape (count,).
 
         Args:
             items: Plural noun for messages.
@@ -297,7 +297,7 @@ class Checks:
         return self.error(f"{label} {words}", name=argument_of(label), value=value, limit=limit)
 
     def _check_shape(self, label: str, array: Array, shape: tuple[int | str, ...], least: int, meaning: str) -> Array:
-        """Return the array after checking that it has a shape in which some dimensions are free."""
+        """Return the array after checking its shape against `shape`, in which strings stand for free dimensions."""
         if len(shape) == 1 and ((array.ndim == 0 and isinstance(shape[0], str)) or array.shape[1:] == (1,)):
             array = array.reshape(-1)
         fits = array.ndim == len(shape) and all(
@@ -320,7 +320,7 @@ def _in(unit: str) -> str:
 
 
 def _description(array: Array, wrong: Any) -> str:
-    """Return the text that describes an invalid array in an error message: all of it if short, else its first fault."""
+    """Return the text that shows an invalid array in an error message: all of it, or its first invalid entry or row."""
     if array.ndim < 2 and array.size <= MAX_LISTED:
         return f"{array.tolist()}"
     if array.ndim == 1:
@@ -352,7 +352,7 @@ def warn_of_millimetres(label: str, lengths: ArrayInput, name: str | None = None
 
 
 def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tuple[float, float], words: str) -> None:
-    """Warn about the first entry whose magnitude suggests another unit."""
+    """Warn about the first value whose magnitude suggests another unit, such as degrees or millimetres."""
     low, high = range_
     for value in np.ravel(values).tolist():  # faster than array operations on few entries
         if low < abs(value) < high:

@@ -7,13 +7,13 @@ from typing import Any
 
 
 class DetailedError(Exception):
-    """An exception that carries the data of its message as fields, also through pickling.
+    """An exception that stores the data of its message as attributes, which are preserved by pickling.
 
     Attributes:
         name: Name of the faulty argument, option, joint, link, state or constraint; None if there is none.
         value: The value at fault.
         limit: What the value violates: a bound, a pair of bounds, a shape or the allowed choices.
-        time: When, s, or where along a path, m. This and the two above are None if the message states none.
+        time: Time of the fault, s, or its position along a path, m. This and the two above may be None.
     """
 
     def __init__(
@@ -28,11 +28,11 @@ class DetailedError(Exception):
 
 
 class ModelError(DetailedError, ValueError):
-    """Error about an impossible machine, or about an argument that does not fit it."""
+    """Error about a machine that cannot exist, or about an argument that is invalid or does not fit the machine."""
 
 
 class ModelWarning(DetailedError, UserWarning):
-    """Warning about a suspicious but usable description of a machine; the message says where."""
+    """Warning about a suspicious but usable description of a machine; the message names the part."""
 
 
 def _picklable(value: Any) -> Any:

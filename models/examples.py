@@ -1,4 +1,4 @@
-"""Example machines: typical arms for first plans, and the machines of the four reproduced papers.
+"""Example machines: two typical robot arms, and the machines of the reproduced papers.
 
 The docstring of each paper's machine names the data that the paper does not print and that are assumed.
 """
@@ -20,7 +20,7 @@ from models.robot.robot import Robot, planar_chain
 
 
 def paper_example() -> FreeFloating:
-    """Return the planar three-joint free-floating machine of Kim, Kim 2011, section 5.
+    """Return the planar three-joint free-floating machine of Kim and Kim (2011), section 5.
 
     Printed: base 100 kg and 66.67 kg m^2 (a plate of 2 m x 2 m), links of 2 kg and 0.7083 kg m^2 (plates of
     2 m x 0.5 m). Assumed, identified from the pattern of Table 1: links 2 m long, arm mounted at (1, 0) m of the
@@ -33,7 +33,7 @@ def paper_example() -> FreeFloating:
 
 
 STANDING_STARTS = {1: np.deg2rad([45.0, 160.0, 240.0, 200.0, 50.0]), 2: np.deg2rad([60.0, 80.0, 295.0, 230.0, 100.0])}
-"""Start configurations of the tasks of Tables 1 and 2, rad."""
+"""Start joint angles of `standing_example` in Tables 1 and 2 of Yoo et al. 2004, by the number of the table, rad."""
 
 
 def standing_example() -> Standing:
@@ -60,18 +60,21 @@ def standing_example() -> Standing:
 
 
 def reference_rig(**limits: Any) -> Rig:
-    """Return the rig of the reference numbers. Its lengths are assumed: 20, 20, 4, 30, 20, 10 in."""
+    """Return the captive trajectory rig of the reproduced results; assumed lengths: 20, 20, 4, 30, 20, 10 in."""
     return Rig(*(INCH * length for length in (20.0, 20.0, 4.0, 30.0, 20.0, 10.0)), **limits)
 
 
 def reference_tunnel() -> Tunnel:
-    """Return the tunnel of the reference numbers. Assumed: centre (80, 0, 0) in, ranges (60, 48, 40) in, weights 1."""
+    """Return the wind tunnel of the reproduced results for `reference_rig`.
+
+    Assumed: centre (80, 0, 0) in, ranges (60, 48, 40) in, weights 1.
+    """
     return Tunnel(INCH * np.array([80.0, 0.0, 0.0]), INCH * np.array([60.0, 48.0, 40.0]))
 
 
 X, Y, Z = np.eye(3)
 ALONG = {id(X): ((0, 0, 1), (0, 1, 0), (-1, 0, 0)), id(Y): ((1, 0, 0), (0, 0, 1), (0, -1, 0)), id(Z): np.eye(3)}
-"""Rotations that align a cylinder with an axis."""
+"""Rotations that turn the z axis of a cylinder to the axis X, Y or Z, by the `id` of that axis."""
 ROWS: dict[str, list[tuple[Any, ...]]] = {
     "six_axis": [
         ("shoulder", (0, 0, 0.09), Z, 3.14, 3.14, 150, Z, -0.05, 0.06, 0.06, 3.5),
@@ -91,8 +94,8 @@ ROWS: dict[str, list[tuple[Any, ...]]] = {
         ("link_7", (0, 0, 0.08), Z, 3.05, 3.1, 40, Z, 0.0, 0.045, 0.04, 0.3),
     ],
 }
-"""Each link: name, position in the previous link, joint axis, limits of position, velocity, effort (rad, rad/s, N m);
-then its body, a homogeneous cylinder: axis, start and end along it, radius (m), mass (kg).
+"""Links of each example robot: name, position in the previous link (m), joint axis, limits of position, velocity and
+effort (rad, rad/s, N m), and a homogeneous cylinder: its axis, start and end along it, radius (m), mass (kg).
 """
 
 

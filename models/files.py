@@ -39,7 +39,7 @@ __all__ = ["INPUT_LIMITS", "InputLimits", "UnfitFile", "open_regular", "parse_xm
 
 @dataclass(frozen=True)
 class InputLimits:
-    """Limits on input: several times the largest known files, and small enough for the available memory.
+    """Upper limits on the size of input: several times the largest known files, but small enough for the memory.
 
     Attributes:
         count: Any number that a user chooses, such as a number of nodes; larger values would run too long.
@@ -175,18 +175,18 @@ def parse_xml(data: str | bytes) -> ElementTree.Element:
 
 MAX_VALUE_BYTES = 2**20
 MAX_LIBRARY_BYTES = 2**28
-"""Size of all libraries together, beyond which the least recently used are removed."""
+"""Total size of the cached shared libraries, bytes, beyond which the least recently used are removed."""
 KINDS = (".json", ".so", ".lock", ".part")
 UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
-"""Exceptions that a missing or damaged file raises; RuntimeError if the user has no home folder."""
+"""Exceptions that reading a missing or damaged cache file can raise; RuntimeError if there is no home folder."""
 
 
 def cache_key(version: str, *contents: Any) -> str:
-    """Return a cache key for some contents, SHA-256 in hexadecimal digits.
+    """Return the cache key of a result: the SHA-256 digest, in hexadecimal digits, of the data that determine it.
 
     Args:
-        version: Version of the code that uses them, see `source_version`.
-        contents: Arrays or strings.
+        version: Version of the code that computes the result, see `source_version`.
+        contents: Arrays or strings that the result depends on.
     """
     digest = hashlib.sha256(version.encode())
     for content in contents:
@@ -198,7 +198,7 @@ def cache_key(version: str, *contents: Any) -> str:
 
 @functools.cache
 def source_version(module: str) -> str:
-    """Return a digest of a module's source and of all modules of its package that it imports, directly or not.
+    """Return a digest of the source of a module and of all modules of its package that it imports, directly or not.
 
     So any change of the code invalidates its cached values. Imports must be written `from PACKAGE... import`.
     """
@@ -291,7 +291,7 @@ def _digest(key: str, content: bytes) -> bytes:
 
 
 def load_library(key: str) -> Path | None:
-    """Return the path of the shared library stored under a key and mark it as used, or None.
+    """Return the path of the shared library stored under a key and mark it as used; return None if there is none.
 
     Damaged libraries are removed; those that another user owns or may write are ignored.
     """
@@ -321,7 +321,9 @@ def store_library(key: str, library: bytes) -> Path | None:
 
 @contextmanager
 def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
-    """Hold the lock of a key, so that no other process or thread works on it; do nothing if the folder has no locks.
+    """Lock a cache key for a `with` block, so that only one process or thread at a time computes its value.
+
+    If the lock file cannot be created, the block runs without a lock.
 
     Args:
         ask: Called every 20 ms while waiting. It may raise to stop waiting.
@@ -339,7 +341,7 @@ def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]
 
 
 def _open_locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
-    """Open a file, creating it if necessary, and lock it."""
+    """Open a lock file, creating it if necessary, and wait until this process holds its lock."""
     while True:
         stream = open(file, "ab")  # noqa: SIM115
         try:
@@ -361,7 +363,7 @@ def _library_name(key: str, library: bytes) -> str:
 
 
 def _evict(newest: Path) -> None:
-    """Remove locks of dead processes, and the least recently used libraries until all fit MAX_LIBRARY_BYTES."""
+    """Remove locks of ended processes, and the least recently used libraries until all fit MAX_LIBRARY_BYTES."""
     for lock in newest.parent.glob("*.lock"):
         with suppress(OSError), open(lock, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while the lock is in use

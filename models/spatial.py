@@ -26,10 +26,10 @@ from models.checks import NOT_NUMBERS, ROUNDING, Array, floats
 from models.errors import ModelError
 
 Expression = Any
-"""An SX, MX or DM, anything that NumPy reads as an array of floats, or a (nested) list with CasADi entries."""
+"""A CasADi SX, MX or DM, anything that NumPy reads as an array of floats, or a (nested) list with CasADi entries."""
 
 FULL_TURN = 2 * np.pi
-"""2 pi, rad."""
+"""Angle of a full turn: 2 pi, rad."""
 
 _Callable = TypeVar("_Callable", bound=Callable[..., Any])
 
@@ -46,7 +46,7 @@ class Frame(NamedTuple):
     position: Expression
 
     def point(self, position: Expression) -> Expression:
-        """Return the coordinates in A of a point given in B. Shape (3, 1), m."""
+        """Return the coordinates in frame A of a point given in frame B. Shape (3, 1), m."""
         return self.position + ca.mtimes(self.rotation, expression(position))
 
 
@@ -85,7 +85,7 @@ def _is_sequence(value: Any) -> bool:
 
 
 def on_scalars(function: _Callable) -> _Callable:
-    """Evaluate a function on SX symbols even for MX arguments, because element-wise MX graphs are slow.
+    """Decorate a function so that it is evaluated with SX symbols even for MX arguments.
 
     Element-wise MX graphs are slow to build and to run. If an argument is MX, the decorated function is evaluated once
     with SX symbols of the same sparsity, and the resulting Function is called. Other arguments pass through unchanged.
@@ -116,20 +116,20 @@ def on_scalars(function: _Callable) -> _Callable:
 
 
 def skew(vector: Expression) -> Expression:
-    """Return the matrix [a x] with [a x] b = a x b. Shape (3, 3)."""
+    """Return the skew-symmetric matrix [a x] of a vector a, for the cross product a x b = [a x] b. Shape (3, 3)."""
     a = expression(vector)
     zero = type(a)(1, 1)
     return ca.vertcat(ca.horzcat(zero, -a[2], a[1]), ca.horzcat(a[2], zero, -a[0]), ca.horzcat(-a[1], a[0], zero))
 
 
 def cross(a: Expression, b: Expression) -> Expression:
-    """Return the vector product; unlike that of CasADi, it keeps structural zeros. Shape (3, 1)."""
+    """Return the cross product of two vectors; unlike that of CasADi, it keeps structural zeros. Shape (3, 1)."""
     a, b = expression(a), expression(b)
     return ca.vertcat(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def rotation(axis: Expression, angle: Expression) -> Expression:
-    """Return the rotation by `angle` (rad) about the unit vector `axis`. Shape (3, 3).
+    """Return the matrix of a rotation by `angle` (rad) about the unit vector `axis`. Shape (3, 3).
 
     Rodrigues' formula as a a' + cos (1 - a a') + sin [a x]: for a coordinate axis its zeros and its one are exact.
     """
@@ -229,14 +229,14 @@ def angular_velocity_from_quaternion(quaternion: Expression, rate: Expression) -
 
 
 def motion_transform(frame: tuple[Expression, Expression]) -> Expression:
-    """Return the Pluecker transform of motion vectors from frame B to A for the pose of B in A. Shape (6, 6)."""
+    """Return the Pluecker transform of motion vectors from frame B to A, given the pose of B in A. Shape (6, 6)."""
     turn, position = expression(frame[0]), expression(frame[1])
     zero = type(turn)(3, 3)
     return ca.vertcat(ca.horzcat(turn, zero), ca.horzcat(ca.mtimes(skew(position), turn), turn))
 
 
 def force_transform(frame: tuple[Expression, Expression]) -> Expression:
-    """Return the Pluecker transform of force vectors (and momenta) from frame B to A, `frame` being the pose of B in A.
+    """Return the Pluecker transform of force vectors (and momenta) from frame B to A, given the pose of B in A.
 
     Shape (6, 6). The inverse transpose of motion_transform: power does not depend on the frame.
     """
@@ -246,9 +246,9 @@ def force_transform(frame: tuple[Expression, Expression]) -> Expression:
 
 
 def motion_cross(velocity: Expression) -> Expression:
-    """Return the operator v x on motion vectors: the rate of a motion vector fixed in a body that moves with v.
+    """Return the spatial cross product operator v x on motion vectors, for the velocity v of a body.
 
-    Shape (6, 6).
+    It maps a motion vector fixed in the body to its rate. Shape (6, 6).
     """
     v = expression(velocity)
     zero = type(v)(3, 3)
@@ -256,12 +256,12 @@ def motion_cross(velocity: Expression) -> Expression:
 
 
 def force_cross(velocity: Expression) -> Expression:
-    """Return the operator v x* on force vectors, which is minus the transpose of motion_cross. Shape (6, 6)."""
+    """Return the spatial cross product operator v x* on force vectors: -motion_cross(v)'. Shape (6, 6)."""
     return -motion_cross(velocity).T
 
 
 def spatial_inertia(mass: Expression, center_of_mass: Expression, inertia: Expression) -> Expression:
-    """Return the spatial inertia of a rigid body about its frame's origin, which maps a motion vector to a momentum.
+    """Return the spatial inertia of a rigid body about its frame's origin: the matrix from its twist to its momentum.
 
     Args:
         mass: kg.
@@ -278,7 +278,7 @@ def spatial_inertia(mass: Expression, center_of_mass: Expression, inertia: Expre
 
 @on_scalars
 def solve_spd(matrix: Expression, right: Expression) -> Expression:
-    """Solve matrix x = right for a small symmetric positive definite matrix. Shape (n, m) for `right` of (n, m).
+    """Solve matrix x = right for x, with a small symmetric positive definite matrix. Shape (n, m), that of `right`.
 
     L D L' elimination without pivoting or square roots, meant for n <= 7; only the lower triangle is read.
     An indefinite matrix is not detected, and a singular one gives inf or nan.
@@ -308,7 +308,7 @@ def solve_spd(matrix: Expression, right: Expression) -> Expression:
 
 @on_scalars
 def determinant(matrix: Expression) -> Expression:
-    """Return the determinant of a small square matrix (n <= 7) without divisions, so that exact zeros stay finite.
+    """Return the determinant of a small square matrix (n <= 7) without divisions, so that zero pivots give no nan.
 
     Shape (1, 1). Laplace expansion that computes each minor of the first rows once: n 2^(n-1) products instead of n!.
     Instructions against ca.det: n = 4: 56 (74), 6: 337 (1977).
@@ -337,7 +337,7 @@ NUMBERS = re.compile(r"static const casadi_(?:real|int) (\w+)\[\d+\] =\s*\{([^}]
 
 
 def expand_tables(values: Any) -> Any:
-    """Return an SX matrix with its look-up tables written out in elementary operations.
+    """Return an SX matrix in which look-up tables of one argument are replaced by piecewise polynomials.
 
     Raises:
         ModelError: It calls a function that is not a table of one argument.
@@ -363,7 +363,7 @@ def expand_tables(values: Any) -> Any:
 
 
 def _table(function: Any, inputs: list[Any]) -> list[Any]:
-    """Replace a look-up table by polynomials, whose data are read from the C code that CasADi generates for it."""
+    """Return the outputs of a look-up table as piecewise polynomials, read from the C code that CasADi generates."""
     code = ca.CodeGenerator("table")
     code.add(function)
     text = code.dump()
@@ -393,7 +393,7 @@ def _table(function: Any, inputs: list[Any]) -> list[Any]:
 
 
 def _polynomials(breaks: Array, coefficients: Array, x: Any, *, beyond: bool) -> Any:
-    """Return a piecewise polynomial as an expression without branches.
+    """Return a piecewise polynomial of x, given by breakpoints and coefficients, as one expression without branches.
 
     Outside all breakpoints the end segments continue if `beyond`, else the value is zero.
     """

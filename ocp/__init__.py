@@ -1,4 +1,4 @@
-"""Optimal control: declare a problem, transcribe it, solve it, audit it; ready problems and plans for machines."""
+"""Optimal control: declaration, transcription, solution and audit of problems, and motion planning of machines."""
 
 from ocp.audit.audit import Audit, Finding
 from ocp.direct.discretisation import Collocation, MultipleShooting

@@ -1,4 +1,4 @@
-"""Ctrl-C, time limits, progress and CasADi's output during a call.
+"""Handling of Ctrl-C, time limits, progress display and CasADi's output during calls of public functions.
 
 A public call runs in its own thread, for which the main thread waits. So Ctrl-C reaches Python at once, whatever CasADi
 is doing, and never CasADi itself, which would turn it into a RuntimeError that looks like a numerical failure.
@@ -35,18 +35,20 @@ T = TypeVar("T")
 
 
 GRACE_PERIOD_S = 0.8
-"""Time after Ctrl-C, s, in which a call may end by itself and return its iterate; control returns within a second."""
+"""Time after Ctrl-C, s, for a call to end by itself with its last iterate; then it is stopped, within a second in all.
+"""
 
 
 # ---- Ctrl-C ------------------------------------------------------------------------------------------------------
 
 
 class _Call(threading.Thread):
-    """A public call in progress.
+    """Thread that executes a call of a public function, and that the main thread can stop.
 
     Attributes:
-        stop: Whether it has been asked to end.
-        listeners: Number of loops inside it that poll ``stop`` and end by themselves. heard: Whether one has seen it.
+        stop: Whether the call has been asked to end.
+        listeners: Number of loops in the call that poll ``stop`` and end by themselves. heard: Whether a loop has seen
+            that ``stop`` is set.
     """
 
     def __init__(self, work: Callable[[], Any]) -> None:
@@ -75,7 +77,7 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Stop the call: set the flag that its loop polls, or else raise KeyboardInterrupt at its next Python step."""
+        """Stop the call: set the flag ``stop``; if that does not end it, raise KeyboardInterrupt in its thread."""
         self.stop = True
         began = time.monotonic()
         try:
@@ -131,7 +133,7 @@ def interruptible(function: Callable[P, T]) -> Callable[P, T]:
 
 @contextmanager
 def stop_requests_polled() -> Iterator[None]:
-    """Declare that the code in this block polls :func:`reason_to_stop` regularly and ends by itself."""
+    """Declare that the code of a ``with`` block polls :func:`reason_to_stop` regularly and ends by itself."""
     call = _CALL.get()
     if call is None:
         yield
@@ -144,7 +146,7 @@ def stop_requests_polled() -> Iterator[None]:
 
 
 def reason_to_stop() -> SolverStatus | None:
-    """Return INTERRUPTED or TIME_LIMIT if the current work should end, else None."""
+    """Return the status INTERRUPTED or TIME_LIMIT if the current call should end, else None."""
     call = _CALL.get()
     if call is not None and call.stop:
         call.heard = True
@@ -157,7 +159,7 @@ def reason_to_stop() -> SolverStatus | None:
 
 @contextmanager
 def time_limited(seconds: float | None) -> Iterator[None]:
-    """Limit the time of all solves in this block to some seconds; None adds no limit to that of an outer block."""
+    """Limit the total wall time of the solves in a ``with`` block; None keeps the limit of an enclosing block."""
     outer = _DEADLINE.get()
     token = _DEADLINE.set(outer if seconds is None else min(outer, time.monotonic() + seconds))
     try:
@@ -167,7 +169,7 @@ def time_limited(seconds: float | None) -> Iterator[None]:
 
 
 def time_left() -> float:
-    """Return the time until the time limit, s; infinite without a limit, negative after it."""
+    """Return the time that remains until the time limit, s; infinite without a limit, negative once it has passed."""
     return _DEADLINE.get() - time.monotonic()
 
 
@@ -185,7 +187,7 @@ def check_time() -> None:
 
 
 class _FilteredStream(io.TextIOBase):
-    """Replacement of ``sys.stderr`` that drops the output of silenced threads."""
+    """Replacement for ``sys.stderr`` that discards what the threads in ``silent`` write."""
 
     def __init__(self, real: Any) -> None:
         self.real = real
@@ -211,7 +213,7 @@ _FILTER_LOCK = threading.Lock()
 def casadi_silenced() -> Iterator[None]:
     """Suppress CasADi's messages on ``sys.stderr`` from this thread, for evaluations that are expected to fail.
 
-    It would print the function's inputs, and no option of its functions prevents that.
+    CasADi would print the function's inputs, and no option of its functions prevents that.
     """
     thread = threading.get_ident()
     with _FILTER_LOCK:
@@ -232,19 +234,19 @@ def casadi_silenced() -> Iterator[None]:
 # ---- progress of long calls --------------------------------------------------------------------------------------
 
 LOG_PERIOD_S = 30.0
-"""Time between two lines in a log."""
+"""Time between two progress lines in a log, s."""
 TERMINAL_DELAY_S = 0.5
-"""Time before the line of a command appears on a terminal, and between its updates."""
+"""Time before the progress line of a command appears on a terminal, and between its updates, s."""
 SOLVE_DELAY_S = 1.0
-"""Time before the line of a solver appears."""
+"""Time before the progress line of a solver appears, s."""
 CALL_DELAY_S = 2.0
-"""Time before the line of a call appears."""
+"""Time before the progress line of a call of a public function appears, s."""
 
 _LISTENER: ContextVar[Callable[[str], Any] | None] = ContextVar("listener", default=None)
 
 
 def report(stage: str) -> None:
-    """Report the current stage of the work to the listener of the call, if there is one."""
+    """Report the name of the current stage to the function that shows the progress of the call, if there is one."""
     listener = _LISTENER.get()
     if listener is not None:
         listener(stage)
@@ -252,7 +254,7 @@ def report(stage: str) -> None:
 
 @contextmanager
 def shown_progress(title: str, progress: Any) -> Iterator[None]:
-    """Show the stages that are reported in this block as progress.
+    """Show the progress of a ``with`` block: the names of the stages that its code reports by :func:`report`.
 
     Args:
         title: Name of the call.
@@ -284,14 +286,15 @@ def shown_progress(title: str, progress: Any) -> Iterator[None]:
 
 
 def _is_interactive() -> bool:
-    """Return whether standard error is a terminal or the output of a notebook."""
+    """Return whether progress can be displayed: standard error is a terminal, or the code runs in a notebook."""
     return sys.stderr.isatty() or "ipykernel" in sys.modules
 
 
 class Progress:
-    """Progress display of a command or call; in a log, a line at the start, every 30 s, and at the end.
+    """Progress display of a command or call: one line that is updated on a terminal, or lines in a log.
 
-    The line appears on a terminal or in a notebook after `delay` seconds.
+    On a terminal or in a notebook the line appears after `delay` seconds; a log has a line at the start, every 30 s and
+    at the end.
     """
 
     def __init__(self, title: str, quiet: bool = False, delay: float = TERMINAL_DELAY_S) -> None:
@@ -308,7 +311,7 @@ class Progress:
 
     @property
     def seconds(self) -> float:
-        """Time since the start, s."""
+        """Time since the display was created, s."""
         return time.monotonic() - self.began
 
     def say(self, text: str) -> None:
@@ -357,7 +360,7 @@ class Progress:
 
 
 class _Monitor(ca.Callback):  # type: ignore[misc]
-    """Solver callback that stores the iterate, and stops the solver on Ctrl-C or at the time limit."""
+    """Solver callback that stores the current iterate, and stops the solver on Ctrl-C or at the time limit."""
 
     def __init__(self, n: int, title: str, name: str) -> None:
         ca.Callback.__init__(self)
@@ -366,18 +369,18 @@ class _Monitor(ca.Callback):  # type: ignore[misc]
         self.construct(name, {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Begin a solve, with these bounds of the constraint rows."""
+        """Prepare the monitor for a solve whose constraint rows have the given bounds."""
         self.lower, self.upper = lower, upper
         self.stopped, self.iterations = None, 0
 
     def close(self) -> None:
-        """End a solve."""
+        """Finish the monitoring of a solve."""
 
     def get_n_out(self) -> int:
         return 1
 
     def _store(self, iterate: Any) -> None:
-        """Store an iterate, and decide whether the solver shall stop."""
+        """Store an iterate of the solver, and decide whether the solver shall stop."""
         try:
             self.stopped = self.stopped or reason_to_stop()
         except KeyboardInterrupt:  # CasADi would turn it into another error
@@ -386,7 +389,7 @@ class _Monitor(ca.Callback):  # type: ignore[misc]
 
 
 class IterationMonitor(_Monitor):
-    """Iteration callback that also shows a progress line on a terminal, unless the call has its own display."""
+    """Iteration callback of a solver, with a progress line on a terminal unless the call has its own display."""
 
     def __init__(self, n: int, m: int, np_: int, *, title: str, show: bool) -> None:
         self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
@@ -422,7 +425,7 @@ class IterationMonitor(_Monitor):
 
 
 class FatropMonitor(_Monitor):
-    """Function of an iterate that returns 1 to continue or 0 to stop fatrop, which has no iteration callback."""
+    """Function that is evaluated at each iterate of fatrop, which has no callback: 1 to continue, 0 to stop."""
 
     def __init__(self, n: int, title: str) -> None:
         self.size = n

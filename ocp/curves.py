@@ -1,4 +1,4 @@
-"""Piecewise polynomials given by values at nodes, the form of a solution's interpolants, and integrators of ODEs."""
+"""Piecewise polynomials given by values at nodes, as the interpolants of a solution, and integrators of ODEs."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ DORMAND_PRINCE = (
     (8 / 9, (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729)),
     (1.0, (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656)),
     (1.0, (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)),
-)  # position and weights of each stage; the last weights are those of the step
+)  # position and weights of each stage of the method; the last weights are those of the step
 DORMAND_PRINCE_ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 
 
 @dataclass(frozen=True)
 class PiecewisePolynomial:
-    """A polynomial on each interval, given by its values at nodes.
+    """A piecewise polynomial, given on every interval by its values at the same relative positions (nodes).
 
     Attributes:
         breaks: Ends of the intervals, increasing. Shape (K + 1,).
         nodes: Positions of the values in an interval, in 0..1. Shape (d,); one node gives a piecewise constant.
-        values: Shape (K, d, n).
+        values: Values at the nodes of each interval. Shape (K, d, n).
     """
 
     breaks: np.ndarray
@@ -44,20 +44,23 @@ class PiecewisePolynomial:
         return f"<PiecewisePolynomial of {intervals} intervals of {nodes} nodes, {columns} columns>"
 
     def __call__(self, at: np.ndarray) -> np.ndarray:
-        """Return values at ``at`` (M,), right-continuous at breaks, clipped to the ends. Shape (M, n)."""
+        """Return the values at positions ``at`` (M,), right-continuous and constant beyond the ends. Shape (M, n)."""
         interval = np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, len(self.breaks) - 2)
         start, end = self.breaks[interval], self.breaks[interval + 1]
         return self.within(interval, np.clip((at - start) / (end - start), 0.0, 1.0))
 
     def derivative(self) -> PiecewisePolynomial:
-        """Return the derivative, in the unit of the breaks; zero if there is one node."""
+        """Return the derivative with respect to the position, in the unit of the breaks; zero if there is one node."""
         if len(self.nodes) == 1:
             return PiecewisePolynomial(self.breaks, self.nodes, np.zeros_like(self.values))
         slopes = np.einsum("ij,kjn->kin", differentiation_matrix(self.nodes), self.values)
         return PiecewisePolynomial(self.breaks, self.nodes, slopes / np.diff(self.breaks)[:, None, None])
 
     def within(self, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Return values at positions ``place`` (M,), 0..1, of given intervals (M,), which select a side at a break."""
+        """Return the values at relative positions 0..1 of given intervals; at a break the interval selects the side.
+
+        Shape (M, n) for ``interval`` and ``place`` of shape (M,).
+        """
         return np.asarray(np.einsum("md,mdn->mn", lagrange(self.nodes, place), self.values[interval]))
 
 
@@ -69,7 +72,7 @@ def barycentric_weights(nodes: np.ndarray) -> np.ndarray:
 
 
 def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return Lagrange basis polynomials of ``nodes`` (d,) at ``at`` (M,), in barycentric form. Shape (M, d)."""
+    """Evaluate the Lagrange basis polynomials of ``nodes`` (d,) at ``at`` (M,), in barycentric form. Shape (M, d)."""
     at = np.asarray(at, dtype=float)
     if len(nodes) == 1:
         return np.ones((len(at), 1))
@@ -82,7 +85,7 @@ def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
-    """Return derivatives of the Lagrange basis at its nodes; row j, column i is l_i'(node_j). Shape (d, d)."""
+    """Return the derivatives of the Lagrange basis polynomials (columns) at their nodes (rows). Shape (d, d)."""
     weights = barycentric_weights(nodes)
     difference = nodes[:, None] - nodes[None, :]
     np.fill_diagonal(difference, 1.0)
@@ -99,9 +102,10 @@ def quadrature_weights(points: np.ndarray) -> np.ndarray:
 
 
 def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return Newton's divided differences of values (K, d, n) at nodes (d,). Shape (K, d, n).
+    """Return the coefficients of K interpolation polynomials in Newton's form (divided differences). Shape (K, d, n).
 
-    The polynomial is c0 + (s - node 0) (c1 + (s - node 1) (c2 + ...)), which takes the fewest operations.
+    The polynomial is c0 + (s - node 0) (c1 + (s - node 1) (c2 + ...)), which takes the fewest operations. ``values``
+    (K, d, n) are those at ``nodes`` (d,).
     """
     coefficients = np.array(values, dtype=float)
     for i in range(1, len(nodes)):
@@ -111,9 +115,9 @@ def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
-    """Take one step of width ``h`` of the classical Runge-Kutta method from ``x``, an array or an expression.
+    """Return the state after one step of width ``h`` of the classical Runge-Kutta method from the state ``x``.
 
-    ``slope(place, x)`` is dx/dt at the position 0, 1/2 or 1 of the step.
+    ``slope(place, x)`` is dx/dt at the position 0, 1/2 or 1 of the step. States are arrays or expressions.
     """
     k1 = slope(0.0, x)
     k2 = slope(0.5, x + h / 2 * k1)
@@ -123,9 +127,10 @@ def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
 
 
 def dormand_prince_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> tuple[Any, Any]:
-    """Take one step of order 5 from ``x``; return it with its error estimate of order 4 (Dormand, Prince 1980).
+    """Return the state after a Runge-Kutta step of order 5, and an estimate of its error (Dormand, Prince 1980).
 
-    ``slope(place, x)`` is dx/dt at a position 0..1 of the step, whose width is ``h``.
+    ``slope(place, x)`` is dx/dt at a position 0..1 of the step, which starts at ``x`` and has the width ``h``. The
+    error is estimated as the difference from the embedded step of order 4.
     """
     slopes: list[Any] = []
     after = x
@@ -148,10 +153,11 @@ def integrator(
     smooth: bool = True,
     start: float = 0.0,
 ) -> Any:
-    """Return a casadi integrator (CVODES, variable step and order) of ``dae`` from ``start`` to all ``places``.
+    """Return a casadi integrator of differential equations by CVODES, with variable step width and order.
 
     Args:
         dae: casadi's dictionary: x, t, p, ode and, if any, quad, which is under error control too.
+        start, places: Initial time, and the times at which the integrator returns the states.
         tolerance: Relative and absolute tolerance of the local error. max_steps: Maximum number of steps between two
             places.
         smooth: Use Adams formulas, for smooth dynamics that are not stiff, and no warning of a failed trial step; else

@@ -1,4 +1,4 @@
-"""Exceptions of the package, `require`, the checks of arguments, and the status of a solve.
+"""Exceptions and warnings of the package, its checks of arguments (`require`), and the status of a solver.
 
 Each message names the faulty argument or constraint, its value and the remedy. The exception holds the same data as
 fields.
@@ -63,19 +63,19 @@ class Interrupted(KeyboardInterrupt):
 
 
 class AuditError(DetailedError, RuntimeError):
-    """Error that an audit is impossible, for example of a loaded solution without its problem."""
+    """Error that a solution cannot be audited, for example because it was loaded without its problem."""
 
 
 class RefinementWarning(DetailedError, UserWarning):
-    """Warning that a refinement stopped before the audit passed; ``value`` is that of the worst row over its limit."""
+    """Warning that mesh refinement stopped before the audit passed; ``value`` is the largest error over its limit."""
 
 
 class StorageWarning(DetailedError, UserWarning):
-    """Warning about a part that cannot be saved as data, such as a problem that calls a Python function."""
+    """Warning that a part of a plan cannot be saved as data, such as a problem that calls a Python function."""
 
 
 class BoundWarning(DetailedError, UserWarning):
-    """Warning about a bug of this package: a motion costs less, ``value``, than its proven lower bound, ``limit``."""
+    """Warning about a bug of this package: a motion's cost ``value`` is below its proven lower bound ``limit``."""
 
 
 class SolverStatus(Enum):
@@ -96,21 +96,21 @@ class SolverStatus(Enum):
     REJECTED = "Rejected"
     """The solver found a point that a later check rejected; the message gives the reason."""
     FAILED = "Failed"
-    """Any other end; the message holds the solver's own word."""
+    """Any other status; the message is the status text of the solver itself."""
 
     @classmethod
     def of_word(cls, word: str) -> SolverStatus:
-        """Return the status whose value is a solver's own name of it; FAILED for any other name."""
+        """Return the status for the status text that a solver returns; FAILED for an unknown text."""
         return cls(word) if word in cls._value2member_map_ else cls.FAILED
 
     @property
     def is_success(self) -> bool:
-        """Return whether the solver reports an optimum."""
+        """Whether the solver reports an optimum."""
         return self in (SolverStatus.SOLVED, SolverStatus.ACCEPTABLE)
 
     @property
     def message(self) -> str:
-        """Text of the status with advice on what to try next; "" for a success."""
+        """Text of the status with advice on what to try next; "" after a success."""
         if self.is_success:
             return ""
         return f"{self.value}: {ADVICE[self]}" if self in ADVICE else self.value
@@ -137,7 +137,7 @@ ADVICE = {
 
 @contextmanager
 def error_names(name: str) -> Iterator[None]:
-    """Set the name of exceptions that are raised in this block without one."""
+    """Set the field ``name`` of exceptions that the code of a ``with`` block raises without a name."""
     try:
         yield
     except DetailedError as error:
@@ -156,7 +156,7 @@ def format_distinct(*numbers: float) -> list[str]:
 
 
 def sample_times(label: str, period: Any, duration: float) -> np.ndarray:
-    """Return the times 0, period, 2 period, ... before the end of the duration, and the end itself, s.
+    """Return the sample times 0, period, 2 period, ... before the end of the duration, and the end itself, s.
 
     Raises:
         ProblemError: The period is not positive, or gives more than `INPUT_LIMITS.array_entries` samples.

@@ -1,4 +1,4 @@
-"""``solve(problem, method)``, ``prepare`` for repeated solves, and ``certificate`` for the comparison of methods.
+"""Functions ``solve(problem, method)``, ``prepare`` for repeated solves, and ``certificate`` to compare methods.
 
 A second solver of another kind confirms a plan. The interior-point method that solves problems and the active-set
 method SLEQP have no step in common: SLEQP (sequential linear programs that determine the active set, then
@@ -53,12 +53,12 @@ class PreparedProblem(Protocol):
     def solve(
         self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
     ) -> Solution:
-        """Solve with these parameters from this guess; see :func:`solve`."""
+        """Solve the prepared problem with the given parameters from the given guess; see :func:`solve`."""
         ...
 
 
 class Method(Protocol):
-    """A method of solution: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
+    """A method that solves problems: ``Collocation(...)``, ``MultipleShooting(...)``, ``Indirect(...)``."""
 
     def prepare(
         self,
@@ -69,7 +69,7 @@ class Method(Protocol):
         compiled: bool = False,
         scaling: bool = True,
     ) -> PreparedProblem:
-        """Build a problem once for repeated solves; see :func:`prepare`."""
+        """Prepare a problem once for repeated solves; see :func:`prepare`."""
         ...
 
 
@@ -83,12 +83,12 @@ def prepare(
     compiled: bool = False,
     scaling: bool = True,
 ) -> PreparedProblem:
-    """Build a problem once; call the result's ``solve(parameters=, guess=)`` repeatedly.
+    """Prepare a problem once, and return an object whose ``solve(parameters=, guess=)`` can be called repeatedly.
 
     Args:
         problem: The problem. method: How it is transcribed.
         solver: ``ipopt``, ``fatrop`` (another interior-point method, whose linear algebra exploits the stage structure;
-            slow to build, and without terms that couple controls at the end) or ``sleqp`` (an active-set method, to
+            slow to build, and without conditions on controls at the end) or ``sleqp`` (an active-set method, to
             confirm a plan from which it starts). For the indirect method, the solver of the direct solution that seeds
             it.
         options: Options of the solver, for example ``{"max_iter": 500}``.
@@ -125,7 +125,7 @@ def solve(
     check: bool = True,
     time_limit: float | None = None,
 ) -> Solution:
-    """Solve a problem by a method.
+    """Solve an optimal control problem by the given method.
 
     If the solver fails from the guess, it starts again from zeros (moved inside the bounds, a free horizon longer),
     from a roll-out of the dynamics with the controls of the guess, and from the plan of least constraint violation;
@@ -160,7 +160,7 @@ def solve(
 
 
 def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
-    """Return the plan itself, or a better one if a feasible variation lowers its cost.
+    """Return the given solution, or a nearby one of lower cost if a feasible variation lowers the cost.
 
     Raises:
         SolveError: There is such a variation, but the solver finds no plan along it: the cost may be unbounded below.
@@ -200,7 +200,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
 def _displaced_guess(
     form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
 ) -> dict[str, Any]:
-    """Return a guess: the plan, displaced visibly along the variation that lowers its cost.
+    """Return an initial guess: the plan, displaced to one side (``sign``) along the variation that lowers its cost.
 
     If the variation is unknown, all controls are displaced by seeded random amounts.
     """
@@ -233,13 +233,13 @@ def _displaced_guess(
 class Comparison:
     """Differences between a solution and the reference solution, relative to the size of the reference.
 
-    The Hamiltonian is judged by the size of its parts, and the cost also by that of the running cost, since both may
-    vanish.
+    The reference size of the Hamiltonian is that of its terms, and the size of the cost is at least that of the running
+    cost, since both values may vanish.
 
     Attributes:
         name: Name of the solution.
         passed: Whether its audit passed.
-        cost, horizon: Values.
+        cost, horizon: Cost and final time (s) of the solution.
         cost_difference, horizon_difference: Relative differences.
         state, costate: Largest difference over time.
         control: Mean difference over time: at a jump, solutions with slightly different switching times differ by the
@@ -260,7 +260,7 @@ class Comparison:
 
     @property
     def worst(self) -> float:
-        """The largest of all differences."""
+        """The largest difference of any kind between the solution and the reference."""
         differences = (self.cost_difference, self.horizon_difference, self.state, self.control, self.costate)
         return max(*differences, self.hamiltonian)
 
@@ -272,7 +272,7 @@ class Certificate:
     Attributes:
         problem: Name of the problem.
         reference: Name of the solution that the others are compared with.
-        comparisons: One for each solution, the reference first.
+        comparisons: Comparison of each solution with the reference; the reference itself comes first.
         tolerance: Largest relative difference at which solutions agree.
         audits: The audit of each solution by name.
     """
@@ -290,7 +290,7 @@ class Certificate:
 
     @property
     def verdict(self) -> str:
-        """The result in one sentence."""
+        """The result of the comparison in one sentence."""
         different = [c.name for c in self.comparisons if not c.worst <= self.tolerance]
         failed = [c.name for c in self.comparisons if not c.passed]
         if self.passed:
@@ -329,7 +329,7 @@ def certificate(
     tolerance: float = LIMIT_SHARE,
     second_solver: bool = False,
 ) -> Certificate:
-    """Compare solutions of one problem by different methods, and audit each.
+    """Compare solutions of one problem that different methods found, and audit each solution.
 
     Args:
         problem: The common problem.
@@ -397,7 +397,7 @@ def certificate(
 
 
 def checked_solutions(solutions: Any) -> dict[str, Solution]:
-    """Return solutions by name, named by their methods if none are given; raise ProblemError for anything else."""
+    """Return solutions by name, or by method if they come without names; raise ProblemError for anything else."""
     if not isinstance(solutions, Mapping):
         return name_by_method(require.each("certificate: solutions", solutions, Solution))
     named = require.mapping("certificate: solutions", solutions)
@@ -406,7 +406,7 @@ def checked_solutions(solutions: Any) -> dict[str, Solution]:
 
 
 def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
-    """Return names of solutions such as ``Collocation legendre-3, 50``, numbered if they repeat."""
+    """Return solutions by names of their methods, such as ``Collocation legendre-3, 50``, numbered if they repeat."""
     named: dict[str, Solution] = {}
     for solution in solutions:
         method = solution.method
@@ -427,10 +427,11 @@ def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
 def _sample(
     form: Formulation, solution: Solution, p: np.ndarray, fractions: np.ndarray, reported: np.ndarray
 ) -> tuple[list[np.ndarray], float, float]:
-    """Sample a solution: states and controls at ``fractions``, costates and Hamiltonian at ``reported``.
+    """Return samples of a solution for a comparison, and the sizes of its Hamiltonian and of its running cost.
 
-    The sizes are the largest sum of the absolute parts of the Hamiltonian, which itself vanishes for a free horizon,
-    and the mean absolute running cost.
+    States and controls are sampled at ``fractions`` of the horizon, costates and Hamiltonian at ``reported`` ones. The
+    sizes are the largest sum of the absolute terms of the Hamiltonian, which itself vanishes for a free horizon, and
+    the mean absolute running cost.
     """
     lam = solution.costate_interpolant(reported)
     symbol = form.sym("lam", form.nx)
@@ -444,6 +445,6 @@ def _sample(
 
 
 def difference(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return the differences of values from a reference, relative to its largest entry."""
+    """Return the absolute differences of values from a reference, relative to the largest entry of the reference."""
     size = float(np.max(np.abs(reference), initial=0.0))
     return np.asarray(np.abs(values - reference) / (size if size > 0 else 1.0))

@@ -1,4 +1,4 @@
-"""Mesh refinement driven by the audit: intervals are split until every row of the audit is within its limit."""
+"""Mesh refinement driven by the audit: intervals are split until every error that it reports is within its limit."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class RefinementSettings:
             :func:`ocp.audit.audit.audit`: ``{"constraints": 1e-6}``. By default the audit's own.
         max_intervals: Maximum number of intervals.
         solver: As for :func:`ocp.methods.prepare`.
-        target: Value of a row, relative to its limit, aimed at by splitting: half, as the order of an error is
+        target: Value of a row, relative to its limit, at which splitting aims: half, as the order of an error is
             uncertain.
         max_parts: Maximum number of parts into which an interval is split at once.
         least_width: Smallest width of an interval, relative to the horizon: less is rounding.
         rounds: Maximum number of rounds. patience: Rounds without progress of any row before it stops.
-        nearer: Ratio to its best value to which a row must fall to count as progress.
+        nearer: Largest ratio of a row to its best earlier value that counts as progress.
 
     Raises:
         ProblemError: An unknown limit of the audit, or max_intervals is no positive integer.
@@ -77,12 +77,12 @@ def refine(
     settings: RefinementSettings = RefinementSettings(),
     time_limit: float | None = None,
 ) -> Solution:
-    """Solve a problem, and refine the mesh until every row of the audit is within its limit.
+    """Solve a problem, and refine its mesh until every error that the audit reports is within its limit.
 
     In every interval it evaluates the deviation of the plan from its re-integration, the violations of path equalities,
     bounds and inequalities between the points, and the cost that the controls lose. Each falls with a power of the
-    width that the method determines, from which follows the number of parts of an interval. A row that cannot be
-    attributed to intervals (end conditions) is met by splitting the intervals with the largest other errors. Nodes are
+    width that the method determines, from which follows the number of parts of an interval. An error that cannot be
+    attributed to intervals (end conditions) is reduced by splitting those with the largest other errors. Nodes are
     kept. Every round starts from the previous plan.
 
     Args:
@@ -186,7 +186,7 @@ def _refine_mesh(
 def _shortfall(
     stopped: str, late: bool, idles: bool, beyond: list[_Row], audit: Audit, form: Formulation
 ) -> RefinementWarning | None:
-    """Return a warning about the worst row that is still too large; None if the last plan passes its audit."""
+    """Return the warning that explains why the last plan does not pass its audit; None if it passes."""
     if beyond:
         worst = max(beyond, key=lambda row: row.value)
         hint = "the time limit is reached: raise time_limit" if late else "raise max_intervals"
@@ -212,7 +212,7 @@ def _first(
     settings: RefinementSettings,
     time_limit: float | None,
 ) -> tuple[Solution, Audit]:
-    """Solve on the first mesh and audit the plan; raise SolveError at the time limit or if the solve fails."""
+    """Solve the problem on the first mesh and audit the plan; raise SolveError on failure or at the time limit."""
     solution = solve(problem, method, **arguments)
     try:
         return solution, judge(problem, solution, **settings.limits)
@@ -229,7 +229,7 @@ def _first(
 def _next(
     problem: Problem, method: DirectMethod, arguments: dict[str, Any], settings: RefinementSettings
 ) -> tuple[Solution, Audit] | None:
-    """Solve on a finer mesh and audit the plan; return None if the time limit is reached first."""
+    """Solve the problem on a finer mesh and audit the plan; return None if the time limit is reached first."""
     if time_left() <= 0:
         return None
     try:
@@ -244,9 +244,10 @@ def _next(
 
 
 class _Row(NamedTuple):
-    """Row of the audit: its value and the contribution of each interval (N,), divided by the limit of the row.
+    """An error that the audit reports: its value and the contributions of the intervals, relative to its limit.
 
-    ``order`` is the power of the width with which it falls; ``errors`` is None if it cannot be attributed to intervals.
+    ``errors`` (N,) are the contributions, None if it cannot be attributed to intervals; ``order`` is the power of the
+    interval width with which it falls.
     """
 
     name: str
@@ -257,7 +258,10 @@ class _Row(NamedTuple):
 
 
 class _Parts(NamedTuple):
-    """Contributions of the intervals to an audit row (N,) in any unit; the row is their sum or maximum."""
+    """Contributions of the mesh intervals to an error that the audit reports, which is their sum or their maximum.
+
+    ``values`` (N,) are in any unit.
+    """
 
     kind: str
     values: np.ndarray
@@ -265,7 +269,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Return the contributions, scaled to be comparable with the value of their row. Shape (N,)."""
+        """Return the contributions, scaled so that their maximum (of a sum, their mean) is ``total``. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))
@@ -276,7 +280,7 @@ class _Parts(NamedTuple):
 def _rows(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit, tolerance: float, method: DirectMethod
 ) -> list[_Row]:
-    """Return the rows of a plan's audit, each with the contributions of the intervals."""
+    """Return the errors that the audit of a plan reports, each with the contributions of the mesh intervals to it."""
     # over the whole horizon an unstable motion diverges; the sum is what feedback would have to correct
     deviation = min(audit.integration_error, float(audit.local_errors.sum()))
     requested = Finding(f"integration error, {tolerance:.0e} requested", deviation, tolerance)
@@ -308,7 +312,7 @@ def _rows(
 def _violations(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit
 ) -> dict[str, tuple[bool, np.ndarray]]:
-    """Return by name the violation of each bounded quantity in each interval (N,), and whether it is an equality."""
+    """Return for each bound and path constraint whether it is an equality, and its violation in each interval (N,)."""
     n = len(audit.local_errors)
     x, u = stack(audit.states), stack(audit.controls, len(audit.t))
     g = form.sampled([form.path.expression], x, u, audit.t, solution.horizon, p)[0]
@@ -330,7 +334,7 @@ def _violations(
 def _parts_per_interval(
     beyond: list[_Row], rows: list[_Row], mesh: np.ndarray, settings: RefinementSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of parts into which to split each interval, and its largest error. Shape (N,) each."""
+    """Return the number of parts into which to split each interval, and its largest relative error. Shape (N,) each."""
     n = len(mesh) - 1
     parts, error = np.ones(n, int), np.zeros(n)
     for row in beyond:
@@ -349,9 +353,9 @@ def _parts_per_interval(
 
 
 def split(mesh: np.ndarray, parts: np.ndarray, error: np.ndarray, max_intervals: int) -> np.ndarray:
-    """Split each interval of a mesh (N + 1,) into parts, with at most ``max_intervals`` intervals in total.
+    """Return a mesh in which each interval is split into equal parts, with at most ``max_intervals`` intervals in all.
 
-    If these are too few, the intervals of least ``error`` (N,) are split less.
+    If these are too few, the intervals of least ``error`` (N,) are split less. ``mesh`` (N + 1,) are the interval ends.
     """
     parts = parts.copy()
     available = max_intervals - len(parts)

@@ -1,4 +1,4 @@
-"""A solved problem as plain arrays: access, interpolation, files, audit."""
+"""The solution of an optimal control problem as plain arrays, with interpolation, files and audit."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ class Solution:
         solver: ``ipopt``, ``fatrop``, ...; ``newton`` for a solve that corrected an earlier plan.
         success: Whether the solver reports an optimum within its tolerance.
         status: How the solver ended. message: What to try after a failure, or another remark; may be "".
-        cost: Value of the cost. iterations: of the solver. horizon: Final time, s.
+        cost: Value of the cost. iterations: Number of solver iterations. horizon: Final time, s.
         t: Reported times, s; first 0, last the horizon. Shape (M,).
         states, controls, costates: Values at the reported times by name, each (M, n). Costates are d(optimal
             cost)/d(state), so that H = running cost + costate . derivative.
-        parameters: Their values by name. cost_gradients: Derivatives of the optimal cost in them, by name.
+        parameters: Their values by name. cost_gradients: Derivatives of the optimal cost with respect to them, by name.
         state_interpolant, control_interpolant, costate_interpolant: Stacked states (controls, costates) over fractions
             0..1 of the horizon.
-        variables, multipliers: Of the variables and rows of the nonlinear program, for warm starts.
+        variables, multipliers: Variables of the nonlinear program and multipliers of its rows, for warm starts.
         seconds: Wall time of ``build`` and ``solve``.
         problem: The problem, or None if it could not be saved. problem_lost: The reason, or "".
         refinement: Record of the mesh refinement, or None.
@@ -134,7 +134,7 @@ class Solution:
     message: str = ""
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return values of a state or control at the reported times. Shape (M, n)."""
+        """Return the values of the state or control of a given name at the reported times. Shape (M, n)."""
         return entry_named("state or control", name, {**self.states, **self.controls})
 
     def __repr__(self) -> str:
@@ -181,9 +181,9 @@ class Solution:
         return str(call_registered("html_of_solution", self))
 
     def table(self) -> dict[str, np.ndarray]:
-        """Return columns by name, with a row for every reported time, for pandas, polars or pyarrow.
+        """Return times, states and controls as columns by name, for a table in pandas, polars or pyarrow.
 
-        ``time`` (s), states and controls; the entries of a vector are called ``NAME[k]``. Shape (M,) each.
+        The times are called ``time`` (s), the entries of a vector ``NAME[k]``. Shape (M,) each.
         """
         columns = {"time": self.t}
         for name, values in {**self.states, **self.controls}.items():
@@ -197,10 +197,10 @@ class Solution:
 
     @interruptible
     def sensitivity(self, name: str) -> Sensitivity:
-        """Return the derivatives of this plan by a parameter, and the range in which they are valid.
+        """Return the derivatives of this plan with respect to a parameter, and the parameter range in which they hold.
 
         It solves one linear system in the derivatives of variables and multipliers, with the active limits fixed, for
-        plans of direct methods. See :mod:`ocp.direct.sensitivity`.
+        plans of direct methods. In the range the active limits do not change. See :mod:`ocp.direct.sensitivity`.
 
         Raises:
             ProblemError: An unknown parameter; not an optimum of a direct method under the bounds of its problem; or
@@ -210,11 +210,11 @@ class Solution:
         return computed
 
     def cost_gradient(self, name: str) -> np.ndarray:
-        """Return the derivative of the optimal cost by a parameter, from the multipliers. Shape (n,)."""
+        """Return the derivative of the optimal cost with respect to a parameter, from the multipliers. Shape (n,)."""
         return entry_named("parameter", name, self.cost_gradients)
 
     def at(self, time: Any) -> Sample:
-        """Return states and controls at a time, each (n,), or at times (M,), each (M, n), by the method's interpolant.
+        """Return the interpolated states and controls at one time or at several, s. Shape (n,) or (M, n) each.
 
         Raises:
             ProblemError: A time outside 0 to the horizon, or not finite.
@@ -260,9 +260,9 @@ class Solution:
         return {name: (float(b), float(b + n)) for name, b, n in zip(declared, begins, lengths, strict=True)}
 
     def phase(self, name: str) -> Solution:
-        """Return one phase as a solution over its own time, from 0 to its duration, with the phase's own names.
+        """Return one phase as a solution over its own time, 0 to its duration, with the variable names of the phase.
 
-        Its cost is the phase's share. It has no problem, as only the whole can be audited.
+        Its cost is the cost of the phase alone. It has no problem, as only the whole plan can be audited.
 
         Raises:
             ProblemError: There is no such phase.
@@ -302,7 +302,7 @@ class Solution:
         )
 
     def _sample(self, expressions: list[Any], fractions: np.ndarray) -> list[np.ndarray]:
-        """Return expressions of the declared symbols at fractions (M,) of the horizon. Shape (M, n) each."""
+        """Evaluate expressions of declared symbols along the plan at horizon fractions (M,). Shape (M, n) each."""
         form = Formulation.of(self.problem)
         plan = match_order(form, self)
         x, u = plan.state_interpolant(fractions), plan.control_interpolant(fractions)
@@ -326,11 +326,11 @@ class Solution:
         return call_registered("audit", audited, self, **settings)
 
     def with_problem(self, problem: Any) -> Solution:
-        """Return the solution with another problem, or with None."""
+        """Return a copy of the solution that refers to another problem, or to none."""
         return replace(self, problem=problem, problem_lost="")
 
     def tied_to(self, problem: Problem) -> Solution:
-        """Attach a problem from a file to the solution; raise ProblemError if it is damaged or has other variables."""
+        """Return the plan with a problem from a file; raise ProblemError if this is damaged or has other variables."""
         try:
             check_variables_match(Formulation.of(problem), self)
         except ProblemError:
@@ -394,7 +394,7 @@ class Solution:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Solution:
-        """Read a file that :meth:`save` has written, with its problem, but without guesses that were functions.
+        """Return the plan and its problem from a file that :meth:`save` wrote, except guesses that were functions.
 
         The file is pure data. Its problem is rebuilt from checked operations, and none of it is executed.
 
@@ -407,7 +407,7 @@ class Solution:
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> Solution:
-        """Return the solution from the arrays of a file, which are consumed; raises the errors of :meth:`load`."""
+        """Return the solution from the arrays of its file, which are removed from ``arrays``; raises as `load`."""
         try:
             head = read_head(path, arrays.pop("head"))
             version = head.pop("version")
@@ -451,7 +451,7 @@ class Solution:
     # ---- with and without its problem ------------------------------------------------------------------------
 
     def _written_problem(self) -> tuple[dict[str, Any] | None, str]:
-        """Return the problem as data and ""; if it cannot be saved, None and the reason."""
+        """Return the problem as data and an empty text, or None and the reason why the problem cannot be saved."""
         if self.problem is None:
             return None, self.problem_lost
         try:
@@ -460,7 +460,7 @@ class Solution:
             return None, str(error)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the data for pickling, with the problem if it can be saved, else with the reason."""
+        """Return the data for pickling, with the problem, or with the reason why the problem cannot be saved."""
         written, why = self._written_problem()
         return {**self.__dict__, "problem": written, "problem_lost": why}
 

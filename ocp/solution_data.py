@@ -1,4 +1,4 @@
-"""Parts of a solution besides the class itself, checks of their consistency, and the registry of its methods.
+"""Data classes and consistency checks of solutions, and a registry of functions that other packages implement.
 
 `Solution.audit`, `Solution.sensitivity` and the `plot` methods belong to classes, but their work is done by packages
 that import `Solution`. These packages register their functions here by name, and the methods look them up, so that
@@ -22,7 +22,7 @@ __all__ = ["call_registered", "register"]
 
 
 T = TypeVar("T")
-MAX_HEAD_BYTES = 2**24  # a mesh of half a million intervals
+MAX_HEAD_BYTES = 2**24  # enough for a mesh of half a million intervals
 HEAD = {
     "name": str,
     "method": dict,
@@ -72,12 +72,12 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """First-order change of a plan with a parameter that has k entries.
+    """Derivatives of a plan with respect to a parameter of k entries, and the range in which they are valid.
 
     Attributes:
-        name, value: Of the parameter, (k,).
+        name, value: Name of the parameter, and its value. Shape (k,).
         t: The reported times, s. Shape (M,).
-        states, controls: Derivatives in the entries of the parameter, at fixed fractions of the horizon. (M, n, k).
+        states, controls: Derivatives with respect to the entries, at fixed fractions of the horizon. Shape (M, n, k).
         horizon, cost: Derivatives of the horizon, s, and of the optimal cost. Shape (k,) each.
         lower, upper: Range of an entry, the others fixed, in which the set of active limits does not change, to first
             order; infinite if unbounded. Shape (k,) each.
@@ -96,11 +96,11 @@ class Sensitivity:
     limits: tuple[tuple[str, str], ...]
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return the derivative of a state or control at the reported times. Shape (M, n, k)."""
+        """Return the derivative of a state or control with respect to the parameter, over time. Shape (M, n, k)."""
         return entry_named("state or control", name, {**self.states, **self.controls})
 
     def __str__(self) -> str:
-        """Return the range in which the change is valid for each entry of the parameter, one per line."""
+        """Return a text with the range of each parameter entry in which the active limits stay the same."""
         lines = []
         for k, (below, above) in enumerate(self.limits):
             entry = self.name if len(self.value) == 1 else f"{self.name}[{k}]"
@@ -113,7 +113,10 @@ class Sensitivity:
 
 
 def read_head(path: Any, text: np.ndarray) -> Any:
-    """Return the header of a file; raise ProblemError if it is long, as JSON takes thirty times its length."""
+    """Return the header of a solution file from its JSON text; raise ProblemError if the text is too long.
+
+    Parsing takes thirty times as much memory as the text.
+    """
     if text.nbytes > MAX_HEAD_BYTES:
         words = f"{path} is not a saved solution: its head has {text.nbytes:.3g} bytes, {MAX_HEAD_BYTES:.3g} at most"
         raise ProblemError(words, name="head", value=text.nbytes, limit=MAX_HEAD_BYTES)
@@ -121,33 +124,33 @@ def read_head(path: Any, text: np.ndarray) -> Any:
 
 
 def read_status(path: Any, word: Any) -> SolverStatus:
-    """Return the status that the header of a file contains, or raise ProblemError."""
+    """Return the solver status that a file header names; raise ProblemError for an unknown name."""
     if word not in [status.value for status in SolverStatus]:
         raise ProblemError(f"{path}: {word!r} is not a solver status", name="status", value=word)
     return SolverStatus(word)
 
 
 def entry_named(kind: str, name: Any, pool: Mapping[str, T]) -> T:
-    """Return the entry of a given name; if there is none, raise ProblemError with similar names."""
+    """Return the entry of a dictionary with a given name; if there is none, raise ProblemError with similar names."""
     if not isinstance(name, str) or name not in pool:
         raise require.unknown(kind, name, pool)
     return pool[name]
 
 
 def plain(value: Any) -> Any:
-    """Convert numpy numbers and arrays in the settings of a method to Python numbers, for JSON."""
+    """Convert NumPy numbers and arrays in the settings of a method to Python numbers and lists, for JSON."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"{value!r} cannot be saved")
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """Stack arrays (M, n) side by side; without any arrays, return an empty array with ``like`` rows."""
+    """Stack the arrays (M, n) of a dictionary side by side; without any, return an empty array of ``like`` rows."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 
 def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.ndarray]:
-    """Split stacked values (M, n) into columns by name, in the order and sizes of ``pool``."""
+    """Split stacked columns (M, n) into arrays by name, with the order and the widths of the arrays in ``pool``."""
     values, offset = {}, 0
     for name, like in pool.items():
         values[name] = stacked[:, offset : offset + like.shape[1]]
@@ -156,7 +159,7 @@ def unstack(pool: dict[str, np.ndarray], stacked: np.ndarray) -> dict[str, np.nd
 
 
 class VariableSlices(Protocol):
-    """Slices of the states and controls of a problem in its vectors, by name."""
+    """Protocol of a problem whose states and controls are slices, given by name, of stacked vectors."""
 
     name: str
     states: dict[str, slice]
@@ -174,7 +177,7 @@ def check_variables_match(form: VariableSlices, solution: Any) -> None:
 
 
 def match_order(form: VariableSlices, solution: Any) -> Any:
-    """Reorder states and controls of a plan to the order in a problem, because interpolants have no names."""
+    """Return a plan with its variables in the order of the problem, because interpolants have columns without names."""
     orders = {"states": list(form.states), "costates": list(form.states), "controls": list(form.controls)}
     changes: dict[str, Any] = {}
     for pool, interpolant in zip(("states", "controls", "costates"), INTERPOLANTS, strict=True):
@@ -198,9 +201,9 @@ def match_order(form: VariableSlices, solution: Any) -> Any:
 
 
 def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the tightening (2, N, m) of bounds in mesh intervals at fractions ``at`` (M,). Shape (2, M, m).
+    """Return the amounts by which the bounds of a plan were tightened at fractions ``at`` (M,). Shape (2, M, m).
 
-    At a node between two intervals it is the larger of both.
+    ``bound_tightening`` (2, N, m) holds them for each interval; at a node between two intervals the larger one counts.
     """
     last = len(mesh) - 2
     sides = (np.clip(np.searchsorted(mesh, at + slip) - 1, 0, last) for slip in (-NODE_TOLERANCE, NODE_TOLERANCE))
@@ -209,7 +212,7 @@ def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray
 
 
 def check_structure(solution: Any) -> None:
-    """Raise ProblemError, naming the part, if the arrays of a plan are inconsistent.
+    """Raise ProblemError, with the name of the faulty array, if the arrays of a plan are inconsistent.
 
     Times increase from 0 and breaks from 0 to 1. Every array has a row for each time. Every interpolant has one
     polynomial between two breaks, nodes within 0..1, and as many columns as the interpolated pool.
@@ -239,7 +242,7 @@ def _invalid(solution: Any, name: str, words: str) -> ProblemError:
 
 
 def _real(solution: Any, name: str, value: Any, dimensions: int) -> np.ndarray:
-    """Return a part of a plan; raise ProblemError unless it is a real array with `dimensions` dimensions."""
+    """Return data of a plan as an array; raise ProblemError unless it is a real array with `dimensions` dimensions."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.ndim != dimensions:
         words = f"is not a real array of {dimensions} dimensions, but {array.dtype} of shape {array.shape}"
@@ -285,7 +288,7 @@ def _check_interpolant(solution: Any, name: str, columns: int) -> None:
 
 
 def _check_tightening(solution: Any) -> None:
-    """Raise ProblemError unless the tightening has a finite, nonnegative entry for each bound."""
+    """Raise ProblemError unless the amount by which each bound of a plan was tightened is finite and nonnegative."""
     amounts = _real(solution, "bound_tightening", solution.bound_tightening, 3)
     entries = sum(values.shape[1] for pool in (solution.states, solution.controls) for values in pool.values())
     shape = (2, len(solution.control_interpolant.breaks) - 1, entries)
@@ -300,7 +303,7 @@ def _check_tightening(solution: Any) -> None:
 
 
 def check_finite(solution: Any) -> None:
-    """Raise ProblemError, naming the part, if a plan that counts as solved contains nan or infinity."""
+    """Raise ProblemError, with the name of the value, if a plan that counts as solved contains nan or infinity."""
     if not solution.success:
         return
     parts: dict[str, Any] = {
@@ -320,7 +323,7 @@ _FUNCTIONS: dict[str, str] = {}
 
 
 def register(operation: str, module: str) -> None:
-    """Make a function of a module available to `call_registered` under its name, without importing it here."""
+    """Make a function available to `call_registered` under its name; its module is imported on the first call."""
     _FUNCTIONS[operation] = module
 
 

@@ -1,4 +1,4 @@
-"""Files of named arrays, written atomically and checked before they are unpacked, and names in CSV tables."""
+"""Files of named arrays, written atomically and checked before they are unpacked, and column names of CSV tables."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ZIP64_LOCATOR = b"PK\x06\x07"  # precedes it in a larger archive
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write one compressed ``.npz`` file atomically, see :func:`write_whole`.
+    """Write named arrays to a compressed ``.npz`` file atomically, see :func:`write_whole`.
 
     Raises:
         ProblemError: path is not the path of a file, or the arrays are larger than :func:`read_arrays` accepts.
@@ -96,7 +96,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any],
 
 
 def open_part(target: Path) -> IO[bytes]:
-    """Return a new, locked file beside the target."""
+    """Return a new, locked temporary file in the folder of the target, to replace the target when it is complete."""
     while True:
         stream = open(target.with_name(f"{target.name}.{secrets.token_hex(4)}.part"), "xb")  # noqa: SIM115
         with suppress(OSError):  # some file systems have no locks
@@ -157,7 +157,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def open_unlinked(path: str | os.PathLike[str]) -> io.BufferedReader:
-    """Open a regular file of at most ``MAX_FILE_BYTES``; reject a link in a folder that others can write to.
+    """Open a regular file of at most ``MAX_FILE_BYTES`` for reading, but no link, which another user may have made.
 
     Raises:
         OSError: It cannot be opened.
@@ -170,7 +170,7 @@ def open_unlinked(path: str | os.PathLike[str]) -> io.BufferedReader:
 
 
 def checked_path(path: Any) -> str | os.PathLike[str]:
-    """Return ``path``; raise ProblemError unless it is a path, since a number would be a file descriptor."""
+    """Return ``path``; raise ProblemError unless it is a string or path, since a number would be a file descriptor."""
     if not isinstance(path, str | os.PathLike):
         raise ProblemError(f"a path is expected, not {path!r}", name="path", value=path)
     return path
@@ -224,8 +224,8 @@ def array_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
 
 SUFFIXES = ("", ".velocity", ".acceleration")
 ESCAPED = re.compile(r"[^\w./: -]|^[^\w]| $")
-"""Characters written as %XX: all but letters, digits and harmless punctuation. A leading `-` would start a formula, a
-leading `/` a command, and spaces at the ends would be lost."""
+"""Characters of names that tables contain as %XX: all but letters, digits and harmless punctuation. A leading `-` would
+start a formula, a leading `/` a command, and spaces at the ends would be lost."""
 FORMULA = re.compile(r"^[=+\-@\t\r%]")
 """First characters of a formula in a spreadsheet, and the escape character itself."""
 
@@ -236,7 +236,7 @@ def column_name(name: str) -> str:
 
 
 def cell(value: Any) -> Any:
-    """Return the text of a CSV cell; the first character of text that looks like a formula becomes %XX."""
+    """Return a value for a CSV cell; in text that looks like a formula the first character becomes %XX."""
     return FORMULA.sub(_quote, value) if isinstance(value, str) else value
 
 
@@ -250,12 +250,12 @@ def joint_name(column: str) -> str:
 
 
 def table_head(names: Sequence[str]) -> list[str]:
-    """Return the header of the table of a plan: time, then positions, velocities and accelerations of joints."""
+    """Return the column names of the table of a plan: time, then joint positions, velocities and accelerations."""
     return ["time", *(column_name(name) + suffix for suffix in SUFFIXES for name in names)]
 
 
 def table_joints(head: Sequence[str]) -> tuple[str, ...]:
-    """Return the joint names in a header of :func:`table_head`; empty for any other header."""
+    """Return the joint names in a table header that :func:`table_head` made; empty for any other header."""
     try:
         names = tuple(map(joint_name, head[1 : 1 + len(head) // 3]))
     except UnicodeDecodeError:

@@ -1,4 +1,4 @@
-"""Limits that hold between the points of a grid as well: tightened bounds, and nodes at the switches of a plan.
+"""Tightened bounds and mesh nodes at control switches, so that plans satisfy their limits between grid points too.
 
 A transcription enforces inequalities at its points; between them a plan may exceed them by a power of the interval
 width. :func:`tighten` tightens each bound, interval by interval, by the excess of the plan, until nothing is exceeded.
@@ -146,7 +146,7 @@ def tighten(
 
 
 def largest_excess(problem: Problem, solution: Solution) -> float:
-    """Return the largest excess of a plan over bounds and inequalities between its grid points, in own units."""
+    """Return the largest violation of a bound or inequality by a plan, also between grid points, in its own unit."""
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
@@ -155,7 +155,7 @@ def largest_excess(problem: Problem, solution: Solution) -> float:
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """Describe the largest excess over a bound: a sentence, and fields for an error; see :func:`_excess`."""
+    """Return a text that describes the largest excess over a bound, and the fields of an error; see :func:`_excess`."""
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
@@ -167,7 +167,10 @@ def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[st
 def _places(
     form: Formulation, transcription: Transcription, shared: bool
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return which state, control or path row (or -1), and which interval, variables ("x") and rows ("g") belong to.
+    """Return the bounded quantity and the intervals to which each variable ("x") and row ("g") of a program belongs.
+
+    The quantity is an index among the stacked states, controls and path constraints, or -1. The indices of two
+    intervals, left and right, differ at a node between intervals.
 
     Args:
         shared: Whether a control at a node belongs to both intervals; otherwise it, and rows with it, may jump there.
@@ -202,7 +205,10 @@ def _slack(
     high: np.ndarray,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Return the smallest distance of points to their bounds in each interval, (2, N, m); inf without points."""
+    """Return the smallest distance of grid values to their lower and upper bounds in each interval. Shape (2, N, m).
+
+    It is infinite for a bound without grid values in the interval.
+    """
     slack = np.full(shape, np.inf)
     for kind, (entry, left, right) in places.items():
         bounded = entry >= 0
@@ -216,7 +222,10 @@ def _slack(
 def _excess(
     form: Formulation, solution: Solution, p: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much values exceed lower and upper bounds in each interval, (2, N, m), and its ends, s."""
+    """Return the largest excess over lower and upper bounds in each interval, and the ends of the intervals, s.
+
+    Shapes (2, N, m) and (N + 1,).
+    """
     breaks = solution.control_interpolant.breaks
     n = len(breaks) - 1
     per_interval = (len(solution.state_interpolant.breaks) - 1) // n
@@ -238,7 +247,7 @@ def _excess(
 
 
 def _peaks(values: np.ndarray) -> np.ndarray:
-    """Return the maxima of sampled curves (N, K, m), with parabolas between the samples. Shape (N, m)."""
+    """Return the maxima of sampled curves (N, K, m), by parabolas through neighbouring samples. Shape (N, m)."""
     left, middle, right = values[:, :-2], values[:, 1:-1], values[:, 2:]
     with np.errstate(invalid="ignore", divide="ignore"):
         rise = (right - left) ** 2 / (8 * (2 * middle - left - right))
@@ -252,11 +261,11 @@ def _peaks(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SwitchingSettings:
-    """Settings by which the switches of a plan are located.
+    """Settings for the location of the switches of a plan, the times at which it reaches or leaves a limit.
 
     Attributes:
-        at_limit: Distance from a limit, relative to the range of both limits, below which a value is at it: the audit's
-            tolerance.
+        at_limit: Distance from a limit, relative to the range of both limits, below which a value is at the limit: the
+            audit's tolerance.
         jump: Smallest jump of a value at a switch, relative to that range.
         longest: Maximum number of intervals over which a jump may be smeared.
         too_near: Distance from a switch, relative to its interval, below which other nodes are removed.
@@ -282,7 +291,7 @@ WARM_START_OPTIONS = {"mu_init": 1e-4}
 
 
 def switches(problem: Problem, solution: Solution) -> np.ndarray:
-    """Return the horizon fractions at which a control or path constraint reaches or leaves a limit. Shape (k,).
+    """Return the fractions of the horizon at which a control or path constraint reaches or leaves a limit. Shape (k,).
 
     Args:
         problem: The problem that was solved, by collocation with controls at the points.
@@ -325,7 +334,10 @@ def switches(problem: Problem, solution: Solution) -> np.ndarray:
 def _limited_values(
     form: Formulation, solution: Solution, at: np.ndarray, owner: np.ndarray, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return values (M, m) and limits (m,) of controls and of path constraints with controls, at M fractions."""
+    """Return values and limits of limited controls, and of limited path constraints that contain controls.
+
+    The values (M, m) are those at fractions ``at`` (M,) of the horizon, the lower and upper limits have shape (m,).
+    """
     p = form.parameter_vector(solution.parameters)
     lower, upper = form.bound_values(p)
     x, u = solution.state_interpolant(at), solution.control_interpolant.within(owner, place)
@@ -341,7 +353,7 @@ def _limited_values(
 def solve_at_switches(
     problem: Problem, method: Collocation, plan: Solution, *, parameters: ByName = None, options: ByName = None
 ) -> Solution:
-    """Solve a plan again with mesh nodes at its switches, which are located more accurately in each round.
+    """Solve a problem again with mesh nodes at the switches of its plan, located more accurately in each round.
 
     Args:
         problem, parameters, options: As for :func:`ocp.methods.solve`.
@@ -369,13 +381,13 @@ def solve_at_switches(
 
 
 def _distinct(fractions: np.ndarray) -> np.ndarray:
-    """Return the switches inside the horizon, with only the first of several close ones."""
+    """Return the fractions of those switches that are inside the horizon; of several close ones, only the first."""
     inside = fractions[(fractions > SWITCHING.same) & (fractions < 1 - SWITCHING.same)]
     return np.asarray(inside[np.diff(inside, prepend=-1.0) > SWITCHING.same])
 
 
 def _mesh(mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return a mesh with nodes at the switches, without those old nodes that are close to them."""
+    """Return a mesh with nodes at the fractions of switches, without those old nodes that are close to them."""
     inner, width = mesh[1:-1], np.diff(mesh)
     interval = np.clip(np.searchsorted(mesh, at, side="right") - 1, 0, len(width) - 1)
     close = (np.abs(inner[:, None] - at) < SWITCHING.too_near * width[interval]).any(axis=1)

@@ -1,1 +1,1 @@
-"""The captive trajectory rig of a wind tunnel: its kinematics, and the roll that its task leaves open."""
+"""Kinematics of the captive trajectory rig of a wind tunnel, and the choice of the roll that its task leaves free."""

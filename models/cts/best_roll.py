@@ -4,13 +4,14 @@ The optimal roll on a set of arcs is a stationary point of the index inside an a
 points come first: in closed form for I1 (`trigonometric.least_point`), and by Newton's method on intervals of convexity
 for I2, which adds the squared change of roll. If the best of them is within reach and limits, it is optimal.
 
-Otherwise the ends of the arcs matter, and `Search` evaluates them in order until no other can improve. Ends by joints
-4 to 6 and by the reach of the pitch link are cheap and all compared. The others are first approximated; one is polished
-and checked only if a lower bound of the index near it is below the incumbent's. On the way uphill from a roll that
-violates a limit of joint 1 alone, the first feasible roll lies on that limit. The ends by a limit of joint 1, which are
-the most expensive, are therefore computed only if a roll better than the incumbent violates that limit.
+Otherwise the ends of the arcs matter, and `Search` evaluates them in order until no other can improve. Ends at limits
+of joints 4 to 6 and at the reach of the pitch link have a closed form and are all compared. The others are first
+approximated; one is polished and checked only if a lower bound of the index near it is below the incumbent's. If the
+roll changes from one that violates a limit of joint 1 alone in the direction of increasing index, the first feasible
+roll is at that limit. The ends at a limit of joint 1, which are the most expensive, are therefore computed only if a
+roll better than the incumbent violates that limit.
 
-The functions of the search exchange records of scalars, one column each.
+The functions of the search exchange matrices. Each column holds the scalars of one named tuple.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ class Incumbent(NamedTuple):
     """The best feasible roll that the search has found so far.
 
     Attributes:
-        cost: Its index, inf if there is none yet.
-        c, s: Its cosine and sine.
-        code: Code of the constraint it lies on, in roll.ACTIVE.
+        cost: Value of the index at the roll; inf if there is none yet.
+        c, s: Cosine and sine of the roll.
+        code: Code in roll.ACTIVE of the constraint that is active at the roll.
         below, above: Least cost of any roll that satisfies all constraints but the lower, or upper, limit of joint 1.
     """
 
@@ -74,9 +75,9 @@ class RoughRoll(NamedTuple):
     Attributes:
         bound: Lower bound of the cost near the point; inf if the roll is infeasible.
         c, s: Cosine and sine.
-        value: Value of cos q2, or q1, at the polished roll; at a stationary point, the present cos q2.
-        code: Code of the constraint that the roll lies on.
-        side: 1 if the constraint holds above the value, -1 if below.
+        value: Value of cos q2, or of q1 (m), at the polished roll; at a stationary point, the present cos q2.
+        code: Code in roll.ACTIVE of the constraint that is active at the polished roll.
+        side: 1 if the constraint is satisfied above the value, -1 if below.
     """
 
     bound: Expression
@@ -88,14 +89,14 @@ class RoughRoll(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Cost of a roll, infinite if it violates limits of joints 4 to 6, and the value of cos q2."""
+    """Cost of a roll, inf if the reach of the pitch link or joints 4 to 6 exclude it, and cos q2 at the roll."""
 
     cost: Expression
     cos2: Expression
 
 
 class LevelBound(NamedTuple):
-    """A limiting value of cos q2, with a lower bound of the cost of all rolls that have it; `side` as in RoughRoll."""
+    """A value of cos q2 at which a limit is reached, and a lower bound of the cost there; `side` as in RoughRoll."""
 
     bound: Expression
     cosine: Expression
@@ -110,7 +111,7 @@ NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
 
 
 class RigSolution(NamedTuple):
-    """Result for one target: joints (6, 1), cost, and the codes of active constraint and status."""
+    """Solution for one target: joint positions (6, 1), cost, code of the active constraint, code of the status."""
 
     joints: Expression
     cost: Expression
@@ -139,21 +140,21 @@ def _inputs(symbols: Any) -> tuple[Any, Any]:
 def optimal_inverse(
     rig: Rig, tunnel: Tunnel, branch: Branch = HOME, *, rate_weight: float = 0.0, limits: bool = True
 ) -> Any:
-    """Return the Function (target, previous) -> (joints, cost, active, status) of the joints with the optimal roll.
+    """Return the casadi Function that computes the joint positions of the rig for a target, at the optimal roll.
 
     Args:
         rig: Dimensions and joint limits.
         tunnel: Centre, ranges and weights of the index.
         branch: Branch of inverse kinematics.
-        rate_weight: w4 of I2 = I1 + w4 / (2 pi) (roll - previous)^2, (37); 0 for I1.
+        rate_weight: w4 of I2 = I1 + w4 / (2 pi) (roll - previous)^2, equation (37) of the paper; 0 for I1.
         limits: Whether reach and joint limits constrain the roll. Without them the minimum of the index is returned, in
             closed form, and the status says whether the pose is within reach and limits.
 
     Returns:
-        A casadi Function. Inputs: target (x, y, z, yaw, pitch), shape (5,); previous roll, rad. Outputs: joints, shape
-        (6,), nan unless the status is 0; the index; code of the active constraint in roll.ACTIVE; code in roll.STATUS.
-        The roll is given in the turn nearest to the previous one that the limits of joint 6 allow or, if they allow
-        less than a turn, in theirs.
+        The Function (target, previous) -> (joints, cost, active, status). Inputs: target (x, y, z, yaw, pitch), shape
+        (5,); previous roll, rad. Outputs: joint positions, shape (6,), nan unless the status is 0; the index; code of
+        the active constraint in roll.ACTIVE; code in roll.STATUS. The roll is given in the turn nearest to the previous
+        roll that the limits of joint 6 allow or, if they are less than a full turn apart, between them.
 
     Raises:
         ModelError: The rate weight is negative or not finite, or limits=False has a rate weight.
@@ -184,12 +185,13 @@ def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits
 
 @dataclass(frozen=True)
 class Search:
-    """The steps of the search for the best roll, each a casadi Function.
+    """Search for the best roll; each step is a casadi Function, which a method returns.
 
-    Their argument `best` is an Incumbent, `evaluations` a row of Evaluation, `rough` columns of RoughRoll.
+    The argument `best` of these Functions is an Incumbent, `evaluations` columns of Evaluation, `rough` columns of
+    RoughRoll. Their result `answer` is a RigSolution.
 
     Attributes:
-        gain: w4 / (2 pi) of I2; 0 for I1.
+        gain: Factor w4 / (2 pi) of the squared change of roll in the index I2; 0 for I1.
     """
 
     rig: Rig
@@ -198,9 +200,10 @@ class Search:
     gain: float
 
     def direct(self) -> Any:
-        """Return the Function (target, previous) -> (answer, done, best, evaluations) for the best stationary roll.
+        """Return the Function that finds the best stationary point of the index as a function of the roll.
 
-        `done` says that the answer is final: it is within reach and limits, or the input is not finite.
+        (target, previous) -> (answer, done, best, evaluations). `done` says that the answer is final: it is within
+        reach and limits, or the input is not finite.
         """
         if self.gain:
             return self._direct_by_descent()
@@ -235,7 +238,10 @@ class Search:
         return ca.Function("direct", [x, before], list(settled))
 
     def search_ends(self, count: int) -> Any:
-        """Return the Function (target, previous, best, `count` evaluations) -> answer that searches all roll limits."""
+        """Return the Function that searches all ends of feasible roll intervals for a roll better than the incumbent.
+
+        (target, previous, best, `count` evaluations) -> answer.
+        """
         target, previous = _inputs(ca.MX)
         first, evaluations = ca.MX.sym("best", INCUMBENT_SIZE), ca.MX.sym("seen", len(Evaluation._fields), count)
         best, more = self._cheap_ends()(target, previous, first)
@@ -260,7 +266,10 @@ class Search:
     # ---- candidates ------------------------------------------------------------------------------------------
 
     def _cheap_ends(self) -> Any:
-        """Return the Function (target, previous, best) -> (best, evaluations) for roll limits with a closed form."""
+        """Return the Function that compares those ends of feasible roll intervals that have a closed form.
+
+        (target, previous, best) -> (best, evaluations).
+        """
         target, previous = _inputs(ca.SX)
         first = ca.SX.sym("best", INCUMBENT_SIZE)
         ends = closed_form_ends(self.rig, target, self.branch)
@@ -270,10 +279,11 @@ class Search:
         )
 
     def _rough_stationary(self) -> Any:
-        """Return the Function (target) -> rolls near the minima of the index I1; NO_ROLL if there is only one minimum.
+        """Return the Function that approximates the rolls at which the index I1 is stationary, if it may have 2 minima.
 
-        In the axes of trigonometric.least_point there are only two stationary points outside the astroid
-        |p|^(2/3) + |q|^(2/3) = (4 r)^(2/3), which the circle hypot(p, q) = 4 r encloses.
+        (target) -> rough; NO_ROLL if there is only one minimum. In the axes of trigonometric.least_point there are only
+        two stationary points outside the astroid |p|^(2/3) + |q|^(2/3) = (4 r)^(2/3), which the circle hypot(p, q) = 4
+        r encloses.
         """
         target, _ = _inputs(ca.SX)
         rough, f = self._approximation(target), self._index(target)
@@ -286,10 +296,11 @@ class Search:
         return ca.Function("rough_stationary", [x], [answer])
 
     def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the Function (target, previous, evaluations, best) -> best for roll limits due to yaw joints.
+        """Return the Function that tries the ends of feasible roll intervals due to the yaw joints 2 and 3.
 
-        A level is searched if an evaluated roll better than the incumbent is on its infeasible side. All levels are
-        searched if one violates a limit of joint 1 alone, since its arc may end before that limit is satisfied.
+        (target, previous, evaluations, best) -> best. A level, the value of cos q2 at such an end, is searched if an
+        evaluated roll better than the incumbent is on its infeasible side. All levels are searched if one violates a
+        limit of joint 1 alone, since its arc may end before that limit is satisfied.
         """
         target, _ = _inputs(ca.SX)
         rolls = ca.SX.sym("seen", len(Evaluation._fields), count)
@@ -330,7 +341,10 @@ class Search:
         return ca.Function("levels", [x, before, evaluations, first], [best])
 
     def _slide_ends(self, chart: Any, upper: bool) -> Any:
-        """Return the Function (target, previous, best) -> best for roll limits due to joint 1 (the slide)."""
+        """Return the Function that tries the rolls at which joint 1 (the slide) is at its lower or upper limit.
+
+        (target, previous, best) -> best.
+        """
         target, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
         rough, reach = self._approximation(target), (0, 1 + self._slack()[1])
         datum = inside_limit(self.rig, 1, upper), limit_code(1, upper)
@@ -353,7 +367,10 @@ class Search:
         return sin4, (ROOTS.root_tolerance * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
 
     def _approximation(self, target: Expression) -> Callable[..., RoughRoll]:
-        """Return a function that creates a RoughRoll; `about` = (middle, half width) restricts its cos q2."""
+        """Return a function that gives an approximate roll a lower bound of the index, to compare with the incumbent.
+
+        `about` = (middle, half width) is the range of cos q2 outside of which the bound is inf.
+        """
         f, (slack4, _) = self._index(target), self._slack()
         slack = ROOTS.root_tolerance * (ca.fabs(f.a1) + ca.fabs(f.b1) + 2 * (ca.fabs(f.a2) + ca.fabs(f.b2)))
 
@@ -370,9 +387,9 @@ class Search:
         return rough
 
     def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
-        """Return the Function (target, previous, rough, best) -> best that polishes and compares `count` rough rolls.
+        """Return the Function that polishes `count` approximate rolls and compares them with the incumbent.
 
-        Points whose bound is not below the cost of the incumbent are skipped.
+        (target, previous, rough, best) -> best. Rolls whose bound is not below the cost of the incumbent are skipped.
         """
         target, previous = _inputs(ca.SX)
         rough, first = ca.SX.sym("rough", len(RoughRoll._fields)), ca.SX.sym("best", INCUMBENT_SIZE)
@@ -390,7 +407,7 @@ class Search:
         return ca.Function("gates", [target, previous, rough, first], [column])
 
     def _stationary(self, target: Expression, rough: RoughRoll) -> Point:
-        """Return the stationary point of the index I1 near a rough roll, by Newton's method."""
+        """Return the stationary point of the index I1 near an approximate roll, by Newton's method."""
         slope = self._index(target).derivative()
         bend = slope.derivative()
         return polish((rough.c, rough.s), lambda c, s: (slope.value(c, s), bend.value(c, s)))
@@ -398,7 +415,7 @@ class Search:
     def _compare(
         self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Incumbent
     ) -> tuple[Incumbent, list[Evaluation], Expression]:
-        """Compare rolls with the incumbent; return the best of all, the evaluations, and the least cost of rolls."""
+        """Return the best of the incumbent and given rolls, the Evaluation of each roll, and the rolls' least cost."""
         f = self._index(target)
         cost, c, s, code, below, above = best
         least, evaluations = ca.SX(ca.inf), []
@@ -429,20 +446,20 @@ class Search:
     # ---- answers ---------------------------------------------------------------------------------------------
 
     def _finish(self) -> Any:
-        """Return the Function (target, previous, best) -> answer that computes joints and status of the incumbent."""
+        """Return the Function (target, previous, best) -> answer that computes the joint positions of the incumbent."""
         target, previous = _inputs(ca.SX)
         best = ca.SX.sym("best", INCUMBENT_SIZE)
         answer = self._solution(target, previous, _record(Incumbent, best), 0)
         return ca.Function("finish", [target, previous, best], ca.cse([answer]))
 
     def _infeasible(self) -> Any:
-        """Return the Function (target) -> answer for an infeasible target: no joints, and a status with the reason."""
+        """Return the Function (target) -> answer for an infeasible target: joint positions nan, and a status."""
         target = ca.SX.sym("target", 5)
         result = RigSolution(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))
 
     def _solution(self, target: Expression, previous: Expression, best: Incumbent, status: Expression) -> Expression:
-        """Return the RigSolution of the best roll so far as a column. Shape (9, 1)."""
+        """Return the RigSolution of an incumbent as a column. Shape (9, 1)."""
         roll = unwrap_roll(self.rig, best.c, best.s, previous)
         joints = joints_of(self.rig, target, roll, self._configuration(target, best.c, best.s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)
@@ -456,7 +473,7 @@ def _is_finite(target: Expression, previous: Expression) -> Expression:
 
 
 def evaluate_unless(alternative: Any, shape: tuple[int, int] = (INCUMBENT_SIZE, 1)) -> Any:
-    """Return the Function (settled, known, arguments) -> `known` if `settled` is true, else alternative(arguments).
+    """Return a Function (settled, known, *arguments) -> `known` if `settled` is true, else alternative(*arguments).
 
     The alternative is only evaluated if needed. casadi.if_else would also evaluate what its arguments depend on.
     """

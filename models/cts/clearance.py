@@ -42,7 +42,7 @@ class LinkCapsule(NamedTuple):
 
 
 def _finite_axes(point: Expression, box: Box) -> Expression:
-    """Return the coordinates of a world point along the finite axes of a box."""
+    """Return the coordinates of a point (in world) in a box's frame, along the axes in which the box is finite."""
     inside = ca.mtimes(ca.DM(box.rotation).T, expression(point) - ca.DM(box.position))
     return ca.vertcat(*[inside[k] for k in range(3) if np.isfinite(box.size[k])])
 
@@ -53,7 +53,7 @@ def _half_size(box: Box) -> Expression:
 
 
 def box_distance(point: Expression, box: Box) -> Expression:
-    """Return the signed distance of a point to a box, as a convex function. Shape (1, 1), m."""
+    """Return the signed distance of a point to a box, a convex function of the point. Shape (1, 1), m."""
     over = ca.fabs(_finite_axes(point, box)) - _half_size(box)
     outside = ca.fmax(over, 0)
     deepest = reduce(ca.fmax, ca.vertsplit(over))
@@ -61,7 +61,7 @@ def box_distance(point: Expression, box: Box) -> Expression:
 
 
 def capsule_to_box(capsule: LinkCapsule | Capsule, box: Box) -> Expression:
-    """Return the distance of a capsule to a solid box. Shape (1, 1), m.
+    """Return the signed distance between a capsule and a solid box. Shape (1, 1), m.
 
     The distance to a box is convex along the segment. A golden-section search of fixed length finds the closest point
     to 1e-8 of the segment. Its position is constant to differentiation, by the envelope theorem.
@@ -95,9 +95,10 @@ def capsule_in_box(capsule: LinkCapsule | Capsule, walls: Box) -> Expression:
 
 
 def capsule_to_capsule(first: LinkCapsule | Capsule, second: LinkCapsule | Capsule) -> Expression:
-    """Return the distance of two capsules; if their axes cross, minus the sum of the radii. Shape (1, 1), m.
+    """Return the signed distance between two capsules, m. Shape (1, 1).
 
-    Closest points of two segments in closed form (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
+    If their axes cross, the distance is minus the sum of the radii. Closest points of two segments in closed form
+    (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
     """
     p, q = expression(first.start), expression(second.start)
     u, v = expression(first.end) - p, expression(second.end) - q
@@ -113,7 +114,7 @@ def capsule_to_capsule(first: LinkCapsule | Capsule, second: LinkCapsule | Capsu
 
 
 def _length(vector: Expression) -> Expression:
-    """Return the Euclidean norm, smoothed at zero."""
+    """Return the Euclidean norm of a vector, smoothed at zero."""
     return ca.sqrt(ca.dot(vector, vector) + KINK**2) - KINK
 
 
@@ -126,10 +127,11 @@ class ClearanceSearch:
     """Settings of the search for a collision-free roll.
 
     Attributes:
-        samples: Number of rolls of the grid.
+        samples: Number of rolls in the grid.
         softness: Width of the smooth minimum of all distances, m; see `soft_minimum`.
-        minima: Number of local minima of the grid that are refined.
-        steps, shrink: Number of steps of the pattern search, and ratio of their sizes: 0.62^44 = 7e-10 of the grid's.
+        minima: Number of local minima on the grid that are refined.
+        steps, shrink: Number of steps of the pattern search, and ratio of successive step sizes: 0.62^44 = 7e-10
+            of the grid's.
         penalty: Penalty on missing clearance in the merit function, 1/m.
         inset: Distance beyond the least clearance that the search aims for, m.
         active_tolerance: Distance from the least clearance below which the constraint counts as active, m.
@@ -183,7 +185,7 @@ class CollisionScene:
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
-    """Return the links of the rig as capsules, by name, from that of joint 2 to the store."""
+    """Return the capsules of the rig's links, from yaw link 1 to the sting, keyed by the name of the link."""
     require.instance("rig: rig", rig, Rig)
     radii = Radii() if radii is None else require.instance("rig: radii", radii, Radii)
     frames = dh_frames(rig, checked_vector("q", q, 6, "one entry for each joint of the rig"))
@@ -204,7 +206,7 @@ def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[st
 def clearances(
     rig: Rig, q: Expression, scene: CollisionScene, radii: Radii | None = None
 ) -> dict[tuple[str, str], Expression]:
-    """Return the distance of every link to every obstacle, by (link, obstacle). Each of shape (1, 1), m.
+    """Return the distance of every link to every obstacle, keyed by (link, obstacle). Each of shape (1, 1), m.
 
     Raises:
         ModelError: The scene is empty.
@@ -225,7 +227,7 @@ def clearances(
 
 
 def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
-    """Return the term weight exp(-gap / width) of the index, which grows as the gap closes; gap and width in m.
+    """Return a cost term, weight exp(-gap / width), that grows as the gap to the scene closes; gap and width in m.
 
     Raises:
         ModelError: The weight is negative or not finite, or the width is not positive.
@@ -236,7 +238,7 @@ def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
 
 
 def checked_clearance(clearance: float) -> float:
-    """Return `clearance`, m; raise a ModelError unless it is a finite distance, or -inf for no clearance."""
+    """Return `clearance`, m; raise a ModelError unless it is a finite distance, or -inf for no constraint."""
     if require.number("rig: clearance", clearance, finite=False) == np.inf:
         message = f"clearance {clearance} m must be a finite distance or -inf for none"
         raise ModelError(message, name="clearance", value=clearance)
@@ -250,7 +252,7 @@ class Avoidance:
     Attributes:
         scene: Obstacles.
         clearance: Least distance of the rig from the scene, m; -inf for no constraint.
-        weight, width: Of the term weight exp(-gap / width) of the index; width in m.
+        weight, width: Weight and width (m) of the term weight exp(-gap / width) of the index.
         radii: Radii of the rig's capsules; the default ones if None.
 
     Raises:
@@ -275,16 +277,18 @@ class Avoidance:
 def collision_free_inverse(
     rig: Rig, tunnel: Tunnel, avoidance: Avoidance, branch: Branch = HOME, *, rate_weight: float = 0.0
 ) -> Any:
-    """Return `optimal_inverse` among obstacles: the Function (target, previous) -> (joints, cost, active, status, gap).
+    """Return the casadi Function that computes the joint positions for a target at the best collision-free roll.
+
+    (target, previous) -> (joints, cost, active, status, gap).
 
     Args:
         avoidance: Obstacles, clearance and proximity term.
         rate_weight: w4 of I2; 0 for I1.
 
     Returns:
-        A casadi Function with the outputs of `optimal_inverse` and the smooth least distance, m. `active` is
-        "clearance" if this constraint is active, else that of the closed form if its roll is best, else "free". The
-        status "clearance" means that a roll reaches the target within limits, but none without collision.
+        A casadi Function with the outputs of `optimal_inverse` and the smooth least distance, m. `active` is the code
+        of "clearance" if this constraint is active, else that of the closed form if its roll is best, else that of
+        "free". The status "clearance" means that a roll reaches the target within limits, but none without collision.
 
     Raises:
         ModelError: The rate weight is out of range, or the scene is empty.
@@ -335,7 +339,10 @@ def collision_free_inverse(
 
 
 def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the function (grid merits) -> (angle, merit, step) of each of the lowest minima."""
+    """Return inputs and outputs of the Function that selects the lowest local minima of the merit on the grid of rolls.
+
+    (merits) -> columns (angle, merit, step), one for each minimum.
+    """
     merits = ca.SX.sym("merits", 1, samples)
     angles = np.linspace(-np.pi, np.pi, samples, endpoint=False)
     remaining = []
@@ -353,7 +360,10 @@ def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
 
 
 def _least_value(count: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the function (angles, values) -> (best angle, minimum, whether it is the first)."""
+    """Return inputs and outputs of the Function that selects the angle of the least value from a row of angles.
+
+    (angles, values) -> (best angle, least value, whether it is the first).
+    """
     angles, values = ca.SX.sym("angles", 1, count), ca.SX.sym("values", 1, count)
     best, least, is_first = angles[0], values[0], ca.SX(1)
     for k in range(1, count):
@@ -364,9 +374,9 @@ def _least_value(count: int) -> tuple[list[Any], list[Any]]:
 
 
 def _pattern_search(merit: Any) -> Any:
-    """Return the Function (states, inputs) -> states that improves each state (angle, merit, step) by a pattern search.
+    """Return the Function that reduces the merit function from several rolls, each by a pattern search.
 
-    Inputs are target and previous roll.
+    (states, inputs) -> states. A state is (angle, merit, step); the inputs are target and previous roll.
     """
     state, inputs = ca.MX.sym("state", 3), ca.MX.sym("inputs", 6)
     angle, least, step = ca.vertsplit(state)

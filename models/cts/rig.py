@@ -1,8 +1,8 @@
 """Kinematics of a captive trajectory rig: six joints P-R-R-R-R-R that hold a store model on a goose-neck sting.
 
 Source: Lee, Lee 2017. Equation numbers are the paper's; misprints are corrected by comparison with the D-H product.
-Joints 2 and 3 produce yaw, 4 and 5 pitch, and 6 alone roll. The task does not specify the roll, which is a functional
-redundancy: it moves the corner P_G of the goose-neck without changing the task.
+Joints 2 and 3 produce yaw, 4 and 5 pitch, and 6 alone roll. The task does not specify the roll, the rotation about the
+tool axis. It is a functional redundancy: it moves the corner P_G of the goose-neck without changing the task.
 
 World is the rig's base frame: x along the prismatic joint towards the nose of the store, z up. A *target* is
 (x, y, z, yaw, pitch) of the tool frame in world, shape (5,), m and rad; a *pose* is a target and its roll, shape (6,).
@@ -77,7 +77,7 @@ class Rig:
         return float((self.upper if upper else self.lower)[joint - 1])
 
     def middle_and_half(self, joint: int) -> tuple[float, float]:
-        """Return middle and half width of the range of a joint with limits."""
+        """Return the mid-range position and half the range of a joint, 1 to 6, that has both limits, m or rad."""
         low, high = self.limit(joint, False), self.limit(joint, True)
         return (low + high) / 2, (high - low) / 2
 
@@ -88,10 +88,10 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Tunnel:
-    """Reference of the index I1, which measures how far the goose-neck's corner is from the tunnel's centre, (35).
+    """Data of the index I1, the weighted squared distance of the goose-neck's corner from the tunnel's centre.
 
     Attributes:
-        center: P_C in world. Shape (3,), m.
+        center: P_C of equation (35) in world. Shape (3,), m.
         ranges: P_M - P_m, the useful extent along x, y, z. Shape (3,), m.
         weights: w1, w2, w3. Shape (3,).
 
@@ -110,16 +110,16 @@ class Tunnel:
 
     @property
     def scale(self) -> Array:
-        """Diagonal of the weight matrix D, w / range^2. Shape (3,), 1/m^2."""
+        """Diagonal of the weight matrix D of the index I1: weights / ranges^2. Shape (3,), 1/m^2."""
         return np.asarray(self.weights / self.ranges**2)
 
 
 class Branch(NamedTuple):
-    """One of the four branches of inverse kinematics.
+    """One of the four branches of the rig's inverse kinematics, given by two signs.
 
     Attributes:
-        yaw: Sign of sin q2: +1 for q2 = +acos(.) in (25), -1 for -acos(.), the side of the home position.
-        pitch: Sign of cos q4: +1 for the principal asin in (23), -1 for pi minus it.
+        yaw: Sign of sin q2: +1 for q2 = +acos(.) in equation (25), -1 for -acos(.), the side of the home position.
+        pitch: Sign of cos q4: +1 for the principal asin in equation (23), -1 for pi minus it.
     """
 
     yaw: int = -1
@@ -131,16 +131,16 @@ HOME = BRANCHES[0]
 
 
 def checked_branch(branch: Branch) -> Branch:
-    """Return the branch itself; raise a ModelError unless it is one of the four."""
+    """Return the branch; raise a ModelError unless it is one of the four in BRANCHES."""
     return Branch(*require.choice("rig: branch", branch, BRANCHES))
 
 
 class RigConfiguration(NamedTuple):
-    """Joint angles of the rig for a target, a roll and a branch, with intermediate scalar expressions.
+    """Positions of joints 1, 2 and 4 and of the goose-neck's corner for a target, a roll and a branch.
 
     Attributes:
-        corner: P_G in world. Shape (3, 1), m.
-        sin4, cos4, sin2, cos2: Sines and cosines of the joint angles. Out of reach sin4 or cos2 leaves [-1, 1] and its
+        corner: P_G, the goose-neck's corner, in world. Shape (3, 1), m.
+        sin4, cos4, sin2, cos2: Sines and cosines of joints 4 and 2. Out of reach sin4 or cos2 leaves [-1, 1] and its
             partner is nearly 0.
         q1: Position of the prismatic joint, m.
     """
@@ -157,7 +157,9 @@ class RigConfiguration(NamedTuple):
 
 
 def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
-    """Return frames 0 to 6 and the tool frame in world as Denavit-Hartenberg products (1)-(4), without joint offsets.
+    """Return the link frames 0 to 6 and the tool frame in world as products of Denavit-Hartenberg transformations.
+
+    Equations (1) to (4) of the paper, without joint offsets.
 
     Args:
         q: Joint positions. Shape (6, 1).
@@ -182,9 +184,9 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
 
 
 def forward(rig: Rig, q: Expression) -> Expression:
-    """Return the tool pose (x, y, z, yaw, pitch, roll) in world, (16)-(22). Shape (6, 1), m and rad.
+    """Return the pose (x, y, z, yaw, pitch, roll) of the tool frame in world. Shape (6, 1), m and rad.
 
-    Yaw and pitch are the sums of the joint angles, not reduced to one turn.
+    Equations (16) to (22) of the paper. Yaw and pitch are the sums of the joint angles, not reduced to one turn.
     """
     q = expression(q)
     (c23, s23), (c45, s45), (c6, s6) = ((ca.cos(x), ca.sin(x)) for x in (q[1] + q[2], q[3] + q[4], q[5]))
@@ -201,7 +203,7 @@ def forward(rig: Rig, q: Expression) -> Expression:
 
 
 def task_jacobian(rig: Rig, q: Expression) -> Expression:
-    """Return the Jacobian of the target (x, y, z, yaw, pitch) by the joints, Table 3. Shape (5, 6)."""
+    """Return the Jacobian (5, 6) of (x, y, z, yaw, pitch) with respect to the joint positions; Table 3 of the paper."""
     joints = ca.SX.sym("q", 6)
     jacobian = ca.Function("task_jacobian", [joints], [ca.jacobian(forward(rig, joints)[:5], joints)])
     return jacobian(q)
@@ -211,19 +213,19 @@ def task_jacobian(rig: Rig, q: Expression) -> Expression:
 
 
 def goose_neck_corner(rig: Rig, target: Expression, roll: Expression) -> Expression:
-    """Return the goose-neck's corner for a target pose and a roll, (32)-(34), in world. Shape (3, 1), m."""
+    """Return the goose-neck's corner in world (3, 1), m, for a target and roll; equations (32) to (34) of the paper."""
     roll = expression(roll)
     return corner_of_roll(rig, expression(target), ca.cos(roll), ca.sin(roll))
 
 
 def corner_of_roll(rig: Rig, target: Expression, c: Expression, s: Expression) -> Expression:
-    """Return the position of the goose-neck's corner for a roll given by cosine and sine. Shape (3, 1), m."""
+    """Return the position of the goose-neck's corner in world for a roll given by cosine and sine. Shape (3, 1), m."""
     axle, cosine_part, sine_part = corner_circle(rig, target)
     return axle + rig.goose_neck * (c * cosine_part + s * sine_part)
 
 
 def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression, Expression]:
-    """Return the circle on which roll moves the goose-neck's corner: centre (m), cosine and sine axis. Shape (3, 1)."""
+    """Return the circle of the goose-neck's corner over all rolls: centre (m), cosine and sine axis. (3, 1) each."""
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     c_pitch, s_pitch = ca.cos(target[4]), ca.sin(target[4])
     axle = target[:3] - rig.sting * ca.vertcat(c_yaw * c_pitch, s_yaw * c_pitch, -s_pitch)
@@ -232,7 +234,7 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
 
 
 def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression, *, branch: Branch) -> RigConfiguration:
-    """Return the configuration of the rig for a roll given by its cosine and sine, (23), (25), (27)."""
+    """Return the rig's configuration for a roll given by cosine and sine. Equations (23), (25), (27) of the paper."""
     corner = corner_of_roll(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     sin4 = -corner[2] / rig.pitch_link
@@ -245,7 +247,9 @@ def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression,
 
 
 def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOME) -> tuple[Expression, Expression]:
-    """Return the joints that reach a target with a given roll, (23)-(27).
+    """Return the joint positions that reach a target with a given roll, and the margins of reach.
+
+    Equations (23) to (27) of the paper.
 
     Args:
         target: (x, y, z, yaw, pitch) in world. Shape (5, 1), m and rad.
@@ -253,8 +257,8 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
         branch: One of the four branches.
 
     Returns:
-        The joints, shape (6, 1), and the reach margins, shape (2, 1): 1 - |sin q4| and 1 - |cos q2|. If a margin is
-        negative the pose is out of reach, and the joints, though finite, do not attain it. q2 and q4 lie in (-pi, pi];
+        Joint positions, shape (6, 1), and reach margins, shape (2, 1): 1 - |sin q4| and 1 - |cos q2|. If a margin is
+        negative the pose is out of reach, and the finite positions do not attain it. q2 and q4 lie in (-pi, pi];
         q3, q5 complete the target's yaw and pitch, unless the limits require another turn.
     """
     target, roll = expression(target), expression(roll)
@@ -264,7 +268,7 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
 
 
 def joints_of(rig: Rig, target: Expression, roll: Expression, configuration: RigConfiguration) -> Expression:
-    """Return the joint positions of a configuration, each in the turn nearest to its mid-range. Shape (6, 1)."""
+    """Return the joint positions of a configuration, each angle in the full turn nearest to mid-range. (6, 1)."""
     q2 = ca.atan2(configuration.sin2, configuration.cos2)
     q4 = ca.atan2(configuration.sin4, configuration.cos4)
     angles = [q2, target[3] - q2 - np.pi / 2, q4, target[4] - q4 + np.pi / 2]

@@ -1,11 +1,13 @@
-"""Feasible rolls of the rig for a target, and the indices I1 and I2 that rank them.
+"""Feasible rolls of the rig for a target, and the indices I1 and I2 by which they are compared.
 
-A roll is represented as a point (cosine, sine) of the unit circle. The feasible rolls, within reach of both links and
-within the joint limits, form a set of arcs. Every end of an arc is a root of a trigonometric polynomial of degree 1
-(joints 4 and 5 and the reach of the pitch link), 2 (joints 2 and 3 and the reach of the yaw link) or 4 (joint 1).
+The roll is the rotation of the store about the tool axis, which the task leaves free. At a given target, that is
+position, yaw and pitch, it determines the positions of all joints up to the branch. It is represented as a point
+(cosine, sine) of the unit circle. The feasible rolls, within reach of both links and within the joint limits, form a
+set of arcs. Every end of an arc is a root of a trigonometric polynomial of degree 1 (joints 4 and 5 and the reach of
+the pitch link), 2 (joints 2 and 3 and the reach of the yaw link) or 4 (joint 1).
 
-The index I2 = I1 + w4 / (2 pi) (roll - previous)^2, (37), also depends on the turn of a roll. Its minima are found by
-Newton's method on intervals of convexity, which at most four roots of I1'' + const delimit.
+The index I2 = I1 + w4 / (2 pi) (roll - previous)^2, equation (37) of Lee, Lee 2017, also depends on the turn of a roll.
+Its minima are found by Newton's method on intervals of convexity, which at most four roots of I1'' + const delimit.
 """
 
 from __future__ import annotations
@@ -45,24 +47,27 @@ from models.spatial import FULL_TURN, Expression
 
 LIMIT_NAMES = tuple(f"joint {joint} {side}" for joint in range(1, 7) for side in ("lower", "upper"))
 ACTIVE = ("free", "pitch reach", "yaw reach", *LIMIT_NAMES, "clearance")
-"""Names of the constraints that a roll may lie on, by code."""
+"""Names of the constraints that may be active at a roll, in the order of their codes."""
 
 STATUS = ("ok", "not a number", "pitch link out of reach", "yaw link out of reach", "joint limits", "clearance")
-"""Reasons why a target has no feasible roll, by code."""
+"""Status of a target, in the order of the codes: "ok", or the reason why it has no feasible roll."""
 
 ANGLE_INSET = 1e-10
 REACH_INSET = 1e-13
-"""Distances inside a limit at which arc ends are placed, so that the strict check of the limits accepts them."""
+"""Distances inside a limit at which ends of roll intervals are placed, so that the strict check accepts them.
+
+The first is in rad or m, the second applies to a sine or cosine.
+"""
 
 SQUARED_POLISH_STEP = 1e-5
 SINE_ROUNDING = 2e-15
-"""Rounding error of sin q4 and of what depends on it."""
+"""Bound of the rounding error of sin q4."""
 COSINE_SLACK = 1e-7
-"""Slack of a cosine in tests of whether an arc end can matter."""
+"""Tolerance of a cosine in the check of joint limits at a possible end of a roll interval."""
 
 
 class Candidate(NamedTuple):
-    """A candidate for the best roll: its cosine and sine, and the code of the constraint that it lies on."""
+    """A candidate for the best roll: cosine, sine, and the code in ACTIVE of the constraint that is active there."""
 
     c: Expression
     s: Expression
@@ -70,7 +75,7 @@ class Candidate(NamedTuple):
 
 
 class ConstraintCheck(NamedTuple):
-    """Constraints that a roll satisfies, as boolean expressions."""
+    """Boolean expressions that say which reach and joint limits a roll satisfies."""
 
     pitch: Expression
     yaw: Expression
@@ -102,8 +107,8 @@ class ArcEndLevel(NamedTuple):
     Attributes:
         cosine: The value.
         code: Code of the constraint, in ACTIVE.
-        above: Whether the constraint holds above the value, not below.
-        relevant: Whether joints 2 and 3 are within their limits at the value, in the branch at hand.
+        above: Whether the constraint is satisfied above the value, not below.
+        relevant: Whether joints 2 and 3 are within their limits at the value, in the given branch.
     """
 
     cosine: Expression
@@ -113,12 +118,12 @@ class ArcEndLevel(NamedTuple):
 
 
 def limit_code(joint: int, upper: bool) -> int:
-    """Return the code of a joint limit, for joint 1 to 6, as in the table ACTIVE."""
+    """Return the index in ACTIVE, the names of the constraints, of the lower or upper limit of a joint, 1 to 6."""
     return 3 + 2 * (joint - 1) + int(upper)
 
 
 def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
-    """Return the index I1 of (36) as a trigonometric polynomial of the roll, which has only two harmonics."""
+    """Return the index I1, equation (36) of the paper, as a trigonometric polynomial of the roll with two harmonics."""
     axle, e_c, e_s = corner_circle(rig, target)
     offset = axle - ca.DM(tunnel.center)
     weight = ca.DM(tunnel.scale)
@@ -137,7 +142,7 @@ def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
 def check_constraints(
     rig: Rig, target: Expression, configuration: RigConfiguration, *, c: Expression, s: Expression
 ) -> ConstraintCheck:
-    """Return the constraints that a configuration satisfies; angles are compared by their cosine from mid-range."""
+    """Return which constraints a configuration satisfies; an angle is compared by its cosine relative to mid-range."""
     p = configuration
     pair3 = _difference(ca.sin(target[3]), -ca.cos(target[3]), p.sin2, p.cos2)  # yaw - pi/2 - q2
     pair5 = _difference(-ca.sin(target[4]), ca.cos(target[4]), p.sin4, p.cos4)  # pitch + pi/2 - q4
@@ -153,7 +158,7 @@ def check_constraints(
 
 
 def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expression:
-    """Return the status code of a target without a feasible roll: a link is out of reach, or joint limits."""
+    """Return the code in STATUS of the reason why a target has no feasible roll: reach of a link or joint limits."""
     rig = rig.unlimited()
     axle, e_c, _ = corner_circle(rig, target)
     pitch = ca.fabs(axle[2]) - rig.goose_neck * ca.fabs(e_c[2]) <= rig.pitch_link
@@ -167,7 +172,7 @@ def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expressi
 
 
 def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return points that include all ends of the intervals of feasible rolls, except those due to limits of joint 1."""
+    """Return rolls that include all ends of the intervals of feasible rolls, except those at limits of joint 1."""
     ends = closed_form_ends(rig, target, branch)
     chart = yaw_chart(rig, branch)
     for level in yaw_levels(rig, target, branch):
@@ -182,7 +187,10 @@ def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
 
 
 def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return ends of feasible roll intervals in closed form: limits of joints 4 to 6, reach of the pitch link."""
+    """Return the possible ends of feasible roll intervals that have a closed form.
+
+    They are due to the limits of joints 4 to 6 and to the reach of the pitch link.
+    """
     axle, e_c, _ = corner_circle(rig, target)
     ends = []
     for sine, code in _pitch_sines(rig, target, branch):
@@ -198,12 +206,15 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
 
 
 def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel]:
-    """Return values of cos q2 at ends of feasible roll intervals: limits of joints 2 and 3, reach of the yaw link."""
+    """Return the values of cos q2 at which an interval of feasible rolls may end.
+
+    They are due to the limits of joints 2 and 3 and to the reach of the yaw link.
+    """
     levels = []
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
     def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Add a value of q2 at a possible end of a roll interval, valid only if joint 3 is within its limits there."""
+        """Append a value of cos q2 to `levels`; it is relevant only if joint 3 is within its limits there."""
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
@@ -227,10 +238,10 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
 
 
 def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
-    """Return four approximate solutions, as (cos, sin) of the roll, of the equation cos q2 = `cosine`.
+    """Return four approximate rolls, as (cos, sin), that give joint 2 a prescribed cosine at a fixed target.
 
-    They are roots of the squared equation. It is smooth near a stretched pitch link, where cos q2 is not; near yaw 0 it
-    has nearly double roots, where cos q2 has simple ones.
+    They are roots of the squared equation cos q2 = `cosine`. It is smooth near a stretched pitch link, where cos q2 is
+    not; near yaw 0 it has nearly double roots, where cos q2 has simple ones.
     """
     axle, e_c, e_s = corner_circle(rig, target)
     lg, lp = rig.goose_neck, rig.pitch_link
@@ -270,7 +281,7 @@ def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
 
 
 def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = COSINE_SLACK) -> Expression:
-    """Return whether an angle, given by sine and cosine, is within a joint's limits, with a tolerance of the cosine."""
+    """Return whether an angle, given by sine and cosine, is within a joint's limits, to a tolerance of the cosine."""
     if not rig.limited(joint):
         return 1
     middle, half = rig.middle_and_half(joint)
@@ -286,7 +297,11 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return the Function (target, cosine, sine of roll) -> cos q2, its derivative, q1, its derivative, cos q4."""
+    """Return a casadi Function that evaluates cos q2, q1 and cos q4 at a roll, with derivatives for root finding.
+
+    (target, cosine, sine of the roll) -> (cos q2, its derivative, q1, its derivative, cos q4), with derivatives with
+    respect to the roll. Other functions take it as their argument `chart`.
+    """
     t, c, s = ca.SX.sym("target", 5), ca.SX.sym("c"), ca.SX.sym("s")
     configuration = configuration_at(rig, t, c, s, branch=branch)
     values = ca.vertcat(configuration.cos2, configuration.q1)
@@ -295,15 +310,15 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 
 def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Solve cos q2 = value (output 0 of the chart) or q1 = value (output 2) for the roll by Newton steps."""
+    """Return the roll at which cos q2 (`output` 0) or q1 (`output` 2) has a given value, by Newton steps."""
     return polish(point, chart_residual(chart, target, output, value))
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Solve cos q2 = value for the roll by Newton steps, and stay on the feasible side of it despite rounding.
+    """Return the roll at which cos q2 has a given value, kept on its feasible side despite rounding errors.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
-    holds above the value, -1 if below.
+    is satisfied above the value, -1 if below.
     """
     c, s = polish_to_value(chart, target, 0, value=value, point=point)
     cos4 = ca.fabs(chart(target, c, s)[4])
@@ -312,9 +327,9 @@ def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expressi
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return a chart output minus a value as a function of cosine and sine of the roll, for `polish` to solve.
+    """Return the function of the roll whose root `polish` finds: cos q2 or q1 minus a given value, and its derivative.
 
-    The output is 0 or 2; the function also returns its derivative by the roll.
+    `output` is 0 for cos q2 and 2 for q1. The function takes cosine and sine of the roll.
     """
 
     def function(c: Expression, s: Expression) -> Point:
@@ -325,7 +340,7 @@ def chart_residual(chart: Any, target: Expression, output: int, value: Expressio
 
 
 def _difference(cos_a: Expression, sin_a: Expression, sin_b: Expression, cos_b: Expression) -> Point:
-    """Return cosine and sine of the difference of two angles, given by cosines and sines."""
+    """Return cosine and sine of the difference a - b of two angles that are given by their cosines and sines."""
     return cos_a * cos_b + sin_a * sin_b, sin_a * cos_b - cos_a * sin_b
 
 
@@ -334,7 +349,7 @@ def _not_zero(x: Expression) -> Expression:
 
 
 def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
-    """Return the Function (target) -> rolls that include all ends of feasible intervals due to one limit of joint 1.
+    """Return a casadi Function (target) -> rolls that include all ends of feasible intervals at one limit of joint 1.
 
     Output shape (2, 8): rows cosine and sine of the roll.
     """
@@ -348,7 +363,7 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
 
 
 def slide_points(rig: Rig, upper: bool) -> Any:
-    """Return the Function (target) -> approximate rolls at one limit of joint 1. Output shape (2, 8)."""
+    """Return a casadi Function (target) -> approximate rolls at which joint 1 is at a limit. Output shape (2, 8)."""
     limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
@@ -374,12 +389,16 @@ def slide_points(rig: Rig, upper: bool) -> Any:
 
 
 def checked_gain(rate_weight: float) -> float:
-    """Return the roll rate's weight divided by 2 pi; raise ModelError if it is negative or not finite."""
+    """Return w4 / (2 pi), the factor of the squared change of roll in the index I2, equation (37) of the paper.
+
+    Raises:
+        ModelError: The weight w4, `rate_weight`, is negative or not finite.
+    """
     return require.nonnegative("rig: rate_weight", rate_weight) / FULL_TURN
 
 
 def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:
-    """Return the angle of a roll given by cosine and sine, in the turn of the previous roll or of the limits."""
+    """Return the angle of a roll given by cosine and sine: within joint 6's limits and nearest to `previous`."""
     angle = ca.atan2(s, c)
     if rig.limited(6):
         return nearest_turn(angle, rig.middle_and_half(6)[0])
@@ -387,7 +406,7 @@ def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) ->
 
 
 def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]:
-    """Return the interval of rolls within limits that are nearest to the previous roll, at most one turn long."""
+    """Return the interval of rolls within joint 6's limits, at most a turn long, that is nearest to a previous roll."""
     start, low, high = previous - np.pi, rig.limit(6, False), rig.limit(6, True)
     if not np.isfinite(low):
         return start, start + FULL_TURN
@@ -396,10 +415,10 @@ def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]
 
 
 def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
-    """Return the Function (target, previous) -> rolls that include all minima of I1 + gain change^2. Shape (5, 1), rad.
+    """Return a casadi Function (target, previous roll) -> rolls that include all minima of the index I2.
 
-    If I2 is convex there is one minimum. Otherwise the window of rolls is split where I1'' = -2 gain, and each convex
-    interval has its own minimum.
+    I2 = I1 + gain (roll - previous)^2. Output shape (5, 1), rad. If I2 is convex there is one minimum. Otherwise the
+    window of rolls is split where I1'' = -2 gain, and each convex interval has its own minimum.
     """
     target, previous = ca.SX.sym("target", 5), ca.SX.sym("previous")
     f = index_harmonics(rig, tunnel, target)
@@ -420,7 +439,7 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
 def minimize_convex(
     f: Harmonics, gain: float, previous: Expression, bracket: Point, *, start: Expression, steps: int
 ) -> Expression:
-    """Return the minimum of I2 on an interval of convexity, by Newton steps within a shrinking bracket."""
+    """Return the roll of least index I2 in an interval where I2 is convex, by Newton steps in a shrinking bracket."""
     a, b = bracket
     slope, bend = f.derivative(), f.derivative().derivative()
     x = start
@@ -435,14 +454,14 @@ def minimize_convex(
 
 
 def _inflections(f: Harmonics, gain: float, start: Expression, end: Expression) -> list[Expression]:
-    """Return the rolls of the window at which I2 changes between convex and concave, that is I1'' = -2 gain."""
+    """Return the rolls in [start, end] at which the index I2 changes between convex and concave: I1'' = -2 gain."""
     bend = f.derivative().derivative()
     points = roots(bend._replace(a0=2 * gain))
     return [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in points]
 
 
 def _sort_four(values: list[Expression]) -> list[Expression]:
-    """Return four expressions in increasing order, by a network of five exchanges."""
+    """Return four expressions in increasing order, by a sorting network of five compare-and-swap steps."""
     v = list(values)
     for i, k in ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2)):
         v[i], v[k] = ca.fmin(v[i], v[k]), ca.fmax(v[i], v[k])

@@ -1,4 +1,4 @@
-"""Batch inverse kinematics of the rig, its feasible rolls, and export of its functions as C.
+"""Inverse kinematics of the rig for tables of targets, intervals of feasible rolls, and export to C.
 
 `solve_table` converts a table of targets to a table of joints; rows without a solution have the reason as their status.
 `rig_functions` and `export` serve controllers without Python. The generated C needs only the mathematics library. It is
@@ -39,15 +39,15 @@ from models.spatial import FULL_TURN
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Joints for a table of targets.
+    """Inverse kinematics solutions of the rig for a table of targets.
 
     Attributes:
-        targets: Shape (samples, 5), m and rad.
-        joints: Shape (samples, 6), m and rad; nan in rows that are not ok.
-        cost: Index of the roll, nan in rows that are not ok. Shape (samples,).
-        status: "ok" or the reason why there are no joints, for each row; one of roll.STATUS.
-        active: Active constraint of each row, one of roll.ACTIVE; "free" if there is none, "" in rows that are not ok.
-        branch: Branch of each row, None in rows that are not ok.
+        targets: (x, y, z, yaw, pitch) in world. Shape (samples, 5), m and rad.
+        joints: Joint positions. Shape (samples, 6), m and rad; nan for targets without a solution.
+        cost: Value of the index at the roll, nan for targets without a solution. Shape (samples,).
+        status: "ok" or the reason why there is no solution, for each target; one of roll.STATUS.
+        active: Active constraint of each target, one of roll.ACTIVE; "free" if there is none, "" without a solution.
+        branch: Branch of inverse kinematics of each target, None without a solution.
     """
 
     targets: Array
@@ -74,14 +74,14 @@ def solve_table(
     rate_weight: float = 0.0,
     avoidance: Avoidance | None = None,
 ) -> Table:
-    """Return the joints with the least index for every target; targets without a solution do not affect others.
+    """Return the joint positions of least index for every target; a target without a solution affects no other.
 
     Args:
         targets: Shape (samples, 5), m and rad; rows may hold nan.
-        branches: Branches to choose from; the one of least index is taken, the first of equals.
+        branches: Branches of inverse kinematics to choose from; of equal indices the first branch is taken.
         previous: Roll before each target, rad, shape (samples,) or one for all; with in_sequence, before the first.
-        in_sequence: Whether each row's roll is the previous one of the next, as in a motion; rows without a solution
-            are skipped.
+        in_sequence: Whether the roll of each row is the previous roll of the next, as in a motion; rows without a
+            solution are skipped.
         rate_weight: w4 of I2; 0 for I1.
         avoidance: Obstacles to avoid, as in `collision_free_inverse`; None for none.
 
@@ -122,7 +122,7 @@ def solve_table(
 
 
 def _best_branch(results: list[Any]) -> Array:
-    """Return the result of the best branch: joints, cost, branch number, active, status. Shape (samples, 10)."""
+    """Return each target's best result: joints, cost, branch number, active constraint, status. Shape (samples, 10)."""
     best: Array | None = None
     for number, (joints, cost, active, status, *_) in enumerate(results):
         columns = [np.array(part, dtype=float) for part in (joints, cost, active, status)]
@@ -142,7 +142,7 @@ def _best_branch(results: list[Any]) -> Array:
 
 @dataclass(frozen=True)
 class RollInterval:
-    """An interval of rolls that are within reach and within all limits.
+    """An interval of rolls at which the rig reaches the target within all joint limits.
 
     Attributes:
         start, end: rad, end >= start; a full turn is -pi .. pi.
@@ -155,7 +155,9 @@ class RollInterval:
 
 
 def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[RollInterval]:
-    """Return all intervals of roll, modulo a turn, that reach a target within joint limits, with start in [-pi, pi).
+    """Return all intervals of roll, modulo a full turn, in which the rig reaches a target within its joint limits.
+
+    Every interval starts in [-pi, pi).
 
     Args:
         target: Shape (5,), m and rad.
@@ -190,7 +192,10 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
 
 @lru_cache(maxsize=16)
 def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
-    """Return the Functions (target) -> ends of feasible roll intervals and (target, roll) -> whether it is feasible."""
+    """Return two casadi Functions: the possible ends of feasible roll intervals, and whether a roll is feasible.
+
+    (target) -> points, with rows cosine, sine and code of the constraint in roll.ACTIVE; (target, roll) -> feasible.
+    """
     target, roll = ca.SX.sym("target", 5), ca.SX.sym("roll")
     angle = ca.horzcat(*[ca.vertcat(*candidate) for candidate in arc_ends(rig, target, branch)])
     x = ca.MX.sym("target", 5)
@@ -206,7 +211,9 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
 
 
 def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Branch, Array]]:
-    """Return the joints, shape (6,), of every branch that reaches a target with a given roll, without joint limits.
+    """Return every branch that reaches a target with a given roll, and its joint positions, regardless of joint limits.
+
+    The joint positions have shape (6,).
 
     Raises:
         ModelError: The target or roll is not finite, or no branch reaches the pose (names the link).
@@ -236,7 +243,7 @@ def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
 
 
 def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: float = 5.0) -> dict[str, Any]:
-    """Return all functions of a rig, by name; `.map(samples)` applies one to a table.
+    """Return the casadi Functions of a rig's kinematics by their names; `.map(samples)` applies one to a table.
 
     forward: (joints) -> (pose). inverse: (target, roll) -> (joints, reach), see `rig.inverse`. corner: (target, roll)
     -> (P_G). arc_ends, feasible: see `roll_interval_functions`. optimal_inverse_i1_free, optimal_inverse_i1,
@@ -257,7 +264,7 @@ def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: 
 
 
 def export(functions: dict[str, Any] | Iterable[Any], path: Path) -> Path:
-    """Write functions as one C file with its header, which depends only on the C mathematics library.
+    """Write casadi Functions as a C file and its header; the code needs only the C mathematics library.
 
     Args:
         functions: casadi Functions, or a dictionary of them.

@@ -20,7 +20,7 @@ Point = tuple[Expression, Expression]
 """A point of the unit circle: (cosine, sine) of an angle."""
 
 Slope = Callable[[Expression, Expression], tuple[Expression, Expression]]
-"""A function of a point of the circle that returns a value and its derivative by the angle."""
+"""A function of a point of the unit circle that returns a value and its derivative with respect to the angle."""
 
 SMALLEST_DIVISOR = 1e-300
 """Added to divisors that may be zero; it changes no other number."""
@@ -28,7 +28,7 @@ SMALLEST_DIVISOR = 1e-300
 
 @dataclass(frozen=True)
 class RootSettings:
-    """Settings of the root finding, which limit its number of operations.
+    """Settings of the root finding for trigonometric polynomials, which bound its number of operations.
 
     Attributes:
         min_second_harmonic: Smallest relative second harmonic in the pencil of conics; a smaller one is raised, and the
@@ -38,9 +38,9 @@ class RootSettings:
             minimum, after which only rounding errors are left.
         max_polish_step: Largest step of the polish, rad.
         root_tolerance: Largest distance of an approximate root from its polished root, rad.
-        stages: Steps on all roots; after each stage but the last, the iteration ends if all roots move by less than
-            `step_tolerance`.
-        step_tolerance: Relative.
+        stages: Numbers of simultaneous steps on all roots in `series_roots`; after each stage but the last, the
+            iteration ends if all roots move by less than `step_tolerance`.
+        step_tolerance: Step of a root, relative to the root, at which the iteration ends.
     """
 
     min_second_harmonic: float = 1e-6
@@ -58,7 +58,7 @@ ROOTS = RootSettings()
 
 
 class Harmonics(NamedTuple):
-    """A trigonometric polynomial f = a0 + a1 cos x + b1 sin x + a2 cos 2x + b2 sin 2x with scalar coefficients."""
+    """A trigonometric polynomial of an angle x: f = a0 + a1 cos x + b1 sin x + a2 cos 2x + b2 sin 2x."""
 
     a0: Expression
     a1: Expression
@@ -71,7 +71,7 @@ class Harmonics(NamedTuple):
         return self.a0 + self.a1 * c + self.b1 * s + self.a2 * (c * c - s * s) + 2 * self.b2 * c * s
 
     def derivative(self) -> Harmonics:
-        """Return the derivative of the polynomial by the angle."""
+        """Return the derivative of the polynomial with respect to the angle."""
         return Harmonics(0.0, self.b1, -self.a1, 2 * self.b2, -2 * self.a2)
 
     def slope_bound(self) -> Expression:
@@ -80,7 +80,7 @@ class Harmonics(NamedTuple):
 
 
 def square_of_first_harmonic(a0: Expression, a1: Expression, b1: Expression) -> Harmonics:
-    """Return the square of a0 + a1 cos x + b1 sin x as Harmonics."""
+    """Return the square of the trigonometric polynomial a0 + a1 cos x + b1 sin x of an angle x."""
     mean = a0 * a0 + (a1 * a1 + b1 * b1) / 2
     return Harmonics(mean, 2 * a0 * a1, 2 * a0 * b1, (a1 * a1 - b1 * b1) / 2, a1 * b1)
 
@@ -96,16 +96,16 @@ def scale_harmonics(f: Harmonics, factor: Expression) -> Harmonics:
 
 
 def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS.polish_steps) -> list[Point]:
-    """Return four points of the circle that include all roots of f; if f has fewer, the others have no meaning.
+    """Return four points of the unit circle that include all roots of a trigonometric polynomial of two harmonics.
 
-    The roots are the intersections of the unit circle with the conic f = 0, in axes with the second harmonic r (x^2 -
-    y^2). The pencil f + l (x^2 + y^2 - 1) contains a pair of real lines for a root l in [-r, r] of a cubic, which
-    always has one. The lines intersect the circle in the roots, which Newton steps then polish. Simple roots are
-    accurate to rounding. At double roots a step only halves the error of the lines, typically the square root of the
-    machine precision.
+    If it has fewer roots, the other points have no meaning. The roots are the intersections of the unit circle with the
+    conic f = 0, in axes with the second harmonic r (x^2 - y^2). The pencil f + l (x^2 + y^2 - 1) contains a pair of
+    real lines for a root l in [-r, r] of a cubic, which always has one. The lines intersect the circle in the roots,
+    which Newton steps then polish. Simple roots are accurate to rounding. At double roots a step only halves the error
+    of the lines, typically the square root of the machine precision.
 
     Args:
-        f: The polynomial.
+        f: The trigonometric polynomial.
         polish_function: Function to polish with instead of f, with the same relevant roots, but simple ones.
         steps: Newton steps of the polish; without any, simple roots are accurate to about 1e-6.
     """
@@ -145,9 +145,10 @@ def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
-    """Return cosine and sine of the rotation to axes with f = a0 + p x + q y + r (x^2 - y^2), then p, q and r > 0.
+    """Return the rotation of axes (cosine, sine) that removes the term x y of f, and f's coefficients p, q, r in them.
 
-    `shift` is added to a2, so that the second harmonic has a direction.
+    With (x, y) on the unit circle f = a0 + p x + q y + r (x^2 - y^2), r > 0, in the rotated axes. `shift` is added to
+    a2, so that the second harmonic has a direction.
     """
     a2 = f.a2 + shift
     r = ca.sqrt(a2 * a2 + f.b2 * f.b2)
@@ -159,7 +160,7 @@ def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expr
 
 
 def least_point(f: Harmonics) -> Point:
-    """Return the point (cos, sin) of the unit circle at which f has its global minimum.
+    """Return the point (cos, sin) of the unit circle at which a polynomial f has its global minimum.
 
     In axes with f = a0 + p x + q y + r (x^2 - y^2), r > 0, mirroring x or y only changes the terms p x and q y, so the
     minimum is in the quadrant where neither is positive. There f has exactly one stationary point, the root of
@@ -206,8 +207,8 @@ def polish(
 ) -> Point:
     """Refine a root on the unit circle by Newton steps of limited size (rad).
 
-    `function` returns value and derivative by the angle. If the square of the derivative is below `floor` the steps
-    vanish.
+    `function` returns value and derivative with respect to the angle. If the square of the derivative is below `floor`
+    the steps vanish.
     """
     c, s = point
     for _ in range(steps):
@@ -226,9 +227,9 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """Return the root t = l / r in [-1, 1] of the cubic of a pencil of conics.
+    """Return the parameter in [-1, 1] at which the pencil of conics in `roots` contains a pair of real lines.
 
-    The cubic is 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0.
+    The parameter t = l / r is a root of the cubic 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0.
     """
     b2 = -a0 / r
     b1 = (p * p + q * q) / (4 * r * r) - 1
@@ -254,7 +255,7 @@ def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expr
 
 
 Series = list[tuple[Expression, Expression]]
-"""Coefficients (a_k, b_k) of cos k and sin k of an angle, k = 0, 1, ...; b_0 is 0."""
+"""Coefficients (a_k, b_k) of cos kx and sin kx in a trigonometric polynomial of an angle x, k = 0, 1, ...; b_0 is 0."""
 
 
 def multiply_series(f: Series, g: Series) -> Series:
@@ -279,12 +280,12 @@ def add_series(f: Series, g: Series, factor: float = 1) -> Series:
 
 
 def series_roots(degree: int) -> Any:
-    """Return the Function (coefficients of a trigonometric series) -> points of the circle at its simple roots.
+    """Return the casadi Function that finds the simple roots of a trigonometric series from its coefficients.
 
-    Input (2, degree + 1), rows a and b; output (2, 2 degree), rows cosine and sine. The roots z = exp(i angle) of the
-    polynomial z^degree f are points simultaneously (Aberth 1973) in at most sum(ROOTS.stages) steps. Roots off the
-    circle are projected to it and meaningless. The result has a few correct digits; polish it with the function at
-    hand.
+    The roots are points of the unit circle. Input (2, degree + 1), rows a and b; output (2, 2 degree), rows cosine and
+    sine. The roots z = exp(i angle) of the polynomial z^degree f are computed simultaneously (Aberth 1973) in at most
+    sum(ROOTS.stages) steps. Roots off the circle are projected to it and meaningless. The result has a few correct
+    digits; polish it with the function at hand.
     """
     n = 2 * degree
     coefficients = ca.SX.sym("coefficients", 2, degree + 1)
@@ -347,7 +348,7 @@ def series_roots(degree: int) -> Any:
 
 
 def _steps(step: Any, count: int) -> Any:
-    """Return the Function of `count` iterations of the root finding: (z, coefficients) -> (z, last step length)."""
+    """Return the Function of `count` steps on all roots: (roots, coefficients) -> (roots, excess of the last step)."""
     z, unit = ca.MX.sym("z", *step.size_in(0)), ca.MX.sym("scaled", *step.size_in(1))
     iterates, longest = z, None
     for _ in range(count):

@@ -29,11 +29,11 @@ from models.shapes.shapes import KINDS, Box, MovingObstacle, Shape, checked_shap
 from models.spatial import Expression, Frame, expression
 
 MIN_SOFTNESS_M = 1e-6
-"""Least smoothing of the minimum of several distances, m."""
+"""Smallest smoothing width of the soft minimum of several distances, m."""
 
 
 class Levers(NamedTuple):
-    """Bounds on the relative velocity of the two bodies of each of n pairs per unit rate of base and joint coordinates.
+    """Upper bounds on the relative velocities of n pairs of bodies, per unit rate of each base and joint coordinate.
 
     A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
     turn times |r|.
@@ -152,7 +152,7 @@ class CollisionScene:
     def _pairs_with_obstacles(
         self, own: Sequence[Body], ignored: set[tuple[str, str]]
     ) -> tuple[list[tuple[int, int]], dict[tuple[str, str], Reason]]:
-        """Return indices of the bodies and obstacles that may collide, and why other pairs are excluded."""
+        """Return index pairs (body, obstacle) that may collide, and the reasons why other pairs are excluded."""
         pairs, excluded = [], dict[tuple[str, str], Reason]()
         for number, obstacle in enumerate(self.obstacles):
             name = f"obstacle {number}"
@@ -216,7 +216,7 @@ class CollisionScene:
 
     @property
     def labels(self) -> tuple[tuple[str, str], ...]:
-        """Names of the two bodies of each pair."""
+        """Names of the two bodies of each checked pair."""
         return tuple((self.bodies[i].name, self.bodies[j].name) for i, j, _ in self.pairs)
 
     def pair_names(self, pair: int) -> tuple[str, str]:
@@ -243,11 +243,11 @@ class CollisionScene:
 
     @property
     def has_moving_obstacles(self) -> bool:
-        """Whether an obstacle moves."""
+        """Whether at least one obstacle moves."""
         return any(isinstance(obstacle, MovingObstacle) for obstacle in self.obstacles)
 
     def placements(self, base: Expression, q: Expression, time: Expression = 0.0) -> Expression:
-        """Return the frames of the bodies, stacked: rotation column by column, then position. Shape (12 F, 1)."""
+        """Return the frames of links and moving obstacles, stacked (rotation by columns, position). Shape (12 F, 1)."""
         frames = self._frames(base, q, time)
         columns = [part for frame in frames for part in (ca.vec(frame.rotation), frame.position)]
         return ca.densify(ca.vertcat(*columns)) if columns else expression(q)[:0]
@@ -261,7 +261,7 @@ class CollisionScene:
         pairs: Sequence[int] | None = None,
         rounding: float = 0.0,
     ) -> Expression:
-        """Return the signed distances of pairs, m, exact or lower bounds, see `models.shapes.distance`. Shape (n, 1).
+        """Return the signed distances of pairs of bodies, m, exact or lower bounds, see `distance`. Shape (n, 1).
 
         For two hulls of meshes it is the distance of their covers, a lower bound.
 
@@ -298,9 +298,9 @@ class CollisionScene:
         return ca.vertcat(*distances) if distances else expression(q)[:0]
 
     def distance_gradients(self, *, pairs: Sequence[int] | None = None, rounding: float = 0.0) -> Any:
-        """Return a Function (base, q, time) -> signed distances of pairs and their gradients; see `distances`.
+        """Return the CasADi Function from (base, q, time) to signed distances of pairs of bodies and their gradients.
 
-        Distances have shape (n, 1), m, gradients by base and joints shape (n, base_size + joint_size). All pairs of the
+        Distances have shape (n, 1), m, gradients for base and q shape (n, base_size + joint_size). All pairs of the
         same two kinds of shapes are evaluated together, and only frames are differentiated: a distance of rigid bodies
         changes only with their relative twist, through a wrench. That is about fifteen times faster than `distances`
         and its Jacobian. For a base with a quaternion, gradients hold along rates that keep it a unit quaternion.
@@ -314,7 +314,7 @@ class CollisionScene:
         return distance_gradients(self.machine, self.bodies, self._carriers, self._obstacle_frames, **options)
 
     def _checked_request(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
-        """Check the pairs and the rounding that a caller requests; return the indices of the pairs and the rounding."""
+        """Return the indices of the requested pairs (all for None) and the smoothing width, after checking both."""
         indices = np.arange(len(self.pairs))
         if isinstance(pairs, list | tuple) and not pairs:
             indices = indices[:0]
@@ -355,13 +355,13 @@ class CollisionScene:
         return [*(frames[link] for link in self._carriers), *self._obstacle_frames(time)]
 
     def _obstacle_frames(self, time: Expression) -> list[Frame]:
-        """Return the frames of the moving obstacles at a time."""
+        """Return the frames of the moving obstacles in world at a time (s)."""
         return [obstacle.frame(time) for obstacle in self.obstacles if isinstance(obstacle, MovingObstacle)]
 
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
-        """Return the pairs of bodies, one of them a mesh, that are close on the robot and are checked by convex hulls.
+        """Return the pairs of bodies with a mesh and at most three joints between them, to be checked by convex hulls.
 
         Such links may be only millimetres apart by design, closer than the covers of their meshes allow. So the hulls
         of meshes are checked, as are those of meshes whose covers always collide.
@@ -376,11 +376,11 @@ class CollisionScene:
         return pairs
 
     def _moves(self, link: str) -> bool:
-        """Return whether a link can move in world."""
+        """Return whether a link can move in the world, with the base or by a joint."""
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
     def _levers_of(self, placed: PlacedShape, reference: int) -> Levers:
-        """Return the velocity bounds of one body in a reference frame: the frame of a link, or the world (-1)."""
+        """Return the velocity bounds (`Levers`) of one body in a reference frame: that of a link, or the world (-1)."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
         joints, turns, base, base_turns = np.zeros(robot.dof), np.zeros(robot.dof), np.zeros(size), np.zeros(size)
         levers = Levers(base, base_turns, joints, turns)

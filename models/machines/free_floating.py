@@ -1,6 +1,6 @@
-"""Arms on an unactuated, freely floating base with conserved momentum, zero by default (Kim, Kim 2011).
+"""Arms on an unactuated, freely floating base with conserved momentum, zero by default (Kim and Kim 2011).
 
-The base moves so that E1 x1' + E2 x2' = 0 (24), with x1' the base twist and x2' the joint rates; the tip
+The base moves so that E1 x1' + E2 x2' = 0 (equation 24), with x1' the base twist and x2' the joint rates; the tip
 moves with F1 x1' + F2 x2' = G x2', G = F2 - F1 E1^-1 E2 being the generalized Jacobian (25). A non-zero momentum
 adds the twist of the whole machine as one rigid body: both become affine in the joint rates.
 
@@ -56,7 +56,7 @@ from models.spatial import (
 BaseKind: TypeAlias = Literal["planar", "spatial"]
 
 PLANAR_ROWS = [2, 3, 4]
-"""Rows of a spatial vector that planar motion (z = constant) has: rotation about z, translation along x and y."""
+"""Indices of the twist components of planar motion (z = constant): rotation about z, translation along x and y."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,12 +101,12 @@ class FreeFloating:
 
     @property
     def joint_size(self) -> int:
-        """Number of moving joints."""
+        """Number of independently moving joints."""
         return self.robot.dof
 
     @property
     def twist_rows(self) -> list[int]:
-        """Indices of the twist components that the base has: (rotation about z, x, y) if planar, else all six."""
+        """Indices of the twist components in which the base moves: (rotation about z, x, y) if planar, else all six."""
         return PLANAR_ROWS if self.base == "planar" else list(range(6))
 
     def base_home(self) -> Array:
@@ -130,20 +130,23 @@ class FreeFloating:
 
     @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the generalized Jacobian G (25), the linear part of the tip's twist. Shape (6, joint_size)."""
+        """Return the generalized Jacobian G, the matrix from joint rates to the tip's twist without the drift.
+
+        Equation (25) of the paper. Shape (6, joint_size).
+        """
         return self._tip_motion(base, self._reaction(q, None, tip=True))
 
     @on_scalars
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the twist of the tip: G joint_rates (25) plus the drift of the conserved momentum. Shape (6, 1)."""
+        """Return the tip's twist: generalized Jacobian times joint rates, plus drift by momentum. Shape (6, 1)."""
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
         return self._tip_motion(base, self._reaction(q, rates, base, tip=True))
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the twist of the base under the conserved momentum, E1^-1 (momentum - E2 joint_rates) (24).
+        """Return the twist of the base that conserves the momentum for given joint rates.
 
-        Shape (6, 1) or (3, 1).
+        E1^-1 (momentum - E2 joint_rates), equation (24). Shape (6, 1) or (3, 1).
         """
         reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), base)
         turn = self.world_from_base(base).rotation
@@ -174,7 +177,7 @@ class FreeFloating:
 
     @on_scalars
     def momentum_matrices(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return E1 and E2 of (24): momentum = E1 base_twist + E2 joint_rates.
+        """Return the matrices E1 and E2 of the total momentum E1 base_twist + E2 joint_rates, equation (24).
 
         Returns:
             E1 of shape (6, 6), E2 of shape (6, joint_size), rows (moment of momentum about the world's origin, linear
@@ -189,7 +192,7 @@ class FreeFloating:
 
     @on_scalars
     def momentum(self, base: Expression, q: Expression, base_twist: Expression, joint_rates: Expression) -> Expression:
-        """Return total angular momentum about the world's origin and linear momentum; (Lz, Px, Py) if planar.
+        """Return the total momentum (angular about the world's origin, linear), or (Lz, Px, Py) if planar.
 
         Shape (6, 1) or (3, 1).
         """
@@ -207,7 +210,7 @@ class FreeFloating:
         components change as these axes rotate with the angular velocity w: h' = -w x h.
 
         Args:
-            base, q, joint_rates: Symbols, because the base twist is differentiated by them. Shape (base_size, 1), (n,
+            base, q, joint_rates: Symbols, because the base twist is differentiated in them. Shape (base_size, 1), (n,
                 1) and (n, 1).
             accelerations: Of the joints. Shape (n, 1).
 
@@ -236,9 +239,9 @@ class FreeFloating:
     def momentum_residual(
         self, base: Expression, q: Expression, base_rate: Expression, joint_rates: Expression
     ) -> Expression:
-        """Return the momentum of a motion minus the conserved momentum; zero for a motion that is possible.
+        """Return the momentum of a motion minus the conserved momentum, which is zero for every possible motion.
 
-        The motion is given by the rates of base configuration and joints.
+        The motion is given by the rates of the base configuration and of the joints.
         """
         momentum = self.momentum(base, q, self.twist_of_rate(base, base_rate), joint_rates)
         carried = self._spatial_momentum()
@@ -250,7 +253,7 @@ class FreeFloating:
 
     @on_scalars
     def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return F1 and F2 of (25): tip twist = F1 base_twist + F2 joint_rates, with base and joints independent.
+        """Return F1 and F2 of the tip's twist F1 base_twist + F2 joint_rates (25), with base and joints independent.
 
         Returns:
             F1 of shape (6, 6), (6, 3) for a planar base; F2 of shape (6, joint_size).
@@ -293,7 +296,7 @@ class FreeFloating:
     def _reaction(
         self, q: Expression, joint_rates: Expression | None, base: Expression = None, tip: bool = False
     ) -> _Reaction:
-        """Return the base motion that joint rates cause; with joint rates given, include the conserved momentum."""
+        """Return the base motion for given joint rates and the conserved momentum, or for unit joint rates if None."""
         carried = None
         if joint_rates is not None and (momentum := self._spatial_momentum()) is not None:
             turn = self.world_from_base(base).rotation
@@ -302,7 +305,7 @@ class FreeFloating:
 
 
 class _Reaction(NamedTuple):
-    """Motion of base and tip in base axes: one column per joint for unit rates, or one column for given joint rates.
+    """Velocities of base and tip in base axes: one column per joint for unit rates, or one column for given rates.
 
     The latter includes the effect of the conserved momentum. The motion of the tip is None unless requested.
     """
@@ -322,7 +325,7 @@ def _reaction(
     planar: bool,
     tip: bool,
 ) -> _Reaction:
-    """Return the motion of a floating base for unit rates of each joint (n columns), or for given rates (one column).
+    """Return the velocity of a floating base for unit rates of each joint (n columns) or for given rates (one column).
 
     Args:
         robot: Kinematic tree with a free root link.

@@ -1,4 +1,4 @@
-"""The machine protocol that planners use, its simplest implementation, a robot on a fixed base, and reaction wheels.
+"""The protocol of machines that planners use, robots on a fixed base as its simplest case, and reaction wheels.
 
 A reaction wheel is an ordinary joint with a rotor. The motor's torque is the joint's effort limit, and the momentum
 h = I w at which the wheel saturates gives its speed limit w. So momentum, torques and limits follow from the robot, for
@@ -46,15 +46,15 @@ class Machine(Protocol):
 
     @property
     def robot(self) -> Robot:
-        """Kinematic tree."""
+        """Kinematic tree of the machine's links and joints."""
 
     @property
     def base_size(self) -> int:
-        """Length of the base configuration: 0, 3 or 7."""
+        """Length of the base configuration: 0 (fixed), 3 (planar) or 7 (spatial)."""
 
     @property
     def joint_size(self) -> int:
-        """Number of moving joints."""
+        """Number of independently moving joints."""
 
     def base_home(self) -> Array:
         """Return the base configuration at the world's origin. Shape (base_size,)."""
@@ -66,16 +66,19 @@ class Machine(Protocol):
         """Return the frame of the tip in the world: rotation (3, 3), position (3, 1) in m."""
 
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the map from joint rates to the tip's twist, including the base motion that they cause.
+        """Return the matrix from joint rates to the tip's twist, including the base motion that the joints cause.
 
         Shape (6, joint_size).
         """
 
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return tip_jacobian times joint_rates, in fewer operations, plus the drift. Shape (6, 1)."""
+        """Return the tip's twist for given joint rates, including the drift by conserved momentum.
+
+        It is tip_jacobian times joint_rates, in fewer operations, plus the drift. Shape (6, 1).
+        """
 
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the time derivative of the base configuration, including the drift. Shape (base_size, 1)."""
+        """Return the rate of the base configuration, including the drift by momentum. Shape (base_size, 1)."""
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
         """Return the manipulability of a task that fixes some rows of the tip's twist, see jacobian_manipulability.
@@ -109,12 +112,12 @@ class FixedBase:
 
     @property
     def base_size(self) -> int:
-        """Always 0."""
+        """Length of the base configuration: always 0."""
         return 0
 
     @property
     def joint_size(self) -> int:
-        """Number of moving joints."""
+        """Number of independently moving joints."""
         return self.robot.dof
 
     def base_home(self) -> Array:
@@ -138,13 +141,13 @@ class FixedBase:
 
     @cached_property
     def _pose_function(self) -> Any:
-        """Cached CasADi Function from joints to the tip's pose; inlining it is faster than building its expressions."""
+        """Cached CasADi Function from joint positions to the tip's pose, faster than building its expressions anew."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_pose", [q], [*map(ca.densify, tip_pose(self.robot, q, self.world_from_base()))])
 
     @cached_property
     def _jacobian_function(self) -> Any:
-        """Cached CasADi Function from joints to the Jacobian of the tip."""
+        """Cached CasADi Function from joint positions to the Jacobian of the tip."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_jacobian", [q], [tip_jacobian(self.robot, q, self.world_from_base())])
 
@@ -155,7 +158,7 @@ class FixedBase:
 
     @on_scalars
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return an empty vector of the type of the joint rates. Shape (0, 1)."""
+        """Return the empty rate of the base configuration, of the type of the joint rates. Shape (0, 1)."""
         return type(joint_vector(self.robot, joint_rates, "joint_rates"))(0, 1)
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
@@ -181,7 +184,7 @@ def with_tip(
 
 
 def hold_joints(machine: Machine, positions: Mapping[str, float]) -> Machine:
-    """Return the same machine with joints, and their followers, locked at positions (rad or m) given by name.
+    """Return the machine with some joints, and those that mimic them, locked at positions (rad or m) by name.
 
     Raises:
         ModelError: As `models.robot.rebuild.lock_joints`; or as `with_tip` for the machine.
@@ -190,7 +193,7 @@ def hold_joints(machine: Machine, positions: Mapping[str, float]) -> Machine:
 
 
 def _with_robot(machine: Machine) -> Any:
-    """Return the machine, a dataclass with a field `robot`; raise ModelError for any other."""
+    """Return the machine after checking that it is a dataclass with a field `robot`, which can be replaced."""
     if not is_dataclass(machine) or isinstance(machine, type) or "robot" not in {each.name for each in fields(machine)}:
         message = f"{type(machine).__name__} is no dataclass with a field 'robot', which cannot be replaced"
         raise ModelError(message, name="machine", value=machine)

@@ -1,7 +1,7 @@
-"""Distances of many pairs of bodies with their gradients.
+"""Signed distances of many pairs of bodies, and their gradients with respect to base and joint coordinates.
 
 The distance of two rigid bodies changes only with their relative twist, through a wrench. That twist is a sum of the
-screws of the joints between them, so only the frames are differentiated, by the base. All pairs of the same two
+screws of the joints between them, so only the base frame is differentiated. All pairs of the same two
 kinds of shapes are evaluated together as columns.
 """
 
@@ -22,11 +22,11 @@ from models.shapes.shapes import Shape
 from models.spatial import Expression, Frame, cross
 
 WORLD = -1
-"""Index that stands for the world instead of a frame."""
+"""Frame index that stands for the world."""
 
 
 class PlacedShape(NamedTuple):
-    """A shape in a collision scene.
+    """A shape in a collision scene, with its name and the frame that carries it.
 
     Attributes:
         name: Name of its link, with a number if the link has several shapes, or of an obstacle.
@@ -49,7 +49,9 @@ def distance_gradients(
     rounding: float,
     softness: float,
 ) -> Any:
-    """Return a Function (base, q, time) -> distances, shape (n, 1), m, and gradients, shape (n, size of base and q).
+    """Return the CasADi Function from (base, q, time) to distances of pairs of bodies and their gradients.
+
+    Distances have shape (n, 1), m, and gradients shape (n, size of base and q).
 
     Args:
         machine: Machine that carries the bodies.
@@ -101,7 +103,7 @@ def distance_gradients(
 def _reduce_groups(
     value: Expression, gradient: Expression, positions: list[int], counts: list[int], softness: float
 ) -> tuple[Expression, Expression]:
-    """Return the distance of each pair with its gradient; bodies covered by several shapes get a soft minimum."""
+    """Return the soft minimum of the distances of each group of pairs of shapes, and its gradient."""
     values, rows, order = [value], [gradient], []
     for begin, end in pairwise(accumulate(counts, initial=0)):
         members = positions[begin:end]
@@ -130,7 +132,7 @@ def _motion_signs(
 
 
 def _leader_columns(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
-    """Return the matrix that adds the columns of followers to those of their leaders; None without followers."""
+    """Return the matrix that adds columns of mimic joints to those of the joints they mimic; None if there are none."""
     robot, size = machine.robot, machine.base_size
     matrix = np.zeros((size + len(joints), size + robot.dof))
     matrix[:size, :size] = np.eye(size)

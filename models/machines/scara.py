@@ -1,4 +1,4 @@
-"""SCARA arms, and their joints along smooth paths.
+"""SCARA arms, and their joint positions along smooth paths of the tool.
 
 A SCARA arm has two parallel links in a horizontal plane, a quill and a wrist about the same vertical direction. Its
 joint vector is (shoulder, elbow, quill, wrist): rad, rad, m, rad. In the frame of the mount
@@ -100,7 +100,7 @@ class Scara:
         return Robot(links, tuple(joints))
 
     def forward(self, joints: Expression) -> Frame:
-        """Return the frame of the tool in world. `joints` has shape (4,), CasADi or numbers."""
+        """Return the frame of the tool in world for joint positions of shape (4,), CasADi or numbers."""
         q = checked_vector("joints", joints, 4, f"one entry for each of {list(self.names)}")
         bend = q[0] + q[1]
         x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
@@ -108,7 +108,7 @@ class Scara:
         return Frame(rotation((0, 0, 1), bend + q[3]), ca.DM(self.mount) + ca.vertcat(x, y, q[2]))
 
     def inverse(self, position: ArrayInput, yaw: float = 0.0, elbow: Elbow = "left") -> Array:
-        """Return the joints that put the tool at a point with a yaw. Shape (4,).
+        """Return the joint positions that put the tool at a given point with a given yaw. Shape (4,).
 
         Shoulder and elbow are within (-pi, pi] and wrist = yaw - shoulder - elbow; whole turns are added only where a
         limit requires them. At both ends of the reach the two elbows agree; on the shoulder axis the shoulder is
@@ -139,13 +139,13 @@ class Scara:
         return q
 
     def whole_turn(self, joint: int, least: float, most: float) -> float | None:
-        """Return the multiple of 2 pi that moves the range of a joint into its limits (to 1e-9), or None.
+        """Return the multiple of 2 pi that shifts a range of joint positions into the joint's limits, else None.
 
-        It is always 0 for the quill.
+        The tolerance is 1e-9. The result is always 0 for the quill, which is prismatic.
 
         Args:
             joint: Index.
-            least, most: The range, rad or m.
+            least, most: Ends of the range, rad or m.
         """
         low, high = float(self.lower[joint]) - 1e-9, float(self.upper[joint]) + 1e-9
         turn = 0.0
@@ -156,7 +156,7 @@ class Scara:
         return turn if low <= least + turn and most + turn <= high else None
 
     def inverse_expression(self, pose: Expression, elbow: Elbow = "left") -> Expression:
-        """Return the closed-form inverse kinematics of (x, y, z, yaw) in world, without checks. Shape (4, 1).
+        """Return the joint positions for a tool pose (x, y, z, yaw) in world in closed form, unchecked. Shape (4, 1).
 
         sin q2 is computed from the product of the distances to both ends of the reach, which is accurate near them.
         """
@@ -175,9 +175,9 @@ class Scara:
         return ca.vertcat(shoulder, bend, z, p[3] - shoulder - bend)
 
     def inverse_rates(self, elbow: Elbow = "left") -> Any:
-        """Return the CasADi Function from a pose (x, y, z, yaw) and its first three derivatives to those of the joints.
+        """Return the CasADi Function from tool pose (x, y, z, yaw) and derivatives to joint positions and derivatives.
 
-        All derivatives are by the same parameter; inputs and outputs have 4 entries each.
+        Three derivatives each, with respect to the same parameter; inputs and outputs have 4 entries each.
         """
         inputs = [ca.SX.sym(name, 4) for name in ("pose", "first", "second", "third")]
         at = ca.SX.sym("at")
@@ -204,7 +204,7 @@ ANGLES = [0, 1, 3]
 
 
 class JointsAlong(NamedTuple):
-    """Joints along a path and three derivatives by arc length. Shape (M, 4) each, rad and m, per m, m^2, m^3."""
+    """Joint positions along a path and three arc-length derivatives. Shape (M, 4) each, rad and m, per m, m^2, m^3."""
 
     position: Array
     first: Array
@@ -214,14 +214,14 @@ class JointsAlong(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScaraPath:
-    """Joints of a SCARA arm whose tool follows a path, as `scara_along` computes them.
+    """Joint positions of a SCARA arm along a path of its tool, as `scara_along` computes them.
 
     Attributes:
         scara: The arm.
         path: Path of the tool.
         elbow: Side of the elbow along the whole path.
         rates: Function of the pose and its derivatives, see `Scara.inverse_rates`.
-        table: Arc lengths (m) and continuous joints that resolve the turns. Shape (K,) and (K, 4).
+        table: Arc lengths (m) and continuous joint positions, dense enough to tell full turns. Shape (K,) and (K, 4).
         turns: Whole turns added to the joints so that they keep their limits. Shape (4,), rad.
     """
 
@@ -238,7 +238,7 @@ class ScaraPath:
         return self.scara.names
 
     def at(self, distance: ArrayInput) -> JointsAlong:
-        """Return the joints, with continuous angles, and their derivatives at arc lengths. Shape (M,), m."""
+        """Return joint positions, with continuous angles, and their derivatives at arc lengths (m) of shape (M,)."""
         s = self.path.checked_distance(distance)
         values = [np.array(v).T for v in self.rates.map(len(s))(*_poses(self.path, s))]
         table_s, table_q = self.table
@@ -250,7 +250,7 @@ class ScaraPath:
 
 
 def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, clearance: float = 1e-3) -> ScaraPath:
-    """Compute the joints of an arm along a path, with the elbow on one side.
+    """Compute the joint positions of a SCARA arm along a path of its tool, with the elbow always on one side.
 
     Args:
         scara: The arm.
@@ -292,7 +292,7 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
 
 
 def _poses(path: SmoothPath, s: Array) -> list[Any]:
-    """Return tool poses (x, y, z, yaw) of a path and three derivatives at arc lengths (M,). Shape (4, M) each."""
+    """Return the tool poses (x, y, z, yaw) of a path and three derivatives at M arc lengths. Shape (4, M) each."""
     position, orientation = path.at(s), path.turn(s)
     yaw = 2 * np.arctan2(orientation.quaternion[:, 3], orientation.quaternion[:, 0])
     angular = (yaw, orientation.rate[:, 2], orientation.acceleration[:, 2], orientation.jerk[:, 2])
@@ -300,7 +300,7 @@ def _poses(path: SmoothPath, s: Array) -> list[Any]:
 
 
 def _turns(joints_along: ScaraPath) -> Array:
-    """Return the multiples of 2 pi to add to the joints so that they stay within their limits. Shape (4,), rad."""
+    """Return the multiples of 2 pi that bring the joint positions along the path into their limits. Shape (4,), rad."""
     turns, scara, (s, q) = np.zeros(4), joints_along.scara, joints_along.table
     for joint, (name, low, high) in enumerate(zip(scara.names, scara.lower, scara.upper, strict=True)):
         if np.isneginf(low) and np.isposinf(high):
@@ -345,7 +345,7 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
 
 
 def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:
-    """Return arc length and value of a function's maximum (sign 1) or minimum (-1), found between samples too.
+    """Return arc length and value of a function's maximum (sign 1) or minimum (-1), refined between the samples.
 
     Args:
         function: Of arc lengths, shape (M,) to (M,).

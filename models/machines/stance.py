@@ -1,4 +1,4 @@
-"""Machines that stand on several feet, each fixed on a foothold: contact loads and conditions for the contacts to hold.
+"""Machines that stand on several feet, each fixed on a foothold: contact loads and conditions for lasting contact.
 
 While the feet do not move, the machine is one on a fixed base, rooted at its first foot. The loads of the other feet
 close the kinematic loops, and the first foot bears the rest. A foot is a sole, whose contact can push but not pull, or
@@ -29,7 +29,7 @@ from models.spatial import Expression, Frame, cross
 __all__ = ["Foot", "Foothold", "Stance"]
 
 SAMPLES = 5
-"""Number of random motions that determine what the joints can move."""
+"""Number of random motions that show which load components and centers of pressure the joints can change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Foot:
 
     @cached_property
     def corners(self) -> Array:
-        """Corners of the sole in the sole's frame; its origin for a grip. Shape (k, 3), m."""
+        """Corners of the sole in the sole's frame; the origin of that frame for a grip. Shape (k, 3), m."""
         if self.sole is None:
             return np.zeros((1, 3))
         plane = np.asarray(self.sole.vertices)
@@ -84,11 +84,11 @@ class Foot:
 
 @dataclass(frozen=True, eq=False)
 class Foothold:
-    """Pose of a sole's frame while the foot is fixed on the ground.
+    """Pose of the frame of a foot's sole in the world while the foot is fixed on the ground.
 
     Attributes:
-        position: Its origin in the world. Shape (3,), m.
-        rotation: Its axes, as columns, in the world, z out of the ground. Shape (3, 3).
+        position: Origin of the frame in the world. Shape (3,), m.
+        rotation: Axes of the frame, as columns, in the world, z out of the ground. Shape (3, 3).
     """
 
     position: ArrayInput
@@ -129,7 +129,7 @@ class Stance(FixedBase):
     def on(
         cls, robot: Robot, feet: Mapping[str, Foot], footholds: Mapping[str, Foothold], gravity: float = 9.81
     ) -> Self:
-        """Put a robot on footholds.
+        """Return the stance of a robot whose feet stand on given footholds.
 
         Raises:
             ModelError: No foothold, a foothold without a foot, two feet on one link, an unknown link, a robot without
@@ -164,12 +164,12 @@ class Stance(FixedBase):
 
     @property
     def weight(self) -> float:
-        """Weight, N."""
+        """Weight of the robot, N."""
         return self.robot.total_mass * self.gravity
 
     @cached_property
     def bodies(self) -> Robot:
-        """The robot with fixed links merged, which has the same dynamics and is faster to evaluate."""
+        """The robot with links on fixed joints merged, which has the same dynamics and is faster to evaluate."""
         return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:
@@ -202,7 +202,7 @@ class Stance(FixedBase):
     def loads(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> dict[str, Expression]:
-        """Return the loads of all standing feet during a motion, given those of all but the first foot."""
+        """Return the contact loads of all standing feet during a motion, given those of all feet but the first."""
         reaction = base_reaction(
             self.bodies,
             q,
@@ -220,7 +220,7 @@ class Stance(FixedBase):
     def joint_torques(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> Expression:
-        """Return the torques (forces) of the joints by inverse dynamics with the other feet's loads. Shape (n, 1)."""
+        """Return the joint torques (or forces) of a motion, given the loads of all feet but the first. Shape (n, 1)."""
         return inverse_dynamics(
             self.bodies,
             q,
@@ -249,7 +249,7 @@ class Stance(FixedBase):
 
     @cached_property
     def load_rows(self) -> dict[str, tuple[int, ...]]:
-        """Twist components of each foot but the first, in world axes, that the joints can change.
+        """Indices of the twist components (world axes) that the joints can change, for each foot but the first.
 
         They are all six, or three in a plane, also for feet in the air. The load of a foot has the same rows: nothing
         resists the others.
@@ -286,7 +286,7 @@ class Stance(FixedBase):
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
-        """Return moment and force of a load in the axes of the foothold. Shape (3, 1) each."""
+        """Return moment and force of a foot's load in the axes of its foothold. Shape (3, 1) each."""
         turn = ca.DM(np.asarray(self.footholds[name].rotation).T)
         return ca.mtimes(turn, load[:3]), ca.mtimes(turn, load[3:])
 
@@ -333,7 +333,7 @@ class Stance(FixedBase):
 
     @cached_property
     def _sampled_pressures(self) -> dict[str, Array]:
-        """Centers of pressure in each sole for random motions. Shape (samples, 2) each, m."""
+        """Centers of pressure of each standing sole, in its frame, for random motions. Shape (samples, 2) each, m."""
         rng = np.random.default_rng(0)
         points_by_foot: dict[str, list[Array]] = {name: [] for name in self.footholds}
         for _ in range(SAMPLES):
@@ -376,7 +376,7 @@ class Stance(FixedBase):
         return Support(convex_hull(np.vstack(points)))
 
     def zero_moment_point(self, loads: Mapping[str, Expression]) -> Expression:
-        """Return the point about which the loads have no horizontal moment, at the height of the first foothold.
+        """Return the point about which the feet's loads have no horizontal moment, at the height of the first foothold.
 
         Shape (2, 1), m.
         """

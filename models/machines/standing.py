@@ -38,7 +38,11 @@ External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
 
 
 def wrenches_at(external: External | None, time: Expression, tip: Expression) -> tuple[Wrench, ...]:
-    """Return the wrenches that the function `external` returns, () if it is None; raise ModelError for others."""
+    """Return the external wrenches at a time and tip position, () if `external` is None.
+
+    Raises:
+        ModelError: `external` is neither None nor a function that returns wrenches.
+    """
     if external is None:
         return ()
     if not callable(external):
@@ -48,9 +52,9 @@ def wrenches_at(external: External | None, time: Expression, tip: Expression) ->
 
 
 class ZmpRows(NamedTuple):
-    """Equation (18), which fixes the zero moment point at a given position: J_m q'' + q'^T H_m q' = C.
+    """Coefficients of the joint acceleration constraint that fixes the zero moment point at a given position.
 
-    Row 0 fixes its x, row 1 its y; both are moments about the position, in N m.
+    J_m q'' + q'^T H_m q' = C, equation (18) of the paper. Row 0 fixes x, row 1 y, as moments about the position, N m.
 
     Attributes:
         jacobian: J_m. Shape (2, n).
@@ -63,7 +67,7 @@ class ZmpRows(NamedTuple):
     right: Expression
 
     def needed(self, qd: Expression) -> Expression:
-        """Return C - q'^T H_m q', the required value of J_m q''. Shape (2, 1), N m."""
+        """Return the moments that joint accelerations must produce, J_m q'' = C - q'^T H_m q'. Shape (2, 1), N m."""
         qd = expression(qd)
         return self.right - ca.vertcat(*(ca.mtimes([qd.T, plane, qd]) for plane in self.hessians))
 
@@ -109,16 +113,16 @@ class Standing(FixedBase):
 
     @property
     def weight(self) -> float:
-        """Weight, N."""
+        """Weight of the robot, N."""
         return self.robot.total_mass * self.gravity
 
     @property
     def gravity_in_world(self) -> Array:
-        """Gravitational acceleration. Shape (3,), m/s^2."""
+        """Gravitational acceleration in world axes. Shape (3,), m/s^2."""
         return np.array([0.0, 0.0, -self.gravity])
 
     def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
-        """Return the robot with fixed links merged, which has the same dynamics and is faster to evaluate."""
+        """Return the robot with links on fixed joints merged, except links with wrenches, for faster evaluation."""
         keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
         if keep not in self._bodies:
             self._bodies[keep] = simplify(self.robot, keep)
@@ -140,28 +144,32 @@ class Standing(FixedBase):
     def zero_moment_point(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
-        """Return the ground point about which the reaction has no horizontal moment, (2)-(3), (35)-(36) corrected.
+        """Return the zero moment point: the ground point about which the reaction has no horizontal moment.
 
-        Shape (2, 1), m. Meaningful only while the vertical force is positive.
+        Equations (2), (3) and, corrected, (35), (36) of the paper. Shape (2, 1), m. Only meaningful while the vertical
+        force is positive.
         """
         return center_of_pressure(self.ground_reaction(q, qd, qdd, wrenches))
 
     def joint_torques(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
-        """Return the torques (forces) of the joints by inverse dynamics. Shape (n, 1), N m or N."""
+        """Return the joint torques (or forces) that a motion requires, by inverse dynamics. Shape (n, 1), N m or N."""
         robot = self.bodies(wrenches)
         return inverse_dynamics(
             robot, q, qd, qdd, wrenches=wrenches, gravity=self.gravity_in_world, world_from_base=self.world_from_base()
         )
 
     def stability_index(self, point: Expression) -> Expression:
-        """Return 1 - ((point - most stable point) / half-width)^2 for x and y, (5)-(6). Shape (2, 1)."""
+        """Return the stability indices in x and y of a zero moment point: 1 at the most stable point, 0 at half_widths.
+
+        1 - ((point - most_stable_point) / half_widths)^2, equations (5) and (6) of the paper. Shape (2, 1).
+        """
         offset = checked_vector("point", point, 2, "x and y on the ground") - ca.DM(self.most_stable_point)
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
-        """Return the acceleration constraint (18) that fixes the zero moment point at `point`.
+        """Return the acceleration constraint that fixes the zero moment point at `point`, equation (18) of the paper.
 
         Args:
             q, qd: Shape (n, 1) each.
@@ -182,7 +190,7 @@ class Standing(FixedBase):
         x, y = ca.vertsplit(point)
 
         def moments(velocity: Expression, acceleration: Expression) -> Expression:
-            """Return the moments about the prescribed point, in order and with signs of (11)-(12). Shape (2, 1)."""
+            """Return the reaction's moments about `point` as in equations (11) and (12) of the paper. Shape (2, 1)."""
             reaction = self.ground_reaction(q, velocity, acceleration) - external
             return ca.vertcat(-reaction[1] - x * reaction[5], reaction[0] - y * reaction[5])
 
@@ -195,14 +203,14 @@ class Standing(FixedBase):
 
     @cached_property
     def _sampled_points(self) -> Array:
-        """Zero moment points of random motions without wrenches. Shape (5, 2), m."""
+        """Zero moment points of random motions without external wrenches. Shape (5, 2), m."""
         rng = np.random.default_rng(0)
         points = [ca.DM(self.zero_moment_point(*rng.normal(size=(3, self.joint_size)))) for _ in range(5)]
         return np.array([np.array(point).ravel() for point in points])
 
     @cached_property
     def moving_directions(self) -> Array:
-        """Directions on the ground in which motion can shift the zero moment point, orthonormal. Shape (k, 2).
+        """Orthonormal directions on the ground in which joint motion can shift the zero moment point. Shape (k, 2).
 
         Both axes if k = 2; one direction for a machine that moves in a vertical plane.
         """
@@ -215,7 +223,7 @@ class Standing(FixedBase):
 
     @property
     def moving_axes(self) -> tuple[int, ...]:
-        """Coordinates of the zero moment point that motion can change: (0, 1), one of them, or none."""
+        """Coordinates of the zero moment point that joint motion can change: 0 (x), 1 (y), both, or none."""
         return tuple(axis for axis in (0, 1) if self.moving_directions[:, axis].any())
 
     def nearest_reachable(self, point: ArrayInput) -> Array:
@@ -225,7 +233,7 @@ class Standing(FixedBase):
         return np.asarray(projection @ target + (np.eye(2) - projection) @ self._sampled_points.mean(axis=0))
 
     def tip_wrench(self, force: Expression, moment: Expression = (0.0, 0.0, 0.0)) -> Wrench:
-        """Return the wrench of a force (N) and a moment (N m) in world axes at the tip. Shape (3,) each."""
+        """Return the wrench of a force (N) and a moment (N m), in world axes, that act at the tip. Shape (3,) each."""
         return Wrench(self.robot.tip_link, force, moment, self.robot.tip_translation)
 
 
@@ -236,7 +244,7 @@ def center_of_pressure(reaction: Expression) -> Expression:
 
 
 def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> External:
-    """Return the wrench function of a spring at the tip: force -stiffness (tip - rest), axis by axis.
+    """Return the external wrench function of a spring at the tip, with the force -stiffness (tip - rest) in each axis.
 
     Args:
         stiffness: Along world x, y, z. Shape (3,), N/m.
@@ -249,12 +257,12 @@ def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> Ex
 
 
 Rows: TypeAlias = Sequence[int] | Callable[[Expression], Expression]
-"""Task of the reported manipulability: rows of the tip's twist, or a Jacobian (m, n) as a function of q."""
+"""Task whose manipulability is reported: rows of the tip's twist, or a Jacobian (m, n) as a function of q."""
 
 
 @dataclass(frozen=True)
 class StandingMotion:
-    """A motion of a standing machine at M times, with the required torques and ground reaction.
+    """A motion of a standing machine at M sampled times, with the joint torques and ground reaction it requires.
 
     Attributes:
         t: Times. Shape (M,), s.
@@ -265,11 +273,11 @@ class StandingMotion:
         center_of_mass: Shape (M, 3), m.
         ground_force: Force of the ground on the foot. Shape (M, 3), N.
         zero_moment_point: (x, y). Shape (M, 2), m.
-        index: Stability index in x and y, (5)-(6). Shape (M, 2).
+        index: Stability index in x and y, equations (5) and (6). Shape (M, 2).
         foot_margin: Signed distance of the zero moment point from the edge of the support. Shape (M,), m.
         joint_excess: Largest violation of a joint limit, negative inside. Shape (M,), rad or m.
-        joint_limit_index: p1 (23). Shape (M,).
-        manipulability: p2 (27) of the task's rows. Shape (M,).
+        joint_limit_index: p1, equation (23). Shape (M,).
+        manipulability: p2, equation (27), of the task's rows. Shape (M,).
     """
 
     t: Array
@@ -290,7 +298,7 @@ class StandingMotion:
 
     @property
     def friction(self) -> Array:
-        """Horizontal over vertical ground force: the required coefficient of friction. Shape (M,)."""
+        """Required coefficient of friction, horizontal over vertical ground force; inf without contact. Shape (M,)."""
         vertical = self.ground_force[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.linalg.norm(self.ground_force[:, :2], axis=1) / vertical
@@ -303,12 +311,12 @@ class StandingMotion:
 
     @property
     def stays_in_foot(self) -> bool:
-        """Whether the zero moment point stays in the support."""
+        """Whether the zero moment point stays in the support polygon of the foot."""
         return bool((self.foot_margin >= -ROUNDING).all())
 
     @property
     def stays_in_limits(self) -> bool:
-        """Whether all joints keep their position limits."""
+        """Whether all joints stay within their position limits."""
         return bool((self.joint_excess <= ROUNDING).all())
 
     @property
@@ -317,7 +325,7 @@ class StandingMotion:
         return self.stays_on_ground and self.stays_in_foot
 
     def summary(self) -> dict[str, float | bool]:
-        """Return the extreme values, by name."""
+        """Return the extreme values of the motion's quantities, and whether it stands, by name."""
         zmp = self.zero_moment_point
         return {
             "stands": self.stands,
@@ -361,9 +369,9 @@ class StandingMotion:
 
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
-    """Return the CasADi function (time, q, qd, qdd) -> the computed attributes of a `StandingMotion`, torques first.
+    """Return the CasADi Function from (time, q, qd, qdd) to the computed attributes of a `StandingMotion`.
 
-    Its symbols are SX, or MX if `external` requires it.
+    The joint torques come first. Its symbols are SX, or MX if `external` requires it.
     """
     try:
         return _motion_function(machine, external, rows, ca.SX)
@@ -381,7 +389,7 @@ def standing_motion(
     external: External | None = None,
     rows: Rows = (3, 4, 5),
 ) -> StandingMotion:
-    """Evaluate a motion of a standing machine.
+    """Compute torques, ground reaction and stability of a standing machine's motion, given at sampled times.
 
     Args:
         machine: Standing machine.
@@ -402,7 +410,7 @@ def standing_motion(
 
 
 def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, *, qdd: Array) -> dict[str, Array]:
-    """Return the outputs of a motion function at M times, by name. Shape (M, k), or (M,) for scalars."""
+    """Return the outputs of a function of `motion_function` at M times, by name. Shape (M, k), or (M,) for scalars."""
     outputs = function.map(len(t))(t[None, :], q.T, qd.T, qdd.T)
     names = [function.name_out(i) for i in range(function.n_out())]
     values = {name: np.array(ca.DM(value)).T for name, value in zip(names, outputs, strict=True)}

@@ -22,7 +22,7 @@ from models.spatial import FULL_TURN, Expression, Frame
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """A convex polygon on the ground, in world axes.
+    """A support polygon: the convex region of the ground that a foot rests on, in world axes.
 
     Attributes:
         vertices: Corners in order, in either sense; stored counter-clockwise, without corners on a straight edge. Shape
@@ -67,22 +67,22 @@ class Support:
 
     @property
     def area(self) -> float:
-        """Area, m^2."""
+        """Area of the polygon, m^2."""
         return _area(self.vertices)
 
     @property
     def center(self) -> Array:
-        """Centre of the bounding box. Shape (2,), m."""
+        """Centre of the polygon's bounding box. Shape (2,), m."""
         return np.asarray(self.vertices.max(axis=0) + self.vertices.min(axis=0)) / 2
 
     @property
     def half_widths(self) -> Array:
-        """Half the side lengths of the bounding box. Shape (2,), m."""
+        """Half the side lengths of the polygon's bounding box. Shape (2,), m."""
         return np.asarray(np.ptp(self.vertices, axis=0)) / 2
 
     @cached_property
     def inner_radius(self) -> float:
-        """Radius of the largest inscribed circle, m: the largest margin of any point."""
+        """Radius of the largest circle inside the polygon, m: the largest `margin` of any point."""
         offsets = (self.normals * self.vertices).sum(axis=1)
         best = 0.0
         for indices in combinations(range(len(offsets)), 3):  # the circle touches three edges
@@ -96,7 +96,7 @@ class Support:
 
     @cached_property
     def normals(self) -> Array:
-        """Inward unit normals of the edges; edge i runs from corner i to the next. Shape (k, 2)."""
+        """Inward unit normals of the polygon's edges; edge i runs from corner i to the next. Shape (k, 2)."""
         edges = np.roll(self.vertices, -1, axis=0) - self.vertices
         return np.asarray(np.column_stack([-edges[:, 1], edges[:, 0]]) / np.linalg.norm(edges, axis=1)[:, None])
 
@@ -107,7 +107,7 @@ class Support:
         return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM(offsets)
 
     def margin(self, point: Expression) -> Expression:
-        """Return the least of :meth:`distances`, by which a point may move before it leaves the polygon.
+        """Return how far a point may move before it leaves the polygon: the least of its :meth:`distances`.
 
         Outside it is negative; its size is the distance from the farthest line, which is at most that from the polygon.
         Shape (1, 1), m.
@@ -116,7 +116,7 @@ class Support:
 
 
 def rectangle(x: ArrayInput, y: ArrayInput) -> Support:
-    """Return a rectangular support from (lower, upper) bounds of x and y, m.
+    """Return a rectangular support polygon from (lower, upper) bounds of x and y, m.
 
     Raises:
         ModelError: Not two numbers each, or a side without length.
@@ -138,7 +138,7 @@ def _area(corners: Array) -> float:
 
 
 RIM = 32
-"""Number of vertices of the polygon, inscribed in the rim, that represents a cylinder's contact."""
+"""Number of vertices of the inscribed polygon that represents the circular rim of a cylinder in contact."""
 
 
 class Footprint(NamedTuple):

@@ -1,9 +1,10 @@
-"""Curves that round the corner between two segments, their closed forms, the best shape factor, arc length.
+"""Polynomial blends that round the corner between two path segments: coefficients, best shape factor, arc length.
 
-The cubic of Lee, Ryu, Cheong 2006, eqs (1)-(9), has the end tangents alpha n1, alpha n2 with alpha = shape * remaining
-(9). With the shape factor 3 its end curvature between lines is exactly zero for every angle; next to an arc it differs
-from that of the arc. The quintic prescribes the second derivative as well and so matches the curvature of every
-neighbour.
+The remaining distance is that from the vertex to both ends of the blend, along the segments. The cubic of Lee, Ryu,
+Cheong 2006, eqs (1)-(9), has the end tangents alpha n1, alpha n2 with alpha = shape * remaining (9), where n1, n2 are
+the unit tangents of the segments and shape is the shape factor. With the shape factor 3 its end curvature between lines
+is exactly zero for every angle; next to an arc it differs from that of the arc. The quintic prescribes the second
+derivative as well and so matches the curvature of every neighbour.
 
 Polynomials are ascending: r(u) = sum_k coefficients[k] u^k, u in [0, 1]. Shape (..., 6, 3), a cubic padded with zeros.
 `angle` is the interior angle at the vertex: pi for a straight line, small for a sharp corner.
@@ -17,8 +18,8 @@ remaining distance. A tangent joint of line and arc keeps the arc's own curvatur
 permits 0.79 of it.
 
 The arc length is computed to rounding. The speed |dr/du| is analytic but nearly singular in the middle of a sharp
-corner. Each curve is therefore split into cells in which the 10-point Gauss-Legendre rule is exact to rounding and the
-cubic Hermite guess of the inverse is monotone, from which Chebyshev's method converges.
+corner. Each curve is therefore split into cells, intervals of u, in which the 10-point Gauss-Legendre rule is exact to
+rounding and the cubic Hermite guess of the inverse is monotone, from which Chebyshev's method converges.
 """
 
 from __future__ import annotations
@@ -67,11 +68,11 @@ PAPER_SHAPE = 3.0
 LARGEST_SHAPE: dict[str, float] = {"cubic": 6.0, "quintic": 30 / 7}
 """Shape factors at which the curve between two lines has a cusp in its middle."""
 MIDDLE_FACTORS: dict[str, float] = {"cubic": 1 / 4, "quintic": 5 / 16}
-"""Factors of the shape in the distance from the vertex at u = 1/2, (8)."""
+"""Factors c in the distance of the blend's middle (u = 1/2) from the vertex, |1 - c shape| cos(angle/2), eq. (8)."""
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
-    """Return the shape factors of vertices, from one for all or one for each, after checks. Shape (count,).
+    """Return the checked shape factors of the blends, from one factor for all or one for each vertex. Shape (count,).
 
     Raises:
         ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
@@ -99,7 +100,10 @@ def rest_to_rest(s: Expression) -> Expression:
 
 
 def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array:
-    """Return the cubic with given end points and end derivatives by u, eqs (1)-(7). Shapes (..., 3) to (..., 6, 3)."""
+    """Return the coefficients of the cubic with given end points and, at the ends, derivatives with respect to u.
+
+    Equations (1) to (7) of the paper; u is the curve parameter. Shapes (..., 3) to (..., 6, 3).
+    """
     chord = end - start
     zero = np.zeros_like(chord)
     second = 3 * chord - 2 * start_rate - end_rate
@@ -108,7 +112,10 @@ def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array
 
 
 def quintic(start: End, end: End) -> Array:
-    """Return the quintic with given ends, first and second derivatives by u. Shapes (..., 3) to (..., 6, 3)."""
+    """Return the coefficients of the quintic with given end points and, at the ends, two derivatives with respect to u.
+
+    An end is (point, first derivative, second derivative); u is the curve parameter. Shapes (..., 3) to (..., 6, 3).
+    """
     (start_value, start_rate, start_second), (end_value, end_rate, end_second) = start, end
     value = end_value - start_value - start_rate - start_second / 2
     rate = end_rate - start_rate - start_second
@@ -127,7 +134,7 @@ def quintic(start: End, end: End) -> Array:
 
 
 def polynomial(coefficients: Array, u: Array, order: int = 0) -> Array:
-    """Evaluate polynomials or their derivatives at u. Shapes (..., 6, 3), (...) to (..., 3)."""
+    """Return points or derivatives of polynomial curves at the parameter u. Shapes (..., 6, 3), (...) to (..., 3)."""
     factors = _falling_factorials(order)
     value = coefficients[..., 5, :] * factors[5]
     u = np.asarray(u, dtype=float)[..., None]
@@ -142,7 +149,7 @@ def _falling_factorials(order: int) -> list[float]:
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
-    """Return the ratio of the blend's distance from the vertex to the remaining distance, eq. (8), between two lines.
+    """Return the distance of a blend between two lines from the vertex, divided by that of its ends, eq. (8).
 
     |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic: the distance at u = 1/2,
     which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
@@ -156,14 +163,14 @@ def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
 
 
 def curvature(coefficients: Array, u: Array) -> Array:
-    """Return the curvature |F' x F''| / |F'|^3 of curves at u. Shapes (..., 6, 3), (...) to (...), 1/m."""
+    """Return the curvature of polynomial curves at the parameter u. Shapes (..., 6, 3), (...) to (...), 1/m."""
     first, second = polynomial(coefficients, u, 1), polynomial(coefficients, u, 2)
     bend = np.linalg.norm(np.cross(first, second), axis=-1)
     return np.asarray(bend / np.linalg.norm(first, axis=-1) ** 3)
 
 
 def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:
-    """Return position and its first three derivatives by arc length, from polynomials of u by the chain rule."""
+    """Return the position of polynomial curves at u, and its first three derivatives with respect to arc length."""
     position, first, second, third = (polynomial(coefficients, u, order) for order in range(4))
     rate = np.linalg.norm(first, axis=-1, keepdims=True)
     rate_u = (first * second).sum(axis=-1, keepdims=True) / rate
@@ -175,13 +182,13 @@ def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Arr
 
 @dataclass(frozen=True)
 class ShapeSearch:
-    """Settings of the search for the best shape factor.
+    """Settings of the search for the shape factor of least peak curvature.
 
     Attributes:
-        narrowest, widest: Range of the factor times remaining distance over the chord; between two lines the best lies
-            from 0.885 to 2.44.
+        narrowest, widest: Range searched for the factor times remaining distance over the chord; between two lines the
+            best lies from 0.885 to 2.44.
         below_cusp: Upper limit of the factor, relative to that of the cusp.
-        coarse: Factors of the coarse grid.
+        coarse: Number of factors of the coarse grid.
         steps: Golden-section steps between the neighbours of the best.
         samples: Samples of a blend for its peak curvature.
         table_angles, table_samples: Corners of the table, and samples of each.
@@ -206,14 +213,20 @@ SEARCH = ShapeSearch()
 
 
 def corner_shape(angle: Array) -> Array:
-    """Return the optimal shape factors of blends between two lines with interior angles (rad). Shapes (V,) to (V,)."""
+    """Return the shape factors of least peak curvature of quintic blends between two lines.
+
+    `angle` has the interior angles, rad. Shapes (V,) to (V,).
+    """
     angles, shape_over_chord = _table()
     return np.asarray(2 * np.sin(angle / 2) * np.interp(angle, angles, shape_over_chord))
 
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Return a table of interior angles (rad) and optimal shape factors over the chord, at unit remaining distance."""
+    """Return the table that `corner_shape` interpolates: interior angles (rad), and shape factors over the chord.
+
+    The chord is that at unit remaining distance.
+    """
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
     before = np.column_stack([np.ones(SEARCH.table_angles), zero[:, :2]])
@@ -280,7 +293,7 @@ def _search_shapes(ends: Sequence[Array], remaining: Array, samples: int) -> Arr
 
 
 def gauss_rule(count: int) -> tuple[Array, Array]:
-    """Return nodes and weights of the Gauss-Legendre rule on 0 to 1."""
+    """Return nodes and weights of the Gauss-Legendre quadrature rule on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return (nodes + 1) / 2, weights / 2
 
@@ -290,12 +303,12 @@ MAX_STEPS = 4
 
 
 class Cells(NamedTuple):
-    """Cells of polynomial curves, sorted by curve and parameter u; each has its own table of arc length.
+    """Intervals of the parameter u into which polynomial curves are split to compute arc lengths, by curve and u.
 
     Attributes:
         curve: Index of the curve. Shape (C,).
-        start, width: In u. Shape (C,).
-        length: Arc length. Shape (C,), m.
+        start, width: Start and width of the interval of u. Shape (C,).
+        length: Arc length of the interval. Shape (C,), m.
     """
 
     curve: NDArray[np.intp]
@@ -305,7 +318,7 @@ class Cells(NamedTuple):
 
 
 def speed(coefficients: Array, u: Array) -> Array:
-    """Return the speed |dr/du| at u. Shapes (M, 6, 3), (M,) to (M,), m."""
+    """Return the parametric speed |dr/du| of curves at the parameter u. Shapes (M, 6, 3), (M,) to (M,), m."""
     return _speed(_derivative(coefficients), u)
 
 
@@ -347,7 +360,7 @@ def _lengths(derivative: Array, start: Array, width: Array) -> Array:
 
 
 def cells(coefficients: Array) -> Cells:
-    """Split polynomial curves, shape (B, 6, 3), into cells in which the arc length can be inverted reliably.
+    """Split polynomial curves (B, 6, 3) into intervals of u in which the arc length can be inverted reliably.
 
     Raises:
         ModelError: A curve has a cusp, which no finite number of cells resolves.
@@ -384,7 +397,7 @@ def cells(coefficients: Array) -> Cells:
 
 
 def parameter(coefficients: Array, start: Array, width: Array, *, length: Array, distance: Array) -> Array:
-    """Return the parameter u at which the arc length from the start of a cell equals `distance`.
+    """Return the parameter u at which the arc length from the start of an interval of u (a cell) equals `distance`.
 
     Shapes: coefficients (M, 6, 3), all others (M,). A cubic Hermite guess from the cell's ends is refined by Chebyshev
     iterations, which converge cubically, with the 10-point rule. The result is accurate to rounding for distances from
@@ -409,7 +422,7 @@ def parameter(coefficients: Array, start: Array, width: Array, *, length: Array,
 
 
 def arc_length(coefficients: Array, u: Array) -> Array:
-    """Return the arc length from 0 to u of one curve, shape (6, 3). Shapes (M,) to (M,), m."""
+    """Return the arc length of one curve, shape (6, 3), from parameter 0 to u. Shapes (M,) to (M,), m."""
     curve = coefficients[None]
     parts = cells(curve)
     index = np.clip(np.searchsorted(parts.start, u, side="right") - 1, 0, len(parts.start) - 1)

@@ -1,4 +1,4 @@
-"""Smooth paths as casadi Functions, for expressions and for generated C.
+"""Smooth paths as casadi Functions, for use in expressions and for generated C code.
 
 `path_function` and `turn_function` accept any distance. A real-time controller only steps along a blend from one
 sample to the next: `predictor_corrector` and `gauss_newton` map steps of the distance to the curve parameter. Both
@@ -25,15 +25,16 @@ from models.spatial import angular_velocity_from_quaternion, quaternion_product
 __all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
 
 MAX_TERMS = 100
-"""Largest number of corrections, or nodes, of a mapping, whose expression grows with them."""
+"""Largest number of corrector steps or quadrature nodes, with which the expression of a mapping grows."""
 
 
 def path_function(path: SmoothPath) -> Any:
-    """Return the Function distance (m) -> position (3, m), tangent (3), curvature (3, 1/m), its derivative (3, 1/m^2).
+    """Return the casadi Function of a distance (m) that evaluates position, tangent and curvature of a path.
 
-    It is an MX function with the tables of the path in it; distances outside the path are clamped to it. It computes
-    the same as `SmoothPath.at`, with a binary search for the cell, so that `generate` writes C without any library.
-    casadi differentiates inside a cell only.
+    Outputs: position (3, m), tangent (3), curvature vector (3, 1/m), its derivative (3, 1/m^2). It is an MX function
+    with the tables of the path in it; distances outside the path are clamped to it. It computes the same as
+    `SmoothPath.at`, with a binary search for the cell, so that `generate` writes C without any library. casadi
+    differentiates inside a cell only.
     """
     knots, columns = _cell_table(require.instance("path_function: path", path, SmoothPath))
     s = ca.MX.sym("distance")
@@ -43,9 +44,10 @@ def path_function(path: SmoothPath) -> Any:
 
 
 def turn_function(path: SmoothPath) -> Any:
-    """Return the Function distance (m) -> quaternion (4) and rate, acceleration, jerk (3, rad/m, rad/m^2, rad/m^3).
+    """Return the casadi Function of a distance (m) that evaluates the tool orientation on a path and its rates.
 
-    Tool orientation in world and its rates, as `SmoothPath.turn`; an MX function like `path_function`.
+    Outputs as `SmoothPath.turn`: quaternion (4), rate, acceleration, jerk (3 each, rad/m, rad/m^2, rad/m^3). It is an
+    MX function like `path_function`.
     """
     reference, theta = require.instance("turn_function: path", path, SmoothPath).charts
     columns = np.column_stack([reference, theta.reshape(-1, 18), path.piece_lengths, path.bounds[:-1]]).T
@@ -57,7 +59,7 @@ def turn_function(path: SmoothPath) -> Any:
 
 
 def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
-    """Return the table column of the cell that contains a distance, by binary search.
+    """Return the column of a table for the interval between knots that contains a distance, by binary search.
 
     The tables are interpolants, since CasADi copies a constant matrix whenever it evaluates a function.
     """
@@ -120,7 +122,7 @@ def _cell_function() -> Any:
 
 
 def _derivative(columns: Any) -> Any:
-    """Return the coefficients of a polynomial's derivative, which has one column less."""
+    """Return the coefficients of a polynomial's derivative, one column for each power."""
     return ca.horzcat(*[power * columns[:, power] for power in range(1, columns.shape[1])])
 
 
@@ -132,11 +134,11 @@ def _horner(columns: Any, u: Any) -> Any:
 
 
 def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
-    """Return the start distance of each cell, then the path's length, and one column of data per cell.
+    """Return the table of `path_function`: start distances of the path's parts, then its length, and a column per part.
 
-    For a segment: its start point, the axial, tangential and inward vectors of its screw, and its rotation rate. For a
-    blend: the coefficients, three a power. For both: distance, length, whether it is a blend; u at the start, width in
-    u, speeds at both ends.
+    A part is what remains of a segment, or a cell of a blend. For a segment: its start point, the axial, tangential and
+    inward vectors of its screw, and its rotation rate. For a blend: the coefficients, three a power. For both:
+    distance, length, whether it is a blend; u at the start, width in u, speeds at both ends.
     """
     on_segment = np.flatnonzero(path.piece_segment >= 0)
     count, segment, task, cells = len(on_segment), path.piece_segment[on_segment], path.path, path.cells
@@ -161,9 +163,10 @@ def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
 
 
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
-    """Return the map of distance to path parameter from the paper: predictor (15), then `corrections` correctors (13).
+    """Return the mapping of Lee, Ryu, Cheong 2006 from the distance along a blend to its parameter u.
 
-    It does not control its error: with the trapezoid rule (12) the sample drifts from its distance.
+    Predictor (15), then `corrections` correctors (13). It does not control its error: with the
+    trapezoid rule (12) the sample drifts from its distance.
 
     Args:
         degree: Degree of the blend, 3 or 5.
@@ -189,10 +192,11 @@ def _predictor_corrector(degree: int, corrections: int) -> Any:
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """Return the default map from distance to path parameter: the predictor (15), then Newton steps on the arc length.
+    """Return the default mapping from the distance along a blend to its parameter u, by a predictor and Newton steps.
 
-    Arguments and result as for `predictor_corrector`, except `nodes`: the number of quadrature nodes over one control
-    step, for each Newton step. The first steps need few nodes; the last one determines the drift.
+    The predictor is equation (15), the Newton steps solve for the arc length. Arguments and result as for
+    `predictor_corrector`, except `nodes`: the number of quadrature nodes over one control step, for each Newton step.
+    The first steps need few nodes; the last one determines the drift.
     """
     numbers = tuple(
         require.count("mapping: nodes", n, 1, MAX_TERMS) for n in require.each("mapping: nodes", nodes, int)
@@ -215,11 +219,11 @@ def _gauss_newton(degree: int, nodes: tuple[int, ...]) -> Any:
 
 
 def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
-    """Return the parameters at increasing distances (m) from the start of a blend, step by step. Shape (M,).
+    """Return the parameters u of a blend at increasing distances (m) from its start, step by step. Shape (M,).
 
     Args:
         mapping: Result of `predictor_corrector` or `gauss_newton`.
-        coefficients: Of one blend. Shape (6, 3).
+        coefficients: Polynomial coefficients of one blend. Shape (6, 3).
         distances: Shape (M,), m.
 
     Raises:
@@ -269,11 +273,11 @@ def exponential(vector: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def orientation_function() -> Any:
-    """Return the casadi Function of tool orientation and its rates on one segment; the samples are columns.
+    """Return the casadi Function that evaluates the tool orientation and its rates on one segment or blend.
 
     Inputs: reference (4); theta (3, 6) as 18 entries column by column, ascending powers of distance over length; length
     (m); distance over length. Outputs: unit quaternion (4); in world axes the angular rate per metre (3, rad/m), its
-    first and second derivatives by the distance (rad/m^2, rad/m^3).
+    first and second derivatives with respect to the distance (rad/m^2, rad/m^3).
     """
     reference, theta = ca.SX.sym("reference", 4), ca.SX.sym("theta", 18)
     length, fraction = ca.SX.sym("length"), ca.SX.sym("fraction")

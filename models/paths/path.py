@@ -1,4 +1,4 @@
-"""Task paths: connected segments, and what to do where they reverse their direction.
+"""Task paths of connected segments, and the treatment of points at which they reverse their direction.
 
 No smooth curve rounds a reversal (a corner of 180 deg). `split_at_reversals` ends the path there, or inserts a bulb
 turn of three arcs of 60, 300 and 60 degrees. The bulb leaves the vertex in the direction of arrival and returns to it
@@ -34,11 +34,12 @@ class Path:
     """A chain of lines, arcs and helices, each starting at the end of the one before.
 
     Attributes:
-        segments: At least one.
+        segments: The segments in order, at least one.
         lengths: Lengths of the segments. Shape (n,), m.
         start, tangent, normal: Start point and frame of each segment at its start, in world. Shape (n, 3), m and unit
             vectors.
-        curvature, torsion: Of each segment; zero for a line, the torsion for an arc too. Shape (n,), 1/m.
+        curvature, torsion: Curvature and torsion of each segment; both zero for a line, torsion zero for an arc. Shape
+            (n,), 1/m.
         orientation: Tool orientation at the start of each segment, unit quaternion. Shape (n, 4).
         turn: Rotation vector of the tool along each segment, in the axes of its start orientation. Shape (n, 3), rad.
 
@@ -72,7 +73,7 @@ class Path:
         """Return the path of straight lines through points.
 
         Args:
-            points: In world, at least two. Shape (n, 3), m.
+            points: Points in world, at least two. Shape (n, 3), m.
             orientations: Unit quaternions at the points; None: the tool does not turn. Shape (n, 4).
 
         Raises:
@@ -108,7 +109,7 @@ class Path:
         return any(s.start_orientation is not None or s.end_orientation is not None for s in self.segments)
 
     def at(self, index: Any, distance: ArrayInput) -> tuple[Array, Array, Array, Array]:
-        """Return position and its first three derivatives by the distance, at a distance (m) along segments.
+        """Return position and its first three derivatives with respect to distance, at distances (m) along segments.
 
         Shapes: index (M,) of int, distance (M,), each result (M, 3).
         """
@@ -123,11 +124,11 @@ class Path:
         return _angles(self.at(index, self.lengths[:-1])[1], self.tangent[1:])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = (1.0, 0.0, 0.0, 0.0)) -> Path:
-        """Return the path moved to a given pose in the world; tool orientations rotate with it.
+        """Return the path moved to a given pose in world; tool orientations rotate with it.
 
         Args:
-            position: Origin of the path's axes in that world. Shape (3,), m.
-            orientation: Orientation of the path's axes in that world, unit quaternion. Shape (4,).
+            position: Origin of the path's axes in world. Shape (3,), m.
+            orientation: Orientation of the path's axes in world, unit quaternion. Shape (4,).
         """
         origin = require.array("path: position", position, (3,))
         rotation = unit_quaternion(orientation, "path: orientation")
@@ -233,15 +234,15 @@ Reversal: TypeAlias = Literal["split"] | float
 def split_at_reversals(
     segments: Sequence[Segment], reversal: Reversal = "split"
 ) -> tuple[tuple[Path, NDArray[np.intp]], ...]:
-    """Return the paths of connected segments that may reverse their direction.
+    """Split connected segments into paths at reversals of direction, or join them there by bulb turns.
 
     Args:
         segments: At least one; each starts at the end of the one before.
         reversal: "split" ends a path at a reversal and begins another; a width (m) inserts a bulb turn.
 
     Returns:
-        Each path, and for each of its segments the index of the input segment; a bulb has that of the segment before
-        it.
+        Each path, and for each of its segments the index of the input segment; the arcs of a bulb turn have that of the
+        segment before it.
 
     Raises:
         ModelError: As for Path, except reversals; or the width is not positive.
@@ -271,7 +272,10 @@ def split_at_reversals(
 
 
 def bulb_turn(segment: Segment, width: float) -> tuple[Arc, Arc, Arc]:
-    """Return the arcs of a bulb-shaped turn at the end of a segment, horizontal unless the segment is vertical."""
+    """Return the three arcs of a bulb-shaped turn that reverses the direction at the end of a segment.
+
+    Their plane contains the segment's curvature vector or, after a line, a horizontal normal of the line.
+    """
     frame = np.asarray(segment.start), segment.tangent, segment.normal
     bends: Any = {"curvature": segment.curvature, "torsion": segment.torsion}
     _, ahead, bend, _ = screw(*frame, **bends, distance=segment.length)

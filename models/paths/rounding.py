@@ -1,4 +1,7 @@
-"""Rounding of every corner of a path: sizes of the blends, from distances or from a tolerance, without overlaps."""
+"""Rounding of every corner of a path by blends, whose sizes are given as distances or follow from a tolerance.
+
+The remaining distance of a blend is that from its vertex to both of its ends, along the segments.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,7 @@ class RoundingSettings:
     Attributes:
         samples: Samples of a blend for its deviation, of the neighbourhood of the maximum, and of one turn of a helix
             for its closest point.
-        reserve: Share of the tolerance reserved for what lies between the samples.
+        reserve: Fraction of the tolerance reserved for deviations between the samples.
         iterations: Largest number of remaining distances tried, and of rounds that shrink overlapping blends.
         newton_iterations: Newton iterations to the closest point of a helix.
         least_slope: Slope of the condition of the closest point below which a step is damped: near the helix axis.
@@ -68,7 +71,7 @@ class _Corners(NamedTuple):
 
     Attributes:
         shape: Shape factors. Shape (V,).
-        vertices: Indices; 0 is the end of the first segment. Shape (V,).
+        vertices: Indices of the vertices; 0 is the end of the first segment. Shape (V,).
     """
 
     path: Path
@@ -82,19 +85,19 @@ class _Corners(NamedTuple):
 
     @property
     def curved(self) -> NDArray[np.intp]:
-        """Indices of the corners with an arc or a helix on either side."""
+        """Indices of the corners with an arc or a helix on at least one side."""
         segments = self.path.curvature > 0
         return np.flatnonzero(segments[self.vertices] | segments[self.vertices + 1])
 
     def ends(self, remaining: Array) -> Ends:
-        """Return position, tangent and curvature vector at the start and end of the blends. Shape (V, 3) each."""
+        """Return point, unit tangent and curvature vector at the start and end of each blend. Shape (V, 3) each."""
         before = self.vertices
         p0, n0, k0, _ = self.path.at(before, self.path.lengths[before] - remaining)
         p1, n1, k1, _ = self.path.at(before + 1, remaining)
         return p0, n0, k0, p1, n1, k1
 
     def blends(self, remaining: Array) -> Array:
-        """Return the polynomials of the blends with remaining distances (V,). Shape (V, 6, 3)."""
+        """Return the polynomial coefficients of the blends with given remaining distances, (V,). Shape (V, 6, 3)."""
         p0, n0, k0, p1, n1, k1 = self.ends(remaining)
         rate = (self.shape * remaining)[:, None]
         if self.kind == "cubic":
@@ -102,7 +105,7 @@ class _Corners(NamedTuple):
         return quintic((p0, rate * n0, rate**2 * k0), (p1, rate * n1, rate**2 * k1))
 
     def with_best_shape(self, remaining: Array) -> _Corners:
-        """Return the same corners with the shape factor of each optimised."""
+        """Return the corners with the shape factor of each that gives its quintic blend the least peak curvature."""
         shape, curved = corner_shape(self.path.corner_angles()[self.vertices]), self.curved
         subset = self.subset(curved)
         shape[curved] = best_shape(subset.ends(remaining[curved]), remaining[curved])
@@ -112,7 +115,7 @@ class _Corners(NamedTuple):
 def _remaining_distances(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """Return the corners, with optimised shapes if `free`, and the remaining distances of their blends, (n - 1,), m.
+    """Return the corners, with best shape factors if `free`, and the remaining distances of their blends, (n - 1,), m.
 
     Arguments as for `smooth`.
     """
@@ -135,7 +138,7 @@ def _remaining_distances(
 
 
 def _within_tolerance(corners: _Corners, tolerance: Array, overlap: Overlap) -> Array:
-    """Return the largest remaining distances at which the blends keep a tolerance. Shape (V,), m."""
+    """Return the largest distances from vertex to blend end at which the deviation is within tolerance. (V,), m."""
     path = corners.path
     # at most the segment length, so that every trial curve exists
     longest = np.minimum(path.lengths[:-1], path.lengths[1:])
@@ -209,7 +212,7 @@ def _initial_distances(corners: _Corners, tolerance: Array, longest: Array) -> A
 
 
 def _solve_distances(corners: _Corners, tolerance: Array, longest: Array) -> Array:
-    """Return remaining distances, up to `longest`, at which the deviation reaches the tolerance or stays below it."""
+    """Return distances from vertex to blend end, up to `longest`, at which the deviation is at most the tolerance."""
     low, high, trial = np.zeros_like(longest), longest.copy(), longest.copy()
     todo = np.arange(len(longest))
     for number in range(SETTINGS.iterations):
@@ -257,7 +260,7 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
 
 
 def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
-    """Return the largest distance from the replaced parts of the path to each blend. Shape (V,), m."""
+    """Return the largest distance of each blend from the points of the path that it replaces. Shape (V,), m."""
     path, result = corners.path, np.empty(len(remaining))
     u, v = np.linspace(0, 1, 4 * SETTINGS.samples), np.linspace(0, 1, SETTINGS.samples)
     for first in range(0, len(remaining), SETTINGS.block):
@@ -292,7 +295,10 @@ def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remain
 
 
 def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distance of points (V, S, 3) from the part first..last of one path segment each."""
+    """Return the distances of points (V, S, 3) from parts of path segments, one part for each row of points.
+
+    A part extends from the distance `first` to the distance `last` along its segment. Shape (V, S), m.
+    """
     helices = np.flatnonzero(path.torsion[index] != 0)
     if helices.size:
         result, others = np.empty(points.shape[:2]), np.flatnonzero(path.torsion[index] == 0)
@@ -304,7 +310,7 @@ def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, fir
     along = np.einsum("vsi,vi->vs", offset, path.tangent[index])
     across = np.einsum("vsi,vi->vs", offset, path.normal[index])
     k = path.curvature[index][:, None]
-    # angle about the center from the start, in the turn of the stretch's middle
+    # angle about the center from the start, in the turn of the part's middle
     middle = (first + last)[:, None] / 2
     angle = np.arctan2(k * along, 1 - k * across)
     angle = k * middle + (angle - k * middle + np.pi) % (2 * np.pi) - np.pi
@@ -319,7 +325,7 @@ def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, fir
 
 
 def _distance_to_helix(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the same distances as `_distance_to_segment` for helices, by Newton's method from the closest sample."""
+    """Return distances as `_distance_to_segment` does, for helices, by Newton's method from the closest sample."""
     if len(index) > SETTINGS.block:
         parts = [slice(k, k + SETTINGS.block) for k in range(0, len(index), SETTINGS.block)]
         return np.concatenate([_distance_to_helix(path, index[p], points[p], first[p], last[p]) for p in parts])
@@ -348,10 +354,10 @@ def smooth(
     shape: Any = None,
     overlap: Overlap = "shrink",
 ) -> SmoothPath:
-    """Round every corner of a path.
+    """Return a path with every corner rounded by a polynomial blend.
 
     Args:
-        path: The task.
+        path: The path with corners.
         remaining: Distance (m) along the segments from a vertex to both ends of its blend, one for all vertices or one
             for each.
         deviation: Instead of `remaining`, the largest distance (m) between smooth path and task, in both directions.
@@ -407,7 +413,7 @@ def smooth(
 
 def _check_turns(smoothed: SmoothPath) -> None:
     theta = smoothed.charts[1]
-    largest = np.linalg.norm(theta, axis=2).sum(axis=1)  # bounds |theta| over the whole piece
+    largest = np.linalg.norm(theta, axis=2).sum(axis=1)  # bounds |theta| over the whole segment or blend
     if largest.max() > FULL_TURN:
         bounds = smoothed.bounds[:-1][largest > FULL_TURN]
         u = np.linspace(0, 1, 33)[:, None] ** np.arange(6)

@@ -29,10 +29,10 @@ SHORTEST_SEGMENT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A straight segment.
+    """A straight segment of a path.
 
     Attributes:
-        start, end: In world. Shape (3,), m.
+        start, end: Start and end point in world. Shape (3,), m.
         start_orientation, end_orientation: Tool orientation in world at both ends, unit quaternion [w, x, y, z]. Shape
             (4,). Between them the tool turns about a fixed axis, by the shorter way, in proportion to the distance. A
             start of None continues the segment before (the first one: no rotation); an end of None equals the start.
@@ -62,7 +62,7 @@ class Line:
 
     @cached_property
     def length(self) -> float:
-        """Length, m."""
+        """Length of the line, m."""
         return float(np.linalg.norm(self.end - self.start))
 
     @property
@@ -104,8 +104,8 @@ class Arc(_Circular):
     """A circular arc in any plane, up to a full circle. `Arc.through` and `Arc.about` construct it.
 
     Attributes:
-        start: In world. Shape (3,), m.
-        center: In world. Shape (3,), m.
+        start: Start point in world. Shape (3,), m.
+        center: Center of the circle in world. Shape (3,), m.
         axis: Unit vector about which the arc turns, right-handed. Shape (3,).
         sweep: Angle of rotation, rad, in (0, 2 pi].
         start_orientation, end_orientation: As for a Line.
@@ -186,7 +186,7 @@ class Arc(_Circular):
 
     @property
     def length(self) -> float:
-        """Length, m."""
+        """Length of the arc, m."""
         return self.radius * self.sweep
 
     @property
@@ -196,7 +196,7 @@ class Arc(_Circular):
 
     @property
     def curvature(self) -> float:
-        """Curvature, 1/m."""
+        """Curvature of the arc, 1/m."""
         return 1 / self.radius
 
 
@@ -205,7 +205,7 @@ class Helix(_Circular):
     """A circular helix, or a circle of several turns: a curve of constant curvature and torsion.
 
     Attributes:
-        start: In world. Shape (3,), m.
+        start: Start point in world. Shape (3,), m.
         center: Center of the circle that the helix starts on, in world. Shape (3,), m.
         axis: Unit vector about which the helix turns, right-handed. Shape (3,).
         sweep: Angle of rotation, rad; positive, any number of turns.
@@ -237,7 +237,7 @@ class Helix(_Circular):
 
     @property
     def length(self) -> float:
-        """Length, m."""
+        """Arc length of the helix, m."""
         return float(np.hypot(self.radius * self.sweep, self.rise))
 
     @property
@@ -248,12 +248,12 @@ class Helix(_Circular):
 
     @property
     def curvature(self) -> float:
-        """Curvature, 1/m."""
+        """Curvature of the helix, 1/m."""
         return self.radius * (self.sweep / self.length) ** 2
 
     @property
     def torsion(self) -> float:
-        """Torsion, 1/m; positive for a right-handed screw."""
+        """Torsion of the helix, 1/m; positive for a right-handed one."""
         return self.rise * self.sweep / self.length**2
 
 
@@ -269,11 +269,11 @@ def screw(
     torsion: float | Array,
     distance: float | Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the point at `distance` along a line, an arc or a helix, and its first three derivatives by the distance.
+    """Return the point at a distance along a line, arc or helix, and three derivatives with respect to the distance.
 
     Args:
-        start, tangent, normal: At distance 0. Shape (..., 3), m and unit vectors.
-        curvature, torsion: Shape (...), 1/m; both zero for a line, the torsion for an arc.
+        start, tangent, normal: Point, unit tangent and unit normal at distance 0. Shape (..., 3), m and unit vectors.
+        curvature, torsion: Shape (...), 1/m; both zero for a line, torsion zero for an arc.
         distance: Shape (...), m.
 
     Returns:
@@ -293,9 +293,10 @@ def screw(
 def screw_axes(
     tangent: Array, normal: Array, curvature: float | Array, torsion: float | Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the tangent's axial and tangential components, the vector towards the screw axis and the rotation rate.
+    """Return the vectors and the rotation rate of the screw motion that describes a line, arc or helix.
 
-    Shape (..., 3) three times; (...), rad/m. Arguments as for `screw`.
+    The axial and tangential components of the tangent and the vector towards the screw axis, shape (..., 3) each; the
+    rotation rate, shape (...), rad/m. Arguments as for `screw`.
     """
     k, w = np.asarray(curvature, dtype=float), np.asarray(torsion, dtype=float)
     if not np.any(w):
@@ -309,7 +310,7 @@ def screw_axes(
 
 
 def _set_circle(segment: Any, owner: str) -> float:
-    """Check and set start, center and axis. Return the radius, m."""
+    """Check and set start, center and axis of an arc or a helix. Return its radius, m."""
     for name in ("start", "center", "axis"):
         object.__setattr__(segment, name, require.array(f"{owner}: {name}", getattr(segment, name), (3,)))
     norm = float(np.linalg.norm(segment.axis))
@@ -384,7 +385,7 @@ def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orienta
 
 
 def product(first: ArrayInput, second: ArrayInput) -> Array:
-    """Return the quaternion product of rows or single quaternions: `second` in axes of `first`. Shape (..., 4)."""
+    """Return the product `first` * `second` of two quaternions [w, x, y, z] or of rows of them. Shape (..., 4)."""
     p, q = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
     scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
     vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])

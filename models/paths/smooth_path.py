@@ -1,9 +1,9 @@
 """Paths with rounded corners as functions of the distance along them.
 
-On each piece of a path the tool orientation is q(s) = reference exp(theta(s)) with a polynomial theta of the distance.
-A segment that turns at a constant rate about a fixed axis is linear in this chart, whether the reference is its start
-or the vertex at its end. A quintic in the chart of a vertex therefore joins two segments with continuous rate and
-acceleration.
+On each piece of a path, a blend or what remains of a segment, the tool orientation is q(s) = reference exp(theta(s)),
+where the rotation vector theta is a polynomial of the distance s. For a segment that turns at a constant rate about a
+fixed axis theta is linear, whether the reference is its start or the vertex at its end. A quintic theta with the
+reference at a vertex therefore joins two segments with continuous rate and acceleration.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ BLOCK_SIZE = 50_000
 
 
 class PathPoint(NamedTuple):
-    """Position on a path and its derivatives by the distance, at M distances.
+    """Position on a path and its derivatives with respect to distance, at M distances from the start.
 
     Attributes:
-        position: In world. Shape (M, 3), m.
+        position: Position in world. Shape (M, 3), m.
         tangent: Unit tangent. Shape (M, 3).
         curvature: Curvature vector. Shape (M, 3), 1/m.
         curvature_rate: Derivative of the curvature vector. Shape (M, 3), 1/m^2.
@@ -45,12 +45,13 @@ class PathPoint(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """Tool orientation and its rates at M distances.
+    """Tool orientation and its derivatives with respect to distance, at M distances along a path.
 
     Attributes:
         quaternion: Tool orientation in world. Shape (M, 4).
-        rate: Angular velocity at unit line speed, in world axes. Shape (M, 3), rad/m.
-        acceleration, jerk: Derivatives of the rate by the distance. Shape (M, 3), rad/m^2 and rad/m^3.
+        rate: Angular velocity at unit speed along the path, in world axes. Shape (M, 3), rad/m.
+        acceleration, jerk: First and second derivatives of the rate with respect to distance. Shape (M, 3), rad/m^2 and
+            rad/m^3.
     """
 
     quaternion: Array
@@ -61,7 +62,7 @@ class Turn(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """One rounded corner.
+    """Polynomial curve that rounds one corner of a path.
 
     Attributes:
         vertex: The corner in world. Shape (3,), m.
@@ -69,7 +70,7 @@ class Blend:
         remaining: Distance (m) from the vertex to both ends of the blend, along the segments.
         shape: Shape factor.
         start, end: Distances of the blend's ends along the smooth path, m.
-        coefficients: Ascending polynomial in u of [0, 1]. Shape (6, 3), m.
+        coefficients: Coefficients of the polynomial in u from 0 to 1, in ascending order. Shape (6, 3), m.
     """
 
     vertex: Array
@@ -82,7 +83,7 @@ class Blend:
 
     @property
     def length(self) -> float:
-        """Length, m."""
+        """Length of the blend, m."""
         return self.end - self.start
 
 
@@ -93,10 +94,10 @@ class SmoothPath:
     Its pieces are the remaining parts of the segments and the blends between them.
 
     Attributes:
-        path: The task before its corners were rounded.
+        path: The path before its corners were rounded.
         kind: "cubic" or "quintic".
-        remaining, shape: Of each vertex. Shape (V,), m and 1.
-        coefficients: Of the blends. Shape (V, 6, 3), m.
+        remaining, shape: Remaining distance and shape factor of the blend at each vertex. Shape (V,), m and 1.
+        coefficients: Polynomial coefficients of the blends. Shape (V, 6, 3), m.
         bounds: Distances at which the pieces begin, and finally the length. Shape (P + 1,), m.
         piece_segment: Segment of each piece, -1 for a blend. Shape (P,).
         piece_blend: Vertex of each blend, -1 for a part of a segment. Shape (P,).
@@ -115,12 +116,12 @@ class SmoothPath:
 
     @property
     def length(self) -> float:
-        """Length, m."""
+        """Length of the path, m."""
         return float(self.bounds[-1])
 
     @property
     def piece_lengths(self) -> Array:
-        """Lengths of the pieces, which are segments and blends in order. Shape (P,), m."""
+        """Lengths of the pieces: remaining parts of segments and blends, in order. Shape (P,), m."""
         return np.diff(self.bounds)
 
     @cached_property
@@ -130,7 +131,7 @@ class SmoothPath:
 
     @cached_property
     def cell_bounds(self) -> Array:
-        """Distance at which each cell of each blend begins. Shape (C,), m."""
+        """Distance along the path at which each quadrature cell of the blends begins. Shape (C,), m."""
         before = np.cumsum(self.cells.length) - self.cells.length
         first = np.searchsorted(self.cells.curve, np.arange(len(self.coefficients)))
         # to the last bit, the bound of a blend's first cell must equal the blend's own, or points fall before the blend
@@ -178,16 +179,16 @@ class SmoothPath:
         return Turn(*_in_blocks(self._turn, s, (4, 3, 3, 3)))
 
     def parameter(self, distance: ArrayInput) -> Array:
-        """Return the parameter u of the blend at distances from the start; nan on segments. Shape (M,)."""
+        """Return the curve parameter u of the blends at distances from the start; nan on segments. Shape (M,)."""
         s = self.checked_distance(distance)
         u, curved = np.full(len(s), np.nan), self.piece_blend[self._piece(s)] >= 0
         u[curved] = _in_blocks(lambda at: (self._parameter(at)[1][:, None],), s[curved], (1,))[0][:, 0]
         return u
 
     def sample_distances(self, per_cell: int = 16, per_segment: int = 2) -> Array:
-        """Return distances that resolve every piece: uniform in each cell of a blend and in each part of a segment.
+        """Return distances for sampling the path, such as for plots: equidistant in each segment and cell of a blend.
 
-        Shape (M,), m.
+        Shape (M,), m. A cell is a quadrature interval of a blend.
         """
         for name, number in (("per_cell", per_cell), ("per_segment", per_segment)):
             require.count(f"path: {name}", number)
@@ -203,7 +204,7 @@ class SmoothPath:
         return np.append(inside, self.length)
 
     def by_piece(self, of_segments: ArrayInput) -> Array:
-        """Return the speed on each piece from that of each segment; a blend has the lower speed of its neighbours.
+        """Return the speed on every segment and blend from that on the segments; a blend has its lower neighbour's.
 
         Shape (P,).
 
@@ -216,7 +217,7 @@ class SmoothPath:
         return np.where(self.piece_blend >= 0, blends, values[self.piece_segment])
 
     def curvature_jumps(self) -> Array:
-        """Return the jump of the curvature vector between consecutive pieces. Shape (P - 1,), 1/m."""
+        """Return the jump of the curvature vector between consecutive segments and blends. Shape (P - 1,), 1/m."""
         left, right = self._end_curvatures(1.0)[:-1], self._end_curvatures(0.0)[1:]
         return np.asarray(np.linalg.norm(right - left, axis=1))
 
@@ -271,12 +272,12 @@ class SmoothPath:
         return along_piece(reference[piece], theta[piece], length, (s - self.bounds[piece]) / length)
 
     def _on_segment(self, segment: NDArray[np.intp], distance: Array) -> tuple[Array, ...]:
-        """Return position and derivatives on segments at distances from the end of the blend before each."""
+        """Return position and derivatives on segments, at distances from the ends of the preceding blends."""
         start_offset = np.concatenate([[0.0], self.remaining])[segment]
         return self.path.at(segment, start_offset + distance)
 
     def _end_curvatures(self, u: float) -> Array:
-        """Return the one-sided curvature vector of each piece at its start (u = 0) or end (u = 1)."""
+        """Return the one-sided curvature vector of each segment and blend at its start (u = 0) or end (u = 1)."""
         result = np.empty((len(self.piece_segment), 3))
         parts = np.flatnonzero(self.piece_segment >= 0)
         result[parts] = self._on_segment(self.piece_segment[parts], u * self.piece_lengths[parts])[2]
@@ -286,7 +287,10 @@ class SmoothPath:
 
     @cached_property
     def charts(self) -> tuple[Array, Array]:
-        """Reference quaternion (P, 4) and rotation vector polynomial (P, 6, 3) of each piece; u is distance/length."""
+        """Reference quaternions and rotation vector polynomials of the tool orientation on each segment and blend.
+
+        Shapes (P, 4) and (P, 6, 3). The variable of the polynomials is distance / length.
+        """
         path, lengths = self.path, self.piece_lengths
         rate = path.turn / path.lengths[:, None]
         start_offset = np.concatenate([[0.0], self.remaining])
@@ -307,7 +311,7 @@ class SmoothPath:
 
 
 def _in_blocks(function: Callable[[Array], tuple[Array, ...]], s: Array, widths: tuple[int, ...]) -> list[Array]:
-    """Evaluate a function of distances in blocks to bound its memory. Shapes (M,) to (M, width) each."""
+    """Return the results of a function at many distances, in blocks to bound its memory. Shapes (M,) to (M, width)."""
     results = [np.empty((len(s), width)) for width in widths]
     for first in range(0, len(s), BLOCK_SIZE):
         part = slice(first, first + BLOCK_SIZE)
@@ -320,7 +324,7 @@ SERIES_TERMS = 18
 
 
 def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) -> tuple[Array, Array, Array, Array]:
-    """Return orientation and its rates for M samples, computed in numpy as `orientation_function` does in casadi.
+    """Return tool orientation and its rates at M samples, computed in numpy as `orientation_function` does in casadi.
 
     omega = theta' + B theta x theta' + C theta x (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and
     a = |theta|, in the axes of the reference. B and C are entire functions of a^2.
@@ -331,7 +335,7 @@ def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) 
         length, fraction: Shape (M,).
 
     Returns:
-        Unit quaternion (M, 4); rate, acceleration and jerk by the distance (M, 3).
+        Unit quaternion (M, 4); rate, acceleration and jerk with respect to the distance (M, 3).
     """
     t0, t1, t2, t3 = (polynomial(theta, fraction, order) / length[:, None] ** order for order in range(4))
     square = _dot(t0, t0)
@@ -365,7 +369,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    """Return sum of (-x)^k / (2 k + start)! at x = `square`, and its first two derivatives."""
+    """Return the series of (-x)^k / (2 k + start)! at x = `square`, and its first two derivatives with respect to x."""
     value, first, second = (np.zeros_like(square) for _ in range(3))
     for k in reversed(range(SERIES_TERMS)):
         second = second * square + 2 * first

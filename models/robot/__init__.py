@@ -1,1 +1,1 @@
-"""Robots: trees of links and joints, their kinematics and dynamics as expressions."""
+"""Robots: trees of links and joints, with their kinematics and dynamics as CasADi expressions."""

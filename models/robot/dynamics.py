@@ -1,4 +1,4 @@
-"""Dynamics of robots: momentum, joint torques, base reaction and mass matrix, with external wrenches.
+"""Dynamics of robots: momentum, mass matrix, and the joint torques and base reaction of motions under external loads.
 
 Joint positions, velocities and accelerations have shape (dof, 1) in the order of `robot.joint_names`, as SX, MX, DM or
 numbers. The base is at rest unless its motion is given; moments are about points at rest in the world. All functions
@@ -82,9 +82,9 @@ def inverse_dynamics(
     world_from_base: Placement | None = None,
     base_motion: tuple[Expression, Expression] | None = None,
 ) -> Expression:
-    """Return the joint torques (forces of prismatic joints) of a motion. Shape (dof, 1), N m or N.
+    """Return the joint torques (forces of prismatic joints) that a motion requires. Shape (dof, 1), N m or N.
 
-    A leader also drives its followers: its entry is its own torque plus multiplier times those of its followers.
+    A joint also drives the joints that mimic it: its entry is its own torque plus multiplier times each of theirs.
 
     Args:
         wrenches: External wrenches.
@@ -121,8 +121,8 @@ def base_reaction(
 def mass_matrix(robot: Robot, q: Expression) -> Expression:
     """Return the joint-space mass matrix with the base at rest. Shape (dof, dof), kg m^2, kg m or kg.
 
-    Composite rigid bodies (Featherstone 2008, 6.2): M_ij is the momentum of all that joint j carries, per rate of j,
-    along the axis of each joint i that carries j.
+    Composite rigid bodies (Featherstone 2008, 6.2): M_ij is the momentum of all links that joint j carries, per
+    rate of j, along the axis of each joint i that carries j.
     """
     frames, axes = frames_and_axes(robot, q)
     moments = subtree_moments(robot, frames)
@@ -142,7 +142,7 @@ def mass_matrix(robot: Robot, q: Expression) -> Expression:
 def external_wrench(
     robot: Robot, q: Expression, wrenches: Sequence[Wrench], world_from_base: Placement | None = None
 ) -> Expression:
-    """Return the sum of wrenches: (moment about the world's origin, force). Shape (6, 1)."""
+    """Return the resultant of external wrenches: (moment about the world's origin, force). Shape (6, 1)."""
     frames = link_frames(robot, q, world_from_base)
     total: Expression = ca.DM(6, 1)
     for column, wrench in enumerate(checked_wrenches(wrenches)):
@@ -152,12 +152,12 @@ def external_wrench(
 
 
 def checked_wrenches(wrenches: Sequence[Wrench]) -> tuple[Wrench, ...]:
-    """Return `wrenches` as a tuple; raise ModelError unless all are wrenches."""
+    """Return a list of wrenches as a tuple; raise ModelError if an entry is no Wrench."""
     return require.each("dynamics: wrenches", wrenches, Wrench)
 
 
 def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
-    """Return moment, force and point of every wrench, one column each. Shape (9, k)."""
+    """Return a matrix with one column per wrench: moment, force and point of application. Shape (9, k)."""
     require.instance("dynamics: robot", robot, Robot)
     columns = []
     for wrench in checked_wrenches(wrenches):
@@ -167,13 +167,13 @@ def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
 
 
 def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Expression]:
-    """Return moment, force and application point of a wrench."""
+    """Return moment, force and point of application of one wrench from the matrix of `stacked_wrenches`."""
     moment, force, point = (stacked[3 * i : 3 * i + 3, column] for i in range(3))
     return moment, force, point
 
 
 def _twist_and_rate(base_motion: tuple[Expression, Expression] | None) -> tuple[Expression | None, Expression | None]:
-    """Return twist and twist rate of a base motion; raise ModelError unless it has these two parts."""
+    """Return the twist of the base and its time derivative; raise ModelError unless `base_motion` is such a pair."""
     if base_motion is None:
         return None, None
     if not isinstance(base_motion, tuple | list) or len(base_motion) != 2:
@@ -194,7 +194,7 @@ def _efforts(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> tuple[Expression, Expression]:
-    """Return the joint torques and the base reaction.
+    """Return the joint torques and the base reaction of a motion by the recursive Newton-Euler algorithm.
 
     A point x of a link accelerates by a + U x, with U = [alpha x] + [omega x]^2 of the link and a of its origin, less
     gravity. So the link needs the force m a + U h and the moment cross(h, a) + sum of m cross(x, U x). The entries of
@@ -243,7 +243,10 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Return acceleration less gravity (3, 1) and acceleration field (3, 3) of each link in its own axes, by name."""
+    """Return acceleration of the origin less gravity (3, 1) and acceleration field (3, 3) of each link, by link name.
+
+    Both are in the axes of the link; `_field` explains the field.
+    """
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
@@ -282,17 +285,20 @@ def _mass_sums(link: Link) -> tuple[Expression, Expression]:
 
 
 def _field(spin: Expression, turning: Expression) -> Expression:
-    """Return the acceleration field of a rotating body: [alpha x] + [omega x]^2. Shape (3, 3)."""
+    """Return the acceleration field of a rotating body: the matrix from the position of a point to its acceleration.
+
+    [alpha x] + [omega x]^2 with the angular velocity omega, `spin`, and acceleration alpha, `turning`. Shape (3, 3).
+    """
     squares = ca.mtimes(spin, spin.T)
     return skew(turning) + squares - ca.trace(squares) * ca.DM.eye(3)
 
 
 class MassMoments(NamedTuple):
-    """Mass, first and second moments of bodies about the world's origin, which contain their spatial inertia.
+    """Mass and first and second mass moments of a set of bodies about the world's origin.
 
     Attributes:
         mass: kg.
-        first: Sum of m c. Shape (3, 1), kg m.
+        first: Sum of mass times centre of mass. Shape (3, 1), kg m.
         second: Rotational inertia about the origin, lower triangle only. Shape (3, 3), kg m^2.
     """
 
@@ -305,12 +311,12 @@ class MassMoments(NamedTuple):
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """Return (angular momentum about the origin, linear momentum) of bodies that share a motion vector."""
+        """Return (angular momentum about the world's origin, linear momentum) if all bodies move with one twist."""
         angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
         return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
     def spatial_inertia(self) -> Expression:
-        """Return the spatial inertia about the origin. Shape (6, 6)."""
+        """Return the spatial inertia of the bodies about the world's origin. Shape (6, 6)."""
         arm = skew(self.first)
         return ca.vertcat(ca.horzcat(ca.tril2symm(self.second), arm), ca.horzcat(arm.T, self.mass * ca.DM.eye(3)))
 
@@ -334,13 +340,13 @@ def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | No
 
 
 def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the spatial inertia with locked joints about the world's origin, world axes. Shape (6, 6)."""
+    """Return the spatial inertia of the robot with locked joints about the world's origin, world axes. Shape (6, 6)."""
     frames = link_frames(robot, q, world_from_base)
     return ca.densify(subtree_moments(robot, frames)[robot.root].spatial_inertia())
 
 
 def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
-    """Return the mass moments about the world's origin of each link with all links that it carries, by link name."""
+    """Return the mass moments about the world's origin of each link and all links that it carries, by link name."""
     moments: dict[str, MassMoments] = {}
     for link in robot.links:
         turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)
@@ -357,7 +363,7 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
 def joint_momenta(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
 ) -> Expression:
-    """Return the momentum matrix from the axes of frames_and_axes and the moments of subtree_moments."""
+    """Return the momentum matrix from given joint axes (frames_and_axes) and mass moments (subtree_moments)."""
     children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
     momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
     return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, momenta))
@@ -413,6 +419,6 @@ def momentum_rate(
 
 
 def inertia_in_world(link: Link, frames: dict[str, Frame]) -> Expression:
-    """Return the rotational inertia about the centre of mass, world axes. Shape (3, 3)."""
+    """Return the rotational inertia of a link about its centre of mass, world axes. Shape (3, 3)."""
     turn = frames[link.name].rotation
     return ca.mtimes([turn, ca.sparsify(ca.DM(link.inertia)), turn.T])

@@ -1,7 +1,7 @@
 """Kinematics of robots: frames, Jacobians, motion of links and centre of mass, performance indices.
 
 Joint positions q, velocities qd and accelerations qdd have shape (dof, 1) in the order of `robot.joint_names`, as SX,
-MX, DM or numbers; followers move with their leaders. `world_from_base` = (rotation, position) is the pose of the root
+MX, DM or numbers; mimic joints move as coupled. `world_from_base` = (rotation, position) is the pose of the root
 link in the world, the identity if None. The base is at rest.
 
 Everything is written in world axes, so that what a planar machine cannot do stays a structural zero. All functions
@@ -26,7 +26,7 @@ Placement = tuple[Expression, Expression]
 
 
 class _Turn(NamedTuple):
-    """Rotation about consecutive parallel axes: orientation before the first axis, common axis, sum of the angles."""
+    """Rotation about consecutive parallel joint axes: orientation before the first, common axis, sum of the angles."""
 
     before: Expression
     axis: Array
@@ -34,13 +34,13 @@ class _Turn(NamedTuple):
 
 
 def joint_vector(robot: Robot, q: Expression, name: str = "q") -> Expression:
-    """Return `q` as a column; raise ModelError unless it has one entry for each entry of the joint vector."""
+    """Return a joint vector as a column; raise ModelError unless it has one entry for each independent joint."""
     require.instance("kinematics: robot", robot, Robot)
     return checked_vector(name, q, robot.dof, f"one entry for each of the joints {list(robot.joint_names)}")
 
 
 def checked_vector(label: str, value: Expression, size: int, meaning: str) -> Expression:
-    """Return `value` as a column of `size` entries.
+    """Return a vector as a CasADi column after checking that it has `size` entries.
 
     Args:
         label: As in `models.checks.Checks`.
@@ -84,18 +84,18 @@ def checked_placement(placement: Placement | None) -> Frame:
 
 
 def each_joint(robot: Robot, vector: Expression, what: str = "q") -> dict[str, Expression]:
-    """Expand a joint vector to all moving joints, followers included, by name.
+    """Expand a joint vector to all moving joints, including those that mimic others; return the values by joint name.
 
-    Correct for rates and accelerations; for positions, the offsets of followers are not added.
+    Correct for rates and accelerations; for positions, the offsets of mimic joints are not added.
     """
     vector = joint_vector(robot, vector, what)
     return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.couplings.items()}
 
 
 def by_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> list[Expression]:
-    """Reduce quantities of all moving joints, such as Jacobian columns or forces, to the entries of the joint vector.
+    """Reduce quantities of all moving joints, such as Jacobian columns or forces, to one per entry of the joint vector.
 
-    Each entry is that of the leader plus multiplier times those of its followers.
+    Each entry is that of the joint itself plus multiplier times those of the joints that mimic it.
     """
     entries = [by_joint[name] for name in robot.joint_names]
     for joint in robot.joints:
@@ -106,7 +106,7 @@ def by_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> list[Ex
 
 
 def link_frames(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Frame]:
-    """Return the frames of all links in the world by link name, the root first."""
+    """Return the frames of all links in the world, by link name, the root link first."""
     return frames_and_axes(robot, q, world_from_base)[0]
 
 
@@ -179,7 +179,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 def point_jacobian(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
 ) -> Expression:
-    """Return the Jacobian of a point in the world from the axes of frames_and_axes. Shape (6, dof)."""
+    """Return the Jacobian of a link's point (in world) from given joint axes (frames_and_axes). Shape (6, dof)."""
     carriers = {joint.name for joint in robot.path_to(link)}
     columns = {
         name: ca.vertcat(angular, linear + cross(angular, point)) if name in carriers else ca.DM(6, 1)
@@ -202,7 +202,7 @@ def joint_frames(robot: Robot, q: Expression) -> dict[str, Frame]:
 
 
 def _positions(robot: Robot, q: Expression) -> dict[str, Expression]:
-    """Return the positions of all moving joints, followers included, by name."""
+    """Return the positions of all moving joints, including those that mimic others, by joint name."""
     positions = each_joint(robot, q)
     for name, coupling in robot.couplings.items():
         if coupling.offset:
@@ -213,7 +213,7 @@ def _positions(robot: Robot, q: Expression) -> dict[str, Expression]:
 def frames_and_axes(
     robot: Robot, q: Expression, world_from_base: Placement | None = None
 ) -> tuple[dict[str, Frame], dict[str, tuple[Expression, Expression]]]:
-    """Return the frames of the links, and the motion vectors of all moving joints, followers included, both by name.
+    """Return the frames of all links, and the motion vectors of all moving joints, also of mimic joints, both by name.
 
     A motion vector is (angular velocity, velocity at the world's origin) per unit rate of the joint, world axes.
     """
@@ -247,15 +247,15 @@ def frames_and_axes(
 
 
 def constant(array: Array) -> Expression:
-    """Return an array as a DM without its zeros, including rounding residues such as cos(pi / 2)."""
+    """Return an array as a sparse DM that omits zeros and rounding residues such as cos(pi / 2)."""
     return ca.sparsify(ca.DM(array), 1e-15 * float(np.abs(array).max(initial=0.0)))
 
 
 class LinkMotion(NamedTuple):
-    """Motion of a link, world axes.
+    """Position, velocities and accelerations of a link and its centre of mass, in world axes.
 
     Attributes:
-        center: Position of its centre of mass. Shape (3, 1), m.
+        center: Position of the centre of mass. Shape (3, 1), m.
         velocity, acceleration: Of the centre of mass. Shape (3, 1).
         angular_velocity, angular_acceleration: Shape (3, 1).
     """
@@ -278,7 +278,7 @@ class CenterOfMassMotion(NamedTuple):
 def link_motions(
     robot: Robot, q: Expression, qd: Expression, qdd: Expression, *, world_from_base: Placement | None = None
 ) -> dict[str, LinkMotion]:
-    """Return the motion of every link, by name, root first."""
+    """Return the motion of every link (`LinkMotion`), by link name, the root link first."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     return propagate_motions(robot, frames, axes, qd=qd, qdd=qdd)
 
@@ -287,7 +287,7 @@ def link_motions(
 def center_of_mass_motion(
     robot: Robot, q: Expression, qd: Expression, qdd: Expression, *, world_from_base: Placement | None = None
 ) -> CenterOfMassMotion:
-    """Return the motion of the centre of mass; raise ModelError if the robot has no mass."""
+    """Return the motion of the whole robot's centre of mass; raise ModelError if the robot has no mass."""
     if require.instance("kinematics: robot", robot, Robot).total_mass == 0:
         raise massless_error("hence no centre of mass")
     motions = link_motions(robot, q, qd, qdd, world_from_base=world_from_base)
@@ -304,7 +304,7 @@ def propagate_motions(
     qd: Expression,
     qdd: Expression,
 ) -> dict[str, LinkMotion]:
-    """Propagate the motion from the root outwards over the link frames, then to the centres of mass."""
+    """Return the motion of every link, by name, propagated from the root link outwards."""
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
     # velocity and acceleration of the frame's origin, angular velocity, angular acceleration
     origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {robot.root: (ca.DM(3, 1),) * 4}
@@ -338,9 +338,9 @@ TWIST_SIZE = 6
 
 
 def joint_limit_index(robot: Robot, q: Expression) -> Expression:
-    """Return the sum of ((q - middle) / range)^2 over the joints with two limits, (23) of Yoo et al. 2004.
+    """Return the joint-limit index, the sum of ((q - middle) / range)^2 over all joints with two position limits.
 
-    Each joint adds 0 at the middle of its range and 1/4 at a limit; a joint without limits adds nothing. Shape (1, 1).
+    Equation (23) of Yoo et al. 2004. Each joint adds 0 at the middle of its range, 1/4 at a limit. Shape (1, 1).
     """
     q = joint_vector(robot, q)
     width = robot.upper - robot.lower
@@ -350,7 +350,7 @@ def joint_limit_index(robot: Robot, q: Expression) -> Expression:
 
 
 def joint_excess(robot: Robot, q: Expression) -> Expression:
-    """Return the largest violation of a position limit, negative inside, -inf without limits. Shape (1, 1)."""
+    """Return the largest violation of joint position limits; negative within all, -inf without limits. Shape (1, 1)."""
     q = joint_vector(robot, q)
     lower, upper = np.flatnonzero(np.isfinite(robot.lower)).tolist(), np.flatnonzero(np.isfinite(robot.upper)).tolist()
     if not lower and not upper:
@@ -360,7 +360,9 @@ def joint_excess(robot: Robot, q: Expression) -> Expression:
 
 @on_scalars
 def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-    """Return sqrt(det(G_r G_r')) of the rows r of a tip Jacobian G (Yoshikawa 1985), zero where the task is singular.
+    """Return the manipulability of a task that fixes some rows of the tip's twist; zero where the task is singular.
+
+    sqrt(det(G_r G_r')) of the rows r of the tip Jacobian G (Yoshikawa 1985).
 
     Args:
         jacobian: Shape (6, n).
@@ -377,7 +379,7 @@ def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TW
 
 @on_scalars
 def manipulability_of(task: Expression) -> Expression:
-    """Return sqrt(det(G G')) of a task Jacobian G of shape (m, n). Shape (1, 1)."""
+    """Return Yoshikawa's manipulability, sqrt(det(G G')), of a task Jacobian G of shape (m, n). Shape (1, 1)."""
     square = ca.mtimes(task, task.T)
     if square.shape[0] <= 7:  # division-free
         volume = determinant(square)
@@ -390,7 +392,7 @@ def manipulability_of(task: Expression) -> Expression:
 
 
 def checked_rows(rows: Sequence[int]) -> list[int]:
-    """Return `rows` as a nonempty list; raise ModelError unless they are distinct twist indices from 0 to 5."""
+    """Return twist row indices as a list; raise ModelError if there are none, one is repeated or one is not 0 to 5."""
     try:
         check_entries(rows)
         numbers = floats(list(rows))

@@ -19,7 +19,7 @@ Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic"]
 ShapeKind: TypeAlias = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 
 SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3}
-"""Kinds of collision shapes and the length of their size."""
+"""Number of entries of `size` for each kind of collision shape."""
 INERTIA_TOLERANCE = 1e-6
 """Relative tolerance of the inertia checks, so that inertias printed to six digits pass."""
 
@@ -65,11 +65,11 @@ class CollisionShape:
         object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
 
     def _check_size(self, size: Array, owner: str) -> None:
-        """Warn of sizes that look like millimetres."""
+        """Warn if an entry of the size looks like millimetres."""
         warn_of_millimetres(f"{owner}: size", size)
 
     def placed(self, rotation: Array, translation: Array) -> Self:
-        """Return the shape in another frame, given the pose of its link there, shapes (3, 3) and (3,)."""
+        """Return the shape in another frame, given the pose of its link there: rotation (3, 3), translation (3,), m."""
         turn = require.rotation("placed shape: rotation", rotation)
         shift = require.array("placed shape: translation", translation, (3,)) + turn @ self.translation
         return replace(self, translation=shift, rotation=turn @ self.rotation)
@@ -105,7 +105,7 @@ class VisualShape(CollisionShape):
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A rigid body.
+    """A link of a robot: a rigid body with its inertia and its shapes.
 
     Attributes:
         name: Unique within the robot.
@@ -145,10 +145,10 @@ class Link:
 
 @dataclass(frozen=True)
 class Mimic:
-    """The coupling of a follower to another joint: its position is multiplier times that joint's position, plus offset.
+    """Coupling of a joint that mimics another: its position is multiplier times that joint's position, plus offset.
 
     Attributes:
-        joint: Name of the joint that is followed, which may itself follow another.
+        joint: Name of the joint that is mimicked, which may itself mimic another.
         multiplier: rad or m per rad or m of that joint.
         offset: rad or m.
 
@@ -250,7 +250,7 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether the joint is not fixed; followers move."""
+        """Whether the joint can move, independently or as a mimic of another joint; False if it is fixed."""
         return self.kind != "fixed"
 
     @property
@@ -264,7 +264,7 @@ class Joint:
         return "N" if self.kind == "prismatic" else "N m"
 
     def placed(self, position: float) -> tuple[Array, Array]:
-        """Return the pose of the child link in the parent link at a position (rad or m): rotation, translation."""
+        """Return rotation and translation of the child link in the parent link at a joint position (rad or m)."""
         turn, shift = self.rotation, self.translation
         position = require.number(f"joint {self.name!r}: position", position)
         if self.kind == "prismatic":
@@ -272,7 +272,7 @@ class Joint:
         return (turn @ np.array(ca.DM(rotation(self.axis, position))) if self.moves else turn), shift
 
     def locked(self, position: float) -> Joint:
-        """Return a fixed joint at a given position (rad or m), which may violate the limits.
+        """Return this joint fixed at a given position (rad or m), which may violate its limits.
 
         Raises:
             ModelError: The joint is already fixed, or the position is not finite.
@@ -285,7 +285,7 @@ class Joint:
 
 
 def massless_error(consequence: str) -> ModelError:
-    """Return the error for a robot without mass; `consequence` says what is impossible therefore."""
+    """Return the error for a robot without mass; `consequence` says what that makes impossible."""
     message = f"the robot has no mass, {consequence}: give its links masses; in URDF none has an <inertial>"
     return ModelError(message, name="mass", value=0.0, limit=0.0)
 

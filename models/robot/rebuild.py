@@ -1,4 +1,4 @@
-"""Changes of robots: lock joints, attach tools and loads, join arms, cut branches, change the root or the tip.
+"""Changes of robots: lock joints, attach tools and loads, join arms, remove branches, change the root or the tip.
 
 Every function leaves its robot unchanged and returns a new one. Poses are translations of shape (3,), m, and rotations
 of shape (3, 3) whose columns are axes, the identity if None. All raise ModelError for an unknown name, with similar
@@ -20,7 +20,7 @@ from models.robot.tree import lock_with_followers, prune_joints, reroot_tree
 
 
 def lock_joints(robot: Robot, positions: Mapping[str, float]) -> Robot:
-    """Lock joints, and the joints that follow them, at given positions.
+    """Return the robot with some joints, and the joints that mimic them, locked at given positions.
 
     Args:
         positions: Position of each joint to lock (rad or m), by name. Limits are not checked.
@@ -36,7 +36,7 @@ def lock_joints(robot: Robot, positions: Mapping[str, float]) -> Robot:
 def move_tip(
     robot: Robot, tip: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Robot:
-    """Place the tip at a frame fixed in the link `tip`."""
+    """Return the robot with its tip at another frame, fixed in the link `tip`."""
     return replace(robot, tip=_robot(robot).link(tip).name, tip_translation=translation, tip_rotation=_turn(rotation))
 
 
@@ -48,13 +48,13 @@ def with_load(
     *,
     inertia: ArrayInput | None = None,
 ) -> Robot:
-    """Merge a rigid body into a link.
+    """Return the robot with a load, a rigid body, merged into one of its links.
 
     Args:
         link: Name of the link that carries the load.
         mass: kg.
         center_of_mass: In the link's frame. Shape (3,), m.
-        inertia: About that point, in link axes. Shape (3, 3), kg m^2; a point mass if None.
+        inertia: About the load's centre of mass, in link axes. Shape (3, 3), kg m^2; a point mass if None.
 
     Raises:
         ModelError: An impossible mass or inertia.
@@ -109,7 +109,7 @@ def merge_robots(
     translations: Mapping[str, ArrayInput] | None = None,
     rotations: Mapping[str, ArrayInput] | None = None,
 ) -> Robot:
-    """Join several robots on one base; the tip is that of the first arm, see move_tip.
+    """Join several robots, such as arms, on one base; the tip is that of the first one, see move_tip.
 
     Args:
         base: A link or a robot that carries the arms.
@@ -141,7 +141,7 @@ def merge_robots(
 
 
 def add_prefix(robot: Robot, prefix: str) -> Robot:
-    """Put a prefix before the names of the robot and of all its links and joints."""
+    """Return the robot with a prefix before its name and the names of all its links and joints."""
     robot = _robot(robot)
     if not require.text("add_prefix: prefix", prefix):
         return robot
@@ -156,7 +156,7 @@ def add_prefix(robot: Robot, prefix: str) -> Robot:
 
 
 def reroot(robot: Robot, root: str) -> Robot:
-    """Make another link the root of the tree; links keep their frames, joints their names, limits and signs.
+    """Return the robot with another root link; links keep their frames, joints their names, limits and signs.
 
     See `models.robot.tree.reroot_tree` for the massless links that this adds.
     """
@@ -165,7 +165,9 @@ def reroot(robot: Robot, root: str) -> Robot:
 
 
 def subtree(robot: Robot, root: str, tip: str | None = None) -> Robot:
-    """Return a link with all links that it carries as a robot of its own; followers are treated as by `prune`.
+    """Return a link, with all links that it carries, as a robot of its own.
+
+    Joints that mimic a removed joint are treated as by `prune`.
 
     Args:
         root: Name of the link.
@@ -183,10 +185,10 @@ def subtree(robot: Robot, root: str, tip: str | None = None) -> Robot:
 
 
 def prune(robot: Robot, keep: Iterable[str] = ()) -> Robot:
-    """Keep only the links on the paths from the root to the tip and to the links of `keep`.
+    """Return the robot with only the links on the paths from the root to the tip and to the links of `keep`.
 
     The other branches are removed with their mass. To keep the mass, lock their joints and call `simplify` instead.
-    Joints that follow a removed joint stay coupled to each other, see `models.robot.tree.prune_joints`.
+    Joints that mimic a removed joint stay coupled to each other, see `models.robot.tree.prune_joints`.
 
     Raises:
         ModelError: The robot has no tip and `keep` is empty.
@@ -199,7 +201,7 @@ def prune(robot: Robot, keep: Iterable[str] = ()) -> Robot:
 
 
 def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
-    """Merge links on fixed joints into the links that carry them; motion and dynamics stay the same.
+    """Return the robot with links on fixed joints merged into their carriers; motion and dynamics stay the same.
 
     The tip frame, the names and order of the moving joints and the frames of their links are unchanged.
 
@@ -240,7 +242,7 @@ def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
 
 
 def _merge_links(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
-    """Merge links, with their masses and shapes, into one, given their poses (rotation, translation) in its frame."""
+    """Return a link into which other links are merged with mass and shapes, at given poses (rotation, translation)."""
     shapes = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.collisions)
     visuals = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.visuals)
     link = replace(link, collisions=(*link.collisions, *shapes), visuals=(*link.visuals, *visuals))

@@ -39,7 +39,7 @@ class Robot:
 
     Attributes:
         links: All links, in the given order.
-        joints: All joints, parents before children, otherwise in the given order. Followers of a fixed joint are fixed.
+        joints: All joints, parents before children, otherwise in the given order. Mimics of a fixed joint are fixed.
         tip: Name of the link that carries the tip. If not given, the only leaf, or None if there are several.
         tip_translation: Tip frame's origin in the tip link's frame. Shape (3,), m.
         tip_rotation: Tip frame's axes, as columns, in the tip link's frame. Shape (3, 3).
@@ -47,8 +47,8 @@ class Robot:
         root: Name of the link without a parent, the base.
 
     Raises:
-        ModelError: Duplicate or unknown names, a loop, several roots, wrong sizes, a joint that follows an unknown
-            joint or itself through others, followers whose limits leave their leader no position.
+        ModelError: Duplicate or unknown names, a loop, several roots, wrong sizes, a joint that mimics an unknown
+            joint or itself through others, mimic joints whose limits leave the mimicked joint no position.
     """
 
     links: tuple[Link, ...]
@@ -79,7 +79,7 @@ class Robot:
         )
         object.__setattr__(self, "tip_rotation", require.rotation(f"{owner}: tip_rotation", self.tip_rotation))
         warn_of_millimetres(f"{owner}: tip_translation", self.tip_translation)
-        _ = self._limits  # raises if followers leave a joint no position
+        _ = self._limits  # raises if mimic joints leave a joint no position
 
     def _find_tip(self) -> str | None:
         names = [link.name for link in self.links]
@@ -126,9 +126,9 @@ class Robot:
                 joints their names, limits and signs, see `models.robot.tree.reroot_tree`.
             tip_translation: As in Robot.
             tip_rotation: As in Robot; the identity if None.
-            lock: Joints to lock together with their followers, with their positions (rad or m), by name.
-            mimic: Treatment of followers: couple them to their leaders ("couple"), lock each where it is when the joint
-                that it follows is at 0 ("lock"), or make them independent, including followers of locked joints
+            lock: Positions (rad or m) at which joints, and those that mimic them, are locked, by joint name.
+            mimic: Treatment of joints that mimic others: couple them to these ("couple"), lock each where it is when
+                the joint that it mimics is at 0 ("lock"), or make them independent, even if that joint is locked
                 ("free").
             inertia: Treatment of physically impossible inertias: accept them with a warning ("warn") or silently
                 ("as_given").
@@ -137,8 +137,8 @@ class Robot:
             ModelError: As read_urdf, Robot and `models.robot.rebuild.lock_joints`.
 
         Warns:
-            ModelWarning: Physically impossible inertias, attributes without meaning in URDF, joints whose followers'
-                limits leave them a single position.
+            ModelWarning: Physically impossible inertias, attributes without meaning in URDF, joints to which
+                limits of joints that mimic them leave a single position.
         """
         require.choice("URDF: mimic", mimic, get_args(MimicRule))
         description = read_urdf(source, inertia=inertia)
@@ -187,26 +187,26 @@ class Robot:
 
     @cached_property
     def couplings(self) -> dict[str, JointCoupling]:
-        """Coupling of each moving joint, followers included, to the joint vector, by name."""
+        """Coupling of each moving joint, also if it mimics another, to an entry of the joint vector, by joint name."""
         return joint_couplings(self.joints)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the entries of the joint vector."""
+        """Names of the independently moving joints, in the order of the joint vector."""
         return tuple(joint.name for joint in self.moving_joints)
 
     def unit(self, per: str = "") -> str:
-        """Return the units of the joint vector, "rad", "m" or both in order of appearance, each with `per` appended."""
+        """Return the units of the joint positions, "rad", "m" or "rad, m", each with a suffix `per` such as "/s"."""
         return ", ".join(dict.fromkeys(joint.unit + require.text("unit: per", per) for joint in self.moving_joints))
 
     @property
     def effort_unit(self) -> str:
-        """Unit of the efforts of the joint vector: "N m", "N", or both in order of appearance."""
+        """Units of the joint torques and forces: "N m", "N", or both, separated by a comma, in order of appearance."""
         return ", ".join(dict.fromkeys(joint.effort_unit for joint in self.moving_joints))
 
     @property
     def dof(self) -> int:
-        """Length of the joint vector."""
+        """Number of independently moving joints: the length of the joint vector."""
         return len(self.moving_joints)
 
     @property
@@ -220,17 +220,17 @@ class Robot:
 
     @property
     def lower(self) -> Array:
-        """Lower position limits of the joint vector, including those of followers. Shape (dof,), rad or m."""
+        """Lower position limits of the joints, raised by those of joints that mimic them. Shape (dof,), rad or m."""
         return self._limits["lower"].copy()
 
     @property
     def upper(self) -> Array:
-        """Upper position limits of the joint vector, including those of followers. Shape (dof,), rad or m."""
+        """Upper position limits of the joints, lowered by those of joints that mimic them. Shape (dof,), rad or m."""
         return self._limits["upper"].copy()
 
     @property
     def velocity(self) -> Array:
-        """Speed limits of the joint vector and of its followers; infinite if unknown. Shape (dof,), rad/s or m/s."""
+        """Joint speed limits, lowered by those of mimic joints; infinite if unknown. Shape (dof,), rad/s or m/s."""
         return self._limits["velocity"].copy()
 
     @property
@@ -251,13 +251,13 @@ class Robot:
         return {joint.child: joint for joint in self.joints}
 
     def link(self, name: str) -> Link:
-        """Return the link with a name; raise ModelError, with similar names, if there is none."""
+        """Return the link with a given name; raise ModelError, which lists similar names, if there is none."""
         if not isinstance(name, str) or name not in self._links_by_name:
             raise require.unknown("link", name, self._links_by_name)
         return self._links_by_name[name]
 
     def joint(self, name: str) -> Joint:
-        """Return the moving or fixed joint with a name; raise ModelError, with similar names, if there is none."""
+        """Return the moving or fixed joint with a given name; raise ModelError with similar names if there is none."""
         if not isinstance(name, str) or name not in self._joints_by_name:
             raise require.unknown("joint", name, self._joints_by_name)
         return self._joints_by_name[name]
@@ -321,7 +321,7 @@ def planar_chain(
     mount: ArrayInput = (0.0, 0.0),
     base: Link | None = None,
 ) -> Robot:
-    """Return an arm of revolute joints about z whose links lie along x at zero joint angles.
+    """Return a planar arm of revolute joints about z whose links lie along x at zero joint angles.
 
     Centres of mass are at mid-link.
 

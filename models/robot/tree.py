@@ -1,7 +1,7 @@
-"""Kinematic trees: root and order of the joints, change of the root, followers, joints with several degrees of freedom.
+"""Kinematic trees: root, order of the joints, change of the root, mimic joints, joints with several degrees of freedom.
 
-The position of a follower (a joint with <mimic> in URDF) is multiplier times that of the joint it follows, plus
-offset. Followers may follow each other in a chain. The joint at its end, which follows none, is the leader; only
+The position of a mimic joint, or follower (<mimic> in URDF), is multiplier times that of the joint it mimics, plus
+offset. Mimic joints may mimic each other in a chain. The joint at its end, which mimics none, is the leader; only
 leaders have an entry in the joint vector.
 
 Planar and floating joints become chains of joints with one degree of freedom on massless links, "NAME_x" and so on.
@@ -139,11 +139,11 @@ LIMITS = ("lower", "upper", "velocity", "effort")
 
 
 class JointCoupling(NamedTuple):
-    """Position of a moving joint: multiplier times an entry of the joint vector, plus an offset (rad or m).
+    """Coupling of a joint to the joint vector: its position is multiplier times one entry, plus offset (rad or m).
 
     Attributes:
-        column: Index of the entry, the leader's.
-        multiplier: rad or m per rad or m of the leader.
+        column: Index of that entry.
+        multiplier: rad or m per rad or m of the entry.
         offset: rad or m.
     """
 
@@ -153,7 +153,7 @@ class JointCoupling(NamedTuple):
 
 
 def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
-    """Return the coupling of each follower to its leader, by the follower's name.
+    """Return the coupling of each mimic joint, by name, to the independent joint at the end of its chain of mimics.
 
     Raises:
         ModelError: A joint that follows an unknown joint, or itself through others.
@@ -180,10 +180,10 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
 
 
 def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
-    """Return the joints after locking some, and their followers, at given positions (rad or m, by name).
+    """Return all joints after locking those with a given position (rad or m, by name), and the joints that mimic them.
 
-    Joints that cannot move are locked too: followers of a locked joint, followers of a fixed joint (which counts as
-    being at 0), and followers with multiplier 0. A follower that is locked itself follows no longer.
+    Other joints that cannot move are locked too: those that mimic a fixed joint (which counts as being at 0), or any
+    joint with multiplier 0. A mimic joint that is locked by its own name is no longer coupled.
 
     Raises:
         ModelError: As `ties_to_leaders` and `Joint.locked`.
@@ -199,9 +199,9 @@ def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float])
 
 
 def prune_joints(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, ...]:
-    """Return the joints whose child link is in `kept`.
+    """Return the joints whose child link is in `kept`, with the couplings of mimic joints adapted.
 
-    Followers of a removed joint stay coupled: to its leader if that is kept, else to the first of them, which becomes
+    Mimics of a removed joint stay coupled: to its leader if that is kept, else to the first of them, which becomes
     their leader. So the remaining joints can reach the same positions as before; limits of removed joints are lost.
     """
     ties, result = ties_to_leaders(joints), []
@@ -222,7 +222,7 @@ def prune_joints(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, 
 
 
 def joint_couplings(joints: Sequence[Joint]) -> dict[str, JointCoupling]:
-    """Return the coupling of each moving joint, by name, to the joint vector of the leaders in order."""
+    """Return the coupling of each moving joint, by name, to the vector of the independent joints in their order."""
     leaders = [joint.name for joint in joints if joint.moves and joint.mimic is None]
     columns = {name: column for column, name in enumerate(leaders)}
     couplings = {joint.name: Mimic(joint.name) for joint in joints if joint.moves} | ties_to_leaders(joints)
@@ -230,14 +230,14 @@ def joint_couplings(joints: Sequence[Joint]) -> dict[str, JointCoupling]:
 
 
 def joint_limits(joints: Sequence[Joint], couplings: Mapping[str, JointCoupling]) -> dict[str, Array]:
-    """Return the limits "lower", "upper", "velocity" and "effort" of the joint vector. Shape (dof,) each.
+    """Return the limits "lower", "upper", "velocity" and "effort" of all independent joints. Shape (dof,) each.
 
-    Followers must keep their own limits, so they narrow the positions and the speed of their leader. Effort is that of
-    the leader's actuator, which drives the followers too. A velocity or effort of 0 means, as in many URDF files, that
+    Mimic joints must keep their own limits, so they narrow positions and speed of the joint that they mimic. Effort is
+    that of its actuator, which also drives them. A velocity or effort of 0 means, as in many URDF files, that
     the limit is unknown; it becomes infinite.
 
     Raises:
-        ModelError: Followers that leave their leader no position.
+        ModelError: Limits of mimic joints leave the mimicked joint no position.
     """
     moving = {joint.name: joint for joint in joints if joint.moves}
     leaders = [joint for joint in moving.values() if joint.mimic is None]
@@ -266,14 +266,14 @@ X, Y, Z = np.eye(3)
 
 
 class JointChain(NamedTuple):
-    """Joints from one link to another, and the massless links between them."""
+    """Serial joints that replace a joint with several degrees of freedom, and the massless links between them."""
 
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
 
 
 def planar_joint(place: Joint, axis: Array | None) -> JointChain:
-    """Return the joints "NAME_x", "NAME_y" and "NAME_angle" of a planar joint.
+    """Return a planar joint as a chain of the joints "NAME_x", "NAME_y" and "NAME_angle".
 
     The plane is the one through the joint frame across the axis, the xy plane without an axis. For any other axis, the
     frame is turned by the least rotation that takes its z axis to the axis or the opposite direction.
@@ -292,7 +292,7 @@ def planar_joint(place: Joint, axis: Array | None) -> JointChain:
 
 
 def floating_joint(place: Joint) -> JointChain:
-    """Return the joints "NAME_x" to "NAME_z", "NAME_yaw", "NAME_pitch" and "NAME_roll" of a floating joint.
+    """Return a floating joint as a chain of the joints "NAME_x" to "NAME_z", "NAME_yaw", "NAME_pitch", "NAME_roll".
 
     Args:
         place: Fixed joint with the name, links and frame of the floating one.

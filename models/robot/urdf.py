@@ -36,7 +36,7 @@ COMPOSITE = ("planar", "floating")
 """Kinds of joints with several degrees of freedom."""
 XACRO = "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf"
 BLANK = "\ufeff \t\r\n"
-"""Characters that may precede the first character of a text."""
+"""Characters, such as a byte order mark, that may precede the first "<" of a URDF text."""
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "limit": ("lower", "upper", "velocity", "effort"),
@@ -51,7 +51,7 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "capsule": ("radius", "length"),
     "mesh": ("filename", "scale"),
 }
-"""Elements whose attributes are checked for misspelling, and their attributes."""
+"""Known attributes, by element, of the URDF elements that are checked for misspelt attributes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Description:
 
 
 def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
-    """Read a URDF description.
+    """Read a URDF description from a text or a file.
 
     Missing data have the default values of the format: a zero origin, the axis x, no inertia. A revolute or prismatic
     joint whose <limit> has only one of lower and upper has 0 for the other; with neither, or without <limit>, it has no
@@ -119,7 +119,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
 
 
 def _is_virtual(floating: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> bool:
-    """Return whether a floating joint connects the whole robot to a massless root."""
+    """Return whether a floating joint connects the whole robot to a massless root, so that both can be omitted."""
     base = next((link for link in links if link.name == floating.parent), None)
     alone = all(joint is floating for joint in joints if floating.parent in (joint.parent, joint.child))
     return base is not None and alone and not base.mass and not base.inertia.any()
@@ -219,7 +219,7 @@ def _write_origin(element: ElementTree.Element, translation: Array, rotation: Ar
 
 
 def _rpy(rotation: Array) -> Array:
-    """Return the angles about the fixed x, y, z axes of a rotation matrix. Shape (3,), rad.
+    """Return roll, pitch and yaw (about the fixed x, y, z axes) of a rotation matrix. Shape (3,), rad.
 
     At pitch = +-pi/2 yaw is arbitrary; roll is computed relative to that yaw, so the rotation is exact to rounding
     there too.
@@ -306,7 +306,7 @@ def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[L
 
 
 def _link_arguments(element: ElementTree.Element, folder: str, colors: dict[str | None, Array]) -> dict[str, Any]:
-    """Return the arguments of Link for an element; `colors` are those of the robot's materials."""
+    """Return the arguments of Link for a <link> element; `colors` are those of the robot's materials, by name."""
     name = name_of(element)
     owner = f"link {name!r}"
     shapes = tuple(_shape(each, owner, folder, CollisionShape) for each in element.findall("collision"))
@@ -331,7 +331,7 @@ def _link_arguments(element: ElementTree.Element, folder: str, colors: dict[str 
 
 
 def _color(material: ElementTree.Element) -> Array | None:
-    """Return red, green, blue and opacity, each 0 to 1, or None if the element has no valid color."""
+    """Return red, green, blue and opacity, each 0 to 1, of a <material>, or None if it has no valid color."""
     try:
         color = np.array((material.find("color").get("rgba") or "").split(), dtype=float)  # type: ignore[union-attr]
     except (AttributeError, ValueError):
@@ -340,7 +340,7 @@ def _color(material: ElementTree.Element) -> Array | None:
 
 
 def _shape(element: ElementTree.Element, owner: str, folder: str, shape_type: type[_Shape], **arguments: Any) -> _Shape:
-    """Return the collision or visual shape of an element."""
+    """Return the shape that a <collision> or <visual> element describes, as an instance of `shape_type`."""
     shapes: list[Any] = list(child_of(element, "geometry", owner))
     if len(shapes) != 1:
         message = f"{owner}: <geometry> has {len(shapes)} shapes, not one"
@@ -388,14 +388,14 @@ def _joint(element: ElementTree.Element) -> Joint:
 
 
 def _axis(element: ElementTree.Element) -> Array | None:
-    """Return the axis of a joint, shape (3,), or None."""
+    """Return the axis of a <joint> element, shape (3,), or None if it gives none."""
     owner = f"joint {name_of(element)!r}"
     axis = _only(element, "axis", owner)
     return None if axis is None else numbers_of(axis, "xyz", owner, 3)
 
 
 def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
-    """Describe the unknown attributes of those child elements of a link or joint that lack a known attribute.
+    """Return descriptions of unknown attributes in a <link> or <joint>, of elements that also lack a known attribute.
 
     Unknown attributes in addition to all known ones are an extension and are skipped, like unknown elements.
 
@@ -419,7 +419,7 @@ def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
 
 
 def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
-    """Return position (3,) and rotation (3, 3) of an <origin>; warn if its rpy looks like degrees."""
+    """Return position (3,), m, and rotation (3, 3) of an element's <origin>; warn if its rpy looks like degrees."""
     origin = _only(element, "origin", owner)
     shift, angles = np.zeros(3), np.zeros(3)
     if origin is not None:
@@ -436,7 +436,7 @@ def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
 
 
 def _only(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element | None:
-    """Return the only child with a tag, or None; raise ModelError naming `owner` if there are several."""
+    """Return the only child element with a tag, or None; raise ModelError naming `owner` if there are several."""
     children = element.findall(tag)
     if len(children) > 1:
         message = f"{owner} has {len(children)} <{tag}> elements in <{element.tag}>; it takes one at most"
@@ -445,12 +445,12 @@ def _only(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Ele
 
 
 def name_of(element: ElementTree.Element) -> str:
-    """Return the attribute "name"; raise ModelError if there is none."""
+    """Return the attribute "name" of an element; raise ModelError if there is none."""
     return text_of(element, "name", f"a <{element.tag}> of children {[child.tag for child in element]}")
 
 
 def child_of(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element:
-    """Return the only child with a tag; raise ModelError naming `owner` if there is none or more than one."""
+    """Return the only child element with a tag; raise ModelError naming `owner` if there is none, or several."""
     child = _only(element, tag, owner)
     if child is None:
         raise ModelError(f"{owner}: <{element.tag}> has no <{tag}>", name=tag, value=0, limit=1)
@@ -458,7 +458,7 @@ def child_of(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.
 
 
 def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
-    """Return an attribute; raise ModelError naming `owner` if it is missing or empty."""
+    """Return an attribute of an element as text; raise ModelError naming `owner` if it is missing or empty."""
     value = element.get(key)
     if not value:
         raise ModelError(f"{owner}: <{element.tag}> has no attribute {key!r}", name=key, value=value)
@@ -466,12 +466,12 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
 
 
 def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
-    """Return an attribute with one number, possibly inf or nan; raise ModelError naming `owner` otherwise."""
+    """Return an attribute of an element as one number, perhaps inf or nan; else raise ModelError naming `owner`."""
     return _numbers(element, key, owner, 1)[0]
 
 
 def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int) -> Array:
-    """Return an attribute with `count` finite numbers, shape (count,); raise ModelError naming `owner` otherwise."""
+    """Return an attribute of an element as finite numbers, shape (count,); else raise ModelError naming `owner`."""
     values = _numbers(element, key, owner, count)
     if not all(map(isfinite, values)):
         raise ModelError(f"{_where(element, key, owner)} is not finite", name=key, value=element.get(key))

@@ -30,12 +30,12 @@ MissingRule: TypeAlias = Literal["raise", "skip"]
 Folders: TypeAlias = Sequence[str | os.PathLike[str]]
 
 MAX_CAPSULE_VOLUME = 1.25
-"""Largest volume, relative to a cylinder's, of a capsule that replaces it."""
+"""Largest volume of a capsule that replaces a cylinder, relative to the volume of the cylinder."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinkMesh:
-    """A mesh of a link, which one or more bodies cover.
+    """A mesh of a link, which one or more collision bodies (capsules or a box) cover.
 
     Attributes:
         points: Vertices in the frame of the link. Shape (n, 3), m.
@@ -47,7 +47,7 @@ class LinkMesh:
 
     @cached_property
     def hull(self) -> Mesh:
-        """Convex hull in the frame of the link; coplanar points are first replaced by cubes of half-edge 1 um."""
+        """Convex hull of the mesh in link axes; coplanar points are first replaced by cubes of half-edge 1 um."""
         try:
             return Mesh.around(convex_hull(self.points))
         except ModelError:
@@ -207,7 +207,7 @@ def _mesh_bodies(link: Link, shape: CollisionShape, number: int, folders: Folder
 
 
 class JointStep(NamedTuple):
-    """A moving joint between two rigid parts.
+    """A moving joint between two rigid parts (`RigidParts`), one above it in the tree and one below.
 
     Attributes:
         joint: Its child link names the part below.
@@ -251,7 +251,7 @@ class RigidParts:
         return parts
 
     def path(self, first: str, second: str) -> tuple[list[JointStep], list[JointStep]]:
-        """Return the joints on the path between two parts: those up to their common part, then those down from it."""
+        """Return the joints on the path between two parts: those up to the part that carries both, then those down."""
         up, down = self._above(first), self._above(second)
         while up and down and up[-1] is down[-1]:
             up, down = up[:-1], down[:-1]
@@ -263,7 +263,7 @@ class RigidParts:
         return up[-1].above if up else first
 
     def _above(self, part: str) -> list[JointStep]:
-        """Return the joints from a part up to the root."""
+        """Return the moving joints from a rigid part up to the root."""
         steps = []
         while part in self.step:
             steps.append(self.step[part])
@@ -271,7 +271,7 @@ class RigidParts:
         return steps
 
     def adjacent(self, bodied: set[str]) -> set[frozenset[str]]:
-        """Return the pairs of parts with bodies that a joint, or a chain of parts without bodies, connects."""
+        """Return the pairs of parts with bodies that a joint, or a chain of parts without bodies, connects directly."""
         neighbours: dict[str, set[str]] = defaultdict(set)
         for part, step in self.step.items():
             neighbours[part].add(step.above)

@@ -1,4 +1,4 @@
-"""Signed distances of points, segments and boxes as expressions: the cores of shapes.
+"""Signed distances of points, segments and boxes, the cores of shapes, as CasADi expressions.
 
 Separated cores have the distance of their closest points, the root of a minimum over positions on them. Overlapping
 cores have minus their penetration depth, the largest gap along the candidate separating axes. Every formula accepts
@@ -20,22 +20,22 @@ from models.spatial import Expression
 Triple: TypeAlias = tuple[Expression, Expression, Expression]
 """A vector as three scalars or columns; constants are floats, so that products with zero and one vanish."""
 StopGradient: TypeAlias = Callable[[Expression], Expression]
-"""Makes a value constant to differentiation (`StoppedGradients`), or returns it unchanged."""
+"""Function that makes an expression constant to differentiation (`StoppedGradients`), or returns it unchanged."""
 
 KINK = 1e-12
 """Length that smooths the kink of an exact distance at zero, m."""
 PARALLEL = 1e-18
-"""Squared sine of the angle between edges below which they span no separating direction."""
+"""Squared sine of the angle between two edges below which their cross product gives no separating axis."""
 
 
 class SegmentCore(NamedTuple):
-    """Core of a sphere or a capsule: one or two points."""
+    """Core of a sphere (its centre) or of a capsule (the two ends of its segment)."""
 
     points: tuple[Triple, ...]
 
 
 class BoxCore(NamedTuple):
-    """Core of a box: its centre, axes and half edges."""
+    """Core of a box: its centre, axes and half edge lengths."""
 
     centre: Triple
     axes: tuple[Triple, ...]
@@ -43,7 +43,7 @@ class BoxCore(NamedTuple):
 
 
 def no_stop(value: Expression) -> Expression:
-    """Return the value unchanged; used where derivatives are not to be stopped."""
+    """Return the value unchanged: the `StopGradient` that stops no derivative."""
     return value
 
 
@@ -89,7 +89,7 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
 
 
 def _root(square: Expression, excess: float = 0.0) -> Expression:
-    """Return a lower bound of d, where `square` lies between d^2 and d^2 + excess; d itself if the excess is zero."""
+    """Return a distance from its square; a lower bound of it if the square is up to `excess` > 0 too large."""
     root = ca.sqrt(square + (excess or KINK**2))
     return (square - excess) * (1 / root) if excess else root - KINK
 
@@ -107,7 +107,7 @@ def _positive_part(gap: Expression, rounding: float) -> Expression:
 
 
 def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopGradient) -> Expression:
-    """Return the largest gap, or a smooth lower bound of it within `rounding`."""
+    """Return the largest of several gaps, or a smooth lower bound of it within `rounding`."""
     largest = reduce(ca.fmax, gaps)
     if rounding == 0 or len(gaps) == 1:
         return largest
@@ -121,7 +121,7 @@ def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopG
 def distance_of_segments(
     first: SegmentCore, second: SegmentCore, rounding: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the distance of points and segments; it is zero for crossing segments."""
+    """Return the distance of two points, of a point and a segment, or of two segments; zero for crossing segments."""
     if len(first.points) < len(second.points):
         first, second = second, first
     p, q = first.points[0], second.points[0]
@@ -137,10 +137,11 @@ def distance_of_segments(
 
 
 def _segments_square(gap: Triple, u: Triple, v: Triple, weight: float, stop_gradient: StopGradient) -> Expression:
-    """Return the minimum over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2).
+    """Return the least squared distance of two segments, smoothed by a penalty on the positions if `weight` > 0.
 
-    The unconstrained s is clipped to 0..1, then t is optimised for it and clipped, then s for that t (Ericson,
-    Real-Time Collision Detection, 2005, 5.1.9).
+    The minimum over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2). The unconstrained s is
+    clipped to 0..1, then t is optimised for it and clipped, then s for that t (Ericson, Real-Time Collision Detection,
+    2005, 5.1.9).
     """
     a, e, b = dot(u, u) + weight + KINK**2, dot(v, v) + weight + KINK**2, dot(u, v)
     c, f = dot(u, gap) - weight / 2, dot(v, gap) + weight / 2
@@ -160,7 +161,7 @@ def _segments_square(gap: Triple, u: Triple, v: Triple, weight: float, stop_grad
 def distance_to_box(
     core: SegmentCore | BoxCore, box: BoxCore, rounding: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the signed distance of a point, a segment or a box to a box.
+    """Return the signed distance of a point, a segment or a box to another box.
 
     It is the root of the smallest square for separated cores and minus the penetration depth, the largest gap along the
     candidate separating axes, for overlapping ones. The rounded distance of two boxes, which an interior-point method
@@ -194,7 +195,7 @@ def distance_to_box(
 
 
 def _in_box_axes(core: SegmentCore | BoxCore, box: BoxCore) -> tuple[Triple, list[Triple], Sequence[Expression]]:
-    """Return centre, axes and half extents of a point (without axes), a segment or a box, in the axes of a box."""
+    """Return centre, axes and half extents of a point (no axes), segment or box, in the axes of another box."""
     if isinstance(core, BoxCore):
         centre = in_axes(subtract(core.centre, box.centre), box.axes)
         return centre, [in_axes(axis, box.axes) for axis in core.axes], core.half
@@ -208,7 +209,7 @@ def _in_box_axes(core: SegmentCore | BoxCore, box: BoxCore) -> tuple[Triple, lis
 def _separating_gaps(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, slack: Expression
 ) -> list[Expression]:
-    """Return the gaps of a segment or a box to a box along the separating axes (Gottschalk, Lin & Manocha 1996).
+    """Return the gaps of a segment or box to a box along possible separating axes (Gottschalk, Lin & Manocha 1996).
 
     These are the face normals of both and the cross products of their edges. The absolute values of cosines have kinks
     at aligned boxes; a positive slack replaces them by smooth upper bounds, at most the slack above.
@@ -245,14 +246,14 @@ def _point_box_square(x: Triple, half: Triple, stop_gradient: StopGradient) -> E
 def _segment_box_square(
     middle: Triple, u: Triple, half: Triple, weight: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the minimum over s in -1/2..1/2 of the squared distance of middle + s u to a box plus weight s^2.
+    """Return the least squared distance of a segment to a box, in the box's axes, plus a penalty if `weight` > 0.
 
-    All is in the box's axes. Half the derivative is weight s plus a term for each axis, u_k times the excess of x_k
-    over the box. A term is zero while x_k is inside the box and linear outside. The axes enter one by one: first the
-    one with the largest excess over |u_k| at s = 0; then, of the others, the largest at the minimum of the first; then
-    the last, if its excess is nonzero at the minimum of these. Because an axis that enters later never moves s out of
-    the linear range of an earlier one, three steps find the minimum. Derivatives do not pass through the intermediate
-    positions.
+    The minimum over s in -1/2..1/2 of the squared distance of middle + s u, plus weight s^2. Half the derivative is
+    weight s plus a term for each axis, u_k times the excess of x_k over the box. A term is zero while x_k is inside the
+    box and linear outside. The axes enter one by one: first that of the largest excess over |u_k| at s = 0; then, of
+    the others, the largest at the minimum of the first; then the last, if its excess is nonzero at the minimum of
+    these. Because an axis that enters later never moves s out of the linear range of an earlier one, three steps find
+    the minimum. Derivatives do not pass through the intermediate positions.
     """
     sizes, squares = triple(ca.fabs(part) + KINK for part in u), triple(part * part for part in u)
     s, pull, rise = 0.0, 0.0, weight + KINK**2
@@ -278,7 +279,7 @@ def _without_derivative(s: Expression) -> Expression:
 
 
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
-    """Return 1 for the component with the largest |over| / size and 0 for the others."""
+    """Return an indicator of the largest component: 1 for that with the largest |over| / size, 0 for the others."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])
@@ -304,7 +305,7 @@ def _edge_squares(
 
 
 def _corner_squares(first: BoxCore, second: BoxCore, stop_gradient: StopGradient) -> list[Expression]:
-    """Return the squared distances of the corners of one box to another."""
+    """Return the squared distances of the corners of one box to another box."""
     centre, axes, halves = _in_box_axes(first, second)
     reaches = [triple(h * part for part in axis) for axis, h in zip(axes, halves, strict=True)]
     squares = []

@@ -1,4 +1,4 @@
-"""Covers of a mesh by a few capsules or by one box, whose distances are exact and fast.
+"""Covers of a triangle mesh by a few capsules or by one box, whose distances are exact and fast.
 
 First, one capsule of least volume is fitted to the mesh. Then the mesh is split across the plane that lowers the
 covered volume most, each side gets its own capsule, the largest one is split again, and so on up to a few parts. The
@@ -29,7 +29,9 @@ from models.shapes.shapes import Box, Capsule
 
 @dataclass(frozen=True)
 class CoverSettings:
-    """Settings of the search for covers. Lengths and volumes are relative to a mesh whose largest extent is 1.
+    """Settings of the search for capsules or a box that cover a mesh.
+
+    Lengths and volumes are relative to a mesh whose largest extent is 1.
 
     Attributes:
         parts: Largest number of capsules. The distances of more would cost more than their tighter fit saves.
@@ -116,7 +118,7 @@ def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
 
 
 def fit_cover(triangles: Array) -> tuple[Cover, ...]:
-    """Return the cover of triangles, shape (m, 3, 3), m, without using the cache."""
+    """Return the capsules, or the box, that cover triangles of shape (n, 3, 3), in m, without using the cache."""
     middle, size = _centre_and_size(triangles.reshape(-1, 3))
     unit = (triangles - middle) / size
     points = _points(unit)
@@ -183,10 +185,10 @@ def _fit_capsule(points: Array) -> Capsule:
 
 
 def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, float, float, Array, Array]:
-    """Return volume, radius, ends along the axis, axis and axis point of a capsule with its axis near z.
+    """Return the capsule around points for given parameters: volume, radius, ends along the axis, axis, axis point.
 
-    The parameters, shape (5,), are two slopes of the axis, its position across, and the root of the excess radius. A
-    radius larger than the enclosing cylinder's lets the caps begin earlier.
+    The parameters, shape (5,), are two slopes of the axis (near z), its position across, and the root of the excess
+    radius. A radius larger than the enclosing cylinder's lets the caps begin earlier.
     """
     a, b, x, y, fat = parameters.tolist()
     length, width = math.sqrt(a * a + b * b + 1), math.sqrt(1 + a * a)
@@ -205,7 +207,7 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
 
 
 def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Array]:
-    """Return approximate volumes, axis positions and relative excess radii of enclosing capsules along k given axes."""
+    """Return approximate volume, axis position and relative excess radius of capsules around points along k axes."""
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
     rows = np.arange(len(bases))
@@ -225,7 +227,7 @@ def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Ar
 
 
 def _approximate_capsule(points: Array, bases: Array) -> Capsule:
-    """Return the smallest approximate capsule around points along one of the last axes of bases (k, 3, 3)."""
+    """Return the smallest approximate capsule around points along one of the last axes of k bases (k, 3, 3)."""
     volumes, centres, excess = _approximate_capsules(points, bases)
     k = int(volumes.argmin())
     return _capsule_from_parameters(points, np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])]), bases[k])
@@ -237,7 +239,7 @@ def _capsule_from_parameters(points: Array, parameters: Array, basis: Array) -> 
 
 
 def _enclosing_capsule(capsule: Capsule, points: Array) -> Capsule:
-    """Return the capsule with its radius increased so that it certainly contains every point."""
+    """Return the capsule with its radius increased so that it certainly contains every given point."""
     start, end = np.asarray(capsule.start), np.asarray(capsule.end)
     radius = max(capsule.radius, float(_segment_distances(points, start, end).max())) + SETTINGS.growth
     return Capsule(radius, start, end)
@@ -250,7 +252,7 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
     return np.asarray(np.sqrt(square[:, 0] + square[:, 1] + square[:, 2]))  # faster than a norm of three columns
 
 
-# ------------------------------------------------------------------------------------------------------- cuts
+# ------------------------------------------------------------------------------------------------------- splits
 
 
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
@@ -290,9 +292,9 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
 
 
 def _grid(points: Array) -> tuple[Array, float]:
-    """Return points that fill a box 1.5 times as large as the extent of the given points, and the volume of the box.
+    """Return sample points in a box 1.5 times as large as the extent of given points, and the volume of the box.
 
-    The box contains nearly all of their covers. Shape (k, 3).
+    They serve to estimate covered volumes: the box contains nearly all of the covers. Shape (k, 3).
     """
     frame = _principal_axes(points)
     low, high = (points @ frame).min(axis=0), (points @ frame).max(axis=0)
@@ -303,7 +305,7 @@ def _grid(points: Array) -> tuple[Array, float]:
 
 
 def _covered_share(shapes: Sequence[CoverShape], grid: Array) -> float:
-    """Return the share of grid points that lie in at least one of the shapes."""
+    """Return the fraction of grid points that lie in at least one of the shapes, an estimate of the covered volume."""
     if not len(grid):
         return 0.0
     return float((np.min([exceedance(each, grid) for each in shapes], axis=0) <= 0).sum() / len(grid))
@@ -320,7 +322,7 @@ def _representative_triangles(triangles: Array, frame: Array) -> Array:
 
 
 def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array, Array]:
-    """Return the parts of triangles below and above the plane axis x = level. Shapes (m, 3, 3)."""
+    """Split triangles at the plane axis . x = level; return those below and those above it. Shapes (m, 3, 3)."""
     heights = triangles @ axis - level
     below = heights <= 0
     count = below.sum(axis=1)
@@ -378,7 +380,7 @@ def _fit_box(points: Array, extreme_points: Array) -> Box:
 
 
 def _enclosing_box(box: Box, points: Array) -> Box:
-    """Return the box with its edges lengthened so that it certainly contains every point."""
+    """Return the box with its edges lengthened so that it certainly contains every given point."""
     return Box(
         box.size + 2 * max(0.0, float(exceedance(box, points).max())) + 2 * SETTINGS.growth, box.position, box.rotation
     )
@@ -458,7 +460,7 @@ def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes
 
 
 def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:
-    """Return the shape scaled and moved to the mesh, enlarged by a bound of the rounding errors."""
+    """Return a shape of the normalised mesh converted to the mesh's units, enlarged by a bound of rounding errors."""
     margin = 16 * float(np.finfo(float).eps * (np.abs(middle).max() + size))
     if isinstance(shape, Capsule):
         return Capsule(shape.radius * size + margin, middle + size * shape.start, middle + size * shape.end)
@@ -472,7 +474,7 @@ def _to_json(each: Cover) -> dict[str, Any]:
 
 
 def _from_json(value: Any, points: Array) -> tuple[Cover, ...] | None:
-    """Return covers read from the cache, or None if the entry is invalid or does not contain the mesh's points."""
+    """Return covers read from the cache, or None if they are invalid or do not contain all points of the mesh."""
     if not isinstance(value, list) or not 0 < len(value) <= SETTINGS.parts:
         return None
     try:

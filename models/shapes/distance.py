@@ -54,7 +54,7 @@ class HullCore(NamedTuple):
 
 
 class PlaneCore(NamedTuple):
-    """Boundary plane of a half-space."""
+    """Core of a half-space: its boundary plane, given by a point and the outward normal."""
 
     point: Triple
     normal: Triple
@@ -63,9 +63,9 @@ class PlaneCore(NamedTuple):
 Core: TypeAlias = SegmentCore | BoxCore | HullCore | PlaneCore
 
 COLUMNS: dict[type[Shape], int] = {Sphere: 4, Capsule: 7, Box: 15, HalfSpace: 6}
-"""Number of entries of a shape's column (`column`), for the kinds that have one."""
+"""Number of entries of the vector that describes a shape (see `column`), by kind of shape."""
 VECTORS: dict[type[Shape], tuple[int, int]] = {Sphere: (1, 0), Capsule: (2, 0), Box: (1, 3), HalfSpace: (1, 1)}
-"""Numbers of points and of directions that a column begins with."""
+"""Numbers of points and of directions with which the vector that describes a shape begins, by kind of shape."""
 
 
 def distance(
@@ -141,7 +141,7 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
 
 
 def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0) -> Any:
-    """Return the casadi Function (first column, second column) -> `distance` for two kinds of shapes.
+    """Return the CasADi Function from the columns of two shapes (see `column`) to their `distance`, for given kinds.
 
     `pair_function(Capsule, Box).map(n)` evaluates n pairs, side by side as columns. One small function that is called
     often evaluates and compiles several times faster than one graph of all pairs.
@@ -158,7 +158,7 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
 
 
 def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, count: int) -> Any:
-    """Return the casadi Function (first columns, second columns) -> distances of n pairs and their wrenches.
+    """Return the CasADi Function from the columns of n pairs of shapes to their distances and gradients (wrenches).
 
     Pairs are rows: columns have shapes (n, COLUMNS[kind]), distances (n, 1), m, and wrenches (n, 6). A wrench w is
     (moment about the world's origin, force); the distance changes at the rate w . (first twist - second twist), with
@@ -276,7 +276,7 @@ def _check_kind(kind: Any, what: str) -> None:
 def _distance_of_columns(
     kinds: tuple[Any, Any], entries: Sequence[Sequence[Expression]], rounding: float, stop_gradient: StopGradient
 ) -> Any:
-    """Return the signed distance of two shapes of the given kinds, each described by a column of numbers."""
+    """Return the signed distance of two shapes of the given kinds, each described by its column (see `column`)."""
     first, second = map(_core_of_column, kinds, entries)
     swept_radius = sum(own[-1] for kind, own in zip(kinds, entries, strict=True) if kind in (Sphere, Capsule))
     if isinstance(first, PlaneCore):
@@ -295,7 +295,7 @@ def _distance_of_columns(
 
 @on_scalars
 def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, rounding: float) -> Expression:
-    """Return the signed distance of two shapes, one of them a mesh or a cylinder. `poses`: two rotations, positions."""
+    """Return the signed distance of two shapes, one a mesh or a cylinder. `poses`: rotation, position of each."""
     one, other = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
     if isinstance(one, PlaneCore):
         gap = _least_height(other, one.normal, one.point, rounding)
@@ -350,14 +350,14 @@ def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) ->
 
 
 def _smooth_minimum(values: Sequence[Expression], rounding: float) -> Expression:
-    """Return the smallest value, or a smooth lower bound of it within `rounding`."""
+    """Return the smallest of several values, or a smooth lower bound of it within `rounding`."""
     if rounding == 0 or len(values) == 1:
         return reduce(ca.fmin, values)
     return soft_minimum(values, rounding / log(len(values)))
 
 
 def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
-    """Return the gaps to the second core along the face normals of the first core; none if that is a segment."""
+    """Return the gaps to the second core along the face normals of the first core; an empty list for a segment."""
     if isinstance(first, BoxCore):
         signed = [(axis, side, h) for axis, h in zip(first.axes, first.half, strict=True) for side in (-1.0, 1.0)]
         normals = [(triple(side * part for part in axis), h) for axis, side, h in signed]
@@ -372,7 +372,7 @@ def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
 
 
 def _edge_directions(hull: Hull) -> Array:
-    """Return bisectors of the normals of faces that meet, where the normals differ by more than pi/4. Shape (k, 3).
+    """Return the bisectors of normals of faces that meet, if all these normals differ by more than pi/4. Shape (k, 3).
 
     Beyond an edge whose faces' normals differ by an angle a, the normals alone see at most cos(a/2) of a distance, 92 %
     at pi/4.
@@ -394,7 +394,7 @@ def _edge_directions(hull: Hull) -> Array:
 
 
 def _in_frame(core: Core, centre: Triple, axes: Sequence[Triple]) -> Core:
-    """Return the core in the coordinates of a frame with this centre and these axes."""
+    """Return the core in the coordinates of a frame with the given centre and axes."""
     if isinstance(core, SegmentCore):
         return SegmentCore(tuple(in_axes(subtract(point, centre), axes) for point in core.points))
     assert not isinstance(core, PlaneCore)

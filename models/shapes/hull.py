@@ -24,15 +24,15 @@ __all__ = ["gap_along", "is_box", "nearest_directions"]
 
 
 GAP_TOLERANCE = 1e-12
-"""Relative difference of distance and gap at which the search has converged."""
+"""Relative difference between a distance and its lower bound, the gap, below which the search has converged."""
 DEGENERATE = 1e-14
-"""Squared content, relative to the squared edges, below which a triangle or tetrahedron is degenerate."""
+"""Squared area or volume, relative to the squared edges, below which a triangle or tetrahedron is degenerate."""
 EDGE_I, EDGE_J = np.triu_indices(3, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A convex hull of points.
+    """A convex hull of points in space: its vertices, triangles and face planes.
 
     Attributes:
         vertices: Corners of the hull. Shape (m, 3), m.
@@ -103,7 +103,7 @@ def _convex_hull(points: Array) -> Hull:
 
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of the distinct normals, and for each normal the position of its equal. Shapes (f,), (k,)."""
+    """Return the indices of the distinct normals, and for each normal its index among these. Shapes (f,), (k,)."""
     close_pairs = scipy.spatial.cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
     links = scipy.sparse.coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
     _, same = scipy.sparse.csgraph.connected_components(links, directed=False)
@@ -113,7 +113,7 @@ def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def gap_along(direction: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the gap of two hulls along a unit vector that points from the first to the second, for K pairs.
+    """Return the gaps of K pairs of hulls along unit vectors that point from the first hull to the second.
 
     Args:
         direction: Shape (K, 3).
@@ -181,7 +181,7 @@ def nearest_directions(
 
 
 def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of segments (K, 2, 3) and the vector from the first to the second, (K, 3) each.
+    """Return the closest points of K pairs of segments (K, 2, 3), and the vectors between them. Shape (K, 3) each.
 
     Source: Ericson, Real-Time Collision Detection, 2005, 5.1.9.
     """
@@ -199,9 +199,9 @@ def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray
 
 
 def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return closest points as `_between_segments` does, for segments (K, 2, 3) and corners of boxes (K, 8, 3).
+    """Return the closest points of segments (K, 2, 3) and boxes, given by corners (K, 8, 3), like `_between_segments`.
 
-    Half the derivative of the squared distance by the position s along the segment is increasing and piecewise linear.
+    Half the derivative of the squared distance in the position s along the segment is increasing and piecewise linear.
     It has its kinks where the segment enters or leaves a slab of the box. It is evaluated at the kinks, between two of
     which its root is interpolated.
     """
@@ -229,7 +229,7 @@ def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _point_beside_box(point: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of points (K, 1, 3) and boxes (K, 8, 3) or points, as `_between_segments` does."""
+    """Return the closest points of points (K, 1, 3) and boxes (K, 8, 3) or other points, like `_between_segments`."""
     on_point = point[:, 0]
     if box.shape[1] == 1:
         return on_point, box[:, 0], box[:, 0] - on_point
@@ -243,7 +243,7 @@ def _point_beside_box(point: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return closest points as `_between_segments` does, for hulls (K, m, 3) and (K, l, 3), by the GJK algorithm."""
+    """Return the closest points of hulls (K, m, 3) and (K, l, 3) by the GJK algorithm, like `_between_segments`."""
     on_first, on_second = first[:, 0].astype(float), second[:, 0].astype(float)
     active = np.arange(len(first))
     a, b = np.repeat(on_first[:, None], 4, axis=1), np.repeat(on_second[:, None], 4, axis=1)
@@ -282,7 +282,7 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the point of a simplex that is nearest to the origin, and its barycentric weights.
+    """Return the barycentric weights of the point of a simplex nearest to the origin, and the point itself.
 
     Shape (K, 4, 3) to (K, 4) and (K, 3). The vertices may coincide. Only faces that contain the last vertex are tried.
     """
@@ -319,16 +319,16 @@ def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the cross product along the last axis, faster than numpy does."""
+    """Return cross products of vectors along the last array axis, faster than NumPy does."""
     i, j = [1, 2, 0], [2, 0, 1]
     return np.asarray(first[..., i] * second[..., j] - first[..., j] * second[..., i])
 
 
 def _least_overlap(first: np.ndarray, second: np.ndarray, boxes: tuple[bool, bool]) -> np.ndarray:
-    """Return the candidate unit vectors (K, 3), from first to second hull, along which hulls overlap least.
+    """Return the unit vectors (K, 3), from first to second hull, along which overlapping hulls overlap least.
 
-    Candidates are the line between the centroids, the edges of both hulls and the cross products of their edges. The
-    edges of a hull are those from its first point to the next three; of a box, those from its first corner.
+    Candidates are the line between the centroids, the edges of both hulls, their cross products and the coordinate
+    axes. The edges of a hull are those from its first point to the next three; of a box, those from its first corner.
     """
     ends = [[1, 2, 4] if box else [1, 2, 3][: p.shape[1] - 1] for p, box in zip((first, second), boxes, strict=True)]
     edges = np.concatenate([p[:, indices] - p[:, :1] for p, indices in zip((first, second), ends, strict=True)], axis=1)

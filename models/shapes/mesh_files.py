@@ -41,7 +41,7 @@ STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attri
 
 
 class Triangles(NamedTuple):
-    """A triangle mesh.
+    """A triangle mesh: vertices, triangles and their colours.
 
     Attributes:
         vertices: Shape (n, 3), m.
@@ -55,12 +55,12 @@ class Triangles(NamedTuple):
 
 
 def without_colors(vertices: Array, faces: Faces) -> Triangles:
-    """Return the triangles of a mesh without colours from vertices and faces."""
+    """Return a triangle mesh of given vertices and faces whose colours are unknown."""
     return Triangles(vertices, faces, np.full((len(faces), 4), np.nan))
 
 
 def join_meshes(parts: Sequence[Triangles]) -> Triangles:
-    """Return all parts as one mesh."""
+    """Return several triangle meshes joined to one."""
     if not parts:
         return without_colors(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp))
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -70,13 +70,13 @@ def join_meshes(parts: Sequence[Triangles]) -> Triangles:
 
 
 def mesh_error(file: Path, what: str, value: object = None, limit: object = None) -> ModelError:
-    """Return a ModelError about a mesh file."""
+    """Return the ModelError about a fault, `what`, of a mesh file."""
     bound = f", limit {limit}" if isinstance(limit, int) else ""
     return ModelError(f"mesh {str(file)!r}: {what}{bound}", name=str(file), value=value, limit=limit)
 
 
 def numbered_lines(file: Path, data: bytes) -> Iterator[tuple[int, str]]:
-    """Yield each line's number, from 1, and its text; raise a ModelError if the text is too long."""
+    """Return an iterator over (line number from 1, line) of a text file; raise a ModelError if it is too long."""
     if len(data) > INPUT_LIMITS.mesh_text_bytes:
         raise mesh_error(file, f"it has {len(data)} bytes of text", len(data), INPUT_LIMITS.mesh_text_bytes)
     return enumerate(TextIOWrapper(BytesIO(data), "utf-8", errors="replace"), start=1)
@@ -134,7 +134,7 @@ def find_mesh(
 
 
 def _package_folders() -> list[Path]:
-    """Return the folders of installed packages."""
+    """Return the folders in which installed ROS and pip packages are searched."""
     ros = [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
     ament = [Path(folder, "share") for folder in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if folder]
     pip = [Path(folder, name) for folder in sys.path for name in ("share", "cmeel.prefix/share") if folder]
@@ -248,7 +248,7 @@ def _read_stl_text(file: Path, data: bytes) -> Triangles:
 
 
 def _merge_vertices(corners: Array) -> Triangles:
-    """Return the mesh of triangles, three rows of corners each, with coincident corners merged."""
+    """Return the mesh of triangles given by three rows of `corners` each, with coincident corners merged."""
     vertices, faces = np.unique(corners, axis=0, return_inverse=True)
     return without_colors(vertices, faces.reshape(-1, 3).astype(np.intp))
 
@@ -310,7 +310,10 @@ def _material_colors(file: Path, name: str) -> Iterator[tuple[str, Array]]:
 
 
 def _vertex_index(file: Path, entry: str, count: int, line: int) -> int:
-    """Return the index of v, v/vt or v/vt/vn, which counts from one, or backwards from the last vertex if negative."""
+    """Return the vertex index, from zero, of a face corner in an OBJ file: "v", "v/vt" or "v/vt/vn".
+
+    The number v counts from one, or backwards from the last vertex if negative.
+    """
     try:
         index = int(entry.partition("/")[0])
     except ValueError:
@@ -322,7 +325,7 @@ def _vertex_index(file: Path, entry: str, count: int, line: int) -> int:
 
 
 def read_collada(file: Path, data: bytes) -> Triangles:
-    """Return all geometries that the scene instantiates, or all geometries of a document without a scene.
+    """Return the triangles of the scene of a Collada file, or of all its geometries if it has no scene.
 
     Raises:
         ModelError: pycollada is not installed, the file is no Collada document or too large, or it contains elements
@@ -372,7 +375,7 @@ def read_collada(file: Path, data: bytes) -> Triangles:
 
 
 def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
-    """Return the document reduced to the elements that pycollada may read, and its unit, m.
+    """Return a Collada document reduced to the elements that pycollada may read, and its unit of length, m.
 
     Instances of nodes are replaced by the nodes, and effects are reduced to a colour. Elements that pycollada would
     misinterpret are refused.
@@ -428,7 +431,7 @@ def _check_numbers(file: Path, root: ElementTree.Element) -> None:
 
 
 def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
-    """Replace instances by their nodes; limit the number of nodes, because nested instances multiply it."""
+    """Replace instances of nodes by the nodes; limit their number, because nested instances multiply it."""
     nodes = {each.get("id"): each for each in root.iter("node")}
     counts: dict[ElementTree.Element, int] = {}
 
@@ -454,7 +457,7 @@ def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
 
 
 def _materials_document(document: ElementTree.Element) -> ElementTree.Element:
-    """Return a document that contains only the materials and their diffuse colours, except images.
+    """Return a Collada document with only the materials and their diffuse colours, without images.
 
     All materials are opaque, because programs disagree on what an opacity means.
     """

@@ -30,7 +30,7 @@ class Reason(StrEnum):
     RIGID = "same rigid part"
     ALWAYS = "always in collision"
     COVERED = "always in collision, perhaps only in their covers"
-    """The covers overlap in every sample, but in some by no more than they protrude from their meshes."""
+    """The covers of two meshes overlap in every sample, but in some by no more than they protrude from the meshes."""
     NEVER = "never in collision"
     SRDF = "the SRDF file"
     IGNORED = "ignored by request"
@@ -39,9 +39,9 @@ class Reason(StrEnum):
 
 NEIGHBOURS, RIGID, ALWAYS, COVERED, NEVER, SRDF, IGNORED, IMMOBILE = Reason
 ASSUMED = (ALWAYS, COVERED)
-"""Reasons without a proof: the bodies collide in each of many random configurations."""
+"""Reasons assumed without a proof: the bodies collide in each of many random configurations."""
 MARGIN_M = 1e-6
-"""Margin above the rounding errors of a proof of distance, m."""
+"""Margin above the rounding errors of a proof that two bodies stay apart, m."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def checked_pairs(
 
 
 def _key(robot: Robot, bodies: Sequence[Body], named: Mapping[frozenset[str], Reason], *numbers: Any) -> str:
-    """Return the cache key, which depends on everything that determines the pairs."""
+    """Return the cache key of `checked_pairs`, which depends on everything that determines its result."""
     parts = list(numbers)
     words = ["pairs", *(f"{sorted(pair)} {why}" for pair, why in named.items())]
     for joint in robot.joints:
@@ -188,7 +188,7 @@ def _key(robot: Robot, bodies: Sequence[Body], named: Mapping[frozenset[str], Re
 
 
 def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:
-    """Return the pairs read from the cache, or None if the entry is invalid."""
+    """Return the checked and unchecked pairs read from a cache entry, or None if the entry is invalid."""
     try:
         checked = tuple((int(i), int(j)) for i, j in value["checked"])
         left = {(str(first), str(second)): Reason(why) for first, second, why in value["left"]}
@@ -208,7 +208,7 @@ def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
 
 
 def _disabled_pairs(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[str]]:
-    """Return the pairs of <disable_collisions> whose links exist."""
+    """Return the pairs of links that an SRDF file disables (<disable_collisions>), except those of unknown links."""
     known = {link.name for link in robot.links}
     elements = parse_urdf(source).findall("disable_collisions")
     pairs = [frozenset(text_of(each, key, "SRDF") for key in ("link1", "link2")) for each in elements]
@@ -219,7 +219,7 @@ def _disabled_pairs(robot: Robot, source: str | os.PathLike[str]) -> list[frozen
 
 
 def _random_configurations(robot: Robot, low: Array, high: Array, count: int, rng: np.random.Generator) -> Array:
-    """Return random joint vectors within limits. Shape (count, dof)."""
+    """Return random joint vectors within the given joint limits. Shape (count, dof)."""
     slides = np.array([joint.kind == "prismatic" for joint in robot.moving_joints], dtype=bool)
     half = np.where(slides, 1.0, np.pi)  # m or rad: half of the range of joints without limits
     start = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * half, -half))
@@ -235,7 +235,7 @@ Poses: TypeAlias = tuple[Array, Array]
 
 
 class _Lever(NamedTuple):
-    """A moving joint between two bodies, with its lever arm.
+    """A moving joint between two bodies: its entry in the joint vector and its lever arm.
 
     Attributes:
         column: Index in the joint vector.
@@ -248,14 +248,14 @@ class _Lever(NamedTuple):
     arm: float
 
     def moved(self, half: Array) -> Array:
-        """Return the largest change of the distance of two bodies when a joint moves by at most `half`, rad or m."""
+        """Return the largest change of the bodies' distance when the entry changes by at most `half`, rad or m."""
         turned = np.minimum(abs(self.ratio) * half, np.pi)
         return np.asarray(2 * self.arm * np.sin(turned / 2) if self.arm else abs(self.ratio) * half)
 
 
 @dataclass(frozen=True)
 class _PairClassifier:
-    """Classifier of pairs of bodies within joint limits, by random configurations and then by proofs."""
+    """Classifier of the pairs of bodies that need no collision check, by random configurations and then by proofs."""
 
     robot: Robot
     parts: RigidParts
@@ -268,7 +268,7 @@ class _PairClassifier:
     _poses: dict[str, Poses] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why a pair need not be checked, or None if it must; also whether its covers are known to collide.
+        """Return why a pair need not be checked, None if it must; and whether its covers always collide, its hulls not.
 
         Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
         therefore classified by the convex hulls of meshes.
@@ -308,7 +308,7 @@ class _PairClassifier:
         return self._placed[key]
 
     def _pose(self, part: str) -> Poses:
-        """Return the poses of a rigid part relative to the root at the first of the random configurations."""
+        """Return the pose of a rigid part relative to the root link for each of the first random configurations."""
         if part not in self._poses:
             q = self.configurations[: SETTINGS.first_configurations]
             step = self.parts.step.get(part)
@@ -347,7 +347,7 @@ class _BodyPair:
         return None if colliding.any() or not self._proves_apart(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
-        """Classify two hulls on a joint grid: NEVER in collision if they are apart at all points of all refinements.
+        """Classify two hulls on a grid of joint positions: NEVER if they are apart at all points of all refined grids.
 
         Returns ALWAYS for hulls that overlap on the whole first grid, else None.
         """
@@ -369,11 +369,11 @@ class _BodyPair:
         return NEVER
 
     def overlap_everywhere(self, configurations: Array) -> Reason | None:
-        """Return ALWAYS for bodies that collide in all configurations, else None."""
+        """Return ALWAYS if the bodies collide in all given configurations, else None."""
         return None if (self.bounds(configurations)[0] > 0).any() else ALWAYS
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds of the distances at joint vectors (k, dof), and where bounding balls did not suffice.
+        """Return lower bounds of the distance at joint vectors (k, dof), and where bounding balls did not suffice.
 
         Bounding balls suffice where they prove a distance greater than `above`, m.
         """
@@ -389,7 +389,7 @@ class _BodyPair:
         return bounds, close
 
     def distance_bounds(self, turn: Array, shift: Array) -> Array:
-        """Return lower bounds of the distances for poses of the second body, exact where the search converged."""
+        """Return lower bounds of the distance for given poses of the second body, exact where the search converged."""
         shapes = self.first.shape, self.second.shape
         first, second = (np.repeat(each.core, 2, axis=0) if len(each.core) == 1 else each.core for each in shapes)
         first, second = (
@@ -400,7 +400,7 @@ class _BodyPair:
         return gap_along(direction, first, second) - (shapes[0].swept_radius + shapes[1].swept_radius)
 
     def _relative(self, q: Array) -> Poses:
-        """Return the poses of the second body's rigid part in the first body's."""
+        """Return the poses of the second body's rigid part in that of the first, at joint vectors (k, dof)."""
         first = second = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
         for step in self.up[::-1]:
             first = _poses_behind(self.robot, first, step, q)
@@ -449,7 +449,7 @@ class _BodyPair:
         return False
 
     def _levers(self, low: Array, high: Array) -> list[_Lever]:
-        """Return the levers of the joints between the bodies, each with the shorter arm of the two bodies."""
+        """Return the levers of the joints between the bodies, each with the shorter of its arms to the two bodies."""
         chain = [*((step, False) for step in self.up), *((step, True) for step in self.down)]
         reverse = [(step, not down) for step, down in chain[::-1]]
         arms_second, _ = lever_arms(self.robot, chain, self.second.shape, low=low, high=high)
@@ -467,7 +467,7 @@ def _grid(values: Array, dimension: int) -> Array:
 
 
 def _axis_rotations(axis: Array, angle: Array) -> Array:
-    """Return rotations about a unit axis. Shape (k, 3, 3)."""
+    """Return rotation matrices about a unit axis for k angles (rad). Shape (k, 3, 3)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     sine, rest = np.sin(angle)[:, None, None], (1 - np.cos(angle))[:, None, None]
@@ -475,7 +475,7 @@ def _axis_rotations(axis: Array, angle: Array) -> Array:
 
 
 def _poses_behind(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
-    """Return the poses of the part behind a joint from the poses of the part before it."""
+    """Return the poses of the rigid part behind a joint from those of the part before it, at joint vectors q."""
     (turn, shift), (column, ratio, offset) = above, robot.couplings[step.joint.name]
     position = ratio * q[:, column] + offset
     shift = shift + turn @ step.translation
@@ -486,6 +486,6 @@ def _poses_behind(robot: Robot, above: Poses, step: JointStep, q: Array) -> Pose
 
 
 def _relative_poses(first: Poses, second: Poses) -> Poses:
-    """Return the second poses relative to the first poses."""
+    """Return the poses of a second rigid part in the frame of a first, from the poses of both."""
     back = first[0].transpose(0, 2, 1)
     return back @ second[0], (back @ (second[1] - first[1])[:, :, None])[:, :, 0]

@@ -49,10 +49,10 @@ class _SweptCore:
 
 
 class _Posed(_SweptCore):
-    """Base class of shapes with a pose of their own."""
+    """Base class of shapes with a position and a rotation of their own."""
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
-        """Return the shape in another frame, given rotation (3, 3) and position (3,) of its present frame in it, m."""
+        """Return the shape in another frame, given the pose of its present frame there: (3, 3) and (3,), m."""
         turn, shift = _motion(rotation, translation)
         own: Any = copy(self)  # shares the hull, which is costly to compute
         object.__setattr__(own, "position", freeze(turn @ own.position + shift))
@@ -90,14 +90,14 @@ class Sphere(_SweptCore):
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Sphere:
-        """Return the sphere in another frame, given rotation (3, 3) and position (3,) of its present frame in it, m."""
+        """Return the sphere in another frame, given the pose of its present frame there: (3, 3) and (3,), m."""
         turn, shift = _motion(rotation, translation)
         return Sphere(self.radius, turn @ self.position + shift)
 
 
 @dataclass(frozen=True, eq=False)
 class Capsule(_SweptCore):
-    """All points within a radius of a segment; a sphere if both ends coincide.
+    """A capsule: all points within a radius of a segment; a sphere if both ends coincide.
 
     Attributes:
         radius: m; 0 for a segment without thickness.
@@ -121,7 +121,7 @@ class Capsule(_SweptCore):
 
     @property
     def core(self) -> Array:
-        """Ends of the segment. Shape (2, 3), m."""
+        """Ends of the capsule's segment. Shape (2, 3), m."""
         return np.array([self.start, self.end])
 
     @property
@@ -130,7 +130,7 @@ class Capsule(_SweptCore):
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Capsule:
-        """Return the capsule in another frame, given rotation (3, 3) and position (3,), m, of its present frame."""
+        """Return the capsule in another frame, given the pose of its present frame there: (3, 3) and (3,), m."""
         turn, shift = _motion(rotation, translation)
         return Capsule(self.radius, turn @ self.start + shift, turn @ self.end + shift)
 
@@ -172,7 +172,7 @@ class Cylinder(_Posed):
 
     @cached_property
     def hull(self) -> Hull:
-        """The prism in the axes of the cylinder."""
+        """The prism that represents the cylinder, in the axes of the cylinder."""
         angles = 2 * pi / SIDES * (np.arange(SIDES) + 0.5)
         around = self.radius / cos(pi / SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
         half = np.full((SIDES, 1), self.length / 2)
@@ -223,7 +223,7 @@ class Box(_Posed):
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace(_SweptCore):
-    """All points on one side of a plane: a floor or a wall.
+    """A half-space: all points on one side of a plane, such as a floor or a wall.
 
     Attributes:
         normal: Normal of the plane, pointing out of the solid; normalised. Shape (3,).
@@ -246,11 +246,11 @@ class HalfSpace(_SweptCore):
 
     @property
     def core(self) -> Array:
-        """Point on the plane. Shape (1, 3), m."""
+        """A point on the boundary plane. Shape (1, 3), m."""
         return np.array([self.point])
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> HalfSpace:
-        """Return the half-space in another frame, given rotation (3, 3) and position (3,), m, of its present frame."""
+        """Return the half-space in another frame, given the pose of its present frame there: (3, 3) and (3,), m."""
         turn, shift = _motion(rotation, translation)
         return HalfSpace(turn @ self.normal, turn @ self.point + shift)
 
@@ -318,7 +318,7 @@ class Mesh(_Posed):
 
     @classmethod
     def around(cls, hull: Hull) -> Mesh:
-        """Return the mesh of a known hull, without computing the hull again."""
+        """Return the mesh shape of a known convex hull, without computing the hull again."""
         mesh = object.__new__(cls)
         fields = {"vertices": hull.vertices, "faces": hull.faces, "position": np.zeros(3), "rotation": np.eye(3)}
         for name, value in {**fields, "file": None, "scale": np.ones(3), "hull": hull}.items():
@@ -327,7 +327,7 @@ class Mesh(_Posed):
 
     @property
     def core(self) -> Array:
-        """Vertices of the hull. Shape (m, 3), m."""
+        """Vertices of the convex hull in the frame of the shape. Shape (m, 3), m."""
         return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
 
 
@@ -337,7 +337,7 @@ KINDS = (Sphere, Capsule, Cylinder, Box, HalfSpace, Mesh)
 
 
 def checked_shape(label: str, value: Any) -> Shape:
-    """Return `value`; raise ModelError unless it is a shape."""
+    """Return the value after checking that it is a shape; raise ModelError otherwise."""
     if not isinstance(value, KINDS):
         names = ", ".join(kind.__name__ for kind in KINDS)
         raise require.invalid(label, f"a shape ({names})", value, names)
@@ -363,7 +363,7 @@ class MovingObstacle:
         shape: Shape in a frame of its own; not a half-space.
         position: Function from time (s, a CasADi symbol) to the origin of that frame in world, shape (3,), m. Tables
             with one argument (`casadi.interpolant`, "linear" or "bspline") are converted to polynomials.
-        rotation: The same for its axes, as columns. Shape (3, 3). None: those of the world.
+        rotation: Function from time to the frame's axes, as columns. Shape (3, 3). None: those of the world.
 
     Raises:
         ModelError: An invalid shape, a half-space, functions that return something else or depend on more than time, an
@@ -412,7 +412,7 @@ class MovingObstacle:
         return Frame(*self._at(time))
 
     def check(self, begin: float, end: float) -> None:
-        """Raise ModelError if the pose is invalid at a sampled time between `begin` and `end` (s)."""
+        """Raise ModelError if the obstacle's pose is invalid at a sampled time between `begin` and `end` (s)."""
         times = np.linspace(begin, end, 513)
         turns, places = (np.array(part) for part in self._at(times[None]))
         broken = ~np.isfinite(places).all(axis=0)

@@ -50,7 +50,7 @@ EXAMPLES = """examples:
 Exit status: 0 all holds, 1 a check fails or is undetermined, or there is no plan, 2 bad input, 130 Ctrl-C.
 `selfmotion COMMAND --help` shows more examples."""
 CommandFunction: TypeAlias = Callable[[argparse.Namespace, Progress], tuple[int, str, Any]]
-"""Function of a subcommand: options and progress to exit status, text and contents of JSON."""
+"""Function that runs a subcommand: (options, progress) to (exit status, text to print, contents of the JSON output)."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _version() -> str:
-    """Return the installed version."""
+    """Return the version of the installed package, or a note that it is not installed."""
     try:
         return version("selfmotion")
     except PackageNotFoundError:
@@ -129,7 +129,7 @@ def _printable(text: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value so that JSON can represent it: null if it is not finite, text if it is another object."""
+    """Return a value as JSON can represent it: null for a number that is not finite, text for any other object."""
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -288,7 +288,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
 def _command(
     commands: Any, name: str, short: str, about: str, examples: str, run: CommandFunction
 ) -> argparse.ArgumentParser:
-    """Add a subcommand to the command line."""
+    """Add a subcommand to the command line and return its parser."""
     subcommand: argparse.ArgumentParser = commands.add_parser(
         name, help=short, description=about, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -312,7 +312,7 @@ def _force(parser: argparse.ArgumentParser) -> None:
 
 
 def robot_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how a URDF is read."""
+    """Add the options that describe the robot: tip, locked joints, load, pose of the base, meshes."""
     group = parser.add_argument_group("the robot")
     group.add_argument("--tip", metavar="LINK", help="link that carries the tip")
     group.add_argument(

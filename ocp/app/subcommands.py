@@ -1,4 +1,4 @@
-"""Run the subcommands of `selfmotion`: each turns options into an exit status, a text and JSON contents."""
+"""Functions that run the subcommands of `selfmotion`; each returns an exit status, a text and contents of JSON."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ __all__ = [
 
 
 def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """Run `selfmotion check`."""
+    """Run `selfmotion check`: check a trajectory and write a report of it if requested."""
     if options.report is not None:
         checked_output("report", options.report, force=options.force)
     progress("reading the robot")
@@ -94,7 +94,7 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
 
 
 def machine_of(options: argparse.Namespace, robot: Robot, raw: RawTrajectory) -> tuple[Machine, list[str]]:
-    """Return the robot on the base that the options name, and a note about assumed feet."""
+    """Return the robot on its base as the options specify it, and notes about links assumed to be feet."""
     if options.floating:
         return FreeFloating(robot, "planar" if set(PLANAR_BASE) <= set(raw.names) else "spatial"), []
     translation, rotation = base_pose(options)
@@ -112,7 +112,7 @@ def machine_of(options: argparse.Namespace, robot: Robot, raw: RawTrajectory) ->
 
 
 def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """Run `selfmotion plan`."""
+    """Run `selfmotion plan`: plan the motion of a task file and write its outputs."""
     progress("reading the task")
     task = read_task(options.task, options.output_folder)
     progress("planning")
@@ -120,14 +120,14 @@ def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
 
 
 def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """Run `selfmotion export`."""
+    """Run `selfmotion export`: write a plan in another file format."""
     progress("writing")
     export_plan(Plan.load(options.plan), options.file, options.period, options.force)
     return 0, f"written: {options.file}", {"written": str(options.file)}
 
 
 def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """Run `selfmotion report`."""
+    """Run `selfmotion report`: audit a plan and write an HTML report of it."""
     from ocp.app.view.report import report_of_plan
 
     file = checked_output("report", options.file, force=options.force)
@@ -141,7 +141,7 @@ def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, st
 
 
 def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """Run `selfmotion view`."""
+    """Run `selfmotion view`: write or serve an HTML page that shows motions."""
     from ocp.app.view.player import PageServer, build_page
 
     if options.page is not None:
@@ -170,7 +170,7 @@ def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
 
 
 def motions_of(options: argparse.Namespace) -> list[Any]:
-    """Return the motions in the files of `view`, the plan first."""
+    """Return the motions in the files given to `selfmotion view`, that of the plan first."""
     from ocp.app.view.animation import animate_plan, animate_solution, animate_trajectory
     from ocp.solution import Solution
 
@@ -201,7 +201,7 @@ def motions_of(options: argparse.Namespace) -> list[Any]:
 
 
 def run_cache(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """Run `selfmotion cache`."""
+    """Run `selfmotion cache`: show the size of the cache, or clear it."""
     files = cache_files()
     size = sum(file.stat().st_size for file in files)
     if options.action == "clear":
@@ -220,7 +220,7 @@ def run_cache(options: argparse.Namespace, progress: Progress) -> tuple[int, str
 
 
 def run_completion(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
-    """Run `selfmotion completion`."""
+    """Run `selfmotion completion`: return the script that completes commands in a shell."""
     try:
         import shtab
     except ImportError as error:
@@ -240,24 +240,24 @@ def read_robot(options: argparse.Namespace) -> Robot:
 
 
 def base_pose(options: argparse.Namespace) -> tuple[Array, Array]:
-    """Return translation (3,), m, and rotation (3, 3) of the base in world."""
+    """Return the base pose in world that the option --mount gives: translation (3,), m, and rotation matrix (3, 3)."""
     numbers = options.mount or [0.0] * 6
     return np.array(numbers[:3]), np.array(rotation_from_rpy(*numbers[3:]), dtype=float)
 
 
 FINDING_FIELDS = ("name", "value", "limit", "unit", "time", "passed", "verdict", "note")
-"""Fields of the audit's findings that JSON shows."""
+"""Fields of an audit finding that the JSON output contains."""
 
 
 def run_task(
     task: Task, output: Path | None, progress: Callable[[str], None], force: bool = False
 ) -> tuple[int, str, Any]:
-    """Plan the motion of a task file, audit it and write the outputs; return exit status, text and JSON contents.
+    """Plan and audit the motion of a task file, write the outputs, and return exit status, text and contents of JSON.
 
     Args:
         task: Contents of the task file.
-        output: File of the plan, anywhere; None: as in the task.
-        progress: Is called with the name of each stage.
+        output: File of the plan, in any folder; None: as in the task.
+        progress: Function that is called with the name of each stage.
         force: Whether files that selfmotion did not write are overwritten.
 
     Raises:
@@ -303,7 +303,7 @@ def run_task(
 
 
 def _segments(result: Plan) -> dict[str, Any]:
-    """Describe the segments of a plan and the motions between them; "" if it has only one."""
+    """Return the JSON entries of a plan's segments and of the reconfigurations between them; {} for other plans."""
     if not isinstance(result, SegmentedPlan):
         return {}
     names = ("time", "before", "after", "duration", "failure")
@@ -323,7 +323,7 @@ def _output_lines(files: list[Path]) -> list[str]:
 
 
 def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> None:
-    """Write a plan in the format of the file's suffix.
+    """Write a plan to a file in the format that the file's suffix names.
 
     Raises:
         ProblemError: The suffix is unknown, the period is not positive, or selfmotion did not write an existing file

@@ -1,1 +1,1 @@
-"""The audit: checks of feasibility, also between the nodes of a plan, and of optimality."""
+"""Audit of a plan: checks that it is feasible, also between its mesh nodes, and that it is locally optimal."""

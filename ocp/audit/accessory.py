@@ -28,9 +28,10 @@ __all__ = ["AccessoryProblem", "end_conditions"]
 
 
 class AccessoryProblem:
-    """Dynamics, Hamiltonian and active constraints of a plan at the Gauss points, in scaled variations.
+    """Linear-quadratic problem in the scaled variations of a plan: dynamics, Hamiltonian and active constraints.
 
-    z = (x, T if free, x0 if the end conditions contain it); all derivatives are those of dz/ds over the fraction s.
+    It is stated at the Gauss points. z = (state x, horizon T if free, start x0 if the end conditions contain it); the
+    independent variable is the fraction s of the horizon.
 
     Attributes:
         along: The plan.
@@ -40,10 +41,10 @@ class AccessoryProblem:
         normals: Gradients of all limits at the points. Shape (M, l, nz + nu).
         strong: Which of them are equalities or have a multiplier. Shape (M, l), bool.
         weak: Which of them are active without a multiplier. Shape (M, l), bool.
-        node_normals, node_strong: The same for the states at the ends of the intervals.
+        node_normals, node_strong: Gradients, and which are strong, of the state limits at the ends of the intervals.
             Shapes (N + 1, l', nz), (N + 1, l').
         moved: Whether a control switches in an interval. Shape (N, nu), bool.
-        switching: Second variation of shifting that switch, per squared area, unscaled. Shape (N, nu).
+        switching: Second variation of the cost for shifting that switch, per squared area, unscaled. Shape (N, nu).
         unit: Scales of (z, u) with which the sweep is well conditioned. Shape (nz + nu,).
         obstacle: Why the second variation is unknown, or "".
     """
@@ -62,9 +63,9 @@ class AccessoryProblem:
     def _units(self) -> None:
         """Choose scales that make the backward sweep well conditioned; they affect no verdict.
 
-        Horizon and states have their sizes; states that hardly move take those of others of their unit. Controls are
-        scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature take their
-        sizes, or their values if they never move.
+        Horizon and states are scaled by their sizes; states that hardly move by those of others of the same unit.
+        Controls are scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature
+        are scaled by their sizes, or their values if they never move.
         """
         sizes, horizon = self.along.sizes, [self.along.solution.horizon] if self.free else []
         curvature = np.abs(np.einsum("kii->ki", self.curved)).mean(axis=0)
@@ -73,7 +74,7 @@ class AccessoryProblem:
         size = np.where(highest - lowest <= SOLVER_SHARE * value, np.maximum(value, sizes.control), sizes.control)
         weight = curvature * size**2
         largest = float(weight.max(initial=0.0))
-        negligible = size <= RESOLVED_SHARE * size.max(initial=0.0)  # whose size is not meaningful
+        negligible = size <= RESOLVED_SHARE * size.max(initial=0.0)  # controls whose size is not meaningful
         is_curved = curvature > MACHINE_SHARE * curvature.max(initial=0.0)
         curves = (weight > MACHINE_SHARE * largest) | (negligible & is_curved)
         self.range = np.where(curves, np.sqrt(largest / np.where(curves, curvature, 1.0)), sizes.control)
@@ -82,7 +83,7 @@ class AccessoryProblem:
         self.unit = np.concatenate([state, horizon, *([state] if self.with_start else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
-        """Return the indices of the variables of y = (x, T, u) that are used, and their indices in (z, u)."""
+        """Return the indices of the states, controls and free horizon in (x, T, u), and their indices in (z, u)."""
         nx = self.nx
         keep = [*range(nx), *([nx] if self.free else [])]
         inputs = range(nx + 1, nx + 1 + self.nu)
@@ -125,7 +126,7 @@ class AccessoryProblem:
 
     @cached_property
     def residual_slope(self) -> np.ndarray:
-        """Derivative of T H by the scaled controls that no multiplier balances. Shape (M, nu)."""
+        """Residual gradient of T H in the scaled controls; 0 for controls in which H is linear. Shape (M, nu)."""
         along = self.along
         multipliers = self.adjoint.control_multipliers
         gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
@@ -133,27 +134,30 @@ class AccessoryProblem:
 
     @property
     def start_slope(self) -> np.ndarray:
-        """Derivative of the cost by start and horizon, in scaled variables z. Shape (nz,)."""
+        """Gradient of the cost with respect to start state and horizon, in the scaled variables z. Shape (nz,)."""
         gradient, nx = self.adjoint.ends.slope, self.nx
         slope = np.concatenate([gradient[:nx], gradient[nx:] if self.free else [], np.zeros(nx * self.with_start)])
         return np.asarray(slope * self.unit[: self.nz])
 
     @property
     def hamiltonian_scale(self) -> float:
-        """Second-order change of the Hamiltonian if states and controls change by their sizes, in units of cost."""
+        """Second-order change of the Hamiltonian, in units of cost, if variables change by characteristic sizes."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
 
     @property
     def cost_scale(self) -> float:
-        """Curvature of the cost for changes by the sizes; for states only that of the running cost counts."""
+        """Second-order change of the cost if states and controls change by their characteristic sizes.
+
+        In units of cost. For states only the running cost counts, for controls the Hamiltonian.
+        """
         sizes, curvature = self.along.sizes, np.abs(self._curves[:, self.nx + 1 :])
         total = self.along.share @ (np.abs(self._cost_curves) @ sizes.state**2 + curvature @ sizes.control**2)
         return float(total) / 2
 
     @property
     def control_scale(self) -> float:
-        """Second-order change of the cost when every control changes by its own value, in units of cost."""
+        """Second-order change of the cost if every control changes by as much as its own value, in units of cost."""
         return float(self.along.share @ np.sum(np.abs(self._curves[:, self.nx + 1 :]) * self.along.u**2, axis=1)) / 2
 
     def _constraints(self) -> None:
@@ -198,7 +202,7 @@ class AccessoryProblem:
         self.node_normals, self.node_strong = node * self.unit[: self.nz], on_arc & along.node_limits.near
 
     def _switches(self) -> None:
-        """Find the controls that switch within an interval, and the second variation for a shift of the switch."""
+        """Find the controls that switch between limits in an interval, and the second variation of shifted switches."""
         along, nu = self.along, self.nu
         n, q = along.shape
         self.moved, self.switching = np.zeros((n, nu), bool), np.zeros((n, nu))
@@ -230,9 +234,10 @@ def obstacle(form: Formulation) -> str:
 
 
 def curved_ends(form: Formulation) -> Any:
-    """Return a Function of the second derivatives in (x, T, x0) of end and start rows times their multipliers.
+    """Return the CasADi Function of the Hessians of the end and start constraints, weighted by their multipliers.
 
-    Its arguments are (x, x0, T, p, multipliers of the end rows, multipliers of the start rows).
+    Its arguments are (x, x0, T, p, multipliers of the end rows, multipliers of the start rows); the Hessians are with
+    respect to (x, T, x0).
     """
     nu_end, nu_start = (form.sym(name, len(r)) for name, r in (("nu", form.end), ("nu0", form.start)))
     last = ca.substitute([form.end.expression], [form.t], [form.T])[0]
@@ -244,9 +249,10 @@ def curved_ends(form: Formulation) -> Any:
 
 
 def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the Hessian and the active rows of the conditions at the end, then at the start, in scaled z.
+    """Return Hessian and active rows of the end constraints of a plan, then those of its start constraints.
 
-    Inequalities are active if they have multipliers, state bounds if the plan rests on them.
+    They refer to the scaled variations z. Inequalities are active if they have multipliers, state bounds if the plan
+    rests on them.
     """
     along, ends = accessory.along, accessory.adjoint.ends
     form, solution, (low, high) = along.form, along.solution, along.bounds

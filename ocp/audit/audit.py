@@ -1,4 +1,4 @@
-"""The audit: is a plan feasible, also between its nodes, and is it a local minimum?
+"""Audit of a plan: is it feasible, also between its mesh nodes, and is it a local minimum of the cost?
 
 The audit does not rely on the solver. It integrates the controls anew, evaluates every constraint on a grid ten times
 as fine as the plan, and checks the minimum principle with newly computed multipliers.
@@ -34,12 +34,12 @@ from ocp.tolerances import (
 __all__ = ["COST_LOST", "Audit", "Finding", "audit", "clearance_finding"]
 
 COST_LOST = "cost lost, relative"
-"""Name of the finding of how much a plan may cost above the nearest extremal."""
+"""Name of the finding that reports how much more a plan costs than the nearest extremal, relative to the cost."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check.
+    """Result of one check of an audit: the deviation found and the largest allowed one.
 
     Attributes:
         name: What is checked.
@@ -61,22 +61,22 @@ class Finding:
 
     @property
     def passed(self) -> bool:
-        """Whether the value is within its limit; nan does not pass."""
+        """Whether the value does not exceed the limit, if there is one; nan does not pass."""
         return self.limit is None or bool(self.value <= self.limit)
 
 
 @dataclass(frozen=True)
 class Audit:
-    """Result of an audit.
+    """Result of the audit of a plan: the findings of all checks, and the quantities computed for them.
 
     Attributes:
         name: Name of the problem.
-        findings: One for every check.
+        findings: Results of the checks, one for every check.
         undecided: Why it is undetermined whether the plan is a local minimum, or "".
-        constraints: Largest violation of every bound and constraint on the fine grid by name; 0 if it holds.
+        constraints: Largest violation of every bound and constraint on the fine grid by name; 0 if it is satisfied.
         integration_error: Largest difference of the plan's states from the re-integrated ones over the whole horizon,
             relative to the size of each state.
-        local_errors: The same within each interval, integrated from its own start. Shape (N,).
+        local_errors: The same within each mesh interval, integrated from the plan's state at its start. Shape (N,).
         t: Times of the re-integrated plan, s. Interior mesh times occur twice, with the controls of both sides. Shape
             (M,).
         states, controls: Values of the re-integrated plan by name. Shape (M, n) each.
@@ -99,7 +99,7 @@ class Audit:
 
     @property
     def feasible(self) -> bool:
-        """Whether dynamics, bounds, constraints, ends, horizon and reported cost are right."""
+        """Whether the plan satisfies dynamics, bounds, constraints and horizon, and reports its cost correctly."""
         return all(finding.passed for finding in self.findings if finding.verdict == "feasible")
 
     @property
@@ -116,12 +116,12 @@ class Audit:
 
     @property
     def failures(self) -> tuple[Finding, ...]:
-        """The findings beyond their limits."""
+        """Findings of the checks that the plan did not pass."""
         return tuple(finding for finding in self.findings if not finding.passed)
 
     @property
     def lost(self) -> np.ndarray:
-        """Cost of each interval above that of the nearest extremal, in units of cost. Shape (N,)."""
+        """Excess cost of each mesh interval over the nearest extremal, in units of the cost. Shape (N,)."""
         return np.zeros(0) if self.optimality is None else self.optimality.lost
 
     def __getitem__(self, name: str) -> Finding:
@@ -133,7 +133,7 @@ class Audit:
 
     @property
     def sentence(self) -> str:
-        """The verdict in one sentence."""
+        """Verdict of the audit in words, which follow "The plan" in a sentence."""
         if not self.feasible:
             worst = next(f for f in self.failures if f.verdict == "feasible")
             where = "" if worst.time is None else f" at {worst.time:.4g} s"
@@ -151,7 +151,7 @@ class Audit:
 
     @property
     def _word(self) -> str:
-        """The verdict in one or two words."""
+        """Verdict of the audit in one or two words, for example "passed"."""
         return "passed" if self.passed else "not decided" if self.feasible and self.optimal is None else "FAILED"
 
     def __str__(self) -> str:
@@ -197,8 +197,8 @@ def audit(
 
     Derived functions are cached with the problem until more is declared, so that further audits take less time.
 
-    If unstable dynamics carry the re-integrated states away from a plan that every interval keeps, the finding for the
-    whole horizon is only reported, and bounds, constraints and cost are judged interval by interval.
+    Unstable dynamics may carry the re-integrated states away from a plan that satisfies the dynamics in every interval.
+    Then the finding for the whole horizon is only reported, and bounds, constraints and cost are judged by interval.
 
     Args:
         problem: The problem.
@@ -264,7 +264,7 @@ def audit(
     )
     findings.append(_jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
     is_sound = all(finding.passed for finding in findings)
-    # an infeasible plan needs no best multipliers
+    # an infeasible plan does not need the best multipliers
     optimum = optimality(form, solution, p, bounds, along=along, allowed=lost if is_sound else np.inf)
     excess = cost.value if cost.passed and solution.cost > running + final else 0.0
     findings += optimality_findings(form, optimum, excess, lost, costates=costates)
@@ -287,7 +287,7 @@ def audit(
 
 
 def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Finding:
-    """Compare the horizon and the last time of a plan with the declared horizon, within the solver's tolerance."""
+    """Return the finding about the difference of a plan's horizon and last time from the declared horizon."""
     low, high = (float(side[form.bounds.places["horizon"][0]]) for side in bounds)
     miss = max(low - solution.horizon, solution.horizon - high, abs(float(solution.t[-1]) - solution.horizon))
     declared = f"{low:.6g} s" if low == high else f"{low:.6g} to {high:.6g} s"
@@ -298,7 +298,7 @@ def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Fi
 def optimality_findings(
     form: Formulation, optimum: Optimality, excess: float, lost: float, *, costates: float | None
 ) -> list[Finding]:
-    """Return the findings about the first and second order optimality conditions.
+    """Return the findings about the first- and second-order optimality conditions of a plan.
 
     The cost is quadratic in errors of the costates: a transcription that loses a share of the cost determines its
     costates to the root of this share. The curvature is judged only at an extremal. ``excess`` is the share of the cost
@@ -342,7 +342,7 @@ def clearance_finding(clearance: Clearance, limit: float) -> Finding:
 
 
 def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) -> Finding:
-    """Return the finding about the relative deviation of the plan from its re-integration over the horizon."""
+    """Return the finding about the relative deviation of a plan from its states re-integrated over the horizon."""
     notes = [] if motion.breakdown_time is None else [f"the integration broke down at {motion.breakdown_time:.6g} s"]
     if is_unstable:
         notes.append(f"unstable dynamics amplify {motion.added[-1]:.2g}, the sum of the defects of the intervals")
@@ -351,7 +351,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
-    """Return the finding about the largest violation, relative to its size, or in its own unit with a `tolerance`."""
+    """Return the finding about the largest violation of a constraint, relative to its size or to a `tolerance`."""
     if tolerance is not None:
         return _worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))
@@ -360,7 +360,7 @@ def violation_finding(violation: Violation, constraints: float, tolerance: float
 
 
 def _worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None, note: str = "") -> Finding:
-    """Return the finding with the largest value; nan counts as the largest."""
+    """Return a finding about the largest of several values over time; nan counts as infinite."""
     if values.size == 0:
         return Finding(name, 0.0, limit, None, note)
     clean = np.where(np.isnan(values), np.inf, values)
@@ -369,7 +369,7 @@ def _worst(name: str, values: np.ndarray, times: np.ndarray, limit: float | None
 
 
 def _cost_finding(solution: Solution, running: float, final: float, sizes: Sizes, limit: float) -> Finding:
-    """Compare the reported cost with that of the re-integrated plan, along it and at its end."""
+    """Return the finding about the difference of a plan's reported cost from that of the re-integrated plan."""
     cost = running + final
     size = max(abs(cost), abs(final), abs(solution.cost), sizes.cost)  # parts of the cost may cancel
     error = abs(cost - solution.cost) / size if size > 0 else abs(cost - solution.cost)
@@ -377,7 +377,10 @@ def _cost_finding(solution: Solution, running: float, final: float, sizes: Sizes
 
 
 def reported_finding(solution: Solution, sizes: Sizes, limit: float) -> Finding:
-    """Compare the reported arrays with the interpolants, relative to the sizes; at a break either side may fit."""
+    """Return the finding about the largest difference of a plan's reported samples from its interpolants.
+
+    It is relative to the sizes. At a break of an interpolant the values of either side count.
+    """
     errors = np.zeros(len(solution.t))
     costates = float(np.max(np.abs(solution.costate_interpolant.values), initial=0.0)) or 1.0
     at = np.add.outer([-1e-12, 1e-12], solution.t / solution.horizon).ravel()
@@ -395,7 +398,7 @@ def reported_finding(solution: Solution, sizes: Sizes, limit: float) -> Finding:
 def _jump(
     name: str, interpolant: PiecewisePolynomial, horizon: float, sizes: np.ndarray, limit: float | None
 ) -> Finding:
-    """Return the finding about the largest jump between two segments of a curve, relative to its sizes."""
+    """Return the finding about the largest jump of a piecewise polynomial at its breaks, relative to given sizes."""
     n = len(interpolant.breaks) - 1
     segments = np.arange(n)
     left = interpolant.within(segments[:-1], np.ones(n - 1))

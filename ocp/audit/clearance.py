@@ -1,4 +1,4 @@
-"""Verified clearance: lower bounds of the distances of bodies along a motion at all times, also between samples.
+"""Verified clearance: lower bounds of the distances between bodies at all times of a motion, also between samples.
 
 For a fixed direction n the gap between two convex hulls is the smallest gap between their points, and the curvature of
 each point's gap over time is bounded by the acceleration of the point (:mod:`ocp.problem.hulls`). On an interval
@@ -40,18 +40,18 @@ __all__ = [
 ]
 
 MAX_PRINTED = 4
-"""Number of pairs left out by assumption that a line of text names; `Clearance.assumed` holds all."""
+"""Largest number of pairs of bodies left out by assumption that a text lists; `Clearance.assumed` contains all."""
 
 
 @dataclass(frozen=True)
 class ProofSettings:
-    """Resolution and limits of the search that bounds the distances on halved intervals.
+    """Resolution and limits of the bisection of time intervals that bounds the distances between bodies.
 
     Attributes:
         share: Relative accuracy of the difference between the smallest and the required distance.
         finest: Absolute accuracy of a distance, m, where that difference is smaller.
         halvings: Largest number of halvings of a mesh interval: 1 s becomes 15 ns.
-        most_intervals: Largest number of pair intervals that are bounded. The remaining ones are not proven.
+        most_intervals: Largest number of intervals, of all pairs, that are bounded. The remaining ones are not proven.
         first_blocks: Largest number of intervals in the first pass. Finer meshes are combined in blocks.
         first_times: Largest number of times at which bounding balls are compared in the first pass.
     """
@@ -73,7 +73,7 @@ class ClosestPair:
         least: Lower bound of their distance at all times, m; negative if they overlap.
         distance: Smallest distance computed at a time, m.
         time: That time, s.
-        points: Closest points of the two hull cores at that time, in world. Shape (2, 3), m.
+        points: Closest points of the two hull cores (hulls without their radius) then, in world. Shape (2, 3), m.
         required: Required distance, m.
     """
 
@@ -96,7 +96,7 @@ class ClosestPair:
 
 
 class Track(NamedTuple):
-    """The motion of the frames that carry the bodies.
+    """Motion of the frames that carry the bodies, with bounds of its rates.
 
     Attributes:
         breaks: Ends of the N polynomial segments, as fractions of the horizon from 0 to 1. Shape (N + 1,).
@@ -119,7 +119,7 @@ class Track(NamedTuple):
 
 @dataclass(frozen=True)
 class Clearance:
-    """Result of a clearance proof.
+    """Result of a clearance proof: bounds of the distances between the bodies of each pair along a motion.
 
     Attributes:
         name: Name of the separation.
@@ -141,7 +141,7 @@ class Clearance:
 
     @property
     def worst(self) -> ClosestPair | None:
-        """The pair with the smallest margin; None if there are no pairs."""
+        """Pair with the smallest difference between its distance and the required one; None if there are no pairs."""
         return self.pairs[0] if self.pairs else None
 
     def __str__(self) -> str:
@@ -153,14 +153,14 @@ class Clearance:
 
     @property
     def _assumptions(self) -> list[str]:
-        """Describe the pairs that are excluded by assumption, as a list with one text; an empty list without any."""
+        """Description of the pairs left out by assumption, as a list with one text; empty if there are none."""
         first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_PRINTED]]
         more = [f"{len(self.assumed) - MAX_PRINTED} more"] if len(self.assumed) > MAX_PRINTED else []
         return [f"left out by assumption: {', '.join([*first, *more])}"] if first else []
 
 
 def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Clearance:
-    """Bound the distance of each pair of bodies along a plan at all times.
+    """Compute a lower bound of the distance of each pair of bodies along a plan, valid at all times.
 
     Args:
         form: Formulation of the problem.
@@ -172,7 +172,10 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
 
 
 def clearance_along(apart: Separation, track: Track | None, settings: ProofSettings = ProofSettings()) -> Clearance:
-    """Bound the distance of each pair of bodies along a track at all times; the track may be None without pairs."""
+    """Compute a lower bound of the distance of each pair of bodies for a given motion of their frames, at all times.
+
+    ``track`` may be None if there are no pairs.
+    """
     if not len(apart) or track is None:
         return Clearance(apart.name, (), True, 0, assumed=apart.assumed)
     return _Search(apart, track, settings).run()
@@ -181,11 +184,11 @@ def clearance_along(apart: Separation, track: Track | None, settings: ProofSetti
 def closest_pairs_along(
     problem: Problem, solution: Solution, times: Iterable[float], suffix: str = ""
 ) -> list[ClosestPair]:
-    """Return the closest pair of bodies of a plan at each time (s); empty if the problem has no separations.
+    """Return the closest pair of bodies at each time (s) of a plan; empty if the problem has no separation constraints.
 
     Args:
         suffix: Suffix of the names of the states that move the bodies: selects one part of a plan whose parts are
-            stored side by side.
+            stacked as separate states.
 
     Raises:
         ProblemError: The plan does not belong to the problem.
@@ -201,7 +204,7 @@ def closest_pairs_along(
 def separation_frames(
     problem: Problem, solution: Solution, times: np.ndarray, suffix: str = ""
 ) -> list[tuple[Separation, Frames]]:
-    """Return each separation of a problem with the frames of its bodies at times (K,), s.
+    """Return each separation constraint of a problem with the poses of its body frames at times (K,), s.
 
     Args:
         suffix: As in `closest_pairs_along`.
@@ -214,7 +217,10 @@ def separation_frames(
 
 
 def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Separation, Track]]:
-    """Return each separation that has pairs and whose moving states have names with a suffix, with its track."""
+    """Return the separation constraints whose states have names with a suffix, each with the motion of its bodies.
+
+    Those without pairs of bodies are left out.
+    """
     form = Formulation.of(problem)
     check_variables_match(form, solution)
     solution, p = match_order(form, solution), form.parameter_vector(solution.parameters)
@@ -223,7 +229,7 @@ def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Sep
 
 
 def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Track:
-    """Return the motion of the bodies of a separation along a plan."""
+    """Return the motion of the bodies of a separation constraint along a plan."""
     columns = [k for name in apart.movers for k in range(*form.states[name].indices(form.nx))]
     curve, horizon = solution.state_interpolant, solution.horizon
     outputs, kept = [form.separations[apart.name]], ("placements", apart.name)
@@ -237,7 +243,7 @@ def _track_of(form: Formulation, apart: Separation, solution: Solution, p: np.nd
 
 
 class _Search:
-    """Bisection of the time intervals of all pairs, until the distance of each is known accurately enough.
+    """Bisection of time intervals until the distance of every pair of bodies is bounded accurately enough.
 
     At level l >= 0 an interval is a block of 2^l segments; at level l < 0 it is the share 2^l of one segment. The
     interval ``index`` begins at segment index 2^l and ends at (index + 1) 2^l.
@@ -257,7 +263,7 @@ class _Search:
         self.best, self.when, self.points = np.full(n, np.inf), np.zeros(n), np.zeros((n, 2, 3))
 
     def run(self) -> Clearance:
-        """Halve intervals until the bounds of every pair suffice, or the limits of the search are reached."""
+        """Halve time intervals until the distance bounds of all pairs suffice, or a limit of the search is reached."""
         n, level = len(self.apart), self.top
         self._evaluate_at_closest_balls()
         blocks = np.arange(-(-self.pieces >> level) if level else self.pieces)
@@ -285,7 +291,7 @@ class _Search:
         return Clearance(self.apart.name, tuple(closest), settled, checked, reason, self.apart.assumed)
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
-        """Return the reason if a prescribed motion prevents sufficient bounds on intervals; else an empty text."""
+        """Return why a prescribed motion prevents sufficient distance bounds on intervals, or "" if none does."""
         begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         if self.track.prescribed is None:
             return ""
@@ -298,13 +304,13 @@ class _Search:
         return f"the prescribed motion between {names} {cause} at {begin[k]:.6g} s"
 
     def at(self, time: float) -> list[ClosestPair]:
-        """Return the distances of all pairs at one time, s."""
+        """Return the distance and the closest points of every pair of bodies at one time, s."""
         self.best[:] = np.inf
         self._evaluate(np.full(len(self.apart), np.clip(time / self.track.horizon, 0.0, 1.0)))
         return self._closest(self.best)
 
     def _closest(self, bounds: np.ndarray) -> list[ClosestPair]:
-        """Return the closest approach found for each pair, with the given lower bounds (n,), m."""
+        """Return the closest approach found so far for each pair, with given lower bounds of its distance (n,), m."""
         rotations, positions = self.track.frames(self.when)
         each, frame = np.arange(len(self.apart)), self.apart.pairs[:, 2]
         points = np.einsum("nij,nkj->nki", rotations[each, frame], self.points) + positions[each, frame][:, None]
@@ -321,7 +327,7 @@ class _Search:
         ]
 
     def _evaluate_at_closest_balls(self) -> None:
-        """Evaluate each pair at the node or interval middle where its bounding balls are closest."""
+        """Compute the distance of each pair at the node or interval midpoint where its bounding balls are closest."""
         times = np.union1d(self.breaks, (self.breaks[:-1] + self.breaks[1:]) / 2)
         times = times[:: -(-len(times) // self.settings.first_times)]
         n, frames = len(self.apart), self.track.frames(times)
@@ -329,7 +335,7 @@ class _Search:
         self._evaluate(times[self.bodies.balls(frames, at, pair).reshape(n, -1).argmin(axis=1)])
 
     def _evaluate(self, when: np.ndarray) -> None:
-        """Evaluate the distance of each pair at its own time (n,), as a fraction of the horizon."""
+        """Compute the distance of each pair at a time of its own, given as a fraction of the horizon (n,)."""
         pair = np.arange(len(self.apart))
         _, gap, points = self.bodies.nearest(self.track.frames(when), pair, pair)
         self._keep(pair, gap, when, points)
@@ -347,10 +353,10 @@ class _Search:
         return np.where(margin >= 0, self.apart.least + max(smallest - max(share * smallest, finest), 0.0), reduced)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower bounds of the distances of pairs on intervals of a level (K,), and sufficient bounds (n,).
+        """Return lower bounds of the distances of given pairs on given time intervals (K,), and sufficient bounds (n,).
 
-        Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. Smallest distances
-        are kept.
+        Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. The smallest
+        distances are stored.
         """
         begin, end = self._fraction(block, level), self._fraction(block + 1, level)
         width = (end - begin) * self.track.horizon
@@ -377,7 +383,7 @@ class _Search:
         return bound, self._sufficient_bounds()
 
     def _fraction(self, place: np.ndarray, level: int) -> np.ndarray:
-        """Return the start of the intervals ``place`` (K,) of a level, as fractions of the horizon."""
+        """Return the starts of the intervals ``place`` (K,) of a bisection level, as fractions of the horizon."""
         if level >= 0:
             return np.asarray(self.breaks[np.minimum(place << level, self.pieces)])
         segment = place >> -level
@@ -388,9 +394,9 @@ class _Search:
     def _moves(
         self, pair: np.ndarray, block: np.ndarray, level: int, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return how much the distances of pairs can decrease within intervals that last ``width`` s.
+        """Return how far the distances of pairs can fall within time intervals of length ``width`` (s).
 
-        Below the value at the middle, and below the chord between the ends. Shape (K,) each, m.
+        This is below the value at the middle, and below the chord between the ends. Shape (K,) each, m.
         """
         apart = self.apart
         rates, seconds = self.fastest[max(level, 0)]
@@ -403,7 +409,7 @@ class _Search:
         return moves * width / 2, (bends + 2 * turns * moves) * width**2 / 8
 
     def _keep(self, pair: np.ndarray, distance: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
-        """Store for each pair a distance that is smaller than all before, with its time and points."""
+        """Store the smallest distance found so far for each pair, with its time and closest points."""
         order = np.lexsort((distance, pair))
         first = order[np.unique(pair[order], return_index=True)[1]]
         first = first[distance[first] < self.best[pair[first]]]
@@ -412,13 +418,13 @@ class _Search:
 
 
 def _pairwise_maximum(values: np.ndarray) -> np.ndarray:
-    """Return the maxima of successive pairs of rows; an odd last row stays. Shapes (N, k) to (ceil(N / 2), k)."""
+    """Return the maximum of every two successive rows; an odd last row stays. Shapes (N, k) to (ceil(N / 2), k)."""
     even = np.concatenate([values, values[-1:]]) if len(values) % 2 else values
     return np.asarray(np.maximum(even[::2], even[1::2]))
 
 
 def _rate_bounds(curve: PiecewisePolynomial, columns: list[int], horizon: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds of the first and second time derivatives of states on each segment. Shapes (N, k).
+    """Return bounds of the absolute first and second time derivatives of states on each segment. Shapes (N, k).
 
     The Bernstein coefficients of a polynomial bound it on its interval.
     """

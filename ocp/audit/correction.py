@@ -1,4 +1,4 @@
-"""Re-integration of a nearly exact plan by Newton corrections of the plan itself.
+"""Re-integration of a nearly exact plan by Newton corrections of its own states.
 
 The defects of the plan in its own dynamics, integrated over the samples of its fine grid and over further samples
 between them, drive the linear equation of its error (Ascher, Mattheij, Russell 1995, chapter 8). All intervals are
@@ -25,10 +25,10 @@ __all__ = ["SETTINGS", "IntegratedMotion", "corrected_motion"]
 
 @dataclass(frozen=True)
 class IntegrationSettings:
-    """Accuracy of the re-integration.
+    """Accuracy of the re-integration of a plan, and limits of its work.
 
     Attributes:
-        tolerance: Error over one grid cell, relative to the size of each state.
+        tolerance: Error over one grid cell (interval of the fine grid), relative to the size of each state.
         rounding: Rounding error, relative to the value of a state.
         corrections: Largest number of corrections.
         remainder: Largest remaining correction, relative to the sizes: ten times the tolerance.
@@ -38,9 +38,9 @@ class IntegrationSettings:
             its width.
         rounds: Largest number of rounds of splitting.
         steps: Largest number of simultaneous steps. Stiffer or chattering dynamics count as a breakdown within seconds.
-        block: Steps in one call.
-        blocks: Calls between two checks of the time limit.
-        inline: Number of instructions of the dynamics up to which a step is one flat function.
+        block: Number of steps in one call of the step function.
+        blocks: Number of calls between two checks of the time limit.
+        inline: Number of instructions of the dynamics up to which a step is one function of scalar symbols.
         growth: Factor between the deviation and the sum of the defects above which the dynamics are unstable.
     """
 
@@ -61,22 +61,22 @@ class IntegrationSettings:
 
 SETTINGS = IntegrationSettings()
 INNER = np.array([0.46, 0.53, 0.44, 0.55, 0.48])
-"""Sample inside each of five cells, as a fraction of the cell. They are uneven, so that oscillations in phase with the
-grid show. One polynomial integrates five cells together; an interval has a multiple of five cells."""
+"""Position of the sample inside each of five grid cells, as a fraction of the cell. They are uneven, so that
+oscillations in phase with the grid show. One polynomial integrates five cells; an interval has a multiple of five."""
 POINTS = np.append(np.ravel([np.arange(5), np.arange(5) + INNER], "F") / 5, 1.0)
-"""Samples of five cells, as fractions of the five."""
+"""Positions of all samples of five successive grid cells, as fractions of their total length."""
 LENGTH = len(POINTS[1:])
 RULE, ROUGH = (quadrature(POINTS, POINTS[1:], degree).T for degree in (LENGTH, LENGTH - 2))
-"""Quadrature from 0 to each of the other points, and one of lower degree: their difference estimates the error."""
+"""Quadrature weights from 0 to each other position, and those of lower degree: their difference estimates the error."""
 
 
 class IntegratedMotion(NamedTuple):
-    """Motion that the controls of a plan produce, on its fine grid.
+    """States and running cost that the controls of a plan produce, on its fine grid.
 
     Attributes:
-        local: Over each interval from the plan's own state at its start. Shape (N, cells + 1, nx).
-        states: Over the whole horizon. Shape (N, cells + 1, nx).
-        local_cost, cost: Running cost along each.
+        local: States integrated over each interval from the plan's own state at its start. Shape (N, cells + 1, nx).
+        states: States integrated over the whole horizon. Shape (N, cells + 1, nx).
+        local_cost, cost: Integrals of the running cost along ``local`` and ``states``.
     """
 
     local: np.ndarray
@@ -86,7 +86,7 @@ class IntegratedMotion(NamedTuple):
 
 
 def corrected_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion | None:
-    """Return the motion that the controls of a plan produce; None if corrections of the plan do not converge."""
+    """Return the motion that the controls of a plan produce; None if the corrections of its states do not converge."""
     if not along.finite:
         return None
     newton = _Newton(along, grid)
@@ -142,7 +142,7 @@ class _Newton:
         self.own = None if self.first is None else self._own_error(self.first, self.x)
 
     def _integral(self, x: np.ndarray) -> np.ndarray | None:
-        """Integrate dynamics and running cost along states x from the start of each interval to every sample.
+        """Integrate dynamics and running cost along given states ``x`` from the start of each interval to every sample.
 
         Shape (N, 2 cells + 1, nx + 1). None if the quadrature error exceeds the tolerance.
         """
@@ -158,9 +158,9 @@ class _Newton:
         return self._cumulative(panels, flow.shape) if (doubt <= allowed).all() else None
 
     def _cumulative(self, panels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Integrate values, arranged as by ``_panels``, from the start of each interval to every sample.
+        """Integrate sampled rates, arranged by ``_panels``, from the start of each interval to every sample.
 
-        ``shape`` is that of the values and of the result, (N, 2 cells + 1, m).
+        ``shape`` is that of the rates and of the result, (N, 2 cells + 1, m).
         """
         n, samples, m = shape
         parts = (panels @ self.rule).reshape(n, -1, m, LENGTH).transpose(0, 1, 3, 2)
@@ -170,10 +170,10 @@ class _Newton:
         return integral
 
     def converged(self, chained: bool, rate: float = 1.0) -> _Converged | None:
-        """Compute the motion that starts from the plan's first state, or one in every interval, by iteration.
+        """Correct the states of the plan until they satisfy its dynamics; None if the corrections do not converge.
 
         Args:
-            chained: Whether the intervals are joined to one motion.
+            chained: Whether one motion starts from the plan's first state, not one in every interval.
             rate: Ratio of successive corrections, as far as it is known.
         """
         nx, x, integral, error, last = self.along.form.nx, self.x, self.first, self.own, np.inf
@@ -199,7 +199,7 @@ class _Newton:
         return float(np.einsum("k,j,kji,kji->", along.width, along.weight, slope, self.at_gauss @ change))
 
     def _own_error(self, integral: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return the first-order integration error that each interval contributes to states x."""
+        """Return the first-order error of states ``x`` that arises within each interval by itself."""
         (n, q), nx = self.along.shape, self.along.form.nx
         defect = integral[..., :nx] - (x - x[:, :1])
         at_gauss = self.at_gauss @ defect
@@ -211,7 +211,7 @@ class _Newton:
         return np.asarray(defect + self._cumulative(_panels(fed), fed.shape))
 
     def _propagate(self, ends: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Propagate errors at the interval ends (N, nx) of states x, and the jumps between intervals, onwards."""
+        """Propagate the errors of states ``x`` at interval ends (N, nx), and jumps there, through later intervals."""
         start = np.zeros(ends.shape)
         jumps = ends[:-1] + x[:-1, -1] - x[1:, 0]
         for k in range(len(jumps)):
@@ -221,13 +221,13 @@ class _Newton:
 
 
 def _panels(values: np.ndarray) -> np.ndarray:
-    """Arrange values (N, 2 cells + 1, m) into panels of five cells each. Shape (N cells / 5 m, 11)."""
+    """Arrange samples (N, 2 cells + 1, m) in groups of five grid cells for quadrature. Shape (N cells / 5 m, 11)."""
     windows = np.lib.stride_tricks.sliding_window_view(values, LENGTH + 1, axis=1)
     return windows[:, ::LENGTH].reshape(-1, LENGTH + 1)
 
 
 def _interleave(ends: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Interleave values at the ends of cells (N, cells + 1, n) with values inside them (N, cells, n)."""
+    """Interleave values at the ends of grid cells (N, cells + 1, n) with values inside the cells (N, cells, n)."""
     values = np.empty((len(ends), ends.shape[1] + inside.shape[1], ends.shape[2]))
     values[:, ::2], values[:, 1::2] = ends, inside
     return values

@@ -1,4 +1,4 @@
-"""The costate equation, lambda' = -dH/dx, and the conditions at the ends, checked for the costates of a plan.
+"""Checks of the costates of a plan: the costate equation, lambda' = -dH/dx, and the conditions at start and end.
 
 The reported costates come from the multipliers of whatever method made the plan. Here each interval is integrated
 backwards from the reported costate at its end by Gauss collocation, with newly computed multipliers of the active
@@ -26,13 +26,13 @@ __all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "end_limits", "interval_en
 
 
 class Ends(NamedTuple):
-    """Residuals of the optimality conditions at start and end of a plan, with the multipliers there.
+    """Residuals and multipliers of the optimality conditions at start and end of a plan.
 
     Attributes:
-        transversality: Residual of the costates at the ends that no multiplier explains, in units of cost.
-        horizon: Residual of the derivative in a free horizon, times the horizon, in units of cost.
-        slope: Residual derivative of the cost in the start and the horizon. Shape (nx + 1,).
-        charge: Products of the multipliers and the gaps to their limits, in units of cost.
+        transversality: Residual of the costates at start and end that no multiplier explains, in units of cost.
+        horizon: Residual of the derivative with respect to a free horizon, times the horizon, in units of cost.
+        slope: Residual derivative of the cost with respect to the start state and the horizon. Shape (nx + 1,).
+        charge: Sum of the multipliers times the gaps to their limits, in units of cost.
         end, start: Multipliers of the end and start conditions. Shapes (m,).
     """
 
@@ -50,20 +50,21 @@ class Adjoint:
 
     Attributes:
         t: Ends of the intervals, s. Shape (N + 1,).
-        costate: At the Gauss points, integrated backwards in every interval from the plan's own at its end. (N q, nx).
-        control_multipliers: Multipliers of the control limits at the Gauss points, per unit of s.
+        costate: Costates at the Gauss points, integrated backwards in every interval from the costate that the plan
+            reports at its end. Shape (N q, nx).
+        control_multipliers: Multipliers of the control limits at the Gauss points, per unit of the horizon fraction s.
             Shape (N q, nu + r + a).
-        state_multipliers: Multipliers of the state limits at the Gauss points, per unit of s. Atoms at the ends of the
-            intervals are distributed to the adjacent points. Shape (N q, nx + r').
+        state_multipliers: Multipliers of the state limits at the Gauss points, per unit of s. Atoms (impulses) at the
+            ends of the intervals are distributed to the adjacent points. Shape (N q, nx + r').
         error: Error of the costates over each interval, from end to end. Shape (N,).
         total: Sum of the errors; where they cancel, the largest deviation from the costates integrated from the end of
             the plan to its start. The smaller of both.
         between: Error of the costates reported between the ends of an interval. Shape (N,).
-        charge: Products of the multipliers of the state limits and their gaps, in each interval. Shape (N,).
+        charge: Multipliers of the state limits times the gaps to these, summed in each interval. Shape (N,).
         node_shifts: Part of the costates reported at the ends of the intervals that belongs to atoms before them: a
             limit that a transcription imposes only at a node acts there at once for both adjacent intervals.
             Shape (N + 1, nx).
-        ends: The conditions at the ends.
+        ends: The conditions at start and end.
     """
 
     t: np.ndarray
@@ -79,11 +80,11 @@ class Adjoint:
 
 
 def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts: np.ndarray | None = None) -> Adjoint:
-    """Integrate the costates of a plan backwards, compute the multipliers, and check the conditions at the ends.
+    """Integrate the costates of a plan backwards, compute the multipliers, and check the start and end conditions.
 
     Args:
         along: Linearisation of the plan.
-        curved: T H_uu at the points, (M, nu, nu), or None if no path inequality has a control.
+        curved: T H_uu at the Gauss points, (M, nu, nu), or None if no path inequality has a control.
         cost: Size of the cost, by which errors are weighted.
         shifts: Node shifts of an earlier call. They are subtracted from the reported costates at the nodes, so that the
             atoms are distributed.
@@ -136,9 +137,9 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
 
 
 def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray | None) -> np.ndarray:
-    """Return the part of the forces near each node that acts before it, weighted by the node's hat function.
+    """Return the part of the costate reported at each mesh node that belongs to multipliers just before the node.
 
-    Half of the ``atoms`` at the starts of the intervals, if these are not distributed yet.
+    Multipliers count by the hat function of the node, and ``atoms`` by half if they are not distributed yet.
     """
     (n, q), nx, nu = along.shape, along.form.nx, along.form.nu
     shifts = np.zeros((n + 1, nx))
@@ -156,7 +157,7 @@ def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, 
 
 
 def interval_end_costates(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reported costates at start and end of every interval, from inside the interval. Shapes (N, nx)."""
+    """Return the one-sided limits of the reported costates at start and end of every interval. Shapes (N, nx)."""
     curve, mesh = along.solution.costate_interpolant, along.mesh
     if len(curve.breaks) == len(mesh) and np.array_equal(curve.breaks, mesh):
         intervals = np.arange(len(mesh) - 1)
@@ -166,7 +167,10 @@ def interval_end_costates(along: Linearisation) -> tuple[np.ndarray, np.ndarray]
 
 
 class BackwardIntegration:
-    """Backward integration of the costate equation over every interval, with the control multipliers as feedback."""
+    """Backward integration of the costate equation over every mesh interval, for given active limits of the controls.
+
+    The multipliers of active path constraints are linear functions of the costate, or constant across a gap.
+    """
 
     def __init__(self, along: Linearisation, multipliers: np.ndarray, across: np.ndarray) -> None:
         self.along = along
@@ -200,12 +204,12 @@ class BackwardIntegration:
         self.drive = np.einsum("k,ij,kja->kia", h, ahead, self.source)
 
     def integrate(self, last: np.ndarray, inside: np.ndarray, atoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the costates at the points (N q, nx) and before the start of every interval (N, nx).
+        """Return the costates at the Gauss points (N q, nx) and just before the start of every interval (N, nx).
 
         Args:
-            last: Costates at the ends. Shape (N, nx).
-            inside: Forces of the state limits at the points. Shape (N, q, m).
-            atoms: Forces at both ends of the intervals. Shape (N, 2, m).
+            last: Costates at the ends of the intervals. Shape (N, nx).
+            inside: Multipliers of the state limits at the Gauss points, times quadrature weights. Shape (N, q, m).
+            atoms: Impulses of the state limits at both ends of the intervals. Shape (N, 2, m).
         """
         along = self.along
         (n, q), nx = along.shape, along.form.nx
@@ -219,7 +223,7 @@ class BackwardIntegration:
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
     def accumulate(self, errors: np.ndarray) -> np.ndarray:
-        """Accumulate the costate errors of the intervals (N, nx) backwards; return the sum at the start of each."""
+        """Propagate the costate errors of the intervals (N, nx) backwards; return their sums at the interval starts."""
         (n, q), nx = self.along.shape, self.along.form.nx
         points = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
         weight = self.along.weight[:, None, None]
@@ -235,7 +239,10 @@ class BackwardIntegration:
 def _forces(
     back: BackwardIntegration, k: int, first: np.ndarray, last: np.ndarray, cost: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return state limit multipliers of interval k that fit its costates: (q, m), and impulses (2, m) at its ends."""
+    """Return the multipliers of the state limits in interval ``k`` that best explain its reported costates.
+
+    Those at the Gauss points (q, m) are multiplied by quadrature weights; those at both ends (2, m) are impulses.
+    """
     along = back.along
     q, nx, m = along.shape[1], along.form.nx, along.state_limits.lower.shape[1]
     points = slice(k * q, (k + 1) * q)
@@ -257,7 +264,7 @@ def _forces(
     inside, atoms = np.zeros((q, m)), np.zeros((2, m))
     if not columns:
         return inside, atoms
-    # responses of the costates at the points and at the start to each force
+    # responses of the costates at the Gauss points and at the start to each multiplier
     responses, start = np.zeros((len(columns), q, nx)), np.zeros((len(columns), nx))
     for c, (kind, j, direction) in enumerate(columns):
         if kind == 0:
@@ -289,7 +296,7 @@ def _forces(
 
 
 def _inside_errors(along: Linearisation, costate: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return the errors of the reported costates inside the intervals, in units of cost. Shape (N,)."""
+    """Return the largest error of the reported costates inside each interval, in units of cost. Shape (N,)."""
     (n, q), nx = along.shape, along.form.nx
     fractions = along.solution.t / along.solution.horizon
     k = np.clip(np.searchsorted(along.mesh, fractions, side="right") - 1, 0, n - 1)
@@ -312,7 +319,7 @@ def _ends(
     cost: float,
     lam1: np.ndarray,
 ) -> Ends:
-    """Return the residuals of the end conditions with best-fitting multipliers of the right signs."""
+    """Return the residuals of the conditions at start and end, with fitted multipliers of admissible sign."""
     form, solution, nx = along.form, along.solution, along.form.nx
     low, high = along.bounds
     places = form.bounds.places
@@ -351,15 +358,16 @@ def _ends(
 
 @dataclass(frozen=True)
 class EndLimits:
-    """Limits that may be active at the ends of a plan: end and start rows, horizon bounds, state limits.
+    """Limits that may be active at start or end of a plan: start and end constraints, bounds of horizon and states.
 
     Attributes:
-        slope: Derivatives in (x, x0, T) of each side that may be active. Shape (K, 2 nx + 1).
+        slope: Derivatives of each limit with respect to end state x, start state x0 and horizon T.
+            Shape (K, 2 nx + 1).
         sign: 1 for an upper limit, -1 for a lower one. Shape (K,).
         gap: Distance to the limit. Shape (K,).
         equal: Whether it is an equality; these are listed once. Shape (K,).
-        row: Index among end and start rows, in this order, or -1. Shape (K,).
-        rows: Numbers of end and start rows.
+        row: Index among the rows of end and start constraints, in this order, or -1. Shape (K,).
+        rows: Numbers of rows of end and start constraints.
     """
 
     slope: np.ndarray
@@ -370,7 +378,7 @@ class EndLimits:
     rows: tuple[int, int]
 
     def table(self, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the signed multipliers of the end and the start rows."""
+        """Return the signed multipliers of the end constraints and of the start constraints."""
         values = np.zeros(sum(self.rows))
         is_row = self.row >= 0
         np.add.at(values, self.row[is_row], (self.sign * multipliers)[is_row])
@@ -378,7 +386,7 @@ class EndLimits:
 
 
 def end_limits(along: Linearisation) -> EndLimits:
-    """Return the limits that may be active at the ends of a plan."""
+    """Return the limits that may be active at start or end of a plan."""
     form, sizes, nx, (low, high) = along.form, along.sizes, along.form.nx, along.bounds
     index = np.concatenate([form.end.bounds, form.start.bounds])
     equal = np.concatenate([form.end.equality, form.start.equality]) | (low[index] == high[index])

@@ -23,11 +23,11 @@ __all__ = ["Curvature", "curvature"]
 
 
 class RankTolerances(NamedTuple):
-    """Tolerances of singular values, for constraint rows of length 1, in the controls of a stage.
+    """Tolerances of singular values by which constraint rows of length 1 count as linearly dependent.
 
     Attributes:
-        size: Below this value constraints count as dependent.
-        seen: Below this value the remainder is a constraint on earlier stages. Between both values it is dropped.
+        size: Singular value in the controls of a stage below which constraints on them count as dependent.
+        seen: Value below which the remainder is a constraint on earlier stages. Between both values it is dropped.
     """
 
     size: float
@@ -52,9 +52,9 @@ class Curvature:
         t: Times of the Gauss points, s. Shape (M,).
         starts: Variations of start and horizon as columns, and the curvature of the cost along each with optimal
             controls, 0 for no curvature. Shapes (nz, k), (k,). None if the sweep ends earlier.
-        gain: Cost that the controls could save in each interval by the best variation, with active constraints held and
-            the states following. Shape (N,).
-        start_slope: Remaining slope of the cost in the start. Shape (nz,).
+        gain: Cost that the controls could save in each interval by the best variation, if active constraints stay
+            active and the states respond. Shape (N,).
+        start_slope: Remaining gradient of the cost with respect to start and horizon. Shape (nz,).
     """
 
     least: float
@@ -74,9 +74,9 @@ class Curvature:
         return bool(self.least > FLAT_SHARE)
 
     def lost(self, slope: np.ndarray) -> float:
-        """Return the second-order cost reduction by a change of start and horizon, given the cost's slope (nz,).
+        """Return the cost, to second order, that a change of start and horizon can save, for a cost gradient (nz,).
 
-        Where the cost does not curve, they change by their scales at most.
+        Where the cost does not curve, start and horizon change by their scales at most.
         """
         if self.starts is None:
             return 0.0
@@ -134,10 +134,10 @@ class _Swept(NamedTuple):
 def _sweep(
     accessory: AccessoryProblem, stages: _Linearised, weak: bool, tolerances: RankTolerances = FULL_RANK
 ) -> _Swept:
-    """Sweep backwards over all stages: by linear solves if all stages are convex, else by eigenvectors.
+    """Sweep backwards over all stages (mesh intervals): by linear solves if all are convex, else by eigenvectors.
 
     Args:
-        weak: Whether active limits without multipliers are held too.
+        weak: Whether active limits without multipliers must stay active too.
         tolerances: Which constraints count as dependent.
     """
     reduced = _reduce_stages(accessory, stages, weak, tolerances)
@@ -153,7 +153,7 @@ def _sweep(
 def _sweep_stages(
     accessory: AccessoryProblem, sweep: _Linearised, stages: list[_Stage], tolerances: RankTolerances, upwards: bool
 ) -> _Swept | None:
-    """Sweep backwards over all stages. With ``upwards``, return None as soon as a stage is not convex.
+    """Sweep backwards over all stages (mesh intervals); with ``upwards``, return None if a stage is not convex.
 
     Cost, step and curvature of a stage refer to (z, 1, controls), so that they include the slope of the cost.
     """
@@ -228,10 +228,10 @@ def _sweep_stages(
 
 
 class _Linearised(NamedTuple):
-    """The linearised problem of all stages: variations at the points as functions of start and controls.
+    """Linearised problem of every stage (mesh interval), in terms of the variations of its start and its controls.
 
     Attributes:
-        whole: Variations of (z, u) at the points. Shape (N, q, nz + nu, nz + q nu).
+        whole: Variations of (z, u) at the Gauss points. Shape (N, q, nz + nu, nz + q nu).
         step, stage: State at the end and cost, as functions of (z, 1, controls).
             Shapes (N, nz + 1, nz + 1 + q nu), (N, nz + 1 + q nu, nz + 1 + q nu).
         metric: Square root of the quadrature weight of each point. Shape (N, q).
@@ -251,7 +251,7 @@ class _Linearised(NamedTuple):
 
     @classmethod
     def of(cls, accessory: AccessoryProblem) -> _Linearised:
-        """Express the variations at all points by those at the interval starts and those of the controls."""
+        """Express the variations at all Gauss points by those at the interval starts and those of the controls."""
         along, nz, nu = accessory.along, accessory.nz, accessory.nu
         (n, q), h = along.shape, along.width
         # variations at the Gauss points from those at the start of the interval and those of the controls
@@ -291,11 +291,11 @@ class _Linearised(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """A stage of the sweep, reduced to the f control variations that its own constraints leave free.
+    """One stage (mesh interval) of the sweep, reduced to the f control variations that its own constraints leave free.
 
     Attributes:
         lift: (z, 1, controls) as a function of (z, 1) and the free variations. Shape (nz + 1 + q nu, nz + 1 + f).
-        move, bend: Step and cost in these.
+        move, bend: Step and cost as functions of (z, 1) and the free variations.
         rows: Remaining constraints on (z, 1), passed on to earlier stages. Shape (r, nz + 1).
     """
 
@@ -308,7 +308,10 @@ class _Stage(NamedTuple):
 def _reduce_stages(
     accessory: AccessoryProblem, sweep: _Linearised, weak: bool, tolerances: RankTolerances
 ) -> list[_Stage]:
-    """Reduce each stage by its own constraints; stages with the same active constraints are treated together."""
+    """Eliminate from each stage (mesh interval) the control variations that its own active constraints determine.
+
+    Stages with the same active constraints are treated together.
+    """
     n, q = accessory.along.shape
     nz, nu = accessory.nz, accessory.nu
     normals = accessory.normals.reshape(n, q, -1, nz + nu)
@@ -338,7 +341,7 @@ def _reduce_stages(
 def _eliminate_controls(
     rows: np.ndarray, nz: int, tolerances: RankTolerances
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Eliminate the controls that constraint rows (K, r, nz + m) determine, at K stages with m controls each.
+    """Eliminate the controls that constraint rows (K, r, nz + m) determine, in K stages with m controls each.
 
     Returns:
         For each group of L stages with equal ranks: their indices, (L,); states and controls from the states and the
@@ -368,35 +371,35 @@ def _eliminate_controls(
 
 
 class _Gain(NamedTuple):
-    """Optimal feedback of a stage: controls as a linear function of (z, 1) and of free variations."""
+    """Optimal linear feedback of a stage (mesh interval), from a variation of the state to those of the controls."""
 
     lift: np.ndarray
     response: np.ndarray
 
     def of(self, z: np.ndarray) -> np.ndarray:
-        """Return the optimal controls for a variation of the state."""
+        """Return the optimal variations of the controls for a variation of the state."""
         inputs = np.append(z, 0.0)
         return np.asarray(self.lift @ np.concatenate([inputs, -self.response @ inputs]))
 
 
 def unit_rows(rows: np.ndarray, rank: float) -> np.ndarray:
-    """Return rows scaled to length 1, without rows that vanish."""
+    """Return the rows of a matrix scaled to length 1, without rows that are zero up to a tolerance."""
     sizes = np.linalg.norm(rows, axis=1)
     nonzero = sizes > rank * max(1.0, float(sizes.max(initial=0.0)))
     return np.asarray(rows[nonzero] / sizes[nonzero, None])
 
 
 def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
-    """Scale end conditions to rows of length 1, so that small entries of states that hardly change count."""
+    """Scale the rows of end conditions to length 1, so that small entries of states that hardly change count."""
     return unit_rows(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 
 class _Variation(NamedTuple):
-    """A variation of controls and states.
+    """Variation of the controls and states of a plan, with its effect on the cost and on the constraints.
 
     Attributes:
-        curvature: Twice its second variation per squared length of its controls.
-        slip: Largest violation of its constraints.
+        curvature: Twice the second variation of the cost per squared length of the control variation.
+        slip: Largest violation of the linearised constraints, relative to the largest entry.
     """
 
     controls: np.ndarray
@@ -413,7 +416,7 @@ def _variation(
     gains: list[_Gain],
     start: np.ndarray | None = None,
 ) -> _Variation:
-    """Return the variation that follows the optimal feedback after these first controls, or from a start."""
+    """Return the variation that begins with given controls or a given start and follows the optimal feedback."""
     along, nz, nu = accessory.along, accessory.nz, accessory.nu
     n, q = along.shape
     without_one = np.delete(np.arange(nz + 1 + q * nu), nz)
@@ -441,7 +444,7 @@ def _variation(
 
 
 def _confirm_negative(least: float, at: float | None, variation: _Variation, scale: float) -> _Swept:
-    """Return a negative curvature only if a variation lowers the cost and keeps the constraints.
+    """Return the result of a sweep with negative curvature, inconclusive unless an admissible variation confirms it.
 
     End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no
     freedom.
@@ -452,7 +455,7 @@ def _confirm_negative(least: float, at: float | None, variation: _Variation, sca
 
 
 def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
-    """Return the reason why the curvature is inconclusive at a stage where the Hamiltonian is linear in a control.
+    """Return why the curvature is inconclusive at a stage if the Hamiltonian is linear in a control there, else "".
 
     For a control that enters linearly the remaining curvature is of the order of the interval's width. A minimum on a
     singular arc is decided by the generalised Legendre-Clebsch condition, which is not checked here.
@@ -472,5 +475,5 @@ def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
 
 
 def _label(form: Formulation, direction: np.ndarray, nu: int) -> str:
-    """Return the name of the control with the largest component in a direction of a stage."""
+    """Return the name of the control that varies most in a given variation of the controls of a stage."""
     return form.control_labels[int(np.argmax(np.abs(direction).reshape(-1, nu).max(axis=0)))]

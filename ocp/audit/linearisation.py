@@ -1,4 +1,4 @@
-"""First derivatives of a problem along a plan, at Gauss points of its intervals, independent of the method of the plan.
+"""First derivatives of a problem along a plan, at Gauss points of its intervals, whatever method made the plan.
 
 The search for multipliers (:mod:`ocp.audit.principle`, :mod:`ocp.audit.costates`) and the second variation
 (:mod:`ocp.audit.accessory`) use these. The independent variable is the fraction s of the horizon, so that dx/ds = T f
@@ -23,13 +23,13 @@ from ocp.tolerances import NEAR_LIMIT_SHARE, RESOLVED_SHARE, SOLVER_SHARE, TIGHT
 __all__ = ["Limits", "Linearisation", "quadrature"]
 
 MIN_POINTS, MAX_POINTS, ENOUGH_POINTS = 3, 5, 150
-"""Smallest and largest number of Gauss points in an interval; number in a plan at which the smallest suffices."""
+"""Smallest and largest number of Gauss points in an interval, and number in the whole plan that is sufficient."""
 MAX_DERIVATIVES = 3
-"""Largest number of time derivatives of a state constraint that are searched for the controls."""
+"""Largest number of times that a state constraint is differentiated until a control appears in it."""
 
 
 class Limits:
-    """Limits that may be active at points of a plan: lower and upper limits of quantities, and distances to them.
+    """Lower and upper limits of quantities at points of a plan, the distances to them, and which may be active.
 
     A limit that was slightly tightened when the plan was solved may be active where the plan rests on it. The price of
     its multiplier is the distance to the declared limit. Multiplier times distance is the excess cost of the plan to
@@ -60,14 +60,14 @@ class Limits:
         self.lower, self.upper = (equal | (gap <= NEAR_LIMIT_SHARE * size) for gap in gaps)
 
     def at(self, points: slice) -> Limits:
-        """Return the limits at a slice of the points."""
+        """Return the limits at a slice of the points of the plan."""
         part = copy(self)
         for name in ("below", "above", "gap", "lower", "upper"):
             setattr(part, name, getattr(self, name)[points])
         return part
 
     def extend(self, count: int) -> None:
-        """Append `count` equalities that the plan satisfies exactly."""
+        """Append `count` equality constraints that the plan satisfies exactly."""
         m = len(self.below)
         self.equal = np.append(self.equal, np.ones(count, bool))
         zeros = np.zeros((m, count))
@@ -80,29 +80,30 @@ class Limits:
         return np.asarray(self.lower | self.upper)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the complementarity products: multipliers (M, m) times distances to the limits, never negative."""
+        """Return the complementarity products, multipliers (M, m) times distances to their limits, never negative."""
         gap = np.where(multipliers > 0, self.above, self.below)
         return np.asarray(np.where(multipliers != 0, gap, 0.0) * np.abs(multipliers))
 
 
 class Linearisation:
-    """First derivatives along a plan.
+    """First derivatives of cost, dynamics and constraints along a plan, at Gauss points of its intervals.
 
     Attributes:
-        width: Widths of the N intervals. Shape (N,).
+        width: Widths of the N mesh intervals, as fractions of the horizon. Shape (N,).
         weight, places: Quadrature weights and positions of the Gauss points in an interval. Shape (q,).
         matrix: Runge-Kutta matrix of these points. Shape (q, q).
         shape: (N, q).
         s, t: Fractions of the horizon and times (s) of the M = N q points. Shape (M,).
         nodal: Whether the plan is reported only at the ends of the intervals.
-        x, u, costate: The plan at the points, as it reports them. Shape (M, n).
+        x, u, costate: States, controls and costates of the plan at the points, as it reports them. Shape (M, n).
         cost_y, rate_y: Derivatives of T L and T f in y = (x, T, u). Shapes (M, ny), (M, nx, ny).
-        row, row_y: Path rows and their derivatives. Shapes (M, r), (M, r, ny).
+        row, row_y: Rows of the path constraints and their derivatives. Shapes (M, r), (M, r, ny).
         sizes: Sizes of all quantities along the plan.
         state_size: Sizes of the states by which costates are judged. Shape (nx,).
         control_size: Sizes of the controls by which distances to their limits are judged. Shape (nu,).
-        end_row, end_y: End rows, then start rows, and their derivatives in (x, x0, T). Shapes (m,), (m, 2 nx + 1).
-        final_y, final_yy: First and second derivatives of the terminal cost in these.
+        end_row, end_y: Rows of end, then start constraints, and their derivatives with respect to end state x, start
+            state x0 and horizon T. Shapes (m,), (m, 2 nx + 1).
+        final_y, final_yy: First and second derivatives of the terminal cost with respect to these.
             Shapes (2 nx + 1,), (2 nx + 1, 2 nx + 1).
         control_limits: Limits of the controls, of path rows with a control (``mixed``) and of arcs along state
             equalities, in this order. Shape (M, nu + r + a).
@@ -141,7 +142,7 @@ class Linearisation:
         self._arcs()
 
     def _differentiate(self) -> None:
-        """Compute the derivatives of running cost, dynamics and path rows."""
+        """Compute the first derivatives of running cost, dynamics and path constraints at the Gauss points."""
         form, m = self.form, len(self.s)
         self.y = ca.vertcat(form.x, form.T, form.u)
         self.fraction, *self.scaled = form.cached("over the fraction of the horizon", lambda: over_fraction(form))
@@ -156,7 +157,7 @@ class Linearisation:
 
     @property
     def point(self) -> tuple[Any, ...]:
-        """Arguments of :meth:`Formulation.sampled` at the points, including the fraction of the horizon."""
+        """Arguments of :meth:`Formulation.sampled` at the Gauss points, including the fraction of the horizon."""
         fraction = (self.fraction, self.s[:, None])
         return self.x, self.u, self.t, self.solution.horizon, self.p, fraction
 
@@ -174,17 +175,17 @@ class Linearisation:
 
     @property
     def slope_size(self) -> float:
-        """First-order change of the running cost if states and controls change by their sizes, in units of cost."""
+        """First-order change of the running cost if states and controls change by their characteristic sizes."""
         unit = np.concatenate([self.state_size, [0.0], self.sizes.control])
         return float(self.share @ (np.abs(self.cost_y) @ unit))
 
     @property
     def share(self) -> np.ndarray:
-        """Quadrature weight of every point in an integral over the fraction s. Shape (M,)."""
+        """Quadrature weight of every Gauss point in an integral over the fraction of the horizon. Shape (M,)."""
         return np.asarray((self.width[:, None] * self.weight).ravel())
 
     def _at_ends(self) -> None:
-        """Compute the rows at the ends, and the derivatives of these rows and of the terminal cost."""
+        """Compute the start and end constraints, and the derivatives of these and of the terminal cost."""
         form, solution = self.form, self.solution
         x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
         u0, u1 = stack(solution.controls, 2)[[0, -1]]
@@ -193,7 +194,7 @@ class Linearisation:
         self.end_row, self.end_y, self.final_y, self.final_yy = ends[0][:, 0], ends[1], ends[2][:, 0], ends[3]
 
     def _state_sizes(self) -> np.ndarray:
-        """Return the sizes of the states. Shape (nx,).
+        """Return the characteristic sizes of the states, also of those constant along the plan. Shape (nx,).
 
         A state that is constant along the plan has no spread. If its value is free, such as a tool length that is
         stored as a state, its size is the smallest change that changes another quantity by its size, or the cost by
@@ -223,10 +224,10 @@ class Linearisation:
         return result
 
     def _control_sizes(self) -> np.ndarray:
-        """Return the sizes of the controls, to which distances to their limits are compared. Shape (nu,).
+        """Return the characteristic sizes of the controls, relative to which a limit is near or not. Shape (nu,).
 
-        An unused control rests on a limit but for the solver's tolerance, so that its spread is no size. It takes the
-        size of other controls of its unit; if all of these are unused, the nearest bound, at most one SI unit.
+        An unused control rests on a limit but for the solver's tolerance, so that its spread is not a size. It takes
+        the size of other controls of its unit; if all of these are unused, the nearest bound, at most one SI unit.
         """
         form, own = self.form, self.sizes.control
         low, high = (side[form.bounds.places["control"]] for side in self.bounds)
@@ -238,7 +239,7 @@ class Linearisation:
         return np.asarray(np.where(distance <= RESOLVED_SHARE * full, full, own))
 
     def _limits(self) -> None:
-        """Determine the limits of controls and states at the points and at the ends of the intervals."""
+        """Set up the limits of controls and states at the Gauss points, and of states at the ends of the intervals."""
         form, sizes, (n, q) = self.form, self.sizes, self.shape
         nx, nu = form.nx, form.nu
         self.mixed = np.flatnonzero(form.path.uses_control)
@@ -304,10 +305,10 @@ class Linearisation:
 
 
 def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampler]]:
-    """Group path rows by their order, that of their first time derivative that contains a control.
+    """Group path constraints by their order, the number of time derivatives until a control appears.
 
     Returns:
-        For each order the indices of its rows, and a sampler of the derivatives of these in the controls.
+        For each order the indices of its rows, and a sampler of the derivatives of these with respect to the controls.
     """
     at, remaining, arcs = form.path.expression[rows.tolist()], np.arange(len(rows)), list[tuple[np.ndarray, Sampler]]()
     rates = [form.sym("w_rate", form.w.numel()) for _ in range(MAX_DERIVATIVES)] if form.signals else []
@@ -325,16 +326,20 @@ def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampl
 
 
 def over_fraction(form: Formulation) -> list[Any]:
-    """Return the symbol s of the horizon fraction, and T L, T f and the path rows as expressions of s."""
+    """Return a symbol for the fraction s of the horizon, and cost, dynamics and path constraints in terms of it.
+
+    The expressions are T L and T f, with horizon T, running cost L and dynamics f, and the rows of the path.
+    """
     fraction = form.sym("s")
     parts = [form.T * form.running, form.T * form.f, form.path.expression]
     return [fraction, *ca.substitute(parts, [form.t], [fraction * form.T])]
 
 
 def ends_of(form: Formulation) -> Any:
-    """Return a casadi Function (x, x0, u, u0, T, p) of the conditions at the ends.
+    """Return the CasADi Function of the end and start constraints and of derivatives of these and the terminal cost.
 
-    Its outputs are the rows, their derivatives, and the gradient and Hessian of the terminal cost.
+    Its arguments are (x, x0, u, u0, T, p). Its outputs are the rows, their derivatives, and the gradient and Hessian
+    of the terminal cost.
     """
     begin = ca.substitute([form.start.expression], [form.x, form.u, form.t], [form.x0, form.u0, 0])[0]
     end, final = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])
@@ -346,13 +351,13 @@ def ends_of(form: Formulation) -> Any:
 
 
 def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Runge-Kutta matrix (q, q) and weights (q,) of collocation at ``places``."""
+    """Return the Runge-Kutta matrix (q, q) and weights (q,) of collocation at positions ``places`` (q,) in 0..1."""
     weights = quadrature(places, np.append(places, 1.0))
     return weights[:-1], weights[-1]
 
 
 def quadrature(places: np.ndarray, ends: np.ndarray, degree: int | None = None) -> np.ndarray:
-    """Return quadrature weights at ``places`` (q,) for integrals from 0 to each of ``ends`` (m,). Shape (m, q).
+    """Return the quadrature weights at ``places`` (q,) for integrals from 0 to each of ``ends`` (m,). Shape (m, q).
 
     The integrand is the least-squares polynomial of the given degree; by default the interpolating one.
     """

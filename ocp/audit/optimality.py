@@ -1,4 +1,4 @@
-"""First and second order optimality of a plan: multipliers, cost above the optimum, and curvature of the cost.
+"""First- and second-order optimality of a plan: multipliers, excess cost over the optimum, curvature of the cost.
 
 Where controls rest on their limits, the plan alone does not determine the costates. A plan that switches between limits
 where its mesh allows it fits a whole set of costates. A solver reports one of them, whose switching functions need not
@@ -29,7 +29,7 @@ from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, RESOLVED_SHARE
 __all__ = ["Optimality", "optimality"]
 
 PROXIMITY_WEIGHT = 1e-5
-"""Weight of the relative mean square distance from the reported costates: selects among equally good multipliers."""
+"""Weight of the relative mean square distance from the reported costates, to select among equally good multipliers."""
 SOLVER = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
@@ -43,13 +43,13 @@ SOLVER = {
 
 
 class Fit(NamedTuple):
-    """Multipliers of a plan that minimise its estimated loss of optimality.
+    """Multipliers of a plan that minimise its estimated excess cost over the optimum (loss).
 
     Attributes:
-        lost: Loss of the plan in each interval without its ends, in units of cost. Shape (N,).
+        lost: Loss of the plan in each interval without that at start and end, in units of cost. Shape (N,).
         adjoint: The multipliers. The errors remain those of the reported costates.
-        distance: Largest distance of the reported costates from these at a node, in units of cost. 0 for state
-            equalities, which determine costates only up to multiples of their gradients.
+        distance: Largest distance of the reported costates from the fitted ones at a mesh node, in units of cost. 0 for
+            state equalities, which determine costates only up to multiples of their gradients.
     """
 
     lost: np.ndarray
@@ -58,12 +58,12 @@ class Fit(NamedTuple):
 
 
 def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, cost: float) -> Fit | None:
-    """Return the multipliers of a plan with the smallest estimated loss; None if their program has no solution.
+    """Return the multipliers that minimise the estimated excess cost of a plan; None if the solver fails.
 
     Args:
         along: Linearisation of the plan.
         known: Multipliers computed before.
-        curved: T H_uu at these. Shape (M, nu, nu).
+        curved: Hessian T H_uu in the controls at these. Shape (M, nu, nu).
         cost: Size of the cost.
     """
     dual = _Dual(along, curved, cost)
@@ -72,33 +72,36 @@ def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, c
 
 
 class _Program:
-    """A sparse convex program: minimise price . x + weight . x^2 / 2 subject to rows x = right and low <= x."""
+    """Sparse convex quadratic program with linear equations and lower bounds, assembled part by part.
+
+    Minimise price . x + weight . x^2 / 2 subject to A x = right and x >= low.
+    """
 
     def __init__(self) -> None:
-        self._variables: list[np.ndarray] = []  # low, price and weight of each, (3, count)
+        self._variables: list[np.ndarray] = []  # low, price and weight of each variable, (3, count)
         self._right: list[np.ndarray] = []
         self._entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def variables(self, count: int, low: Any = -np.inf, price: Any = 0.0, weight: Any = 0.0) -> np.ndarray:
-        """Add variables and return their indices."""
+        """Add variables to the program and return their indices."""
         first = sum(part.shape[1] for part in self._variables)
         self._variables.append(np.array([np.broadcast_to(value, (count,)) for value in (low, price, weight)], float))
         return np.arange(first, first + count)
 
     def equations(self, right: np.ndarray) -> np.ndarray:
-        """Add equations with given right-hand sides; return their indices in the same shape."""
+        """Add equations with given right-hand sides to the program; return their indices in the same shape."""
         first = sum(part.size for part in self._right)
         self._right.append(right)
         return np.arange(first, first + right.size).reshape(right.shape)
 
     def add(self, rows: Any, columns: Any, values: Any) -> None:
-        """Add matrix entries; the three arrays are broadcast to one shape."""
+        """Add entries to the matrix of the equations; the three arguments are broadcast to one shape."""
         rows, columns, values = np.broadcast_arrays(rows, columns, values)
         keep = values.ravel() != 0
         self._entries.append((rows.ravel()[keep], columns.ravel()[keep], values.ravel()[keep]))
 
     def solve(self) -> np.ndarray | None:
-        """Return the optimal x, or None."""
+        """Return the optimal variables of the program; None if the solver does not converge."""
         rows, columns, values = (np.concatenate(part) for part in zip(*self._entries, strict=True))
         low, price, weight = np.hstack(self._variables)
         right = np.concatenate([part.ravel() for part in self._right])
@@ -114,15 +117,15 @@ class _Program:
 
 @dataclass
 class _Multipliers:
-    """Nonnegative multipliers of limits; the price of each is the distance to its limit.
+    """Nonnegative multipliers of limits, as variables of a program in which each costs the distance to its limit.
 
     Attributes:
-        point, limit: Point and index of each limit. Shape (K,).
+        point, limit: Indices of the point and of the limit of each multiplier. Shape (K,).
         sign: 1 for an upper limit, -1 for a lower one. Shape (K,).
         slope: Gradient of the limit, times the sign, over ``reach``. Shape (K, n).
         reach: Effect of a multiplier of one, in units of cost. Shape (K,).
-        price: Gap over reach. Shape (K,).
-        index: Variable of the program. Shape (K,).
+        price: Gap to the limit over ``reach``. Shape (K,).
+        index: Index of the multiplier among the variables of the program. Shape (K,).
     """
 
     point: np.ndarray
@@ -136,11 +139,10 @@ class _Multipliers:
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
            share: Any = 1.0) -> _Multipliers:  # fmt: skip
-        """Add a multiplier for each side of the ``chosen`` limits (M, m), bool, with derivatives (M, m, n).
+        """Add one multiplier for each side of the ``chosen`` limits (M, m), bool, to a program and return them all.
 
-        The variables have the sizes (n,).
-
-        A multiplier per unit of s costs its gap times the ``share`` (M,) of its point.
+        ``slopes`` (M, m, n) are the derivatives of the limits with respect to variables of the given ``size`` (n,).
+        A multiplier per unit of the horizon fraction s costs its gap times the ``share`` (M,) of its point.
         """
         reach = (np.abs(slopes) * size).sum(axis=2)
         sides = []
@@ -154,14 +156,14 @@ class _Multipliers:
         return cls(point, limit, signs, slope, effect, price, program.variables(len(point), 0.0, price))
 
     def table(self, x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the signed multipliers. Shape (M, m)."""
+        """Return the signed multipliers of all limits for a solution of the program, 0 if not added. Shape (M, m)."""
         values = np.zeros(shape)
         np.add.at(values, (self.point, self.limit), self.sign * x[self.index] / self.reach)
         return values
 
 
 class _Dual:
-    """The linear or quadratic program whose solution is the multipliers of a plan, in units of cost."""
+    """Linear or quadratic program whose solution gives the multipliers of a plan, in units of cost."""
 
     def __init__(self, along: Linearisation, curved: np.ndarray, cost: float) -> None:
         self.along, self.cost, self.program = along, cost, _Program()
@@ -189,7 +191,7 @@ class _Dual:
         interior = along.node_limits.near & (along.nodal | ~along.node_limits.equal)
         interior[[0, -1]] = False  # the conditions at the ends are separate
         self.node = _Multipliers.of(self.program, along.node_limits, interior, along.node_limits_x, scales)
-        self.path_slope = np.zeros((len(self.control_limits.point), nx + 1))  # of path rows, in (x, T)
+        self.path_slope = np.zeros((len(self.control_limits.point), nx + 1))  # gradients of path rows in (x, T)
         path = self.control_limits.limit >= nu
         row = along.mixed[self.control_limits.limit[path] - nu]
         self.path_slope[path] = along.row_y[self.control_limits.point[path], row, : nx + 1]
@@ -199,7 +201,7 @@ class _Dual:
         self._ends()
 
     def _costate_equation(self) -> None:
-        """Add the equation lambda' = -dH/dx for every interval, integrated backwards between nodes."""
+        """Add the costate equation, lambda' = -dH/dx, of every interval, integrated backwards between mesh nodes."""
         along, program, node = self.along, self.program, self.node
         controls, states = self.control_limits, self.state_limits
         (n, q), nx, size = along.shape, along.form.nx, along.state_size
@@ -221,9 +223,10 @@ class _Dual:
             program.add(rows_of_point[states.point], states.index[:, None], -force)
 
     def _stationarity(self, curved: np.ndarray) -> None:
-        """Add dH/du = 0 with a residual; its price is quadratic where H is curved in the controls, else linear.
+        """Add the stationarity condition of the Hamiltonian, dH/du = 0, with a penalised residual.
 
-        The step is the size of the control along the plan or, if the control has limits, the range between them.
+        The penalty is quadratic where H is curved in the controls, else linear. Its step is the size of the control
+        along the plan or, if the control has limits, the range between them.
         """
         along, program, controls = self.along, self.program, self.control_limits
         nx, unit, share = along.form.nx, self.step, along.share[:, None]
@@ -242,7 +245,7 @@ class _Dual:
             self.residual.append(part)
 
     def _ends(self) -> None:
-        """Add the end conditions; the price of a residual is the distance that the controls could move the states."""
+        """Add the transversality conditions, with residuals penalised by how far the controls could move the states."""
         along, program, nx = self.along, self.program, self.along.form.nx
         form, (low, high), horizon = along.form, along.bounds, along.solution.horizon
         places, share = form.bounds.places, along.share
@@ -275,7 +278,7 @@ class _Dual:
             program.add(rows[self.free], self.end_residual[-1], sign)
 
     def fit(self, x: np.ndarray, known: Adjoint) -> Fit:
-        """Return the multipliers of a plan from a solution of the program, in units of cost."""
+        """Return the multipliers of a plan and its loss from a solution of the program, in units of cost."""
         along, (n, q), nx, size = self.along, self.along.shape, self.along.form.nx, self.along.state_size
         lost = np.zeros(n)
         for part in self.residual:
@@ -310,17 +313,17 @@ class _Dual:
 
 @dataclass(frozen=True)
 class Optimality:
-    """Result of the first and second order optimality conditions along a plan.
+    """Result of evaluating the first- and second-order optimality conditions along a plan.
 
     Attributes:
-        lost: Cost that the plan could save in each interval, to second order; that of the ends is in the first. Shape
-            (N,).
+        lost: Cost that the plan could save in each interval, to second order; what start and end could save is counted
+            in the first. Shape (N,).
         cost_size: Reference of the loss, in units of cost: the cost or, if it is negligible, the cost of the smallest
             control changes that are resolved.
         error_size: Reference of the costate errors, in units of cost. The cost is quadratic in these errors.
         t: Times of the Gauss points, s. Shape (N q,).
-        stationarity: Largest remaining slope of the Hamiltonian at these, relative to the sizes of its parts.
-            Shape (N q,).
+        stationarity: Largest remaining slope of the Hamiltonian in a control at these times, relative to the sizes of
+            its parts. Shape (N q,).
         adjoint: Costates and multipliers.
         hamiltonian: The Hamiltonian along the plan.
         curvature: The second variation.
@@ -352,13 +355,13 @@ def optimality(
     along: Linearisation | None = None,
     allowed: float = LIMIT_SHARE,
 ) -> Optimality:
-    """Compute the multipliers of a plan, the cost above the optimum, and the curvature of the cost.
+    """Compute the multipliers of a plan, its excess cost over the optimum, and the curvature of the cost.
 
     Args:
         form, p, bounds: The problem, its parameters, and its bounds at these.
         solution: The plan.
-        along: Its linearisation, if known.
-        allowed: Share of the cost above which multipliers are searched that fit better than the reported costates.
+        along: Linearisation of the plan, if known.
+        allowed: Loss, as a share of the cost, above which better multipliers than the reported costates are searched.
     """
     along = along or Linearisation(form, solution, p, bounds, sizes=sizes(form, solution, p, bounds))
     if not (along.finite and np.isfinite(solution.cost)):
@@ -413,12 +416,12 @@ def optimality(
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Return the loss of a plan with these multipliers, in units of cost, without that of its start."""
+    """Return the excess cost of a plan for given multipliers, without what a change of its start could save."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
 def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
-    """Return the loss of a plan with these multipliers plus its costate errors, in units of cost."""
+    """Return the excess cost of a plan for given multipliers plus their errors, by which multipliers are compared."""
     assert curved is not None
     loss = control_loss(along, multipliers.costate, multipliers.control_multipliers, curved).sum()
     return float(
@@ -427,7 +430,10 @@ def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray 
 
 
 def _control_curvature(along: Linearisation) -> np.ndarray | None:
-    """Return T H_uu at the points without path constraints, (M, nu, nu); None if no limit acts at single points."""
+    """Return the Hessian of the Hamiltonian in the controls at the Gauss points, or None if it is not needed.
+
+    It is T H_uu without path constraints, (M, nu, nu), needed for path inequalities and limits at single points.
+    """
     form = along.form
     near = along.state_limits.near.any() or along.node_limits.near.any()
     single = along.nodal and (along.mixed.size > 0 or near)
@@ -443,7 +449,7 @@ def _control_curvature(along: Linearisation) -> np.ndarray | None:
 
 
 def undefined_result(along: Linearisation, values: Hamiltonian) -> Optimality:
-    """Return the result for a plan on which the problem is not finite; all its checks fail."""
+    """Return the result for a plan along which the problem has values that are not finite; all its checks fail."""
     (n, _), m, form = along.shape, len(along.s), along.form
     infinite, t = np.full(n, np.inf), along.mesh * along.solution.horizon
     rows = np.zeros(len(form.end)), np.zeros(len(form.start))

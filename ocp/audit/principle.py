@@ -47,7 +47,7 @@ class Hamiltonian:
 
     @property
     def drift(self) -> float:
-        """Largest minus smallest value."""
+        """Largest minus smallest value of the Hamiltonian along the plan, in cost per second."""
         return float(np.ptp(self.values))
 
 
@@ -65,11 +65,11 @@ def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamilto
 def find_control_multipliers(
     along: Linearisation, costate: np.ndarray, curved: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the control limits that belong to costates (M, nx) at the points.
+    """Return the multipliers of the control limits that fit given costates (M, nx) at the Gauss points.
 
-    They minimise the slope of T H, with controls in units of their sizes. A limit that a plan reaches only at single
-    points of an interval, as for piecewise constant controls, may be active across a gap elsewhere, where that loses
-    less than the slope.
+    They minimise the gradient of T H in the controls, in units of their sizes. A limit that a plan reaches only at
+    single points of an interval, as for piecewise constant controls, may be active across a gap elsewhere, where that
+    loses less than the gradient.
 
     Args:
         along: The plan.
@@ -77,7 +77,7 @@ def find_control_multipliers(
         curved: T H_uu, shape (M, nu, nu); None if unknown. Limits are then inactive across gaps.
 
     Returns:
-        multipliers: Per unit of s. Shape (M, nu + r + a).
+        multipliers: Multipliers per unit of the horizon fraction s. Shape (M, nu + r + a).
         across: Whether a limit is active across a gap. Shape (M,), bool.
     """
     unit, control_limits, mixed = along.control_size, along.control_limits, along.mixed.size
@@ -113,15 +113,15 @@ def find_control_multipliers(
 
 
 def slope(along: Linearisation, costate: np.ndarray) -> np.ndarray:
-    """Return the derivative of T (L + costate . f) by the controls at the points. Shape (M, nu)."""
+    """Return the gradient of the Hamiltonian, times the horizon, with respect to the controls. Shape (M, nu)."""
     first = along.form.nx + 1
     return np.asarray(along.cost_y[:, first:] + np.einsum("kiu,ki->ku", along.rate_y[:, :, first:], costate))
 
 
 def pseudo_inverse_of(along: Linearisation, active: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse of the derivatives of ``active`` limits (M, m), bool, by controls in their sizes.
+    """Return the pseudo-inverse of the derivatives of active limits with respect to the scaled controls.
 
-    Shape (M, nu, m). It is cached with the plan, since it does not depend on the costates.
+    ``active`` (M, m) is boolean. Shape (M, nu, m). It is cached with the plan: it does not depend on the costates.
     """
     key = np.packbits(active).tobytes()
     if key not in along.pseudo_inverses:
@@ -130,7 +130,7 @@ def pseudo_inverse_of(along: Linearisation, active: np.ndarray) -> np.ndarray:
 
 
 def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Return pseudo-inverses (M, n, m) of the ``active`` (M, m), bool, rows of matrices (M, m, n); else zero."""
+    """Return pseudo-inverses (M, n, m) of matrices (M, m, n) whose rows count as zero if not ``active`` (M, m)."""
     m, count, n = rows.shape
     inverses = np.zeros((m, n, count))
     for pattern, members in groups(active):
@@ -143,9 +143,10 @@ def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
 def balance(
     gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray, *, inverse: np.ndarray
 ) -> np.ndarray:
-    """Return the multipliers (M, m) that minimise |gradient + directions' multipliers| at each of M points.
+    """Return multipliers (M, m) of admissible sign that best balance a gradient at each point, by least squares.
 
-    Multipliers are at least zero for ``upper`` limits (M, m), at most zero for ``lower`` limits and free for both.
+    They minimise |gradient + directions' multipliers|, and are at least zero for ``upper`` limits (M, m), at most zero
+    for ``lower`` limits and free for both.
     ``inverse`` (M, n, m) is the pseudo-inverse of the directions of these limits.
     """
     multipliers = -np.einsum("knm,kn->km", inverse, gradient)
@@ -159,7 +160,7 @@ def balance(
 
 
 def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return the largest residual of stationarity of T H in the controls, relative to its terms. Shape (M,)."""
+    """Return the relative residual of dH/du = 0, the largest of all controls at each point. Shape (M,)."""
     form = along.form
     if not form.nu:
         return np.zeros(len(along.s))
@@ -172,9 +173,10 @@ def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.nda
 
 
 def nnls(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Solve nonnegative least squares: minimise |matrix y - target|^2 / 2 + price . y; ``free`` entries have any sign.
+    """Solve a nonnegative least-squares problem with a linear cost; its ``free`` variables may have any sign.
 
-    Active-set method (Lawson, Hanson 1974, chapter 23). Free entries have minimal norm.
+    Minimise |matrix y - target|^2 / 2 + price . y by an active-set method (Lawson, Hanson 1974, chapter 23). Free
+    entries have minimal norm.
     """
     y = np.zeros(matrix.shape[1])
     bound = ~free
@@ -223,10 +225,10 @@ def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """Return the cost, to second order, that controls could still save in each interval within limits. Shape (N,).
+    """Return the cost reduction, to second order, that admissible control changes allow in each interval. Shape (N,).
 
-    A control moves within its limits, and at most by its size if the Hamiltonian does not curve along it. Rows with
-    multipliers stay active.
+    A control changes within its limits, and at most by its size if the Hamiltonian does not curve along it. Limits
+    with multipliers stay active.
 
     Args:
         along: The plan.
@@ -270,9 +272,10 @@ def control_loss(along: Linearisation, costate: np.ndarray, multipliers: np.ndar
 
 
 def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray) -> np.ndarray:
-    """Return the cost that the quadrature misses where dH/du of a linear control changes sign. Shape (N,).
+    """Return the excess cost that the quadrature misses where a switching function changes sign. Shape (N,).
 
-    The integrand is max(slope, 0) and max(-slope, 0) times the distances to both limits. Args as in `control_loss`.
+    A switching function is dH/du of a control in which H is linear. The integrand is max(slope, 0) and max(-slope, 0)
+    times the distances to both limits. Args as in `control_loss`.
     """
     (n, q), unit = along.shape, along.control_size
     gradient, hessian = slope(along, costate) * unit, curved * (unit * unit[:, None])
@@ -302,9 +305,10 @@ def switching_loss(along: Linearisation, costate: np.ndarray, curved: np.ndarray
 
 
 def _step(gradient: np.ndarray, curved: np.ndarray, projector: np.ndarray, scale: float) -> np.ndarray:
-    """Minimise a quadratic function of a control step d at each point; where it is not curved, |d| is about 1.
+    """Return the step of the controls that minimises a quadratic model of the Hamiltonian at each point.
 
-    Shapes (k, nu), (k, nu, nu), (k, nu, nu). ``scale`` is the largest curvature.
+    Along eigenvectors without curvature the step has length 1 before projection. Shapes of the arguments (k, nu),
+    (k, nu, nu), (k, nu, nu). ``scale`` is the largest curvature.
     """
     nu = gradient.shape[1]
     projected = np.einsum("kuv,kv->ku", projector, gradient)

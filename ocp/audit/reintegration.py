@@ -1,4 +1,4 @@
-"""Re-integration of a plan under its own controls, and the violations of its bounds and constraints.
+"""Re-integration of the dynamics under the controls of a plan, and the violations of its bounds and constraints.
 
 The re-integration uses nothing of the transcription. A plan that is nearly exact is corrected
 (:mod:`ocp.audit.correction`). If the corrections do not converge, every interval is integrated in the steps of the fine
@@ -32,7 +32,7 @@ __all__ = ["Reintegration", "Violation", "reintegrate", "violations"]
 
 @dataclass(frozen=True)
 class Reintegration:
-    """Motion that the controls of a plan produce, re-integrated on its fine grid.
+    """States that the controls of a plan produce, re-integrated on its fine grid.
 
     Attributes:
         t: Times, s. Every interval is listed from start to end, so that interior mesh times occur twice. Shape (M,).
@@ -45,7 +45,8 @@ class Reintegration:
         local_cost: Running cost integrated along ``local``.
         errors: Largest difference of ``states`` from the plan, relative to the sizes of the states. Shape (M,).
         local_errors: The same for ``local``. Shape (M,).
-        added: Cumulative sum of the defects between the end of each interval and the plan's next start. Shape (N,).
+        added: Cumulative sum of the defects: differences between the integrated end of each interval and the plan's
+            state at the start of the next one. Shape (N,).
         breakdown_time: Time at which the integration fails, s, or None.
     """
 
@@ -65,8 +66,8 @@ class Reintegration:
     def is_unstable(self, limit: float) -> bool:
         """Return whether unstable dynamics explain why ``states`` differ from the plan by more than ``limit``.
 
-        This holds if each interval keeps the plan: the defects of the intervals, summed without growth, stay below a
-        tenth of the limit up to the time at which the difference exceeds it.
+        This holds if the plan satisfies the dynamics within each interval: the defects, summed without growth, stay
+        below a tenth of the limit up to the time at which the difference exceeds it.
         """
         beyond = ~(self.errors <= limit)
         if not beyond.any():
@@ -101,7 +102,7 @@ def reintegrate(along: Linearisation, grid: FineGrid) -> Reintegration:
 
 
 def integrated_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion:
-    """Return the same motion as :func:`ocp.audit.correction.corrected_motion`, integrated step by step."""
+    """Return the motion that the controls of a plan produce, integrated step by step with error control."""
     n, cells = int(grid.interval[-1]) + 1, grid.samples - 1
     flow = Flow(along)
     starts = grid.states.reshape(n, cells + 1, -1)[:, 0]
@@ -115,7 +116,7 @@ def integrated_motion(along: Linearisation, grid: FineGrid) -> IntegratedMotion:
 
 
 def _worst(values: np.ndarray) -> np.ndarray:
-    """Return the largest entry of each row; infinite for a row with nan. Shape (M,)."""
+    """Return the largest entry of each row of an array; infinite for a row with nan. Shape (M,)."""
     return np.asarray(np.where(np.isnan(values), np.inf, values).max(axis=1, initial=0.0))
 
 
@@ -123,7 +124,7 @@ class Steps(NamedTuple):
     """Integration steps in increasing order of time.
 
     Attributes:
-        cell: Grid cell of each step. Shape (S,).
+        cell: Grid cell (interval of the fine grid) of each step. Shape (S,).
         place, width: Start and width of each step as fractions of its interval. Shape (S,).
     """
 
@@ -133,20 +134,20 @@ class Steps(NamedTuple):
 
     @classmethod
     def even(cls, cells: int, each: int) -> Steps:
-        """Return one integration step per cell, with ``each`` cells per interval."""
+        """Return one integration step per grid cell, with ``each`` cells in every mesh interval."""
         cell = np.arange(cells)
         return cls(cell, (cell % each) / each, np.full(cells, 1.0 / each))
 
     @classmethod
     def merge(cls, parts: list[Steps]) -> Steps:
-        """Merge steps and put them in order."""
+        """Merge several sets of integration steps into one, in increasing order of time."""
         cell, place, width = (np.concatenate(values) for values in zip(*parts, strict=True))
         order = np.lexsort((place, cell))
         return cls(cell[order], place[order], width[order])
 
 
 class Flow:
-    """Integrator of dynamics and running cost under the controls of a plan from given states."""
+    """Integrator of the dynamics and the running cost under the controls of a plan, from given states."""
 
     def __init__(self, along: Linearisation) -> None:
         form, solution, sizes = along.form, along.solution, along.sizes
@@ -159,10 +160,11 @@ class Flow:
         self._intervals = len(curve.values)
 
     def integrate(self, chain: np.ndarray, starts: np.ndarray, steps: Steps | None = None) -> tuple[np.ndarray, Steps]:
-        """Return states and cost at the ends of all cells, which divide intervals evenly; nan after a breakdown.
+        """Return the integrated states and cost at the ends of all grid cells; nan after the integration breaks down.
 
         Args:
-            chain: Number of the chain of successive cells that each cell belongs to, increasing. Shape (cells,).
+            chain: Number of the chain of successive cells that each cell belongs to, increasing; the cells divide the
+                mesh intervals evenly. Shape (cells,).
             starts: State at the start of each chain, where the cost is zero. Shape (chains, nx).
             steps: Initial steps; None for one step per cell.
 
@@ -185,12 +187,12 @@ class Flow:
             # no inaccurate step before it in its chain
             valid = failures == (failures - ~accurate)[first][np.cumsum(first) - 1]
             values[cell[valid & last]] = after[valid & last]
-            current[own[valid]] = after[valid]  # of each chain the last value remains
+            current[own[valid]] = after[valid]  # the last value of each chain remains
             accepted.append(Steps(cell[valid], place[valid], width[valid]))
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = (error / allowed).max(axis=1)
             required = np.ceil(np.where(np.isfinite(ratio), ratio, np.inf) ** (1 / SETTINGS.order))
-            started = np.isfinite(before).all(axis=1)  # a step without a finite start waits
+            started = np.isfinite(before).all(axis=1)  # a step without a finite start is tried later
             parts = np.where(accurate | ~started, 1, np.clip(required, 2, SETTINGS.splits)).astype(int)[~valid]
             cell, place, width = cell[~valid], place[~valid], width[~valid]
             if not parts.size or parts.sum() > SETTINGS.steps:
@@ -204,7 +206,10 @@ class Flow:
     def _run(
         self, first: np.ndarray, starts: np.ndarray, interval: np.ndarray, place: np.ndarray, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Run steps in order; each starts at the end of the previous one, or at its own start if ``first`` is set."""
+        """Return the values after each of several integration steps, and their error estimates.
+
+        A step starts where the previous one ends or, where ``first`` is set, at its own start.
+        """
         count, size = len(first), starts.shape[1]
         padded = -(-count // SETTINGS.block) * SETTINGS.block
         data = np.zeros((padded, self._step.size1_in(1)))  # the last block is filled with steps of zero width
@@ -219,8 +224,9 @@ class Flow:
 
 
 def step_function(form: Formulation, nodes: np.ndarray) -> Any:
-    """Return one Dormand-Prince step: a Function (x, data) -> (x after the step, error), x being states and cost.
+    """Return the CasADi Function of one Dormand-Prince integration step of states and cost, with its error estimate.
 
+    (x, data) -> (x after the step, error), x being states and cost.
     The data are: whether to restart, the start state, place and width of the step in its interval, the divided
     differences of the control at ``nodes`` of the interval, start and width of the interval as fractions of the
     horizon, the parameters and the horizon.
@@ -252,7 +258,7 @@ class Violation:
         label: Description, such as ``end of q``.
         name: Name of the state, control or constraint.
         t: Times, s. Shape (K,).
-        excess: Largest violation among its rows at each time, infinite for nan. Shape (K,).
+        excess: Largest violation among the rows of the constraint at each time, infinite for nan. Shape (K,).
         shares: Largest violation relative to the size of its row. Shape (K,).
         sizes: Size of that row. Shape (K,).
     """
@@ -266,7 +272,7 @@ class Violation:
 
 
 def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, share: float) -> list[Violation]:
-    """Return the violation of every bound and constraint along states (M, nx) on the fine grid.
+    """Return the violations of all bounds and constraints along re-integrated states (M, nx) on the fine grid.
 
     If a constraint declares a tolerance, its size is at most that for which the allowed ``share`` equals the tolerance.
     It is then also judged along the states of the plan itself, which are the ones that are executed.
@@ -329,17 +335,17 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
 
 
 def _with_integrals(form: Formulation, kind: str, g: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return row values (K, m), with the rows that are watched as integrals replaced by their time integrals."""
+    """Return constraint values (K, m), with the rows that are watched as integrals integrated over time."""
     return np.where(form.watch_integral, integral(g, t), g) if kind == "watch" else g
 
 
 def excess_over(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the excess of values (K, m) over their bounds: at least 0, infinite for nan."""
+    """Return how far values (K, m) lie outside their bounds: at least 0, infinite for nan."""
     return np.where(np.isnan(values), np.inf, np.maximum(np.maximum(lower - values, values - upper), 0.0))
 
 
 def _violation_of(label: str, name: str, t: np.ndarray, excess: np.ndarray, sizes: np.ndarray) -> Violation:
-    """Return the violation of a constraint from its excess (K, m), relative to given sizes (m,) or (K, m)."""
+    """Return the `Violation` of a constraint from the excess of its rows (K, m) and their sizes (m,) or (K, m)."""
     shares = excess / sizes
     largest = np.argmax(shares, axis=1)[:, None]
     size = np.take_along_axis(np.broadcast_to(sizes, excess.shape), largest, axis=1)[:, 0]

@@ -40,7 +40,7 @@ N_SAMPLES = 32  # number of samples at which the dependence of a constraint on i
 
 @dataclass(frozen=True)
 class FineGrid:
-    """A plan on its fine grid, which lists every interval from start to end, so that mesh times occur twice.
+    """Samples of a plan on a fine grid, from start to end of every interval, so that interior mesh times occur twice.
 
     Attributes:
         t: Times, s. Shape (M,).
@@ -59,7 +59,7 @@ class FineGrid:
 
 
 def fine_grid(solution: Solution) -> FineGrid:
-    """Sample a plan at ten times as many points as its own."""
+    """Return the samples of a plan on a grid with ten times as many points as the plan has."""
     curve = solution.state_interpolant
     n = len(solution.control_interpolant.breaks) - 1
     points, segments = max(len(curve.nodes) - 1, 1), max((len(curve.breaks) - 1) // n, 1)
@@ -71,9 +71,9 @@ def fine_grid(solution: Solution) -> FineGrid:
 
 @np.errstate(invalid="ignore")  # nan is reported later, with its name
 def plan_at(solution: Solution, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return states (N m, nx), controls (N m, nu) and times (N m,) at m positions, 0..1, of each of N intervals.
+    """Return the states, controls and times of a plan at given positions, 0..1, in every mesh interval.
 
-    At a break each value comes from the side of its interval.
+    Shapes (N m, nx), (N m, nu), (N m,) for m positions. At a break each value comes from the side of its interval.
     """
     curve, control = solution.state_interpolant, solution.control_interpolant
     mesh, width, m = control.breaks, np.diff(control.breaks), len(places)
@@ -99,11 +99,11 @@ def plan_at(solution: Solution, places: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @dataclass(frozen=True)
 class Sizes:
-    """Positive characteristic sizes along a plan, each in its own unit.
+    """Characteristic sizes of all quantities along a plan, each positive and in the unit of its quantity.
 
     Attributes:
-        state, control: Of every entry, since one vector may combine m and rad. Shape (nx,), (nu,).
-        path, start, end, watch: Of every constraint row. Shape (rows,).
+        state, control: Sizes of every entry, since one vector may combine m and rad. Shape (nx,), (nu,).
+        path, start, end, watch: Sizes of every constraint row. Shape (rows,).
         cost: Integral of the absolute running cost, at least a millionth of the change of the cost with its variables.
     """
 
@@ -117,7 +117,7 @@ class Sizes:
 
 
 def sizes(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) -> Sizes:
-    """Return the sizes of states, controls and constraints along a plan.
+    """Return the characteristic sizes of states, controls, constraints and cost along a plan.
 
     A quantity that rests at zero but for rounding has no size of its own. Its size is a millionth of its smallest
     declared bound, of the largest size of its kind, or of one SI unit, whichever is least. The size of a constraint is
@@ -128,7 +128,7 @@ def sizes(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) 
 
 
 def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndarray, bounds: Bounds) -> Sizes:
-    """Return the sizes of states, controls and constraints for a plan on its fine grid, see `sizes`."""
+    """Return the characteristic sizes of all quantities for a plan sampled on its fine grid, see `sizes`."""
     places = form.bounds.places
     fixed = (_select(bounds, places[kind]) for kind in ("initial", "terminal"))
     ends = [np.where(low == high, low, np.nan) for low, high in fixed]
@@ -165,11 +165,11 @@ def evenly_spaced(grid: FineGrid) -> np.ndarray:
 
 
 def share_sizes(size: np.ndarray, places: Mapping[str, slice], declared: Mapping[str, Variable], below: float) -> None:
-    """Replace sizes that are much smaller than others of the same unit by the largest of these, in place.
+    """Replace characteristic sizes that are much smaller than others of the same unit by the largest one, in place.
 
     Args:
         size: Sizes of all states or controls, changed in place. Shape (n,).
-        places, declared: Indices and declarations of these, by name.
+        places, declared: Indices and declarations of the states or controls, by name.
         below: Largest share of the largest size of the unit at which a size is replaced.
     """
     largest: dict[str, float] = {}
@@ -182,14 +182,14 @@ def share_sizes(size: np.ndarray, places: Mapping[str, slice], declared: Mapping
 
 
 def _select(bounds: Bounds, index: np.ndarray) -> Bounds:
-    """Return the bounds of some entries."""
+    """Return the lower and upper bounds at given indices."""
     return bounds[0][index], bounds[1][index]
 
 
 def _sizes_of(
     values: np.ndarray, declared: Bounds, ends: list[np.ndarray], free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sizes (n,) of columns of values (M, n), and flags of those that move or have a nonzero fixed end.
+    """Return the sizes (n,) of sampled states or controls (M, n), and which of them move or have a nonzero fixed end.
 
     Entries that are ``free`` (n,) are constant along a plan: like a horizon they have the size of their value.
     """
@@ -204,7 +204,7 @@ def _sizes_of(
 
 
 def nearest_bound(declared: Bounds) -> np.ndarray:
-    """Return the smaller magnitude of two bounds, among those that are neither zero nor infinite. Shape (n,)."""
+    """Return the smaller magnitude of the two bounds of each entry, without zero and infinite ones. Shape (n,)."""
     sides = np.abs(np.array(declared))
     return np.asarray(np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0, initial=np.inf))
 
@@ -212,7 +212,7 @@ def nearest_bound(declared: Bounds) -> np.ndarray:
 def _raise_to_floor(
     size: np.ndarray, nonzero: np.ndarray, least: np.ndarray, still: Any = STANDSTILL
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Raise the sizes of entries that stay at zero to a floor; also return flags of those that do not."""
+    """Return sizes in which those of entries that stay at zero are raised to a floor, and a mask of other entries."""
     moves = nonzero | (size > np.maximum(ROUNDING_SHARE * size.max(initial=0.0), still))
     floor = SOLVER_SHARE * np.minimum(least, size[moves].max() if moves.any() else 1.0)
     return np.where(moves, size, np.maximum(size, floor)), moves
@@ -238,9 +238,9 @@ def _rows_of(
     entries: tuple[np.ndarray, np.ndarray],
     values: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the sizes of the rows of one kind. Shape (rows,).
+    """Return the characteristic sizes of the constraint rows of one kind, for example "path". Shape (rows,).
 
-    ``values`` (M, rows) are those along the grid, if known.
+    ``values`` (M, rows) are the row values along the grid, if known.
     """
     rows: Rows = getattr(form, kind)
     if len(rows) == 0:
@@ -263,10 +263,10 @@ def _rows_of(
 
 
 def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes of states and controls; those much smaller than others of the same unit are raised to these.
+    """Return the sizes of states and controls, with much smaller ones raised to the largest of the same unit.
 
-    A held row is judged by the change that its variables could cause. At a singular configuration the joints that move
-    may have no effect on it, and those with an effect stand still: their rounding errors are no measure of the row.
+    A watched row is judged by the change that its variables could cause. At a singular configuration the joints that
+    move may have no effect on it, and those with an effect stand still: their rounding errors do not measure the row.
     """
     size, declared = entries[0].copy(), form.problem.declared
     share_sizes(size[: form.nx], form.states, declared.states, LIMIT_SHARE)
@@ -277,10 +277,10 @@ def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[n
 def _watched_row_sizes(
     form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray
 ) -> np.ndarray:
-    """Return the sizes of watched rows: the longest path of rows of one name, or their change with the variables.
+    """Return the sizes of watched constraint rows: the length of their paths, or their change with the variables.
 
     Args:
-        by_variables: Change with the variables. Shape (rows,).
+        by_variables: Change of each row when states and controls change by their sizes. Shape (rows,).
         path_lengths: Path lengths along the grid. Shape (M, rows).
     """
     by_variables = np.where(form.watch_integral, horizon, 1.0) * by_variables
@@ -293,7 +293,7 @@ def _watched_row_sizes(
 
 
 def integral(rates: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Integrate columns (M, n) over times (M,) from the first time to each, by the trapezoidal rule."""
+    """Return the integrals of sampled rates (M, n) from the first time to each of the times (M,), by trapezoids."""
     steps = np.diff(t)[:, None] * (rates[1:] + rates[:-1]) / 2
     return np.vstack([np.zeros((1, rates.shape[1])), np.cumsum(steps, axis=0)])
 
@@ -307,7 +307,7 @@ def _change_by_variables(
     p: np.ndarray,
     entries: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return how strongly the rows of one kind depend on states and controls, at some samples.
+    """Return how strongly the constraint rows of one kind depend on states and controls, at given samples.
 
     Returns:
         Of each row, shape (rows,): the sum of its changes when single entries change by their sizes; whether an entry
@@ -333,7 +333,7 @@ def row_changes(
     p: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return constraint rows of one kind at K samples, and their change with each single state or control.
+    """Return the values of the constraint rows of one kind at K samples, and their changes with each state or control.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.

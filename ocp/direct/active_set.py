@@ -1,4 +1,4 @@
-"""Newton's method on the first-order conditions near a known plan, with its active limits held.
+"""Newton's method on the first-order conditions near a known plan, with the active limits of the plan as equalities.
 
 If the active limits are known, an optimum is the root of a smooth system, and a neighbouring plan is a good start: one
 factorisation and a few back-substitutions, Newton steps whose matrix is kept while they converge well. The matrix is
@@ -31,15 +31,16 @@ from ocp.tolerances import ROUNDING_SHARE
 __all__ = ["RESOLVED", "Conditions", "Newton", "active_sides", "conditions"]
 
 Sides: TypeAlias = dict[str, np.ndarray]
-"""Active side of each variable (x) and row (g): -1 lower limit, 1 upper limit, 0 none."""
+"""Active limit of each variable (x) and each constraint row (g) of a program: -1 lower, 1 upper, 0 none."""
 RESOLVED = 10 * SOLVER_RESIDUAL
-"""Tolerance in units of the solver: of slopes along free directions, whose square is the excess cost; of the distance
-to a limit that is active without a multiplier, and of the residual of linear systems."""
+"""Tolerance of gradients, distances to active limits and residuals of linear systems, in scaled units of the solver.
+The square of the gradient along free directions is the excess cost. The limits meant are active without a multiplier.
+"""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """First and second derivatives of a nonlinear program at a solution, in the scaled variables of the solver.
+    """Derivatives, multipliers and active constraints at a solution, which form the first-order conditions; scaled.
 
     Attributes:
         hessian: Hessian of the Lagrangian, both triangles. Shape (n, n).
@@ -57,7 +58,7 @@ class Conditions:
 
 
 def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Conditions:
-    """Return the first-order conditions at a solver's result, for the given parameters and bounds."""
+    """Return the terms of the first-order conditions at a solver's result, for the given parameters and bounds."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     a, b, c = scales.variables, scales.rows, scales.cost
     slope, jacobian = program.numbers.first(v, p)
@@ -76,7 +77,7 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
 def scaled_values(
     program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales
 ) -> dict[str, tuple[np.ndarray, ...]]:
-    """Return value, lower limit, upper limit and multiplier of variables (x) and rows (g), in units of the solver."""
+    """Return values, both limits and multipliers of variables (x) and rows (g), in the scaled units of the solver."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     result: dict[str, tuple[np.ndarray, ...]] = {}
     slope, jacobian = program.numbers.first(v, p)
@@ -90,7 +91,7 @@ def scaled_values(
 
 
 def active_sides(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
-    """Return the active side of each variable (x) and row (g): -1 lower limit, 1 upper limit, 0 neither."""
+    """Return which limit of each variable (x) and constraint row (g) is active: -1 lower, 1 upper, 0 neither."""
     sides = {}
     for kind, (value, low, high, multiplier) in scaled_values(program, outcome, arguments, scales).items():
         active = at_limit(value, low, high, multiplier)
@@ -107,7 +108,7 @@ def next_active_set(
     sides: Sides,
     tolerance: float,
 ) -> Sides | None:
-    """Return the active sides for the next iteration: violated limits, and those whose multiplier has the right sign.
+    """Return the active limits for the next iteration: violated ones, and those whose multiplier has the right sign.
 
     The active set is right if it does not change. None if the cost still falls along free directions, as when rounding
     ended the solve too early. Primal-dual active set strategy (Hintermueller, Ito, Kunisch 2002).
@@ -127,7 +128,7 @@ def next_active_set(
 
 
 def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return which values are equalities, or at a limit with a multiplier that exceeds the distance to it."""
+    """Return which values have equal limits, or are at a limit whose multiplier exceeds the distance to the limit."""
     with np.errstate(invalid="ignore"):
         below = (multipliers < -SOLVER_RESIDUAL) & (value - lower < -multipliers)
         above = (multipliers > SOLVER_RESIDUAL) & (upper - value < multipliers)
@@ -135,19 +136,19 @@ def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, multiplier
 
 
 def scale_matrix(matrix: scipy.sparse.csc_array, rows: np.ndarray, columns: np.ndarray) -> scipy.sparse.csc_array:
-    """Return a matrix with its rows and columns multiplied by factors."""
+    """Return a sparse matrix with its rows and its columns multiplied by the given factors."""
     factors = rows[matrix.indices] * np.repeat(columns, np.diff(matrix.indptr))
     return scipy.sparse.csc_array((matrix.data * factors, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 @dataclass(frozen=True)
 class NewtonSettings:
-    """Convergence and termination of Newton's method.
+    """Settings of the convergence and termination of Newton's method.
 
     Attributes:
-        tolerance: Of slopes, relative to the largest multiplier over ``multipliers``; of rows, relative to the largest
-            variable; of the cost, for the violation of the rows. References are at least 1.
-        multipliers: Divisor of the largest multiplier when slopes are judged, as s_max of ipopt.
+        tolerance: Tolerance of gradients, relative to the largest multiplier over ``multipliers``; of rows, relative to
+            the largest variable; of the cost of their violation, relative to the cost. References are at least 1.
+        multipliers: Divisor of the largest multiplier in the tolerance of gradients, as s_max of ipopt.
         sets: Largest number of active sets.
         steps: Largest number of steps in all. Beyond it an interior-point method from the guess is as fast.
         exact: Relative residual of a step in its linear system, unless a pass gains less than ``gain``.
@@ -168,10 +169,10 @@ SETTINGS = NewtonSettings()
 
 
 class Newton:
-    """Newton's method for a nonlinear program, with its matrix in an order that makes it banded.
+    """Newton's method for a nonlinear program, whose variables are ordered so that the Newton matrix is banded.
 
     Args:
-        program, transcription: The program.
+        program, transcription: The nonlinear program, and the transcription from which it is assembled.
     """
 
     def __init__(self, program: Program, transcription: Transcription) -> None:
@@ -198,12 +199,12 @@ class Newton:
     ) -> Outcome | None:
         """Return the optimum for other parameters or bounds, from a nearby plan; None without convergence.
 
-        The active limits of the plan are held first. The result determines the next active set (Hintermueller, Ito,
-        Kunisch 2002).
+        The active limits of the plan are equalities at first. The result determines the next active set (Hintermueller,
+        Ito, Kunisch 2002).
 
         Args:
             start: The plan: its variables and multipliers.
-            sides: Active side of each variable (x) and row (g).
+            sides: Active limit of each variable (x) and row (g).
             arguments: p and the bounds.
             scales: Units in which residuals and multipliers are judged.
         """
@@ -228,7 +229,7 @@ class Newton:
     def _root(
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales, max_steps: int
     ) -> Outcome | None:
-        """Take at most ``max_steps`` Newton steps with a fixed active set; return None without convergence."""
+        """Return the result of at most ``max_steps`` Newton steps for a fixed active set; None without convergence."""
         a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
         fixed, held = _held(sides, arguments)
         target = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
@@ -272,7 +273,7 @@ class Newton:
         scales: Scales,
         local: bool = False,
     ) -> _Matrix | None:
-        """Return Newton's matrix for scaled variables and rows; None if it is not positive definite.
+        """Return the factorised Newton matrix for scaled variables and rows; None if it is not positive definite.
 
         ``which`` variables are fixed and which rows held. With ``local`` the penalty of a row is relative to the
         curvature of its own variables, so that rounding does not hide small variables. For a sufficient penalty the
@@ -318,7 +319,7 @@ class _Matrix:
 
     Attributes:
         factors: Factors of the Hessian plus penalty.
-        by_row, by_column: Jacobian of the rows, (m, n) and (n, m), in the order of the factors.
+        by_row, by_column: Jacobian of the constraint rows, (m, n), and its transpose, in the order of the factors.
         weight: Scaling of each row to unit length (m,).
         price: Penalty of rows of unit length.
     """
@@ -330,7 +331,7 @@ class _Matrix:
     price: float
 
     def step(self, gradient: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return Newton's step of scaled variables and multipliers, by passes of the method of multipliers."""
+        """Return the Newton step of scaled variables and multipliers, by iterations of the method of multipliers."""
         place, residual = self.factors.place, self.weight * residual
         side = np.empty_like(gradient)
         side[place] = gradient
@@ -348,7 +349,7 @@ class _Matrix:
 
 
 def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which variables (n,) and rows (m,) act as equalities: declared ones, and those at an active limit."""
+    """Return which variables (n,) and rows (m,) count as equalities: those with equal limits or an active limit."""
     fixed, held = ((arguments[f"lb{kind}"] == arguments[f"ub{kind}"]) | (sides[kind] != 0) for kind in "xg")
     return fixed, held
 
@@ -359,7 +360,7 @@ def _same(sides: Sides, other_sides: Sides) -> bool:
 
 
 class Bordered:
-    """An order of variables that makes a symmetric matrix banded, with a border of a few last variables.
+    """An order of variables that makes a symmetric matrix banded, except for a few last variables, its border.
 
     Attributes:
         place: Position of each variable. Shape (n,).
@@ -382,14 +383,14 @@ class Bordered:
         self._size = size
 
     def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the indices of matrix entries in the argument of :meth:`cholesky`; ``first`` >= ``second``."""
+        """Return the indices of matrix entries (row ``first`` >= column ``second``) in the values for `cholesky`."""
         band = second * self.width + first
         below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
         return np.asarray(np.where(first < self.inner, band, below))
 
     @property
     def length(self) -> int:
-        """Number of values that :meth:`cholesky` takes."""
+        """Number of matrix values that :meth:`cholesky` takes."""
         return (self.width + 1) * self.inner + (self._size - self.inner) * self._size
 
     def cholesky(self, values: np.ndarray) -> Cholesky | None:
@@ -428,7 +429,7 @@ class Cholesky:
         place: Position of each variable.
         lower: Factor of the band, in LAPACK's layout.
         below: Rows of the border (k, n).
-        solved: Solutions of the band for these (n, k).
+        solved: Solutions of the banded system for these rows (n, k).
         corner: Lower factor of the Schur complement of the border (k, k).
     """
 
@@ -439,7 +440,7 @@ class Cholesky:
     corner: np.ndarray
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Solve the linear system for a right-hand side (n,), in the order of :class:`Bordered`."""
+        """Solve the linear system of the matrix for a right-hand side (n,), in the order of :class:`Bordered`."""
         n = self.below.shape[1]
         inner = scipy.linalg.cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
         if not len(self.below):

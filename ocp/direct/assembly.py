@@ -1,4 +1,4 @@
-"""Partially separable nonlinear programs: small functions applied to many index sets, with exact derivatives.
+"""Partially separable nonlinear programs: small functions applied to many sets of variables, with exact derivatives.
 
 A transcription states the variables, the small functions (*blocks*) with the variables that each application reads, and
 the linear rows. The derivatives of a block are derived once, mapped over its applications and scattered by a constant
@@ -25,7 +25,7 @@ __all__ = ["Block", "Derivatives", "Interpolants", "Program", "Stages", "Transcr
 
 @dataclass(frozen=True)
 class Block:
-    """A small function, applied repeatedly to different variables of a program.
+    """A small function that a nonlinear program applies to several sets of its variables.
 
     Attributes:
         function: casadi Function (v (n), d (nd), p) -> (cost, g (m)).
@@ -44,7 +44,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Stages:
-    """Numbers of states, controls and rows in each of N + 1 stages, for structure-exploiting solvers."""
+    """Numbers of states, controls and constraint rows of each stage of a program, for structure-exploiting solvers."""
 
     states: tuple[int, ...]
     controls: tuple[int, ...]
@@ -53,7 +53,7 @@ class Stages:
 
 @dataclass(frozen=True)
 class Interpolants:
-    """Rule by which the curves of states and controls are built from the variables of a phase.
+    """Rule by which interpolants of states and controls are built from the variables of a nonlinear program.
 
     Attributes:
         breaks: Ends of the segments of the states, as fractions of the horizon; every interval has the same number of
@@ -79,7 +79,7 @@ class Interpolants:
     def __call__(
         self, variables: np.ndarray, parameters: np.ndarray, horizon: float
     ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        """Return the curves of states and controls for given values of the variables of a program."""
+        """Return the interpolants of states and controls for given values of the variables of a program."""
         values = variables[self.variables].T
         if self.values is not None:
             inputs = variables[self.variables], self.data, horizon, parameters
@@ -91,7 +91,7 @@ class Interpolants:
 
     @cached_property
     def mapped(self) -> Any:
-        """The Function ``values``, mapped over all intervals."""
+        """The casadi Function ``values``, mapped over all intervals."""
         return self.values.map("curves", "serial", self.variables.shape[1], [2, 3], [])
 
 
@@ -106,8 +106,8 @@ class Transcription:
         variable_role: ``state``, ``control`` or ``horizon`` for each variable. Length size.
         variable_entry, variable_fraction: Entry of the role, and fraction of the horizon, for guesses. Length size.
         row_labels, row_fractions: Description of each row, and its fraction of the horizon. Length n_rows.
-        blocks: Nonlinear part.
-        linear: Linear part as (rows, columns, values).
+        blocks: Nonlinear part of cost and rows.
+        linear: Linear part of the rows as (rows, columns, values).
         horizon: Index of the horizon at the start, or None if it is fixed.
         report: Interval of every reported point, and its position there (0..1). Shape (M,) each.
         report_states: Indices of the states at the reported points. Shape (M, nx).
@@ -116,7 +116,7 @@ class Transcription:
         costate_rows: Rows whose multipliers are the costates at the reported points; -1 if the point is the node
             ``costate_nodes`` (M,), whose costate follows from the intervals after it. Shape (M, nx).
         costate_scale: Factor from multiplier to costate. Shape (M,).
-        interpolants: Construction of the curves.
+        interpolants: Construction of the interpolants.
         stages: Stage structure of a stage-ordered program, or None.
     """
 
@@ -144,21 +144,21 @@ class Transcription:
 
     @property
     def n_rows(self) -> int:
-        """Number of rows."""
+        """Number of constraint rows of the program."""
         return len(self.row_labels)
 
     @property
     def start(self) -> np.ndarray:
-        """Indices of the first state. Shape (nx,)."""
+        """Indices of the variables of the initial state. Shape (nx,)."""
         return self.nodes[:, 0]
 
     @property
     def end(self) -> np.ndarray:
-        """Indices of the last state. Shape (nx,)."""
+        """Indices of the variables of the final state. Shape (nx,)."""
         return self.nodes[:, -1]
 
     def arguments(self, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the solver arguments p, lbx, ubx, lbg and ubg for parameters and a table of bounds."""
+        """Return the solver's arguments p, lbx, ubx, lbg and ubg for parameters and the values of the bound table."""
         lower, upper = bounds
         return {
             "p": p,
@@ -171,7 +171,7 @@ class Transcription:
 
 @dataclass(frozen=True)
 class FunctionSizes:
-    """Numbers of instructions of a function.
+    """Thresholds of the number of instructions of a function.
 
     Attributes:
         compared: Above this number, the search for common subexpressions takes longer than a solve without it.
@@ -196,7 +196,7 @@ class Program:
         gradient, jacobian, hessian: casadi Functions with the signatures of ``nlpsol``'s grad_f, jac_g and hess_lag.
         values: Function (x, p) -> (f, g).
         running_gradient: Function (x, p) -> gradient of the running cost, without the terminal cost.
-        parametric: Function (x, p, lam_g) -> gradient of f + lam_g . g in p.
+        parametric: Function (x, p, lam_g) -> gradient of f + lam_g . g with respect to p.
     """
 
     nlp: dict[str, Any]
@@ -209,12 +209,12 @@ class Program:
 
     @cached_property
     def numbers(self) -> NumericDerivatives:
-        """Functions of the program that return values and derivatives as arrays."""
+        """Evaluator of values and derivatives of the program as arrays."""
         return NumericDerivatives(self)
 
     @cached_property
     def jacobian_entries(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each nonzero of the Jacobian."""
+        """Row and column of each nonzero of the Jacobian of the constraint rows."""
         row, column = self.jacobian.sparsity_out(1).get_triplet()
         return np.array(row, dtype=np.int32), np.array(column, dtype=np.int32)
 
@@ -233,7 +233,7 @@ class NumericDerivatives:
         self._cached: tuple[Any, ...] = ()
 
     def _evaluate(self, x: np.ndarray, p: np.ndarray) -> tuple[Any, ...]:
-        """Return the cost, its gradient, the rows and their Jacobian."""
+        """Return the cost, its gradient, the values of the constraint rows and their Jacobian."""
         at = self._at
         if at is None or not (np.array_equal(at[0], x) and np.array_equal(at[1], p)):
             (cost, slope), (rows, jacobian) = self._gradient(x, p), self._jacobian(x, p)
@@ -242,30 +242,30 @@ class NumericDerivatives:
         return self._cached
 
     def first(self, x: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, scipy.sparse.csc_array]:
-        """Return the first derivatives: gradient of the cost (n,) and Jacobian of the rows (m, n)."""
+        """Return the first derivatives: gradient of the cost (n,) and Jacobian of the constraint rows (m, n)."""
         _, slope, _, jacobian = self._evaluate(x, p)
         return slope, jacobian
 
     def values(self, x: np.ndarray, p: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the cost and the rows (m,)."""
+        """Return the cost and the values of the constraint rows (m,)."""
         cost, _, rows, _ = self._evaluate(x, p)
         return cost, rows
 
     def gradient(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return the gradient of the cost without evaluating the rows. Shape (n,)."""
+        """Return the gradient of the cost without evaluating the constraint rows. Shape (n,)."""
         return np.asarray(self._gradient(x, p)[1])
 
     def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> scipy.sparse.csc_array:
-        """Return the second derivatives: upper triangle of the Hessian of sigma f + lam . g. Shape (n, n)."""
+        """Return the upper triangle of the Hessian of ``sigma`` times cost plus ``lam`` times rows. Shape (n, n)."""
         upper: scipy.sparse.csc_array = self._hessian(x, p, np.array([sigma]), lam)[0]
         return upper
 
     def running_gradient(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return the gradient of the running cost. Shape (n,)."""
+        """Return the gradient of the cost without its terminal part. Shape (n,)."""
         return np.asarray(self._running(x, p)[0])
 
     def parametric(self, x: np.ndarray, p: np.ndarray, lam: np.ndarray) -> np.ndarray:
-        """Return the gradient of f + lam . g by the parameters. Shape (n_p,)."""
+        """Return the gradient of cost plus ``lam`` times rows with respect to the parameters. Shape (n_p,)."""
         return np.asarray(self._parametric(x, p, lam)[0])
 
 
@@ -314,14 +314,14 @@ def dense_column(nonzeros: np.ndarray, rows: np.ndarray, size: int) -> np.ndarra
 
 
 class Derivatives(NamedTuple):
-    """A block function with its derivatives, as casadi Functions of (v, d, p).
+    """The function of a :class:`Block` and its derivatives, as casadi Functions of variables v, data d, parameters p.
 
     Attributes:
         value: -> (cost, g).
         gradient: Of the cost, -> (1, n).
         jacobian: Of g, -> (m, n).
         hessian: (v, d, p, sigma, lam) -> upper triangle (n, n) of the Hessian of sigma cost + lam . g.
-        slope: (v, d, p, lam) -> gradient (n_p, 1) of cost + lam . g in the parameters.
+        slope: (v, d, p, lam) -> gradient (n_p, 1) of cost + lam . g with respect to the parameters.
     """
 
     value: Any
@@ -332,7 +332,7 @@ class Derivatives(NamedTuple):
 
 
 def assemble(transcription: Transcription, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
-    """Assemble the program of a transcription; derivatives of its blocks are given or derived here.
+    """Return the nonlinear program of a transcription, from given or newly derived derivatives of its blocks.
 
     Raises:
         TimeLimitReached: The time limit is over.
@@ -398,7 +398,7 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
 
 
 def derivatives(function: Any) -> Derivatives:
-    """Derive the exact derivatives of a block function symbolically."""
+    """Return the function of a :class:`Block` together with its exact symbolic derivatives."""
     symbol = symbols_of(function).sym
     v, d, p = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
     cost, g = function(v, d, p)
@@ -415,7 +415,7 @@ def derivatives(function: Any) -> Derivatives:
 
 
 def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return row, column and factor in the upper triangle of the program's Hessian for each block Hessian nonzero."""
+    """Return row, column (upper triangle) and factor of a block's Hessian nonzeros in the Hessian of the program."""
     first, second = places_of(pattern)
     where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")
@@ -426,7 +426,7 @@ def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray
 
 
 def places_of(pattern: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row and column of each nonzero of a sparsity pattern."""
+    """Return the row and column of each nonzero of a casadi sparsity pattern."""
     row, column = pattern.get_triplet()
     return np.array(row, dtype=int), np.array(column, dtype=int)
 
@@ -445,7 +445,7 @@ def gather(vector: Any, index: np.ndarray) -> Any:
 
 
 def evaluate_block(function: Any, block: Block, arguments: list[Any]) -> Any:
-    """Evaluate a block function for every column of arguments; all share the parameters (argument 2)."""
+    """Evaluate the function of a block for every column of its arguments; all share the parameters (argument 2)."""
     check_time()
     count = block.variables.shape[1]
     if count == 1:
@@ -475,7 +475,7 @@ def _scatter_matrix(
     shape: tuple[int, int],
     factors: list[np.ndarray] | None = None,
 ) -> Any:
-    """Return a sparse matrix of the nonzeros of ``matrices`` times factors, plus constant entries."""
+    """Return a sparse matrix that sums nonzeros of ``matrices`` times factors at given places, and constant entries."""
     rows = np.concatenate([constant[0], *[at[0] for at in places]]).astype(int)
     columns = np.concatenate([constant[1], *[at[1] for at in places]]).astype(int)
     entries, number = np.unique(columns * shape[0] + rows, return_inverse=True)

@@ -1,4 +1,4 @@
-"""C code of a problem: compiled derivatives of its blocks, and its export for controllers.
+"""C code of a problem: compiled derivatives of the functions of its program, and export for controllers.
 
 Derivatives are compiled into shared libraries, each identified by its source data, the compiler and its flags, so that
 meshes, processes and runs share it (:mod:`models.files`). Compiled functions return exactly the numbers of interpreted
@@ -55,7 +55,7 @@ __all__ = ["CompilerError", "Library", "block_derivatives", "build_library", "ge
 
 VERSION = "1"  # of the generated code
 FLAGS = ("-fPIC", "-shared", "-w", "-ffp-contract=off", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
-"""Undefined symbols are errors at link time; otherwise a call would crash Python."""
+"""Flags of the C compiler; undefined symbols are errors at link time, as otherwise a call would crash Python."""
 LINK = "-lm"  # must follow the source file
 SERIALISED = "casadi:"  # prefix of a serialised function
 WATCHED = """
@@ -63,7 +63,8 @@ exec 3<&0
 (trap "" TERM; read -r _ <&3; kill 0; rm -rf "$PWD"; kill -9 0) &
 exec "$@" </dev/null 3<&-
 """
-"""Shell script that runs a command; when its input closes, as when Python dies, it kills it and removes its folder."""
+"""Shell script that runs a command; if its input closes, as when Python dies, it kills the command and removes the
+folder in which it runs."""
 
 
 class CompilerError(RuntimeError):
@@ -117,7 +118,7 @@ class Library:
 
     Attributes:
         contents: The data that determine its C code, such as serialised functions.
-        text: Generates the C code; not called if the library is in the cache.
+        text: Function that generates the C code; not called if the library is in the cache.
     """
 
     contents: tuple[str, ...]
@@ -155,7 +156,7 @@ def build_library(library: Library) -> Path:
 
 
 _OWN: dict[str, Path] = {}
-"""Libraries of this process, if the cache is not writable."""
+"""Paths of the libraries compiled for this process alone, if the cache is not writable, by their key."""
 
 
 @lru_cache(1)
@@ -167,7 +168,7 @@ def _own_folder() -> tempfile.TemporaryDirectory[str]:
 
 
 def compiler() -> tuple[str, str]:
-    """Return the compiler's command and its version text.
+    """Return the command that calls the C compiler, and its version text.
 
     Raises:
         CompilerError: There is none.
@@ -181,7 +182,7 @@ def compiler() -> tuple[str, str]:
 
 @lru_cache
 def _version(command: str, path: str) -> str:
-    """Return the version text of a compiler on the path; "" if it has none."""
+    """Return the version text that a compiler command on a search path prints; "" if it cannot be run."""
     try:
         words = [*shlex.split(command), "--version"]
         result = subprocess.run(words, capture_output=True, stdin=subprocess.DEVNULL, timeout=10, check=True)
@@ -191,7 +192,7 @@ def _version(command: str, path: str) -> str:
 
 
 def _compile(text: str) -> bytes:
-    """Compile C code and return the shared library; raises the errors of :func:`build_library`."""
+    """Compile C code and return the contents of the shared library; raise the errors of :func:`build_library`."""
     if len(text) > CODE_SIZES.accepted:
         raise CompilerError(f"{len(text)} characters of C are more than {CODE_SIZES.accepted}")
     speed = "-O1" if len(text) <= CODE_SIZES.optimized else "-O0"
@@ -237,7 +238,7 @@ def _exit_status(process: subprocess.Popen[bytes]) -> int:
 
 
 def function_key(function: Any) -> str:
-    """Return the serialised text of a casadi Function, or a name that is unique in this process if it has none."""
+    """Return a text that identifies a casadi Function: its serialised form or, without one, its id in this process."""
     try:
         return SERIALISED + str(function.serialize())
     except RuntimeError:  # of a Callback, say
@@ -251,7 +252,7 @@ def warn_interpreted(reason: str) -> None:
 
 
 def controller_functions(form: Formulation, transcription: Transcription, guess: np.ndarray) -> list[Any]:
-    """Return the functions that `to_c` exports, in the units of the problem.
+    """Return the casadi Functions that are exported to C for a controller, in the units of the problem.
 
     Args:
         guess: Variables that `plan_guess` clips to the bounds at its parameters. Shape (size,).
@@ -306,7 +307,7 @@ def write_controller(form: Formulation, transcription: Transcription, guess: np.
 
 
 def problem_header(form: Formulation, transcription: Transcription) -> str:
-    """Return the text of problem.h: sizes, names, and breaks and nodes of the curves."""
+    """Return the text of the C header problem.h: sizes, names, and breaks and nodes of the interpolants."""
     curves = transcription.interpolants
     sizes = {
         "VARIABLES": transcription.size,
@@ -462,14 +463,14 @@ plan: main.c plan.c plan.h curves.h problem.h
 
 
 RECIPE = hashlib.sha256(Path(assembly.__file__).read_bytes()).hexdigest()
-"""Hash of the code that derives block functions: part of the key of a compiled library."""
+"""Hash of the code that derives the functions of blocks: part of the key of a compiled library."""
 
 
 def block_derivatives(transcription: Transcription, compiled: bool) -> list[Derivatives]:
-    """Return the derivatives of each block; blocks with the same function share them.
+    """Return the derivatives of each block of a transcription; blocks with the same function share them.
 
     Args:
-        transcription: The program.
+        transcription: The transcription.
         compiled: Whether to compile. Functions that cannot be compiled are interpreted, with one warning.
 
     Raises:
@@ -486,7 +487,7 @@ def block_derivatives(transcription: Transcription, compiled: bool) -> list[Deri
 
 
 def _compile_derivatives(function: Any, text: str) -> Derivatives:
-    """Return the derivatives of a function from a compiled library, or interpreted if compilation fails."""
+    """Return the derivatives of a block's function from a compiled library, or interpreted if compilation fails."""
     try:
         path = build_library(
             Library((RECIPE, text), lambda: generate_c(derivatives(function), "unit", header=False)[0])

@@ -32,12 +32,12 @@ REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or 
 
 @dataclass(frozen=True)
 class ElasticSettings:
-    """Settings of the elastic plan: the cost of violations, and the length of the report.
+    """Settings of the elastic plan (the plan of least constraint violation) and of the report.
 
     Attributes:
         cost: Weight of the problem's own cost, which makes the plan unique.
         equality: Price of the violation of an equality relative to that of a limit.
-        lines: Largest number of lines of one kind.
+        lines: Largest number of lines of one kind in the report.
     """
 
     cost: float = 1e-3
@@ -49,7 +49,7 @@ SETTINGS = ElasticSettings()
 
 
 class Built(Protocol):
-    """Parts of a prepared problem that its diagnosis uses."""
+    """Protocol of a prepared problem with the attributes that its diagnosis uses."""
 
     problem: Problem
     formulation: Formulation
@@ -58,7 +58,7 @@ class Built(Protocol):
 
     @property
     def scaled(self) -> Program:
-        """The scaled program."""
+        """The nonlinear program in scaled variables."""
         ...
 
 
@@ -73,7 +73,7 @@ def diagnosis(
     attempts: Sequence[str],
     badly_scaled: str,
 ) -> SolveError:
-    """Return the error that reports conflicting constraints and the largest residuals by constraint, state and time.
+    """Return an error that reports conflicting constraints and the largest residuals by constraint, state and time.
 
     Args:
         outcome, arguments, horizon, solution: Of the first attempt, or of the one in which the time ran out.
@@ -123,7 +123,7 @@ def diagnosis(
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:
-    """Describe which states and controls are at their bounds, and for what share of the plan, one per line."""
+    """Return lines that tell which states and controls are at their bounds, when, and for what share of the plan."""
     form, transcription = built.formulation, built.transcription
     lines = []
     for role, labels in (("state", form.state_labels), ("control", form.control_labels)):
@@ -147,7 +147,7 @@ def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]
 def residuals(
     built: Built, v: np.ndarray, arguments: dict[str, np.ndarray]
 ) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
-    """Return labels, fractions, values and violations of all rows, then of all variables with their bounds."""
+    """Return labels, horizon fractions, values and violations of all constraint rows, then of all variables."""
     form, transcription = built.formulation, built.transcription
     try:
         g = np.asarray(built.program.values(v, arguments["p"])[1].full()).reshape(-1)
@@ -161,13 +161,13 @@ def residuals(
 
 
 def both_bounds(arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper bounds of the rows, then of the variables."""
+    """Return the lower and upper bounds of the constraint rows and, after them, of the variables."""
     low, high = (np.concatenate([arguments[f"{side}g"], arguments[f"{side}x"]]) for side in ("lb", "ub"))
     return low, high
 
 
 def variable_labels(form: Formulation, transcription: Transcription) -> list[str]:
-    """Return the name of the state, control or horizon of each variable; "" for internal variables of stages."""
+    """Return for each variable the name of its state, control or horizon; "" for auxiliary variables of stages."""
     names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
     return [
         names[role][entry] if role else ""
@@ -176,7 +176,7 @@ def variable_labels(form: Formulation, transcription: Transcription) -> list[str
 
 
 def variable_names(form: Formulation, transcription: Transcription) -> list[str]:
-    """Return a description of each variable, such as "state q[2]", or "a stage variable" for internal ones."""
+    """Return a description of each variable, such as "state q[2]"; "a stage variable" for auxiliary ones."""
     return [
         f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
         for role, name in zip(transcription.variable_role, variable_labels(form, transcription), strict=True)
@@ -185,10 +185,10 @@ def variable_names(form: Formulation, transcription: Transcription) -> list[str]
 
 @dataclass(frozen=True)
 class Conflict:
-    """A constraint that must be relaxed.
+    """A constraint or bound that must be relaxed to make a problem feasible.
 
     Attributes:
-        label: Of the constraint, or of the state or control with the bound.
+        label: Name of the constraint, or of the state or control with the bound.
         amount: Required relaxation, in its own unit.
         bound, side: The violated bound, and its side, ``lower`` or ``upper``.
         fraction: Fraction of the horizon with the largest violation.
@@ -214,7 +214,7 @@ class Conflict:
 
 @dataclass(frozen=True)
 class Elastic:
-    """The plan with the smallest violation: its variables (n,), and its conflicts, most severe first."""
+    """The plan of least constraint violation: its variables (n,) and the violated constraints, the worst first."""
 
     plan: np.ndarray
     conflicts: tuple[Conflict, ...]
@@ -223,7 +223,7 @@ class Elastic:
 def elastic_plan(
     built: Built, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales, *, horizon: float
 ) -> Elastic | None:
-    """Return the plan that satisfies dynamics and fixed ends, and violates the other constraints least.
+    """Return the plan that satisfies the dynamics and fixed ends, and violates the other constraints least.
 
     None if the last iterate violates nothing or is not finite, so that the constraints are not the reason for the
     failure, and if no plan is found in the remaining time.
@@ -303,7 +303,7 @@ def elastic_plan(
 
 
 class _Soft:
-    """Rows and bounds that may be violated at a cost: all but dynamics, fixed ends and the smallest horizon.
+    """Constraint rows and bounds that an elastic plan may violate: all but dynamics, fixed ends and least horizon.
 
     Rows are numbered before variables. Those with one label share a slack variable.
     """
@@ -334,7 +334,10 @@ class _Soft:
         self.fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
 
     def matrices(self, n: int, m: int, k: int) -> tuple[Any, Any]:
-        """Return constant matrices R and C such that the elastic rows are R g(v) + C (v, slack)."""
+        """Return the two constant matrices that form the rows of the elastic program from rows, variables and slacks.
+
+        The elastic rows are R g(v) + C (v, slack) with the returned matrices R and C.
+        """
         chosen = np.concatenate([self.hard, self.lower, self.upper])
         number = np.arange(len(chosen))
         of_rows = chosen < m
@@ -346,7 +349,7 @@ class _Soft:
         return rows, sparse(at, columns, signs, (len(chosen), n + k))
 
     def limits(self, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and upper bounds of the elastic rows."""
+        """Return the lower and upper bounds of the rows of the elastic program."""
         low, high = both_bounds(arguments)
         free = np.full(max(len(self.lower), len(self.upper)), np.inf)
         lower = np.concatenate([low[self.hard], low[self.lower], -free[: len(self.upper)]])
@@ -355,7 +358,7 @@ class _Soft:
     def conflicts(
         self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float, units: np.ndarray
     ) -> list[Conflict]:
-        """Return the violated constraints, the worst first, measured in ``units`` of its row or variable."""
+        """Return the violated constraints, the worst first, each measured in the unit of its row or variable."""
         low, high = both_bounds(arguments)
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}

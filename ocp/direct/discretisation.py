@@ -27,7 +27,7 @@ from ocp.problem.values import symbols_of
 
 __all__ = ["Collocation", "MultipleShooting"]
 
-THIRDS = np.linspace(0.0, 1.0, 4)  # nodes of a cubic
+THIRDS = np.linspace(0.0, 1.0, 4)  # nodes of a cubic polynomial: relative positions 0, 1/3, 2/3, 1
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Collocation(DirectMethod):
 
 
 def _transcribe_collocation(method: Collocation, form: Formulation, staged: bool) -> Transcription:
-    """Transcribe a problem by collocation."""
+    """Return the transcription of a problem by collocation."""
     d, nx, nu = method.degree, form.nx, form.nu
     radau, piecewise_constant = method.scheme == "radau", method.control == "held"
     mesh = method.fractions
@@ -218,7 +218,7 @@ class MultipleShooting(DirectMethod):
 
 
 def _transcribe_shooting(method: MultipleShooting, form: Formulation, staged: bool) -> Transcription:
-    """Transcribe a problem by multiple shooting."""
+    """Return the transcription of a problem by multiple shooting."""
     nx, nu = form.nx, form.nu
     mesh = method.fractions
     n, width = len(mesh) - 1, np.diff(mesh)
@@ -277,19 +277,22 @@ def _transcribe_shooting(method: MultipleShooting, form: Formulation, staged: bo
 
 
 def n_controls_of(form: Formulation, method: MultipleShooting) -> int:
-    """Return the number of control variables that act in an interval."""
+    """Return the number of control variables that act in an interval of multiple shooting."""
     return form.nu * (2 if method.control == "linear" else 1)
 
 
 def control_at(form: Formulation, method: MultipleShooting, w: Any, place: Any) -> Any:
-    """Return the control at ``place`` 0..1 of an interval from its control variables ``w``."""
+    """Return the control at a relative position 0..1 of an interval, from the interval's control variables ``w``."""
     if method.control == "held":
         return w
     return (1 - place) * w[: form.nu] + place * w[form.nu :]
 
 
 def interval_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Return the block function of an interval: (v, d, p) -> (running cost, minus the state at its end)."""
+    """Return the casadi Function that integrates an interval; its values are the running cost and minus the end state.
+
+    It is the function of a :class:`Block` with variables v, data d (start and width of the interval) and parameters p.
+    """
     nw = n_controls_of(form, method)
     step, flat = step_function(form, method)
     sym = (ca.SX if flat else ca.MX).sym
@@ -306,7 +309,11 @@ def interval_function(form: Formulation, method: MultipleShooting) -> Any:
 
 
 def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, bool]:
-    """Return an integration step (x, w, d, step number, T, p) -> (x, cost), and whether it is to be inlined as SX."""
+    """Return the casadi Function of an integration step, and whether it is to be inlined as an SX function.
+
+    It maps (x, w, d, step number, T, p) to the next state and the running cost of the step. Its arguments are state,
+    control variables, start and width of the interval as fractions of the horizon, step number, horizon and parameters.
+    """
     if method.integrator == "cvodes":
         return cvodes(form, method, [1.0]), False
     function = form.function("f", [form.f, form.running], ["f", "running"])
@@ -328,7 +335,11 @@ def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, boo
 
 
 def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> Any:
-    """Return the function (x, w, d, _, T, p) -> (states at ``places``, side by side, cost), integrated by CVODES."""
+    """Return the casadi Function that integrates an interval by CVODES and returns states and running cost.
+
+    The arguments are those of :func:`step_function`; the step number is not used. The states are those at ``places``
+    (0..1) of the interval, side by side.
+    """
     sym = form.sym
     nw = n_controls_of(form, method)
     x, place, q = sym("x", form.nx), sym("place"), sym("q", nw + 3 + form.np)
@@ -344,7 +355,10 @@ def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> 
 
 
 def dense_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Return the function ([x; w], d, T, p) -> states at the THIRDS of each step, by cubic Hermite interpolation."""
+    """Return the casadi Function that samples the states inside an interval, by cubic Hermite interpolation.
+
+    It maps ([x; w], d, T, p), as in :func:`step_function`, to the states at the `THIRDS` of each integration step.
+    """
     v, d = ca.MX.sym("v", form.nx + n_controls_of(form, method)), ca.MX.sym("d", 2)
     x, w = v[: form.nx], v[form.nx :]
     horizon, p = ca.MX.sym("T"), ca.MX.sym("p", form.np)

@@ -1,4 +1,4 @@
-"""Initial points of a solver: guesses evaluated at the variables of a transcription, and alternative starts.
+"""Initial points of a solver: guesses evaluated for the variables of a transcription, and alternative starts.
 
 If the solver fails from the guess, it may start from zeros or from a roll-out of the dynamics.
 """
@@ -26,7 +26,7 @@ Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,)
 
 
 def initial_point(form: Formulation, transcription: Transcription, guess: Guess, bounds: Bounds) -> np.ndarray:
-    """Return the initial values of all variables. Shape (size,).
+    """Return the values of all variables of a program from which the solver starts. Shape (size,).
 
     ``guess`` takes precedence over the guess declared with a variable. Without either the values follow a straight line
     between the fixed ends, or the middle of the bounds. A solution on another grid or by another method is read over
@@ -86,7 +86,7 @@ def initial_point(form: Formulation, transcription: Transcription, guess: Guess,
 
 
 def guessed_names(form: Formulation, guess: Guess) -> set[str]:
-    """Return the names of states, controls and ``horizon`` for which the guess or the problem declares a value."""
+    """Return the names of the states, controls and ``horizon`` for which the guess or the problem states a value."""
     names = {name for name, value in form.guesses.items() if value is not None}
     if form.horizon_guess is not None:
         names.add("horizon")
@@ -96,9 +96,9 @@ def guessed_names(form: Formulation, guess: Guess) -> set[str]:
 
 
 def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each variable and row, the index of the same quantity a number of equal intervals later.
+    """Return, for each variable and constraint row, the index of the same quantity a number of equal intervals later.
 
-    The index itself where the horizon ends earlier.
+    Where the horizon ends earlier, it is the index of the variable or row itself.
     """
     step = intervals / (len(transcription.mesh) - 1)
     roles, entries = transcription.variable_role, transcription.variable_entry
@@ -161,16 +161,16 @@ class Samples:
     values: np.ndarray
 
     def over(self, times: np.ndarray) -> np.ndarray:
-        """Return values at ``times`` (K,), linear between the samples and constant beyond them. Shape (K, n)."""
+        """Return the guess at ``times`` (K,), linear between the samples and constant beyond them. Shape (K, n)."""
         return np.column_stack([np.interp(times, self.t, column) for column in self.values.T])
 
     def __call__(self, time: float) -> np.ndarray:
-        """Return the value at one time. Shape (n,)."""
+        """Return the guess at one time, s, interpolated between the samples. Shape (n,)."""
         return np.asarray(self.over(np.array([time]))[0])
 
 
 def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
-    """Return the curves of an earlier solution for every state and control that it shares with the problem."""
+    """Return, by name, the trajectory of every state and control that an earlier solution shares with the problem."""
     shared: dict[str, Trajectory] = {}
     for name, entries in {**form.states, **form.controls}.items():
         values = guess.states if name in guess.states else guess.controls
@@ -189,7 +189,7 @@ def from_solution(form: Formulation, guess: Solution) -> dict[str, Trajectory]:
 
 
 def broadcast_guess(name: str, value: Any, size: int) -> np.ndarray:
-    """Return a guess as an array of ``size`` entries."""
+    """Return a guess as an array of ``size`` entries; a single number is repeated."""
     array = numeric(f"guess of {name!r}", value)
     if array.size not in (1, size):
         words = f"guess of {name!r} has {array.size} entries, {size} expected"
@@ -207,7 +207,7 @@ def default_horizon(form: Formulation, bounds: Bounds) -> float:
 
 
 def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Trajectory:
-    """Return the default guess: a line between fixed ends, else the middle of the bounds or the value nearest zero."""
+    """Return a default guess: a line between fixed ends, else the middle of the bounds or the value nearest to zero."""
 
     def middle(kind: str) -> tuple[np.ndarray, np.ndarray]:
         index = form.bounds.places[kind][place]
@@ -252,10 +252,10 @@ def alternative_starts(
     *,
     bounds: tuple[np.ndarray, np.ndarray],
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the name and the variables of each alternative start, computed on demand.
+    """Yield the name and the variables of each alternative start of the solver, computed on demand.
 
     Args:
-        point: Variables of the guess.
+        point: Values of the variables at the guess.
         bounds: Bounds of the variables, to which the starts are clipped.
     """
     zeros = np.where(transcription.variable_role == "horizon", STARTS.horizon * point, 0.0)
@@ -264,7 +264,7 @@ def alternative_starts(
 
 
 def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return a start whose states follow from its initial state and its controls by integration. Shape (size,).
+    """Return the guess with its states replaced by a simulation from its start with its controls. Shape (size,).
 
     Classical Runge-Kutta steps between the fractions of the states. From the first state that is not finite on, the
     states are constant.

@@ -1,4 +1,4 @@
-"""Solver calls, and the solution from the result of a solver.
+"""Calls of solvers for nonlinear programs, and conversion of their results to solutions.
 
 A call handles options, progress, interruption and status. The solution adds curves, costates and cost gradients.
 """
@@ -35,8 +35,8 @@ __all__ = [
 ]
 
 SOLVER_RESIDUAL = 1e-8
-"""Accepted residual of slopes and rows where rounding prevents a smaller one, relative to multipliers and variables. In
-units of the solver also the smallest significant multiplier."""
+"""Accepted residual of gradients and constraint rows where rounding prevents a smaller one, relative to the largest
+multiplier and variable. In scaled units of the solver it is also the smallest significant multiplier."""
 IPOPT = {
     "tol": 1e-10,
     "constr_viol_tol": 1e-9,
@@ -67,21 +67,21 @@ WORDS = {
     "iteration limit": SolverStatus.ITERATION_LIMIT,
     "Feasible_Point_Found": SolverStatus.ACCEPTABLE,
 }
-"""Status words of SLEQP, and of IPOPT with as many equations as variables."""
+"""Statuses by the status text of SLEQP, and of IPOPT with as many equations as variables."""
 KINDS = {"IpoptInterface": "ipopt", "FatropInterface": "fatrop", "SLEQPInterface": "sleqp"}
 """Names of solvers by their CasADi class."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a solver.
+    """Result of one run of a solver for nonlinear programs.
 
     Attributes:
-        variables, cost, rows: Last iterate, its cost and constraint values.
+        variables, cost, rows: Last iterate, its cost and the values of its constraint rows.
         multipliers: Multipliers of the rows.
         status: How the solver ended.
         message: The status with advice, or the error that ended the solver.
-        iterations, seconds: Effort.
+        iterations, seconds: Number of iterations, and wall time.
         regularised: Whether the cost may not curve upwards at the end: the last step used a modified Hessian, or there
             was no step.
         solver: Name of the solver.
@@ -107,7 +107,7 @@ class Outcome:
 def build_solver(
     program: Program, solver: str, options: dict[str, Any], *, stages: Stages | None, title: str
 ) -> tuple[Any, IterationMonitor | FatropMonitor]:
-    """Return the casadi solver of a program, and its callback, by which it can be stopped.
+    """Return the casadi solver of a nonlinear program, and the callback by which it can be stopped.
 
     Raises:
         ProblemError: The solver does not accept an option.
@@ -158,7 +158,7 @@ def build_solver(
 
 
 def iteration_limit(solver: str, options: dict[str, Any]) -> int:
-    """Return the iteration limit in a solver's options; 0 if they are invalid."""
+    """Return the iteration limit in a solver's options; 0 if the limit is not a number."""
     limit = {"max_iter": IPOPT["max_iter"], **DEFAULTS[solver], **options}["max_iter"]
     return int(limit) if isinstance(limit, int | float | np.number) else 0
 
@@ -190,7 +190,7 @@ def fatrop_functions(program: Program, watch: FatropMonitor) -> dict[str, Any]:
 
 
 def finite(expression: Any) -> Any:
-    """Replace infinite entries by huge numbers of the same sign, and nan by a huge number."""
+    """Return an expression with infinite entries replaced by huge ones of the same sign, and nan by a huge number."""
     return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], 1e20), -1e20))
 
 
@@ -248,7 +248,7 @@ def interrupted_iterate(
 
 
 def log_line(words: str) -> None:
-    """Log one line, unless a terminal shows the progress."""
+    """Write one line to the log, unless a terminal shows the progress."""
     if not sys.stderr.isatty():
         LOG.info(words)
 
@@ -260,7 +260,7 @@ def has_regularised_hessian(stats: dict[str, Any]) -> bool:
 
 
 def broken_down(solver: Any, arguments: dict[str, np.ndarray], error: RuntimeError) -> Outcome:
-    """Return an unsuccessful outcome at the start point for a solver that an evaluation error ended."""
+    """Return an unsuccessful result at the initial point, for a solver run that an evaluation error ended."""
     rows = np.full(arguments["lbg"].shape, np.nan)
     status = SolverStatus.NOT_FINITE
     values = arguments["x0"], np.nan, rows, rows
@@ -275,14 +275,14 @@ def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) ->
 
 
 def largest_violation(values: dict[str, np.ndarray], arguments: dict[str, np.ndarray]) -> float:
-    """Return the largest violation of bounds of variables and rows, over the largest variable or 1."""
+    """Return the largest violation of a bound by variables and rows, relative to the largest variable (at least 1)."""
     gaps = [(arguments[f"lb{k}"] - values[k], values[k] - arguments[f"ub{k}"]) for k in ("x", "g")]
     worst = max(float(np.max(gap, initial=0.0)) for pair in gaps for gap in pair)
     return worst / max(1.0, float(np.max(np.abs(values["x"]), initial=0.0)))
 
 
 def tighten_for_fatrop(arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Tighten bounds by the amount by which fatrop relaxes them, so that plans keep the declared bounds."""
+    """Return solver arguments with bounds tightened as much as fatrop relaxes them, so that plans meet the bounds."""
     relaxation, result = 1e-8, dict(arguments)  # fatrop's own; its casadi interface has no option for it
     for low, high in (("lbx", "ubx"), ("lbg", "ubg")):
         lower, upper = arguments[low], arguments[high]
@@ -300,14 +300,14 @@ def last_line(error: BaseException) -> str:
 
 
 def horizon_of(form: Formulation, transcription: Transcription, outcome: Outcome, p: np.ndarray) -> float:
-    """Return the final time of an outcome, s."""
+    """Return the horizon, that is the final time, of a solver's result, s, whether it is fixed or free."""
     return float(form.horizon_at(p) if transcription.horizon is None else outcome.variables[transcription.horizon])
 
 
 def solution_of(
     form: Formulation, transcription: Transcription, program: Program, outcome: Outcome, *, p: np.ndarray, **fields: Any
 ) -> Solution:
-    """Return the solution that belongs to an outcome.
+    """Return the solution for a solver's result, with interpolants, costates and cost gradients.
 
     Args:
         fields: Further fields of the solution: method, start, seconds.
@@ -349,10 +349,10 @@ def solution_of(
 
 
 def costates_of(program: Program, transcription: Transcription, outcome: Outcome, p: np.ndarray) -> np.ndarray:
-    """Return the costates at the reported points from the multipliers.
+    """Return the costates at the reported points, computed from the multipliers of the nonlinear program.
 
-    At a node the costate is the derivative, in its state, of the contribution of later intervals to the Lagrangian. At
-    the end it is minus the derivative of the contribution of earlier intervals.
+    At a node the costate is the derivative, with respect to the state there, of the contribution of later intervals to
+    the Lagrangian. At the end it is minus the derivative of the contribution of earlier intervals.
     """
     costates = outcome.multipliers[transcription.costate_rows] * transcription.costate_scale[:, None]
     inner = np.where(transcription.row_stages < 0, 0.0, outcome.multipliers)
@@ -378,7 +378,7 @@ def costates_of(program: Program, transcription: Transcription, outcome: Outcome
 def _cost_gradient(
     form: Formulation, program: Program, transcription: Transcription, outcome: Outcome, p: np.ndarray
 ) -> np.ndarray:
-    """Return the derivative of the optimal cost by the parameters, including their effect on active bounds."""
+    """Return the derivative of the optimal cost with respect to parameters, including their effect on active bounds."""
     v, lam = outcome.variables, outcome.multipliers
     direct = program.numbers.parametric(v, p, lam)
     slope, jacobian = program.numbers.first(v, p)
@@ -391,7 +391,7 @@ def _cost_gradient(
 
 
 def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> PiecewisePolynomial:
-    """Return the polynomials through the reported costates of each interval, including both its ends."""
+    """Return the piecewise polynomial through the reported costates of each interval, with both ends included."""
     interval, place = transcription.report
     n = len(transcription.mesh) - 1
     starts = np.searchsorted(interval + (place == 1.0), np.arange(n))
@@ -402,7 +402,7 @@ def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> P
 
 
 def controls_at(controls: Any, transcription: Transcription, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return the controls at the reported points, each from inside its interval."""
+    """Return the controls at the reported points; at a node between intervals, those of the point's own interval."""
     if len(controls.breaks) == len(transcription.mesh):
         return np.asarray(controls.within(interval, place))
     mesh = transcription.mesh

@@ -64,7 +64,7 @@ class DirectMethod(MeshedMethod):
         compiled: bool = False,
         scaling: bool = True,
     ) -> Prepared:
-        """Prepare a problem for repeated solution; see :func:`ocp.methods.prepare`.
+        """Prepare a problem for repeated solves; see :func:`ocp.methods.prepare`.
 
         Raises:
             SolveError: The time limit of an enclosing call is over.
@@ -80,8 +80,8 @@ class Prepared:
     """A problem prepared by a direct method for repeated solves; only one thread solves at a time.
 
     Attributes:
-        problem, method: What was prepared.
-        formulation, transcription, program: The parts that were built.
+        problem, method: The problem and the method.
+        formulation, transcription, program: The stacked problem, its transcription and its nonlinear program.
         solver_name: Name of the solver.
         seconds: Wall time of the preparation.
     """
@@ -123,7 +123,7 @@ class Prepared:
         return scaled_program(self.program)
 
     def _built_solver(self, options: dict[str, Any]) -> tuple[Any, Any]:
-        """Build the solver with given options, and its callback, by which it can be stopped."""
+        """Return the solver with given options, and the callback by which it can be stopped."""
         return build_solver(
             self.scaled, self.solver_name, options, stages=self.transcription.stages, title=self.problem.name
         )
@@ -143,11 +143,11 @@ class Prepared:
         time_limit: float | None = None,
         shift: int = 0,
     ) -> Solution:
-        """Solve with these parameters from this guess, after solves in other threads; see :func:`ocp.methods.solve`.
+        """Solve the prepared problem with given parameters from a given guess; see :func:`ocp.methods.solve`.
 
-        If the guess is a plan of this problem, method and mesh, its active limits are held first, and a few Newton
-        steps determine the solution (:mod:`ocp.direct.active_set`; ``Solution.solver`` is ``newton``). If they do not
-        converge, ipopt starts from the guess as usual.
+        If the guess is a plan of this problem, method and mesh, its active limits are equalities at first, and a few
+        Newton steps determine the solution (:mod:`ocp.direct.active_set`; ``Solution.solver`` is ``newton``). If they
+        do not converge, ipopt starts from the guess as usual. Solves in several threads run one after the other.
 
         Args:
             parameters, guess: Values by name, and the start.
@@ -172,10 +172,11 @@ class Prepared:
 
     @interruptible
     def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
-        """Write a plan, its functions and a program that uses them as C; see :mod:`ocp.direct.code_generation`.
+        """Write a plan, the functions of its problem, and a program that uses both, as C code.
 
         Args:
-            folder: Folder that is created and returned; files of the same names are replaced.
+            folder: Folder that is created and returned; files of the same names are replaced. Its contents are listed
+                in :mod:`ocp.direct.code_generation`.
             parameters: Values at which the guess is evaluated.
             guess: As of :meth:`solve`. A solution of this prepared problem is written as it is.
 
@@ -196,7 +197,7 @@ class Prepared:
     def _solve(
         self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, shift: int
     ) -> Solution:
-        """Solve from a guess that is a plan, from the guess, from alternative starts, then from the elastic plan."""
+        """Solve by Newton steps from a known plan, else from the guess, alternative starts and the elastic plan."""
         form, transcription = self.formulation, self.transcription
         p = form.parameter_vector(require.mapping("parameters", parameters))
         bounds = form.bound_values(p)
@@ -257,7 +258,7 @@ class Prepared:
         return attempts
 
     def _elastic(self, first: Attempt) -> Elastic | None:
-        """Solve for the plan with the smallest violation; Ctrl-C raises an error with the last iterate of `first`."""
+        """Return the plan of least constraint violation; Ctrl-C raises Interrupted with the last iterate of `first`."""
         horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
             return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon=horizon)
@@ -265,14 +266,14 @@ class Prepared:
             raise Interrupted(str(error), first.solution) from error
 
     def _is_own_plan(self, guess: Guess) -> bool:
-        """Return whether a guess is a plan of this program: with its method, mesh, sizes and parameters."""
+        """Return whether a guess is a plan of this program, with the same method, mesh, sizes and parameters."""
         if not isinstance(guess, Solution) or guess.method != self.method.settings:
             return False
         sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)
         return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
     def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
-        """Return the optimum near a guess that is a plan, shifted by ``shift`` intervals; None without one."""
+        """Return the optimum near a guess that is a plan, shifted by ``shift`` intervals; None if none is found."""
         form = self.formulation
         if not isinstance(guess, Solution) or not self._is_own_plan(guess) or self.solver_name != "ipopt":
             return None
@@ -301,12 +302,12 @@ class Prepared:
 
     @cached_property
     def _newton(self) -> Newton:
-        """Newton's method near a plan."""
+        """Newton's method, for solves whose guess is a plan of this program."""
         return Newton(self.program, self.transcription)
 
     @cached_property
     def _short_solver(self) -> tuple[Any, Any]:
-        """The solver for alternative starts, with fewer iterations, and its progress display."""
+        """The solver for alternative starts, with a lower limit of iterations, and its callback."""
         return self._built_solver({**self._options, "max_iter": min(STARTS.iterations, self._max_iterations)})
 
     def _attempt(
@@ -318,7 +319,7 @@ class Prepared:
         bounds: Bounds,
         solver: tuple[Any, Any] | None = None,
     ) -> Attempt:
-        """Run a solver, by default the main one, from a start, with scales computed along that start."""
+        """Run a solver, by default the main one, from an initial point, with the scales that this point determines."""
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
         scales = self._scales(x0, names, bounds, p)
@@ -343,7 +344,7 @@ class Prepared:
         return Attempt(start, arguments, names, scales, outcome, solution)
 
     def _scales(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
-        """Return the scales computed from the sizes along a start; ``names`` are as in :func:`sizes_along`."""
+        """Return the scales of the program for an initial point; ``names`` is ``intended`` of :func:`sizes_along`."""
         if not self._scaling:
             return unit_scales(self.transcription)
         scales = compute_scales(self._pattern, sizes_along(self._pattern, point, names, bounds=bounds, p=p), point, p)
@@ -358,7 +359,7 @@ class Prepared:
         return {*self.formulation.states, *self.formulation.controls, "horizon"}
 
     def _solution(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:
-        """Return the solution that belongs to an outcome."""
+        """Return the solution for a solver's result; ``start`` is the name of the initial point."""
         seconds = {"build": self.seconds, "solve": outcome.seconds}
         fields = {"method": self.method.settings, "seconds": seconds, "start": start}
         return solution_of(self.formulation, self.transcription, self.program, outcome, p=p, **fields)
@@ -366,7 +367,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One run of the solver.
+    """One run of the solver from one initial point (start).
 
     Attributes:
         start: Name of the start.
@@ -374,7 +375,7 @@ class Attempt:
         names: Names of the variables with intended values in the start.
         scales: Scales of the program.
         outcome: Result of the solver.
-        solution: The same as a solution; None if it cannot be evaluated, because of ``error``.
+        solution: The outcome as a solution; None if it cannot be evaluated, because of ``error``.
     """
 
     start: str
@@ -392,7 +393,7 @@ class Attempt:
 
     @property
     def is_final(self) -> bool:
-        """Whether no other start needs to be tried: the solver succeeded, or the time is over."""
+        """Whether no other start is to be tried: the solver succeeded, or the time limit is reached."""
         return self.plan is not None or self.outcome.status is SolverStatus.TIME_LIMIT
 
     @property
@@ -405,7 +406,7 @@ class Attempt:
 
 
 def tighten_bounds(arguments: dict[str, np.ndarray], amounts: Mapping[str, np.ndarray]) -> None:
-    """Move lower bounds up and upper bounds down, at most to the middle between them; equalities stay."""
+    """Move lower bounds up and upper bounds down in place, at most to the middle between them; equalities stay."""
     for kind in ("x", "g"):
         low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
         is_range = low < high

@@ -1,4 +1,4 @@
-"""Scaling of a program by the sizes of its variables, rows and cost, and removal of redundant limits.
+"""Scaling of a nonlinear program by the sizes of its variables, constraint rows and cost; removal of redundant limits.
 
 A solver's tolerances are absolute and suit numbers near 1. Each variable is divided by its size; each row and the cost
 by their change when the variables change by their sizes. Scaling is linear and keeps the optimum. Scales are powers of
@@ -45,7 +45,7 @@ SIDES = ("lbx", "ubx", "lbg", "ubg")
 
 @dataclass(frozen=True)
 class ScalingSettings:
-    """Thresholds of the scaling.
+    """Thresholds and weights for the scaling of a nonlinear program.
 
     Attributes:
         usual: Sizes from 1/usual to usual are not scaled: tolerances of 1e-10 leave seven digits there.
@@ -70,21 +70,21 @@ SCALING = ScalingSettings()
 
 @dataclass(frozen=True)
 class Scales:
-    """Divisors of the variables (n,), the rows (m,) and the cost of a program."""
+    """Numbers by which the variables (n,), constraint rows (m,) and cost of a program are divided to scale it."""
 
     variables: np.ndarray
     rows: np.ndarray
     cost: float
 
     def scale_arguments(self, arguments: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return solver arguments (x0, p and bounds) for the scaled program."""
+        """Return the solver's arguments (initial point, parameters, bounds) in the units of the scaled program."""
         units = {"x": self.variables, "g": self.rows}
         result = {key: arguments[key] / units[key[-1]] for key in SIDES}
         p = np.concatenate([arguments["p"], self.variables, self.rows, [self.cost]])
         return {**result, "x0": arguments["x0"] / self.variables, "p": p}
 
     def unscale(self, outcome: Outcome) -> Outcome:
-        """Return the outcome of the scaled program in the units of the problem."""
+        """Return a solver's result for the scaled program in the units of the problem."""
         return replace(
             outcome,
             variables=outcome.variables * self.variables,
@@ -103,7 +103,7 @@ class Sizes:
     horizon: float
 
     def of_variables(self, transcription: Transcription) -> np.ndarray:
-        """Return the size of each variable of a program; 1 for internal variables of stages."""
+        """Return the size of each variable of a program; 1 for auxiliary variables of stages."""
         result = np.ones(transcription.size)
         for role, sizes in (("state", self.states), ("control", self.controls), ("horizon", np.array([self.horizon]))):
             chosen = transcription.variable_role == role
@@ -112,14 +112,14 @@ class Sizes:
 
 
 class Pattern:
-    """Structure of a program from which its scaling is computed repeatedly.
+    """Sparsity structure of a program, found once for repeated computation of its scales.
 
     Attributes:
         rows, columns: Row and column of each nonzero of the Jacobian.
-        to, source: Of each nonzero the state whose rate the row is, and the entry of (states, controls) of its column;
-            -1 for other rows and for the state itself.
-        width: Width of the interval of each row, as a fraction.
-        label: Number of the label of each row.
+        to, source: For each nonzero the state whose rate the row contains, and the entry of (states, controls) of its
+            column; -1 for other rows and for the state itself.
+        width: Width of the interval of each row, as a fraction of the horizon.
+        label: Number of the label of each row; rows of one label have one scale.
     """
 
     def __init__(self, form: Formulation, transcription: Transcription, program: Program) -> None:
@@ -138,14 +138,15 @@ class Pattern:
 
 
 def unit_scales(transcription: Transcription) -> Scales:
-    """Return scales that are all 1."""
+    """Return scales that are all 1, for a program that is not scaled."""
     return Scales(np.ones(transcription.size), np.ones(transcription.n_rows), 1.0)
 
 
 def scaled_program(program: Program) -> Program:
-    """Return the program in variables x / a with rows g / b and cost f / c, and parameters (p, a, b, c).
+    """Return the program with variables, rows and cost divided by their scales, which become parameters.
 
-    Only the functions that solvers use are replaced.
+    The variables are x / a, the rows g / b, the cost f / c and the parameters (p, a, b, c). Only the functions that
+    solvers use are replaced.
     """
     n, m, k = (program.nlp[key].numel() for key in ("x", "g", "p"))
     x, q = ca.MX.sym("x", n), ca.MX.sym("p", k + n + m + 1)
@@ -178,7 +179,7 @@ def scaled_program(program: Program) -> Program:
 def sizes_along(
     pattern: Pattern, point: np.ndarray, intended: Collection[str], *, bounds: Bounds, p: np.ndarray
 ) -> Sizes:
-    """Return the sizes of the variables along a start.
+    """Return the typical sizes of states, controls and horizon, derived from an initial point of the solver.
 
     Args:
         point: Values of the variables.
@@ -230,7 +231,10 @@ def sizes_along(
 
 
 def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return horizon times largest |derivative| of state rates by other states and controls. Shape (nx, nx + nu)."""
+    """Return the largest derivatives of state rates with respect to other states and controls, times the horizon.
+
+    They are absolute values, over all intervals, at the given values of the variables. Shape (nx, nx + nu).
+    """
     result = np.zeros((pattern.form.nx, pattern.form.nx + pattern.form.nu))
     slopes = _evaluate(pattern.program.numbers.first, point, p)
     if slopes is not None:
@@ -243,7 +247,7 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
-    """Return the scales of a program for given sizes of its variables; rows and cost get the size of their changes."""
+    """Return the scales of a program for given sizes of its variables; rows and cost are scaled by their changes."""
     program, size_of_variable = pattern.program, sizes.of_variables(pattern.transcription)
     # squares of smaller sizes underflow
     size_of_variable = np.where(size_of_variable > np.sqrt(np.finfo(float).tiny), size_of_variable, 1.0)
@@ -291,7 +295,7 @@ def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales:
 
 
 def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
-    """Return the scales of variables, with declared sizes rounded to powers of two in place of computed ones."""
+    """Return the scales of the variables, with declared sizes, rounded to powers of two, in place of computed ones."""
     form = pattern.form
     declared = Sizes(form.scales[: form.nx], form.scales[form.nx :], 1.0).of_variables(pattern.transcription)
     declared[~np.isin(pattern.transcription.variable_role, ("state", "control"))] = np.nan
@@ -313,7 +317,7 @@ def _evaluate(function: Callable[..., Any], point: np.ndarray, p: np.ndarray) ->
 
 
 class PredeterminedVariables:
-    """Variables of a program that the start alone determines, and the limits on them.
+    """Variables of a program that the initial state alone determines, whatever the controls, and the limits on them.
 
     Variables that are joined to a fixed variable, as the end of the last interval is to a fixed end, are known too.
     """
@@ -349,7 +353,7 @@ class PredeterminedVariables:
         return result
 
     def checked(self, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Outcome:
-        """Check an outcome against the limits on predetermined variables; mark it infeasible if one is violated.
+        """Return a solver's result, marked as infeasible if it violates a limit on predetermined variables.
 
         Args:
             scales: Units in which violations are judged.
@@ -365,7 +369,7 @@ class PredeterminedVariables:
 
 
 def uncontrolled_states(form: Formulation) -> np.ndarray:
-    """Return which states depend only on the start and the time, not on the controls. Shape (nx,), bool."""
+    """Return which states depend only on the initial state and time, not on controls. Shape (nx,), bool."""
     if form.horizon_is_free:
         return np.zeros(form.nx, dtype=bool)
 

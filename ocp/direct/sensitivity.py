@@ -26,15 +26,15 @@ from ocp.solution import Sensitivity, Solution
 __all__ = ["METHODS", "sensitivity"]
 
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
-"""Direct methods by the type that a solution stores."""
+"""Classes of the direct methods by the name of the type that a solution stores."""
 SOFTENING = 1e-11
 """Regularisation of dependent rows in the linear system, relative to their size and to the curvature."""
 REFINEMENTS = 4
-"""Passes of iterative refinement that correct for it."""
+"""Number of steps of iterative refinement, which correct for the regularisation."""
 
 
 def sensitivity(solution: Solution, name: str) -> Sensitivity:
-    """Return the derivatives of a plan by the parameter ``name``; see :meth:`ocp.solution.Solution.sensitivity`.
+    """Return the derivatives of a plan with respect to a parameter; see :meth:`ocp.solution.Solution.sensitivity`.
 
     Raises:
         ProblemError: An unknown parameter; a plan that is not an optimum of a direct method under the bounds of its
@@ -120,7 +120,7 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
 
 
 def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]:
-    """Return formulation, transcription and program of a plan; raise ProblemError if it is not their optimum."""
+    """Return formulation, transcription and program whose optimum a plan is; raise ProblemError for any other plan."""
     plan = f"plan {solution.name!r}"
     settings = dict(solution.method)
     method_name = settings.pop("type")
@@ -145,7 +145,7 @@ def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]
 def _by_parameters(
     transcription: Transcription, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return derivatives of the Lagrangian's gradient (n, k) and of the rows (m, k) by some parameters."""
+    """Return derivatives of the Lagrangian's gradient (n, k) and of the rows (m, k) with respect to parameters."""
     slope, change = np.zeros((transcription.size, len(columns))), np.zeros((transcription.n_rows, len(columns)))
     for block in transcription.blocks:
         function = block.function
@@ -166,11 +166,12 @@ def _by_parameters(
 def _solve_system(
     at: Conditions, slope: np.ndarray, change: np.ndarray, at_x: np.ndarray, at_g: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return scaled derivatives of the variables (n, k) and of the multipliers of rows (m, k) and bounds (n, k).
+    """Return derivatives of variables (n, k), row multipliers (m, k) and bound multipliers (n, k) with respect to k
+    parameters, all scaled.
 
     Args:
-        slope, change: Of the gradient of the Lagrangian and of the rows, with fixed variables.
-        at_x, at_g: Of the limits of active variables and rows.
+        slope, change: Derivatives of the gradient of the Lagrangian and of the rows, with fixed variables.
+        at_x, at_g: Derivatives of the limits of active variables and rows.
     """
     fixed, free, held = (np.flatnonzero(which) for which in (at.fixed, ~at.fixed, at.held))
     dv = np.zeros_like(slope)
@@ -205,7 +206,10 @@ def _solve_system(
 
 
 def control_rates(transcription: Transcription, solution: Solution, p: np.ndarray, dv: np.ndarray) -> np.ndarray:
-    """Return derivatives of the controls at the reported times (M, nu, k), which are linear in their variables."""
+    """Return the derivatives of the controls at the reported times, given those of the variables. Shape (M, nu, k).
+
+    The controls are linear in the variables, so that differences are exact.
+    """
     interval, place = transcription.report
     v, columns = solution.variables, []
     for direction in dv.T:

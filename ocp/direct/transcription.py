@@ -1,6 +1,6 @@
-"""Common parts of all transcriptions: the layout of variables, and the construction of the nonlinear program.
+"""Common parts of all transcriptions: the order of the variables, and the construction of the nonlinear program.
 
-:class:`Layout` holds the positions of the variables of a phase in the program. :class:`TranscriptionBuilder` collects
+:class:`Layout` contains the indices of the variables of the program. :class:`TranscriptionBuilder` collects
 variables, rows and blocks, imposes conditions at nodes and ends, and numbers the rows.
 """
 
@@ -27,7 +27,7 @@ __all__ = ["MeshedMethod", "TranscriptionBuilder", "check_meshed"]
 
 @dataclass(frozen=True)
 class Layout:
-    """Indices of the variables of one phase with N intervals.
+    """Indices of the variables of a nonlinear program on a mesh of N intervals.
 
     Nodes lie between intervals. In the plain layout the end of interval k *is* node k + 1, and the horizon is one
     variable. In the staged layout, for structure-exploiting solvers, each stage has copies of the end of its interval,
@@ -55,7 +55,7 @@ class Layout:
 
 
 def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool) -> Layout:
-    """Return the layout with variables in the order node 0, interval 0, node 1, ..., node N, horizon."""
+    """Return the layout of a program with variables in the order node 0, interval 0, node 1, ..., node N, horizon."""
     stride = node_size + interval_size
     grid = np.arange(intervals * stride).reshape(intervals, stride).T
     node = np.column_stack([grid[:node_size], intervals * stride + np.arange(node_size)])
@@ -68,7 +68,7 @@ def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizo
 def _staged_layout(
     intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool
 ) -> Layout:
-    """Return the layout by stages: node k, copies of horizon and start, interval k, copy of its end."""
+    """Return the layout whose stage k has node k, copies of horizon and start, interval k and a copy of its end."""
     carried = node_size + free_horizon + node_size * keep_initial
     inputs = interval_size + node_size
     stride = carried + inputs
@@ -90,7 +90,7 @@ def _staged_layout(
 
 @dataclass
 class TranscriptionBuilder:
-    """Builder of the nonlinear program of one phase; :meth:`finish` numbers the rows stage by stage.
+    """Builder of the nonlinear program of a problem; :meth:`finish` numbers the rows stage by stage.
 
     Args:
         formulation: The problem.
@@ -126,13 +126,19 @@ class TranscriptionBuilder:
 
     @property
     def intervals(self) -> int:
-        """Number of intervals."""
+        """Number of intervals of the mesh."""
         return len(self.mesh) - 1
 
     # ---- variables -------------------------------------------------------------------------------------------
 
     def variables(self, role: str, index: np.ndarray, at: np.ndarray, bounds: str | None) -> None:
-        """Declare variables with indices (n, K) as entries of ``role`` at fractions ``at`` (K,), with named bounds."""
+        """Declare what the variables of given indices are: entries of a state, a control or the horizon, with bounds.
+
+        Args:
+            role: ``state``, ``control`` or ``horizon``.
+            index, at: Indices of n entries at K points (n, K), and the fractions of the horizon of the points (K,).
+            bounds: Name of their bounds in the bound table, such as ``initial``; None leaves them as they are.
+        """
         self.variable_role[index] = role
         self.variable_entry[index] = np.arange(index.shape[0])[:, None]
         self.variable_fraction[index] = at[None, :]
@@ -166,7 +172,7 @@ class TranscriptionBuilder:
                 self.linear(ties, layout.node[:, :1], -1.0)
 
     def point(self, states: np.ndarray, controls: np.ndarray, stages: np.ndarray) -> np.ndarray:
-        """Return the variables [x; u; T if free] of K points from states (nx, K), controls (nu, K) and stages (K,)."""
+        """Return the indices of all variables of K points: states (nx, K), controls (nu, K), and a free horizon."""
         horizon = [] if self.layout.horizon is None else [self.layout.horizon[stages][None, :]]
         return np.vstack([states, controls, *horizon])
 
@@ -182,9 +188,11 @@ class TranscriptionBuilder:
         joins: bool = False,
         ends: bool = False,
     ) -> np.ndarray:
-        """Allocate m rows at each of K places and return their indices (m, K); bounds None means equal to zero.
+        """Allocate constraint rows with given labels at each of K points, and return their indices (m, K).
 
         Args:
+            bounds: Indices of the bounds of the m rows in the bound table; None for rows that are equal to zero.
+            stages, at: Interval of each point, and its fraction of the horizon. Shape (K,).
             joins: Whether the rows tie a stage to the next.
             ends: Whether the rows belong to the ends of the horizon rather than to its inside.
         """
@@ -199,14 +207,14 @@ class TranscriptionBuilder:
         return first + np.arange(m * places).reshape(places, m).T
 
     def linear(self, rows: np.ndarray, columns: np.ndarray, values: np.ndarray | float) -> None:
-        """Add linear terms ``values * variable[columns]`` to ``rows``; the three arrays are broadcast together."""
+        """Add linear terms ``values * variable[columns]`` to constraint rows; the arrays are broadcast together."""
         targets, variables, entries = np.broadcast_arrays(rows, columns, values)
         self._linear.append((targets.ravel(), variables.ravel(), entries.ravel().astype(float)))
 
     def path_rows(
         self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, *, at: np.ndarray
     ) -> None:
-        """Declare path constraints at K points at fractions ``at``, from states (nx, K) and controls (nu, K)."""
+        """Declare path constraints at K points, given the indices of the states (nx, K) and controls (nu, K) there."""
         if len(rows) == 0 or len(at) == 0:
             return
         point_data = self.formulation.point_data(at)
@@ -216,7 +224,7 @@ class TranscriptionBuilder:
         self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
-        """Declare constraints at every node; at the first node only those that fixed initial states do not determine.
+        """Declare path constraints at every node; at the first only those that fixed initial states leave undetermined.
 
         ``controls`` (nu, N + 1) are the variables read there; they do not matter for rows without controls.
         """
@@ -257,7 +265,10 @@ class TranscriptionBuilder:
         initial: tuple[np.ndarray, np.ndarray] | None,
         place: int,
     ) -> None:
-        """Add the block of start (place 0) or end (place 1), a function of v = [x, controls, T, x0, start controls]."""
+        """Add the block with the constraints and the cost at the start (place 0) or the end (place 1) of the horizon.
+
+        Its variables are the state, the controls, the start state and start controls, and the horizon, as far as used.
+        """
         form, layout = self.formulation, self.layout
         sym, nx, nu = form.sym, form.nx, form.nu
         stage = self.intervals if place else 0
@@ -363,7 +374,7 @@ class MeshedMethod(ABC):
     @property
     @abstractmethod
     def control_order(self) -> int:
-        """Order of the interpolation error of a smooth control in the width of an interval."""
+        """Order of the interpolation error of a smooth control with respect to the width of an interval."""
 
     @abstractmethod
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
@@ -371,7 +382,7 @@ class MeshedMethod(ABC):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The method as stored in a solution: its type, and its attributes that are not None."""
+        """The method as a solution stores it: the name of its class, and its attributes that are not None."""
         values = {k: v for k, v in dataclasses.asdict(self).items() if v is not None}  # type: ignore[call-overload]
         return {"type": type(self).__name__, **values}
 
@@ -381,11 +392,11 @@ class MeshedMethod(ABC):
         return np.linspace(0.0, 1.0, self.intervals + 1) if self.mesh is None else np.asarray(self.mesh, dtype=float)
 
     def with_mesh(self, mesh: np.ndarray) -> Self:
-        """Return the method on another mesh (N + 1,)."""
+        """Return the method on another mesh, given by the ends (N + 1,) of its intervals."""
         return dataclasses.replace(self, intervals=len(mesh) - 1, mesh=tuple(mesh.tolist()))  # type: ignore[type-var]
 
     def halve(self) -> Self:
-        """Return the method with every interval halved."""
+        """Return the method with a mesh on which every interval is halved."""
         if self.mesh is None:
             return dataclasses.replace(self, intervals=2 * self.intervals)  # type: ignore[type-var]
         nodes = self.fractions
@@ -418,7 +429,7 @@ class MeshedMethod(ABC):
         return self.with_mesh(nodes)
 
     def _check_mesh(self, count: str, largest: int = INPUT_LIMITS.count) -> None:
-        """Check the mesh and the whole number named ``count``, and convert them to plain Python for storage.
+        """Check the mesh and the integer attribute named ``count``, and convert both to plain Python for storage.
 
         Raises:
             ProblemError: A number is no positive integer, or the mesh does not increase from 0 to 1 in so many

@@ -26,7 +26,7 @@ LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nod
 
 
 class BoundaryProblem:
-    """Boundary value problem of states and costates, y = [x; lambda], in consecutive segments.
+    """Boundary value problem of states and costates, y = [x; lambda], in consecutive shooting segments.
 
     Each segment is integrated from its own y with data q = [start time, duration, horizon, p, bang values, guess].
 
@@ -47,7 +47,10 @@ class BoundaryProblem:
         self._systems: dict[tuple[int, ...], tuple[Any, ...]] = {}
 
     def system(self, arcs: ControlArcs) -> tuple[Any, ...]:
-        """Return residual and Jacobian as functions of (unknowns, data), for the numbers of segments of the arcs."""
+        """Return the residual of the boundary value problem and its Jacobian as functions of unknowns and data.
+
+        They depend on the numbers of segments of the arcs, by which they are cached.
+        """
         key = tuple(arcs.segments)
         if key not in self._systems:
             build = self._backward if self.backward else self._multiple
@@ -58,7 +61,7 @@ class BoundaryProblem:
         return self._systems[key]
 
     def _multiple(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Return the equations of multiple shooting, with y at all segment starts and at the end as unknowns."""
+        """Return unknowns, data and equations of multiple shooting: continuity, switching and end conditions."""
         form = self.form
         at, of = self.layout(arcs), self._data(arcs)
         z, data = ca.MX.sym("z", at["end"].stop), ca.MX.sym("data", of["guess"].stop)
@@ -82,7 +85,7 @@ class BoundaryProblem:
         return z, data, ca.vertcat(*residuals)
 
     def _backward(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
-        """Return the equations of backward shooting: the end state is unknown and must lead to the given start."""
+        """Return unknowns, data and equations of backward shooting from an unknown end state to the given start."""
         form = self.form
         of = self._data(arcs)
         total = sum(arcs.segments)
@@ -106,7 +109,7 @@ class BoundaryProblem:
         return nodes, y
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
-        """Return the integrator data q of all segments, one column per segment."""
+        """Return the integrator data q of all shooting segments, one column per segment."""
         of, total = self._data(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
         begins, lengths = [], []
@@ -124,14 +127,14 @@ class BoundaryProblem:
         )
 
     def arguments(self, y: Any, at: Any, horizon: Any, q: Any) -> list[Any]:
-        """Return the arguments of Hamiltonian functions at times ``at`` from y and q, one column per sample."""
+        """Return the arguments of the Hamiltonian system's functions at times ``at``, one column per sample."""
         sizes = self.ham.sizes
         cuts = np.cumsum([3, *sizes[4:]])
         tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
         return [y[: sizes[0]], y[sizes[0] :], at, horizon, *tail]
 
     def layout(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Return the slices of the parts of the vector of unknowns, by name."""
+        """Return the slice of every part of the vector of unknowns, by name."""
         form = self.form
         total = sum(arcs.segments)
         sizes = {
@@ -144,14 +147,17 @@ class BoundaryProblem:
         return side_by_side(sizes)
 
     def _data(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Return the slices of the data vector by name: fixed horizon, p, end values, bang values, guesses."""
+        """Return the slice of every part of the data vector (parameters, fixed values and guesses), by name."""
         sizes = self.ham.sizes
         total = sum(arcs.segments)
         parts = {"horizon": 1, "p": sizes[4], "ends": 4 * sizes[0], "bang": sizes[5] * total, "guess": sizes[6] * total}
         return side_by_side(parts)
 
     def _integrator(self, places: np.ndarray) -> Any:
-        """Return the integrator of a segment, a function (y, q) -> (y at ``places``, integrals of L and dH/dT)."""
+        """Return the CasADi Function that integrates states, costates, running cost and dH/dT over a shooting segment.
+
+        (y, q) -> (y at ``places``, integrals of L and dH/dT).
+        """
         ham = self.ham
         sizes = ham.sizes
         flow = ham.flow()
@@ -167,7 +173,7 @@ class BoundaryProblem:
         return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])
 
     def integrate(self, segment: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return states (2 nx, places) and integrals (2,); nan if the integration fails."""
+        """Return states and costates (2 nx, places) and integrals (2,) over a segment; nan if the integration fails."""
         try:
             with casadi_silenced():
                 states, integrals = segment(y, q)
@@ -183,7 +189,7 @@ class BoundaryProblem:
         return z[at["start"]], z[at["end"]]
 
     def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
-        """Return y at a position 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
+        """Return states and costates at a position 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
         if place == 0.0:
             return y
         return self.integrate(self.step, y, np.concatenate([[q[0], place * q[1]], q[2:]]))[0][:, -1]
@@ -191,7 +197,7 @@ class BoundaryProblem:
     def unpack(
         self, z: np.ndarray, arcs: ControlArcs, data: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Split the unknowns into y at the nodes (2 nx, S + 1), q of the segments, switch times and horizon."""
+        """Return states and costates at the nodes (2 nx, S + 1), segment data, switch times and horizon of unknowns."""
         form, total = self.form, sum(arcs.segments)
         horizon, switches = float(data[0]), np.zeros(0)
         if self.backward:
@@ -214,7 +220,7 @@ class BoundaryProblem:
 
 
 def side_by_side(sizes: dict[str, int]) -> dict[str, slice]:
-    """Return the slices of consecutive parts in a stacked vector, by name."""
+    """Return the slice of every part of a stacked vector by name, from the sizes of the parts."""
     cuts = np.cumsum([0, *sizes.values()]).tolist()
     return {name: slice(a, b) for name, (a, b) in zip(sizes, itertools.pairwise(cuts), strict=True)}
 
@@ -244,10 +250,11 @@ def check_backward(ham: Hamiltonian) -> None:
 
 
 def end_conditions(form: Formulation) -> Any:
-    """Return the function (y0, yN, T, p, nu0, nu1, ends) -> (residuals of the end conditions, dPhi/dT).
+    """Return the CasADi Function of the residuals of the start, end and transversality conditions.
 
-    ``ends`` holds, for initial and then for terminal states, 1 if an entry is fixed and its value. For free entries the
-    costate is the gradient of Phi = terminal cost + nu . constraints (with a minus sign at the start).
+    (y0, yN, T, p, nu0, nu1, ends) -> (residuals, dPhi/dT). ``ends`` contains, for initial and then for terminal states,
+    flags of the fixed entries and their values. For free entries the costate is the gradient of
+    Phi = terminal cost + nu . constraints (with a minus sign at the start).
     """
     sym = form.sym
     nx = form.nx
@@ -270,7 +277,7 @@ def end_conditions(form: Formulation) -> Any:
 
 @dataclass(frozen=True)
 class NewtonSettings:
-    """Termination of Newton's method.
+    """Criteria for the termination of Newton's method.
 
     Attributes:
         steps: Maximum number of steps. halvings: Maximum number of halvings of a step.
@@ -294,7 +301,7 @@ class NewtonResult:
 
     @property
     def success(self) -> bool:
-        """Return whether Newton's method converged, and no later check rejected its result."""
+        """Whether Newton's method converged, and no later check rejected its result."""
         return self.status.is_success
 
 

@@ -1,4 +1,4 @@
-"""Pontryagin's minimum principle of a problem, derived by automatic differentiation.
+"""Pontryagin's minimum principle for an optimal control problem, derived by automatic differentiation.
 
 H = L + lambda . f + mu . h with running cost L, dynamics f and path equalities h that contain the control. The costates
 obey lambda' = -dH/dx, and the control minimises H. Bryson, Ho, Applied Optimal Control, 1975, chapters 2 and 3.
@@ -23,7 +23,7 @@ __all__ = ["Extremal", "Hamiltonian", "cost_gradient"]
 
 @dataclass(frozen=True)
 class Hamiltonian:
-    """The Hamiltonian system of a problem.
+    """Hamiltonian system of an optimal control problem: its Hamiltonian, and the controls that minimise it.
 
     Attributes:
         form: The problem.
@@ -71,19 +71,25 @@ class Hamiltonian:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Sizes of the arguments x, lam, t, T, p, bang and guess."""
+        """Sizes of the arguments of `unknowns`, `flow` and `outputs`: x, lam, t, T, p, bang and guess."""
         form = self.form
         return (form.nx, form.nx, 1, 1, form.np, len(self.linear), len(self.smooth) + len(form.path))
 
     def flow(self) -> Any:
-        """Return the function (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT) under the optimal control."""
+        """Return the CasADi Function of state rates, costate rates, running cost and dH/dT under the optimal control.
+
+        (x, lam, t, T, p, bang, guess) -> (x', lambda', L, dH/dT).
+        """
         form = self.form
         # H is stationary in u and mu, so both are constant in its derivatives
         outputs = [form.f, -ca.gradient(self.value, form.x), form.running, ca.gradient(self.value, form.T)]
         return self._eliminate("flow", outputs)
 
     def outputs(self) -> Any:
-        """Return the function (x, lam, t, T, p, bang, guess) -> (u, mu, H, dH/du of the linear controls)."""
+        """Return the CasADi Function of optimal controls, multipliers, Hamiltonian and switching functions.
+
+        (x, lam, t, T, p, bang, guess) -> (u, mu, H, dH/du of the linear controls).
+        """
         slope = ca.gradient(self.value, self.form.u)
         switching = slope[list(self.linear)] if self.linear else slope[:0, :]
         return self._eliminate("outputs", [self.form.u, self.mu, self.value, switching])
@@ -91,7 +97,7 @@ class Hamiltonian:
     def multipliers(
         self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, *, t: np.ndarray, horizon: float, p: Any
     ) -> np.ndarray:
-        """Return the path equality multipliers for which H is most nearly stationary in free controls. Shape (K, m).
+        """Return the path equality multipliers that make H most nearly stationary in the free controls. Shape (K, m).
 
         Args:
             free: Which controls are off their bounds. Shape (K, nu), bool.
@@ -110,7 +116,7 @@ class Hamiltonian:
         return mu
 
     def _eliminate(self, name: str, outputs: list[Any]) -> Any:
-        """Return a function of given expressions in which the controls and multipliers w minimise H."""
+        """Return the CasADi Function of given expressions at the controls and multipliers that minimise H."""
         form = self.form
         sym = form.sym
         w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])
@@ -161,7 +167,7 @@ class Hamiltonian:
         return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
 
     def _residual(self, w: Any, bang: Any) -> Any:
-        """Return the gradient of H by the smooth controls, and the path equalities. Shape (n + m, 1)."""
+        """Return the gradient of H in the smooth controls and, below it, the path equalities. Shape (n + m, 1)."""
         n = len(self.smooth)
         gradient = ca.gradient(self.value, self.form.u)[list(self.smooth)] if n else self.form.problem.symbols(0, 1)
         stacked = ca.densify(ca.vertcat(gradient, self.rows))
@@ -186,7 +192,7 @@ class Hamiltonian:
                 )
 
     def _check_regular(self, matrix: Any, symbols: list[Any]) -> None:
-        """Raise ProblemError if the equations of the control are singular at a random point."""
+        """Raise ProblemError if the stationarity equations of the control are singular at a random point."""
         if 0 in matrix.shape:
             return
         rng = np.random.default_rng(0)
@@ -203,7 +209,7 @@ class Hamiltonian:
 
 
 def _assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
-    """Return all controls: smooth ones from the first entries of ``w``, and linear ones at their bounds."""
+    """Return the control vector of smooth controls, the first entries of ``w``, and linear ones at bounds ``bang``."""
     order = {index: w[i] for i, index in enumerate(smooth)} | {index: bang[i] for i, index in enumerate(linear)}
     return ca.densify(ca.vertcat(form.problem.symbols(0, 1), *[order[i] for i in range(form.nu)]))
 
@@ -246,7 +252,10 @@ def check_constraints(form: Formulation) -> None:
 
 
 def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
-    """Return the sparsity of nonzero entries; of an MX expression those nonzero at one of three random points."""
+    """Return the sparsity pattern of the entries of a matrix that are not identically zero.
+
+    Of an MX expression these are the entries that are nonzero at one of three random points.
+    """
     if isinstance(matrix, ca.SX):
         return ca.sparsify(matrix).sparsity()
     rng = np.random.default_rng(0)
@@ -255,25 +264,28 @@ def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
 
 
 def used_columns(pattern: Any) -> list[bool]:
-    """Return which columns of a sparsity pattern have an entry."""
+    """Return which columns of a sparsity pattern contain an entry."""
     starts = pattern.colind()
     return [starts[i + 1] > starts[i] for i in range(pattern.size2())]
 
 
 def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bound table with all parameters set to one, to find which bounds are finite."""
+    """Return the lower and upper bounds with all parameters set to one, to find which bounds are finite."""
     lower, upper = (np.asarray(v.full()).reshape(-1) for v in form.bounds.function(np.ones(form.np)))
     return lower, upper
 
 
 def numbers(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
-    """Evaluate an expression at a random point with coordinates between 0.1 and 1."""
+    """Return the value of a matrix expression at random values of its symbols between 0.1 and 1."""
     function = ca.Function("matrix", symbols, [ca.densify(matrix)])
     return np.asarray(function.call([ca.DM(rng.uniform(0.1, 1.0, s.numel())) for s in symbols])[0].full())
 
 
 def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
-    """Solve [[W, A'], [A, 0]] w = rhs, by elimination of the block W (n, n) if that is positive definite."""
+    """Solve the symbolic equations of an equality-constrained quadratic program for controls and multipliers.
+
+    [[W, A'], [A, 0]] w = rhs, by elimination of the block W (n, n) if that is positive definite.
+    """
     if not isinstance(matrix, ca.SX):
         return ca.solve(matrix, rhs)
     curvature, constraint = matrix[:n, :n], matrix[n:, :n]
@@ -298,7 +310,7 @@ def positive(matrix: Any) -> bool:
 
 @dataclass(frozen=True)
 class Extremal:
-    """Samples of an extremal, segment by segment.
+    """Samples of an extremal (a solution of the equations of the minimum principle), segment by segment.
 
     Attributes:
         places: Positions of the samples in each segment, 0..1. Shape (m,). widths: of the segments, s. Shape (K,).
@@ -319,14 +331,14 @@ class Extremal:
     nu_end: np.ndarray
 
     def sampled(self, ham: Hamiltonian, outputs: list[Any], p: np.ndarray) -> list[np.ndarray]:
-        """Evaluate expressions of x, u, lam, mu, t, T, p at all K m samples. Shape (K m, size) each."""
+        """Return the values of given expressions at all K m samples of the extremal. Shape (K m, size) each."""
         count = self.t.size
         x, u, lam, mu = (v.reshape(count, -1) for v in (self.states, self.controls, self.costates, self.multipliers))
         return ham.form.sampled(outputs, x, u, self.t.ravel(), self.horizon, p, (ham.lam, lam), (ham.mu, mu))
 
 
 def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> np.ndarray:
-    """Return the derivative of the optimal cost by the parameters. Shape (np,)."""
+    """Return the gradient of the optimal cost with respect to the parameters of the problem. Shape (np,)."""
     form = ham.form
     slopes = [ca.gradient(ham.value, s) for s in (form.p, form.T, form.u)]
     by_p, by_horizon, by_control, value = path.sampled(ham, [*slopes, ham.value], p)
@@ -354,7 +366,10 @@ def cost_gradient(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bound
 def _end_gradients(
     ham: Hamiltonian, path: Extremal, x0: np.ndarray, x1: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """Return gradients of Phi = terminal cost + nu . end constraints by p, T, the first and the last state."""
+    """Return the gradients of the terminal cost plus the start and end constraints times their multipliers.
+
+    They are with respect to the parameters, the horizon, the first state and the last state.
+    """
     form = ham.form
     begin = ca.substitute([form.start.expression], [form.x, form.t], [form.x0, 0])[0]
     end, terminal = ca.substitute([form.end.expression, form.terminal], [form.t], [form.T])

@@ -89,7 +89,7 @@ def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: 
 
 
 def control_derivatives(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list[np.ndarray]:
-    """Return the derivatives of H by the controls at K samples, and the path equalities.
+    """Return the derivatives of the Hamiltonian in the controls at K samples of an extremal, and the path equalities.
 
     These are dH/du (K, nu), the sum of absolute terms of dH/du (K, nu), d2H/du2 (K, nu, nu), the path equalities (K, m)
     and their Jacobian (K, m, nu).
@@ -108,7 +108,7 @@ def control_derivatives(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list
 
 
 def null_space(rows: np.ndarray) -> Any:
-    """Return an orthonormal basis (n, k) of the null space of ``rows`` (m, n)."""
+    """Return an orthonormal basis (n, k) of the null space of a matrix ``rows`` (m, n)."""
     if rows.shape[0] == 0:
         return np.eye(rows.shape[1])
     _, sizes, directions = np.linalg.svd(rows)
@@ -118,14 +118,14 @@ def null_space(rows: np.ndarray) -> Any:
 
 @dataclass(frozen=True)
 class Indirect:
-    """The minimum principle, solved by multiple or backward shooting.
+    """Indirect method: the equations of the minimum principle, solved by multiple or backward shooting.
 
     Attributes:
         segments: Number of segments, distributed over the arcs between switches of bang-bang controls.
         shooting: ``multiple`` (forward, all problems) or ``backward`` (from a free end state; fixed start and horizon).
         tolerance: Relative and absolute tolerance of the integrator (cvodes).
         residual: Largest residual of a solution, relative to the size of states and costates.
-        seed: The direct method that seeds it if the guess is not a solution.
+        seed: The direct method whose solution is the initial guess (seed) if the user gives no solution as guess.
 
     Raises:
         ProblemError: An invalid value.
@@ -159,7 +159,7 @@ class Indirect:
     ) -> PreparedIndirect:
         """Derive the Hamiltonian system of a problem once; see :func:`ocp.methods.prepare`.
 
-        ``solver``, ``options``, ``compiled`` and ``scaling`` apply to the direct solution that seeds it.
+        ``solver``, ``options``, ``compiled`` and ``scaling`` apply to the direct solution that is its initial guess.
         """
         require.choice("solver", solver, SOLVERS)
         how = {
@@ -199,7 +199,9 @@ class PreparedIndirect:
     def solve(
         self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
     ) -> Solution:
-        """Solve with these parameters. A solution as ``guess`` is the seed; another guess serves to compute a seed.
+        """Solve the problem with given parameters, from a direct solution as initial guess (seed).
+
+        A solution as ``guess`` is the seed; another guess serves to compute a seed.
 
         Raises:
             ProblemError: Invalid parameters or guess. SolveError: Newton's method failed, or a control has a singular
@@ -257,7 +259,7 @@ class PreparedIndirect:
         return solution
 
     def _no_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
-        """Raise SolveError because of an unusable seed, or return an unsuccessful solution."""
+        """Raise SolveError because of an unusable seed or, without ``check``, return it as an unsuccessful solution."""
         if check or seed is None:
             words = f"problem {self.problem.name!r}: the indirect method failed: {why}{error}"
             details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
@@ -265,10 +267,10 @@ class PreparedIndirect:
         status = seed.status if not seed.success else SolverStatus.REJECTED
         return dataclasses.replace(seed, success=False, status=status, message=f"{why}{error}")
 
-    # ---- before and after ------------------------------------------------------------------------------------
+    # ---- check and report of the result ----------------------------------------------------------------------
 
     def _check_order(self, root: NewtonResult, arcs: ControlArcs, bounds: Bounds) -> NewtonResult:
-        """Reject a result whose switches are out of order, or whose horizon is outside its bounds."""
+        """Reject a result whose bang-bang switches are out of order, or whose horizon is outside its bounds."""
         if self.method.shooting == "backward" or not root.success:
             return root
         at = self.boundary.layout(arcs)
@@ -364,7 +366,7 @@ class PreparedIndirect:
         )
 
     def _segments(self, y: np.ndarray, inputs: np.ndarray, bounds: Bounds) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the first y and q of all reported segments: shooting segments, split where controls reach bounds."""
+        """Return initial values and data of reported segments: shooting segments, split where controls reach bounds."""
         index = self.formulation.bounds.places["control"]
         low, high = bounds[0][index], bounds[1][index]
 
@@ -392,7 +394,7 @@ class PreparedIndirect:
 
 
 def bisect(marks: Callable[[float], np.ndarray], low: float, high: float, before: np.ndarray) -> float:
-    """Find by bisection the position in low..high at which the marks cease to equal ``before``."""
+    """Return the position in low..high at which the values of ``marks`` cease to equal ``before``, by bisection."""
     for _ in range(40):
         middle = 0.5 * (low + high)
         if np.array_equal(marks(middle), before):

@@ -1,4 +1,4 @@
-"""Initial values of the indirect method from a direct solution: arcs of bang-bang controls, unknowns and data.
+"""Initial guess of the indirect method from a direct solution (seed): bang-bang arcs, unknowns and data.
 
 The signs of dH/du along the seed determine at which bound each linear control is, and where it switches. A seed with a
 singular arc or chattering is rejected. States, costates and switch times of the seed are the first unknowns.
@@ -23,7 +23,7 @@ __all__ = ["ControlArcs", "read_arcs", "read_unknowns"]
 
 @dataclass(frozen=True)
 class SeedSettings:
-    """Criteria by which a seed is rejected; they are tolerant because seeds may be coarse.
+    """Criteria by which a direct solution (seed) is rejected; they are tolerant because seeds may be coarse.
 
     Attributes:
         inside: Distance from both bounds, relative to their range, beyond which a control is inside them.
@@ -41,7 +41,7 @@ SETTINGS = SeedSettings()
 
 @dataclass(frozen=True)
 class ControlArcs:
-    """Arcs between the switches of those controls in which the Hamiltonian is linear.
+    """Arcs between the switches of bang-bang controls, those in which the Hamiltonian is linear.
 
     Attributes:
         switches: Fractions of the horizon. Shape (A - 1,).
@@ -57,11 +57,11 @@ class ControlArcs:
 
     @property
     def nodes(self) -> np.ndarray:
-        """Index of the node at every switch. Shape (A - 1,)."""
+        """Index of the shooting node at every switch. Shape (A - 1,)."""
         return np.cumsum(self.segments)[:-1]
 
     def times(self, horizon: float) -> np.ndarray:
-        """Return the times of all nodes, s. Shape (S + 1,)."""
+        """Return the times of all shooting nodes, s. Shape (S + 1,)."""
         knots = np.concatenate([[0.0], self.switches, [1.0]]) * horizon
         arcs = [np.linspace(knots[a], knots[a + 1], n + 1)[:-1] for a, n in enumerate(self.segments)]
         return np.concatenate([*arcs, [horizon]])
@@ -70,7 +70,9 @@ class ControlArcs:
 def read_arcs(
     ham: Hamiltonian, outputs: Any, seed: Solution, p: np.ndarray, *, bounds: Bounds, segments: int
 ) -> ControlArcs:
-    """Return the arcs that the signs of dH/du along a seed define; where dH/du > 0, the lower bound is active.
+    """Return the bang-bang arcs that the signs of dH/du along a direct solution (seed) define.
+
+    Where dH/du > 0, the lower bound is active.
 
     Raises:
         SolveError: A control in which H is linear stays inside its bounds (a singular arc) or chatters.
@@ -112,7 +114,7 @@ def read_arcs(
 
 
 def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
-    """Return the control bounds under which the seed was solved; they may differ from ``bounds``. Shape (nu,) each."""
+    """Return the control bounds under which a seed was computed; they may differ from ``bounds``. Shape (nu,) each."""
     source = form if seed.problem is None else Formulation(seed.problem)
     try:
         low, high = source.bound_values(source.parameter_vector(seed.parameters))
@@ -139,7 +141,7 @@ def signs(slope: np.ndarray) -> np.ndarray:
 
 
 def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.ndarray) -> None:
-    """Raise SolveError if a control that enters linearly stays inside its bounds for too long."""
+    """Raise SolveError if a control in which the Hamiltonian is linear stays inside its bounds for too long."""
     samples = seed.control_interpolant
     widths = np.diff(samples.breaks)
     at = (samples.breaks[:-1, None] + widths[:, None] * samples.nodes).ravel()
@@ -165,7 +167,7 @@ def check_singular(ham: Hamiltonian, seed: Solution, low: np.ndarray, high: np.n
 
 
 def check_chattering(ham: Hamiltonian, events: list[tuple[float, int]], seed: Solution) -> None:
-    """Raise SolveError if a control switches repeatedly within the width of the seed's intervals."""
+    """Raise SolveError if a control switches repeatedly within the width of the seed's mesh intervals."""
     width = 1.5 * float(np.max(np.diff(seed.control_interpolant.breaks)))
     for j, index in enumerate(ham.linear):
         label = ham.form.control_labels[index]
@@ -185,7 +187,7 @@ def check_chattering(ham: Hamiltonian, events: list[tuple[float, int]], seed: So
 def read_unknowns(
     ham: Hamiltonian, seed: Solution, arcs: ControlArcs, p: np.ndarray, *, bounds: Bounds, backward: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the initial unknowns and the data of a :class:`ocp.indirect.boundary.BoundaryProblem` from a seed.
+    """Return initial unknowns and data of a :class:`ocp.indirect.boundary.BoundaryProblem` from a direct solution.
 
     The unknowns are states and costates at all nodes, switch times, the horizon if free, and multipliers of start and
     end constraints (zero); for backward shooting the end state alone. A seed of another horizon is stretched.
@@ -210,7 +212,7 @@ def read_unknowns(
 
 
 def sample_seed(form: Formulation, seed: Solution, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return states (K, nx), costates (K, nx) and controls (K, nu) of a seed at fractions of its horizon."""
+    """Return states (K, nx), costates (K, nx) and controls (K, nu) of a direct solution at fractions of its horizon."""
     sample = seed.at_fraction(fractions)
     reported = np.hstack([seed.costates[name] for name in form.states])
     lam = np.column_stack([np.interp(fractions * seed.horizon, seed.t, column) for column in reported.T])
@@ -221,7 +223,7 @@ def sample_seed(form: Formulation, seed: Solution, fractions: np.ndarray) -> tup
 def control_guess(
     ham: Hamiltonian, seed: Solution, fractions: np.ndarray, *, horizon: float, p: np.ndarray, bounds: Bounds
 ) -> np.ndarray:
-    """Return smooth controls and path equality multipliers at fractions of the horizon. Shape (K, n + m).
+    """Return a guess of smooth controls and path equality multipliers at fractions of the horizon. Shape (K, n + m).
 
     With bounds, the control equations cannot be solved from distant multipliers: all controls would be at bounds.
     """

@@ -1,4 +1,4 @@
-"""The parts of a problem by name, their texts, and the reader that turns values of the user into parts."""
+"""Declared variables, constraints and cost of a problem by name, and a reader that converts user values to them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Variable:
 
     Attributes:
         name: Unique name in the problem.
-        symbol: Shape (n, 1).
+        symbol: casadi symbol. Shape (n, 1).
         lower, upper: Bounds, casadi expressions of parameters. Shape (n, 1).
         initial, terminal: Values at both ends, nan for free entries. Shape (n, 1). States only.
         guess: A value, a function of time, or None. States and controls only.
@@ -106,8 +106,8 @@ class Constraint:
 
     Attributes:
         name: Unique among the constraints of the problem.
-        expression: Shape (m, 1).
-        lower, upper: casadi expressions of parameters. Shape (m, 1).
+        expression: casadi expression that is bounded. Shape (m, 1).
+        lower, upper: Bounds, casadi expressions of parameters. Shape (m, 1).
         unit: As of a variable.
         tolerance: Largest violation of each row that the audit accepts, in its unit; None: relative to its size. Shape
             (m,).
@@ -129,7 +129,7 @@ class Constraint:
         return int(self.expression.numel())
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError if the parts are inconsistent; see :meth:`Declarations.check`."""
+        """Raise ProblemError if expression, bounds, unit or tolerance do not match; see :meth:`Declarations.check`."""
         what = f"constraint {self.name!r}"
         way = () if self.way is None else (self.way,)
         _require_columns(symbols, self.size, what, self.expression, self.lower, self.upper, *way)
@@ -145,7 +145,7 @@ class Constraint:
 
 @dataclass
 class Horizon:
-    """The final time; it is fixed if lower and upper bound are the same expression."""
+    """The declared final time; it is fixed if lower and upper bound are the same expression."""
 
     symbol: Any
     lower: Any
@@ -154,7 +154,7 @@ class Horizon:
     fixed: bool
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError if the parts are inconsistent; see :meth:`Declarations.check`."""
+        """Raise ProblemError if symbol, bounds or guess of the horizon are invalid; see :meth:`Declarations.check`."""
         _require(isinstance(self.fixed, bool), "horizon")
         _require_columns(symbols, 1, "horizon", self.symbol, self.lower, self.upper)
         _require(self.guess is None or bool(np.isfinite(float(self.guess))), "horizon")
@@ -219,7 +219,7 @@ class Declarations:
             raise ProblemError(f"{kind} {name!r}: a constraint of this name exists already")
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError, naming the faulty part, if declarations that were read from a file are inconsistent.
+        """Raise ProblemError that names the faulty declaration if declarations read from a file are inconsistent.
 
         Args:
             symbols: ``casadi.SX`` or ``casadi.MX``, the type of every expression.
@@ -254,7 +254,7 @@ class Declarations:
                 _require(isinstance(variable.unit, str), what)
 
     def _check_equations(self, symbols: Any) -> None:
-        """Check the dynamics, the symbols at the start, the signals and the cost."""
+        """Check sizes and types of the dynamics, the symbols at the start, the signals and the cost."""
         for name, rate in self.dynamics.items():
             _require(name in self.states, f"dynamics of {name!r}")
             _require_columns(symbols, self.states[name].size, f"dynamics of {name!r}", rate)
@@ -296,13 +296,13 @@ PART_KINDS: dict[str, Any] = {
 
 
 def _require(condition: bool, what: str) -> None:
-    """Raise ProblemError with the name of the part if a condition does not hold."""
+    """Raise ProblemError, which names ``what`` as the inconsistent declaration, unless a condition holds."""
     if not condition:
         raise ProblemError(f"{what} does not fit the rest of its problem", name=what)
 
 
 def _require_columns(symbols: Any, size: int, what: str, *values: Any) -> None:
-    """Raise ProblemError unless values are columns of ``size`` entries of the given symbols."""
+    """Raise ProblemError unless values are columns of ``size`` expressions of the given type of symbols."""
     for value in values:
         _require(isinstance(value, symbols) and value.shape == (size, 1), what)
 
@@ -318,7 +318,7 @@ def column_text(value: Any) -> str:
 
 
 def shorten(expression: Any) -> str:
-    """Return an expression as a text on one line of limited length.
+    """Return an expression as text on one line of limited length.
 
     SX prints shared subexpressions first, so a large expression is described by its symbols instead.
     """
@@ -330,7 +330,7 @@ def shorten(expression: Any) -> str:
 
 @dataclass(frozen=True)
 class ExpressionReader:
-    """Reader that converts values to expressions of the symbols of one problem.
+    """Reader that converts values given by the user to expressions in the symbols of one problem.
 
     Attributes:
         symbols: ``casadi.SX`` or ``casadi.MX``. parameters: The symbols of the parameters declared so far.
@@ -340,7 +340,7 @@ class ExpressionReader:
     parameters: tuple[Any, ...]
 
     def expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
-        """Return a value as a dense column of ``known`` symbols only; with ``finite``, constants must be finite."""
+        """Return a value as a column of expressions in ``known`` symbols; with ``finite``, constants must be finite."""
         if value is None or isinstance(value, str):
             raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
         if is_symbolic(value):
@@ -365,7 +365,7 @@ class ExpressionReader:
         return expression
 
     def column(self, what: str, value: Value, size: int, default: float) -> Any:
-        """Return a value as a column that depends on parameters only. Shape (size, 1)."""
+        """Return a value, or a default, as a column of expressions in parameters only. Shape (size, 1)."""
         if value is None:
             return self.symbols(ca.DM.ones(size, 1) * default)
         if is_symbolic(value):
@@ -411,7 +411,7 @@ class ExpressionReader:
         return Constraint(name, vector, low, high, unit, read_tolerance(what, tolerance, vector.numel()))
 
     def horizon(self, what: str, value: Value, lower: Value, upper: Value, *, guess: float | None) -> Horizon:
-        """Return a horizon fixed at ``value``, or free from ``lower`` to ``upper``."""
+        """Return the declaration of a horizon that is fixed at ``value``, or free between ``lower`` and ``upper``."""
         for label, bound in (("value", value), ("lower", lower), ("upper", upper)):
             _check_number(what, label, bound)
         symbol = self.symbols.sym("horizon")
@@ -436,7 +436,7 @@ class ExpressionReader:
 
 
 def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> int:
-    """Return the given size, or else the common size of the values; 1 if all of them are scalars."""
+    """Return the size of a variable: the given one, else the common size of its values, 1 if all are scalars."""
     if size is not None:
         return require.count(f"{what}: size", size)
     labelled = {f"{what}: {k}": v for k, v in values.items() if v is not None and not callable(v)}
@@ -452,7 +452,7 @@ def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> 
 
 
 def read_scale(what: str, value: Value, size: int) -> Any:
-    """Return the typical sizes of the entries, nan if unknown, shape (size,); None if no size is given."""
+    """Return the scales of the entries of a variable, nan if unknown, shape (size,); None if no scale is given."""
     if value is None:
         return None
     array = numeric(f"{what}: scale", value)
@@ -474,7 +474,7 @@ def check_guess(what: str, guess: Any, size: int) -> None:
 
 
 def read_tolerance(what: str, value: Value, size: int) -> list[float] | None:
-    """Return the tolerances of the rows of a constraint, shape (size,); None if none is given."""
+    """Return a tolerance for each entry of a constraint, shape (size,); None if no tolerance is given."""
     if value is None:
         return None
     array = numeric(f"{what}: tolerance", value)
@@ -485,7 +485,7 @@ def read_tolerance(what: str, value: Value, size: int) -> list[float] | None:
 
 
 def signal_function(what: str, track: Callable[[Any], Any]) -> Any:
-    """Return the casadi Function from time to a column that depends on time alone."""
+    """Return a function of time given by the user as a casadi Function whose value is a column."""
     time = ca.MX.sym("time")
     try:
         return ca.Function("signal", [time], [ca.densify(ca.vec(ca.MX(track(time))))])

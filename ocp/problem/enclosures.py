@@ -1,4 +1,4 @@
-"""Enclosures of expressions of one symbol: ranges and slopes over whole intervals, valid across kinks and jumps.
+"""Interval enclosures of functions of one variable: their range and slopes, also across kinks and jumps.
 
 This is forward-mode differentiation in interval arithmetic. Each instruction carries its range and an interval of
 slopes that contains every difference quotient (x(s) - x(t)) / (s - t) of two places in the interval. A smooth operation
@@ -7,7 +7,7 @@ gradient (Clarke 1983, *Optimization and Nonsmooth Analysis*, section 2.3). Wher
 are unbounded, and the range alone bounds the value. No whole expression is differentiated, as casadi's derivatives
 ignore jumps.
 
-They bound the motion of bodies that is prescribed as a function of time. Over an interval of length h, let every
+Enclosures bound the motion of bodies that is prescribed as a function of time. Over an interval of length h, let every
 coordinate of a point have a range of width w and slopes in [l, u]. Then the point's distance from its position at the
 middle is at most
 
@@ -34,10 +34,10 @@ __all__ = ["Enclosure", "Enclosures", "PrescribedMotion"]
 
 
 class Enclosure(NamedTuple):
-    """Bounds of n expressions over M intervals; -inf and inf if unbounded.
+    """Bounds of the values and slopes of expressions over intervals of their variable; -inf and inf if unbounded.
 
     Attributes:
-        low, high: Bounds of the values. Shape (M, n).
+        low, high: Bounds of the values. Shape (M, n) for M intervals and n expressions.
         least, most: Bounds of the slopes, that is of all difference quotients within an interval. Shape (M, n).
     """
 
@@ -48,7 +48,7 @@ class Enclosure(NamedTuple):
 
 
 class Enclosures:
-    """Bounds of a column of expressions of one scalar symbol over intervals of the symbol.
+    """Evaluator of bounds of expressions of one scalar symbol over intervals of that symbol.
 
     The bounds hold wherever an entry and all its subexpressions are defined: the square root of a function that becomes
     negative counts where it is real.
@@ -67,7 +67,7 @@ class Enclosures:
         check_instructions(what, self._function)
 
     def __call__(self, low: np.ndarray, high: np.ndarray) -> Enclosure:
-        """Return bounds of the expressions over M intervals of the symbol, from ``low`` to ``high``, (M,) each."""
+        """Return bounds of the expressions over M intervals of the symbol with the ends ``low`` and ``high`` (M,)."""
         jets = self._jets(_Jet(Interval(low, high), constant(1.0, low)))
         return Enclosure(*(np.column_stack([side(jet) for jet in jets]) for side in _SIDES))
 
@@ -92,7 +92,7 @@ class Enclosures:
 
 
 class _Jet(NamedTuple):
-    """Bounds of an instruction's value and of its derivative over M intervals."""
+    """Bounds of the value and of the slope of one instruction of a casadi function over M intervals."""
 
     value: Interval
     slope: Interval
@@ -111,12 +111,12 @@ ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_
 
 
 def _where(valid: Any, slope: Interval) -> Interval:
-    """Return the derivative's bounds in the valid intervals, and infinite bounds elsewhere."""
+    """Return the given slope bounds in intervals that a mask marks as valid, and infinite bounds in the others."""
     return Interval(np.where(valid, slope.low, -np.inf), np.where(valid, slope.high, np.inf))
 
 
 def _smooth(code: int, *jets: _Jet) -> _Jet:
-    """Return value and derivative bounds of a smooth operation, by the mean value theorem."""
+    """Return bounds of the value and slope of a smooth operation, by the mean value theorem."""
     value = RULES[code](*(jet.value for jet in jets))
     is_power = code in (ca.OP_POW, ca.OP_CONSTPOW)
     exponent = _number(jets[1].value) if is_power else None
@@ -130,7 +130,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
 
 @lru_cache(maxsize=4096)
 def _partials(code: int, count: int, exponent: float | None) -> Any:
-    """Return the partial derivatives of an operation as an SX function; a fixed exponent is a constant."""
+    """Return the partial derivatives of an operation as an SX function; a given exponent counts as a constant."""
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     if count == 1:
         return ca.Function("partials", [x], [ca.densify(ca.gradient(ca.SX.unary(code, x), x))])
@@ -141,13 +141,13 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
 
 
 def _number(x: Interval) -> float | None:
-    """Return the value of M intervals if all consist of the same single number, else None."""
+    """Return the number of which all intervals consist; None if they are not all the same single number."""
     first = float(x.low[0])
     return first if bool((x.low == first).all() and (x.high == first).all()) else None
 
 
 def _steps(code: int, *jets: _Jet) -> _Jet:
-    """Return value and derivative bounds of a piecewise constant operation: floor, ceil, sign, comparisons."""
+    """Return bounds of the value and slope of a piecewise constant operation: floor, ceil, sign, comparisons."""
     value = RULES[code](*(jet.value for jet in jets))
     return _Jet(value, _where(value.low == value.high, constant(0.0, value.low)))
 
@@ -159,7 +159,7 @@ def _absolute(code: int, x: _Jet) -> _Jet:
 
 
 def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
-    """Return value and derivative bounds of fmin or fmax; if the selected argument is unknown, both count."""
+    """Return bounds of the value and slope of fmin or fmax; where either argument may be selected, both count."""
     low, high = (x, y) if code == ca.OP_FMIN else (y, x)
     first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
     ends = [
@@ -191,7 +191,7 @@ def _copysign(code: int, x: _Jet, y: _Jet) -> _Jet:
 
 
 def _angle(code: int, y: _Jet, x: _Jet) -> _Jet:
-    """Return value and derivative bounds of atan2, which jumps by a full turn on a half-line."""
+    """Return bounds of the value and slope of atan2, which jumps by a full turn on a half-line."""
     smooth = _smooth(code, y, x)
     continuous = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
     return _Jet(smooth.value, _where(continuous, smooth.slope))
@@ -211,18 +211,19 @@ _KINKED: dict[int, Callable[..., _Jet]] = {
         for name in ("FLOOR", "CEIL", "SIGN", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR")
     },
 }
-"""Rules of the operations that are not smooth, by the code of casadi's instruction."""
+"""Rules for the bounds of operations that are not smooth, by the code of casadi's instruction."""
 
 
 FRAME_ENTRIES = 12
-"""Entries of a frame: its rotation column by column, then its position."""
+"""Number of entries of a frame: its rotation matrix column by column, then its position."""
 
 
 class PrescribedMotion:
-    """Motion of bodies that depends on time alone, such as that of moving obstacles.
+    """Motion of bodies that is a prescribed function of time alone, such as that of moving obstacles.
 
     Args:
-        separation: The pairs. placements: Their frames, possibly in other symbols. time: The symbol of time.
+        separation: The pairs of bodies. placements: Poses of their frames, possibly in other symbols than those of the
+            separation. time: The symbol of time.
         parameters, values: Symbols of parameters, and their numbers.
 
     Raises:
@@ -257,7 +258,7 @@ class PrescribedMotion:
                 self._bodies.append((frames.index(moving[0].frame), _coordinates(core)))
 
     def bounds(self, pair: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bound the motion of the bodies of given pairs during intervals of time.
+        """Return bounds of the prescribed motion of the bodies of given pairs during intervals of time.
 
         Args:
             pair, begin, end: Indices of the pairs, and the ends of the intervals in the unit of the time. Shape (K,).
@@ -294,7 +295,7 @@ class PrescribedMotion:
 
 
 def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]) -> Any:
-    """Return a frame as an expression of time, with numbers for the parameters; raise if it depends on states."""
+    """Return a frame as an expression of time alone, with numbers for parameters; raise if it depends on states."""
     known = {identity(symbol) for symbol in ca.symvar(ca.vertcat(time, *parameters))}
     others = [symbol for symbol in ca.symvar(frame) if identity(symbol) not in known]
     if others and ca.depends_on(frame, ca.vertcat(*map(ca.vec, others))):
@@ -305,7 +306,10 @@ def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[
 
 
 def _coordinates(core: np.ndarray) -> np.ndarray:
-    """Return the matrix that maps the 12 entries of a frame to bounding box corners in world. Shape (3 C, 12)."""
+    """Return the matrix that maps the entries of a frame to the world coordinates of a body's C bounding box corners.
+
+    Shape (3 C, 12). ``core`` are the points of the body in the frame.
+    """
     ends = np.stack([core.min(axis=0), core.max(axis=0)])
     corners = np.unique(np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3), axis=0)
     with_one = np.column_stack([corners, np.ones(len(corners))])
@@ -313,6 +317,6 @@ def _coordinates(core: np.ndarray) -> np.ndarray:
 
 
 def _longest(coordinates: np.ndarray) -> np.ndarray:
-    """Return the length of the longest of C vectors, stacked in rows (M, 3 C); inf if one is huge. Shape (M,)."""
+    """Return the largest length of the C vectors in each row (M, 3 C); inf if it is huge. Shape (M,)."""
     lengths = np.linalg.norm(coordinates.reshape(len(coordinates), -1, 3), axis=2).max(axis=1)
     return np.where(lengths < 1e100, lengths, np.inf)

@@ -1,4 +1,4 @@
-"""A problem flattened into vectors: the common form that all transcriptions and the audit read.
+"""An optimal control problem in stacked vectors: the common form that all transcriptions and the audit read.
 
 Time is the fraction ``s`` of the horizon, ``t = s * T``, so that a free final time is one additional unknown.
 """
@@ -25,7 +25,7 @@ Bounds: TypeAlias = tuple[np.ndarray, np.ndarray]  # lower and upper values of a
 
 @dataclass(frozen=True)
 class Rows:
-    """Scalar constraint rows of one kind (path, start, end or watch).
+    """Scalar constraints (rows) of one kind: path, start or end constraints, or those that only the audit checks.
 
     Attributes:
         expression: Shape (m, 1), in the symbols of the formulation.
@@ -51,11 +51,11 @@ class Rows:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the constraints, in order."""
+        """Names of the declared constraints to which the rows belong, in order."""
         return tuple(dict.fromkeys(self.owners))
 
     def of(self, name: str) -> np.ndarray:
-        """Return the indices of the rows of a constraint, given by its name."""
+        """Return the indices of the rows that belong to the declared constraint of a given name."""
         return np.array([i for i, owner in enumerate(self.owners) if owner == name])
 
     def select(self, mask: np.ndarray) -> Rows:
@@ -81,7 +81,10 @@ class BoundTable:
     places: dict[str, np.ndarray]
 
     def pullback(self, p: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-        """Return the derivative, by the parameters, of bounds multiplied by multipliers (2, n). Shape (np,)."""
+        """Return the derivative, with respect to the parameters, of the sum of bounds times multipliers. Shape (np,).
+
+        ``multipliers`` (2, n) are those of the lower and of the upper bounds.
+        """
         return np.asarray(self._pullback(p, multipliers.T).full()).reshape(-1)
 
     @cached_property
@@ -98,7 +101,7 @@ class BoundTable:
 
 
 class Formulation:
-    """The vectors and functions of a checked problem, which later changes of the problem do not affect.
+    """Stacked vectors and functions of a checked problem, which later changes of the problem do not affect.
 
     Attributes:
         x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon. sym: Creates
@@ -197,7 +200,7 @@ class Formulation:
         return self._cache[name]
 
     def function(self, name: str, outputs: list[Any], names: list[str]) -> Any:
-        """Return a casadi Function of (x, u, t, T, p); it is of MX type if it depends on signals."""
+        """Return a casadi Function of state, control, time, horizon and parameters; of MX type if signals occur."""
         inputs, labels = [self.x, self.u, self.t, self.T, self.p], ["x", "u", "t", "T", "p"]
         if not (self.signals and ca.depends_on(ca.vertcat(*map(ca.vec, outputs)), self.w)):
             return ca.Function(name, inputs, outputs, labels, names)
@@ -206,7 +209,7 @@ class Formulation:
         return ca.Function(name, symbols, inner.call([*symbols, self._signal(symbols[2])]), labels, names)
 
     def point_data(self, fractions: np.ndarray) -> np.ndarray:
-        """Return the data of point functions at fractions (K,): fractions, then signals. Shape (1 + nw, K)."""
+        """Return the data of a point function at horizon fractions (K,): these and the signals. Shape (1 + nw, K)."""
         return np.vstack([np.reshape(fractions, (1, -1)), self.signals_at(np.ravel(fractions) * self.duration).T])
 
     def signals_at(self, times: np.ndarray, order: int = 0) -> np.ndarray:
@@ -235,10 +238,10 @@ class Formulation:
     def sampled(
         self, outputs: list[Any] | Callable[[], list[Any]], *point: Any, cache_as: Any = None
     ) -> list[np.ndarray]:
-        """Evaluate expressions of (x, u, t, T, p) at M samples. Shape (M, number of entries) each, column by column.
+        """Evaluate expressions of the problem's symbols at M samples. Shape (M, entries) each, column by column.
 
         Args:
-            outputs: Expressions of the symbols, or a function that returns them.
+            outputs: Expressions of the symbols x, u, t, T and p, or a function that returns them.
             point: States (M, nx), controls (M, nu), times (M,), s, horizon, s, and parameters (np,); then pairs of
                 another symbol and its values, (M, n), or (n,) if they are constant.
             cache_as: Name under which the compiled function is cached; it must identify the outputs.
@@ -254,7 +257,7 @@ class Formulation:
         return list(function(x, u, times, horizon, p, self.signals_at(times), *values))
 
     def sampler(self, outputs: list[Any], *more: Any) -> Sampler:
-        """Return the function (x, u, t, T, p, w, *more) -> outputs for evaluation at many samples."""
+        """Return a function that evaluates expressions at many samples of x, u, t, T, p, w and the symbols ``more``."""
         symbols = self.problem.symbols
         inputs = [self.x, self.u, self.t, self.T, self.p, self.w, *more]
         return Sampler(inputs, [symbols(output) for output in outputs])
@@ -270,10 +273,10 @@ class Formulation:
         return self.bounds.function(p)[0][int(self.bounds.places["horizon"][0])]
 
     def point_function(self, name: str, d: Any, cost: Any, g: Any) -> Any:
-        """Return a block function of one point, (v, d, p) -> (cost, g), with v = [x; u; T if free].
+        """Return the casadi Function that evaluates a cost and constraints at one point of a transcription.
 
-        ``cost`` and ``g`` are expressions of x, u, t, T, p, w and of the data ``d``, which begin with a column of
-        :meth:`point_data`.
+        It maps (v, d, p) to (cost, g), with the variables v = [x; u; T if free]. ``cost`` and ``g`` are expressions of
+        x, u, t, T, p, w and of the data ``d``, which begin with a column of :meth:`point_data`.
         """
         v = self.sym("v", self.nx + self.nu + self.horizon_is_free)
         inside = slice(self.nx, self.nx + self.nu)
@@ -309,7 +312,7 @@ class Formulation:
         return vector
 
     def bound_values(self, p: np.ndarray) -> Bounds:
-        """Return lower and upper bounds for the given parameters, after checks. Shape (n,) each."""
+        """Return the lower and upper bounds in the bound table at given parameters, after checks. Shape (n,) each."""
         lower, upper = (np.asarray(v.full()).reshape(-1) for v in self.bounds.function(p))
         places = self.bounds.places
         what = f"problem {self.name!r} at these parameters"
@@ -447,7 +450,7 @@ def slices(pool: Mapping[str, Variable | Signal]) -> dict[str, slice]:
 
 
 def labels(pool: dict[str, Any]) -> tuple[str, ...]:
-    """Return a name for every entry: ``q`` for a scalar, ``q[2]`` in a vector."""
+    """Return a name for every entry of variables or constraints: ``q`` for a scalar, ``q[2]`` in a vector."""
     return tuple(f"{v.name}[{i}]" if v.size > 1 else v.name for v in pool.values() for i in range(v.size))
 
 

@@ -40,7 +40,7 @@ class Hull:
     Attributes:
         frame: Index of the frame with which it moves; -1: the world.
         core: Points in that frame. Shape (m, 3), m.
-        radius: m.
+        radius: Radius by which the hull is inflated, m.
         normal: Outward unit normal of a half-space, in that frame; its core is one point of its plane. Shape (3,), or
             (0,) for a hull.
 
@@ -72,12 +72,12 @@ class Hull:
 
     @cached_property
     def middle(self) -> np.ndarray:
-        """Mean of the points. Shape (3,), m."""
+        """Mean of the points of the hull, in its frame. Shape (3,), m."""
         return np.asarray(self.core.mean(axis=0))
 
     @cached_property
     def kind(self) -> int:
-        """Group of hulls that are evaluated together: 0 for boxes, else the number of points as a power of two."""
+        """Key of hulls evaluated together: 0 for boxes, else the number of points rounded up to a power of two."""
         return 0 if is_box(self.core) else 1 << (len(self.core) - 1).bit_length()
 
     @cached_property
@@ -143,7 +143,7 @@ class HullPairs:
         return points
 
     def nearest(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return unit vectors from first to second body, gaps and nearest points, in the frame of each pair.
+        """Return unit vectors from first to second body, gaps and nearest points, in each pair's reference frame.
 
         Shapes (K, 3), (K,), m, and (K, 2, 3), m.
         """
@@ -154,7 +154,7 @@ class HullPairs:
         return along, gap, np.stack([nearest_first, nearest_second], axis=1)
 
     def distances(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Return distances of pairs at samples, shape (K,), m; in closed form for a ball and a box or another ball."""
+        """Return the distances of pairs at samples, (K,), m; in closed form for a ball and a box or another ball."""
         if self._box_side is None:
             return self.nearest(frames, at, row)[1]
         (rotations, positions), box, ball = frames, self._box_side, 1 - self._box_side
@@ -174,7 +174,7 @@ class HullPairs:
 
 
 class CoveredPairs:
-    """Pairs of bodies, some of which have pairs of smaller shapes that cover the bodies.
+    """Pairs of bodies, with pairs of smaller shapes that cover some of the bodies for sharper bounds of distances.
 
     Covering pairs contain the two bodies between them, so the smallest of their distances is a lower bound of the
     distance of the pair. The distance of the hulls is another one; the larger bound counts. Unlike a hull, covers of
@@ -193,9 +193,9 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """List the rows of K pairs and of their covers: positions of their pairs in `pair`, and row indices, (R,) each.
+        """Return all rows that belong to given pairs: the position of each row's pair in `pair`, and the row's index.
 
-        The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow.
+        The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow. Shape (R,) each.
         """
         counts = self._counts[pair]
         place = np.repeat(np.arange(len(pair)), counts)
@@ -204,7 +204,7 @@ class CoveredPairs:
 
     @staticmethod
     def decisive(place: np.ndarray, gap: np.ndarray, count: int) -> np.ndarray:
-        """Return the row, of R rows, that determines the distance of each of K pairs. Shape (K,).
+        """Return the index of the row, its hulls or covering shapes, that determines each pair's distance. Shape (K,).
 
         Args:
             place: As of `of`. gap: Distance of each row. Shape (R,), m. count: K.
@@ -218,11 +218,11 @@ class CoveredPairs:
 
 
 class SeparatingDirections(NamedTuple):
-    """Directions of shortest distance, for the rows of K pairs of bodies and of their covers.
+    """Directions of shortest distance between two bodies, or shapes that cover them, for rows of `CoveredPairs`.
 
     Attributes:
-        place, row: Shape (R,). along: Unit vectors from the first body to the second, in the frame of observation. (R,
-            3).
+        place, row: As of `CoveredPairs.of`. Shape (R,). along: Unit vectors from the first body to the second, in the
+            frame of observation. Shape (R, 3).
     """
 
     place: np.ndarray
@@ -251,7 +251,7 @@ class BodyPairs:
         self._normals = np.array([_normal(*pair) for pair in bodies]).reshape(-1, 3)
 
     def balls(self, frames: Frames, at: np.ndarray, pair: np.ndarray) -> np.ndarray:
-        """Return the gaps between the bounding balls of given pairs at given samples. Shape (K,), m."""
+        """Return the gaps between the bounding balls of the bodies of given pairs at samples. Shape (K,), m."""
         bodies = self._first[pair], self._second[pair]
         first, second = (self._in_world(frames, at, self._middles[k], self._frames[k]) for k in bodies)
         return self._ball_distance(second - first, pair)
@@ -282,7 +282,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return distances of pairs at samples, (K,), m; above `near`, (K,), they may be lower bounds."""
+        """Return the distances of given pairs at given samples, (K,), m; above `near` they may be lower bounds."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -298,7 +298,7 @@ class BodyPairs:
     def nearest(
         self, frames: Frames, at: np.ndarray, pair: np.ndarray
     ) -> tuple[SeparatingDirections, np.ndarray, np.ndarray]:
-        """Return directions, distances (K,), m, and nearest points of the cores (K, 2, 3), m, of pairs at samples."""
+        """Return directions, distances (K,), m, and nearest core points (K, 2, 3), m, of given pairs at samples."""
         place, rows = self._covered.of(pair)
         along, gap, points = np.empty((len(rows), 3)), np.empty(len(rows)), np.empty((len(rows), 2, 3))
         for kind, chosen, row in self._by_kind(rows):
@@ -307,7 +307,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the gaps of pairs along given directions, the smaller of those at both interval ends. Shape (K,), m.
+        """Return the gap of each pair along a given direction, the smaller one of both interval ends. Shape (K,), m.
 
         The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
         """
@@ -319,16 +319,16 @@ class BodyPairs:
 
     @staticmethod
     def _in_world(frames: Frames, at: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        """Transform points from moving frames to the world at samples."""
+        """Return points on moving frames in world coordinates at given samples."""
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _ball_distance(self, offset: np.ndarray, pair: np.ndarray) -> np.ndarray:
-        """Return the gap between the bounding balls of pairs whose centres differ by `offset`."""
+        """Return the gap between the two bounding balls of each pair, whose centres differ by `offset`."""
         along_normal = (offset * self._normals[pair]).sum(axis=-1)
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Yield each group of pairs with the positions of its rows in `rows`, and their indices in the group."""
+        """Yield each group of pairs of equal kinds, the positions of its rows in `rows`, and their indices in it."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -336,7 +336,7 @@ class BodyPairs:
 
 
 def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
-    """Group pairs (n, 3) of hulls by their kinds; the third column is the reference frame, -1 for the world."""
+    """Return groups of pairs (n, 3) by the kinds of their hulls; column three is the reference frame, -1 for world."""
     kinds: dict[tuple[int, int], list[int]] = {}
     for i, (first, second, _) in enumerate(pairs):
         kinds.setdefault((hulls[first].kind, hulls[second].kind), []).append(i)
@@ -344,12 +344,12 @@ def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
 
 
 def _pad_points(core: np.ndarray, count: int) -> np.ndarray:
-    """Repeat the last point until there are `count` points."""
+    """Return the points of a hull, with the last one repeated until there are `count` points."""
     return np.concatenate([core, np.repeat(core[-1:], count - len(core), axis=0)])
 
 
 def frames_of(placements: np.ndarray) -> Frames:
-    """Return frames from rotations, column by column, and positions side by side, (M, 12 F); the world comes last."""
+    """Return frames from samples (M, 12 F) of rotations, column by column, and positions; the last is the world."""
     count = len(placements)
     world = np.broadcast_to(np.vstack([np.eye(3), np.zeros(3)]), (count, 1, 4, 3))
     values = np.concatenate([placements.reshape(count, placements.shape[1] // 12, 4, 3), world], axis=1)
@@ -367,7 +367,7 @@ WORLD = -1
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Pairs of bodies with a minimum distance.
+    """Declaration of minimum distances between pairs of bodies.
 
     Attributes:
         name: Unique among the constraints of a problem.
@@ -378,8 +378,8 @@ class Separation:
             observed, -1 for the world. Shape (n, 3).
         least: Minimum distances. Shape (n,), m.
         movers: Names of the states that move the bodies, with their sizes.
-        levers, turns: Bounds as above, for the stacked states in ``movers``. Shape (n, k), in m and rad per unit of the
-            state.
+        levers, turns: Bounds lever_k and turn_k of the relative motion, for the stacked states in ``movers``. Shape (n,
+            k), in m and rad per unit of the state.
         covers: By the index of a pair, pairs of bodies, shape (m, 2), that together contain its two bodies: the
             smallest of their distances is a lower bound of the distance of the pair. Levers and turns hold for all of
             them.
@@ -441,7 +441,7 @@ class Separation:
 
     @property
     def labels(self) -> tuple[tuple[str, str], ...]:
-        """Names of the two bodies of each pair."""
+        """Names of the two bodies of each pair, in the order of the pairs."""
         names = tuple(self.hulls)
         return tuple((names[first], names[second]) for first, second, _ in self.pairs)
 
@@ -456,7 +456,7 @@ class Separation:
 
 
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
-    """Return the non-empty covering pairs by the index of the covered pair, after checks."""
+    """Return the pairs of shapes that cover bodies, by the index of the covered pair, after checks."""
     covering: dict[int, np.ndarray] = {}
     for pair, rows in require.mapping(f"{what}: covers", covers, object).items():
         if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < count:
@@ -467,7 +467,7 @@ def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]
 
 
 def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return bounds as an array of a given shape; raise ProblemError if levers or turns are negative."""
+    """Return minimum distances or bounds of motion as an array of a given shape; raise ProblemError if invalid."""
     array = table(f"{what}: {label}", value)
     array = np.broadcast_to(array, shape) if array.ndim == 0 else array.reshape(shape) if not shape[0] else array
     if array.shape != shape:
@@ -490,7 +490,7 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
 
 
 def stack_motion_bounds(what: str, bounds: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
-    """Return levers or turns, given by state name, as columns in the order of the movers; missing ones are zero.
+    """Return bounds of motion, given by state name, as columns in the order of the movers; missing ones are zero.
 
     Args:
         movers: Size of each state that moves a body. count: Number of pairs.

@@ -23,12 +23,12 @@ Array: TypeAlias = np.ndarray
 
 
 class Interval(NamedTuple):
-    """Bounds of a number over each of M intervals of time, with the structure of if_else expressions.
+    """Lower and upper bounds of a number over each of M intervals of the inputs.
 
     Attributes:
-        low, high: Shape (M,).
+        low, high: The bounds. Shape (M,).
         negates: The test of which it is the negation, if any.
-        part: If it is (a test, a value): the value where the test holds and 0 elsewhere.
+        part: For an instruction of if_else, (a test, a value): the value where the test holds and 0 elsewhere.
     """
 
     low: Array
@@ -38,7 +38,7 @@ class Interval(NamedTuple):
 
 
 def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
-    """Return the range of each entry of the only output of an SX function for interval inputs.
+    """Return the range of each entry of the (single) output of an SX function over intervals of its inputs.
 
     Args:
         function: Function of scalars whose instructions are those of `RULES`, see `check_instructions`.
@@ -62,7 +62,7 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
 
 
 def check_instructions(what: str, function: Any) -> None:
-    """Raise ProblemError if an SX function has an instruction without an interval rule, naming it."""
+    """Raise ProblemError with the name of the instruction if an SX function has one without an interval rule."""
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
         if code not in RULES and code not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
@@ -75,7 +75,7 @@ def check_instructions(what: str, function: Any) -> None:
 
 
 def _out(low: Any, high: Any) -> Interval:
-    """Widen bounds by possible rounding errors; nan becomes unbounded."""
+    """Return an interval with its bounds widened by possible rounding errors; nan becomes unbounded."""
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     # the functions of a C library are accurate to four units in the last place
     share, smallest = 4 * np.finfo(float).eps, 1e-300
@@ -89,7 +89,7 @@ def constant(value: float, like: Array) -> Interval:
 
 
 def _range_of(corners: list[Array]) -> Interval:
-    """Return the interval from the smallest to the largest value at the corners."""
+    """Return the interval from the smallest to the largest value of an operation at the corners of its inputs."""
     stacked = np.array(corners)
     return _out(stacked.min(axis=0), stacked.max(axis=0))
 
@@ -209,7 +209,7 @@ def _negative(x: Interval) -> Interval:
 
 
 def _contains_multiple(x: Interval, first: float, step: float) -> Any:
-    """Return whether an interval contains first + k step for an integer k, within rounding."""
+    """Return whether intervals contain `first` plus an integer multiple of `step`, within rounding. Shape (M,)."""
     # multiples of a turn are accurate to fifty units in the last place of the angle
     slack = 1e-14 * (1 + np.maximum(np.abs(x.low), np.abs(x.high)))
     return np.floor((x.high + slack - first) / step) >= np.ceil((x.low - slack - first) / step)
@@ -236,7 +236,7 @@ def _tangent(x: Interval) -> Interval:
 
 
 def _angle(y: Interval, x: Interval) -> Interval:
-    """Return the range of atan2 over rectangles; without origin and branch cut its extremes are at corners."""
+    """Return the range of atan2 over rectangles: from its corners, or a full turn if they meet the branch cut."""
     result = _range_of([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
     crosses_cut = ~((x.low > 0) | (y.low > 0) | (y.high < 0))
     half = float(np.nextafter(np.pi, 4))
@@ -367,5 +367,5 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "IF_ELSE_ZERO": _if_else_zero,
 }
 RULES = {getattr(ca, f"OP_{name}"): _without_warnings(rule) for name, rule in _BY_NAME.items()}
-"""Rules by the code of casadi's instruction."""
+"""Interval rules by the code of casadi's instruction."""
 NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}

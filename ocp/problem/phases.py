@@ -1,4 +1,4 @@
-"""Phases: consecutive problems as one problem, joined at times that may be free.
+"""Phases: consecutive optimal control problems as one problem, joined at times that may be free.
 
 A satellite is approached, grasped and brought to rest; a part is picked up, carried and put down; stages of a rocket
 burn out and are dropped. Each phase is a :class:`~ocp.problem.problem.Problem` with its own states, controls, limits,
@@ -42,7 +42,7 @@ class Phase:
     """A phase of :class:`Phases`, with expressions by which constraints can couple it to other phases.
 
     Attributes:
-        name: Its name.
+        name: Name of the phase.
         begin, duration: Start time and duration, s. Scalar expressions for end constraints and terminal costs.
     """
 
@@ -52,11 +52,11 @@ class Phase:
     _whole: Phases
 
     def at_start(self, state: str) -> Any:
-        """Return a state or control at the start of the phase. Shape (n, 1)."""
+        """Return the symbol of a state or control at the start of the phase. Shape (n, 1)."""
         return self._whole.at_start(self._symbol(state))
 
     def at_end(self, state: str) -> Any:
-        """Return a state or control at the end of the phase, for end constraints and terminal costs. Shape (n, 1)."""
+        """Return the symbol of a state or control at the phase's end, for end constraints and costs. Shape (n, 1)."""
         return self._symbol(state)
 
     def _symbol(self, name: str) -> Any:
@@ -162,7 +162,7 @@ class Phases(Problem):
             self.end(what, gap, lower=0.0, upper=0.0, unit=unit)
 
     def minimize(self, running: Any = 0, terminal: Any = 0) -> None:
-        """Declare a terminal cost of states at ends of phases, which is added to the costs of the phases.
+        """Declare a terminal cost, a function of the states at the ends of phases, in addition to the phases' costs.
 
         Raises:
             ProblemError: ``running`` is not zero: it belongs to the problem of a phase.
@@ -183,7 +183,7 @@ class Phases(Problem):
 
 
 class _PhaseInserter:
-    """Declares the parts of a phase in the whole problem, with symbols of the whole problem."""
+    """Helper that declares variables, equations and constraints of a phase in the symbols of the whole problem."""
 
     def __init__(self, whole: Phases, name: str, problem: Problem) -> None:
         self.whole, self.name, self.problem = whole, name, problem
@@ -192,7 +192,7 @@ class _PhaseInserter:
         self.guess_duration: float | None = None  # duration over which guesses are read, s; None if unknown
 
     def declare(self, begin: Any) -> PhaseTimes:
-        """Declare all parts of the phase except its cost; return its times and its cost."""
+        """Declare the phase in the whole problem, except for its cost; return its times and its cost."""
         whole, declared = self.whole, self.problem.declared
         for parameter in declared.parameters.values():
             self._parameter(parameter)
@@ -262,7 +262,7 @@ class _PhaseInserter:
         self._replace(parameter.symbol, symbol)
 
     def _duration(self) -> tuple[Any, float | None]:
-        """Return the duration as an expression and as a number; the number is None if the duration is free."""
+        """Return the duration of the phase as an expression and as a number, which is None if the duration is free."""
         horizon = self.problem.declared.horizon
         assert horizon is not None
         if horizon.fixed:

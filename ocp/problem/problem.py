@@ -43,7 +43,7 @@ Declared = TypeVar("Declared", bound="Problem")
 
 
 def _about_its_name(method: Declare) -> Declare:
-    """Decorate a method of Problem: errors that it raises name the declaration."""
+    """Decorate a method of Problem so that its errors contain the name of the declaration."""
 
     @wraps(method)
     def declare(self: Any, name: Any, *args: Any, **values: Any) -> Any:
@@ -61,7 +61,7 @@ def checked_problem(problem: Any) -> Problem:
 
 
 def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]], Callable[Arguments, Declared]]:
-    """Decorate a problem builder: its problems store its name and arguments, so that they can be declared again."""
+    """Return a decorator with which problems store their builder's name and arguments, so that they can be rebuilt."""
 
     def decorate(declare: Callable[Arguments, Declared]) -> Callable[Arguments, Declared]:
         parameters = signature(declare)
@@ -105,11 +105,11 @@ class Problem:
     # ---- copies and files ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the problem as data, without those guesses that are functions; see `to_record`."""
+        """Return the problem as plain data, without those guesses that are functions; see `to_record`."""
         return to_record(self.name, self.symbols, self.time, self.declared)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the data that :meth:`__getstate__` returned, with new symbols; raise ProblemError if damaged."""
+        """Restore the problem from data of :meth:`__getstate__`, with new symbols; raise ProblemError if damaged."""
         kinds = (Variable, Signal, Constraint, Horizon, PhaseTimes, Declarations, Separation, Hull)
         self.name, self.symbols, self.time, self.declared = from_record(state, kinds)
         self.declared.check(self.symbols)
@@ -131,7 +131,7 @@ class Problem:
         return duplicate
 
     def __deepcopy__(self, memo: Any) -> Problem:
-        """Return a copy; symbols are immutable."""
+        """Return a copy with the same symbols, which are immutable."""
         return self.__copy__()
 
     # ---- variables -------------------------------------------------------------------------------------------
@@ -220,7 +220,7 @@ class Problem:
 
     @_about_its_name
     def integral(self, name: str, rate: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> Any:
-        """Declare ``lower <= integral of rate dt <= upper``; return the running integral, which is a state.
+        """Declare ``lower <= integral of rate dt <= upper``; return the integral up to each time, which is a state.
 
         Args:
             name: Unique among states and constraints.
@@ -319,7 +319,7 @@ class Problem:
 
     @_about_its_name
     def end(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
-        """Declare ``lower <= expression <= upper`` at the end; ``at_start`` symbols couple it to the start."""
+        """Declare ``lower <= expression <= upper`` at the end; the expression may contain ``at_start`` symbols."""
         known = list(self.declared.at_start.values())
         self.declared.end[name] = self._constraint("end", name, expression, (lower, upper), unit, known=known)
 
@@ -457,7 +457,7 @@ class Problem:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
 
     def _inner(self) -> list[Any]:
-        """Symbols for constraints inside the horizon: states, controls, parameters, signals, time, horizon."""
+        """Return the symbols allowed inside the horizon: states, controls, parameters, signals, time, horizon."""
         d = self.declared
         pools = (d.states, d.controls, d.parameters, d.signals)
         return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]

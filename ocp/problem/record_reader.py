@@ -29,22 +29,22 @@ BINARY = (
 )  # fmt: skip
 STRUCTURAL = ("INPUT", "CONSTANT", "CALL", "RESULT")
 OPERATIONS = (*STRUCTURAL, *UNARY, *BINARY)
-"""Names of the operations. Files store indices of this list: append new operations, never reorder them."""
+"""Names of the operations in stored functions. Files store indices of this list: append only, never reorder."""
 INPUT, CONSTANT, CALL, RESULT = range(len(STRUCTURAL))
 CODES = [getattr(ca, f"OP_{name}") for name in OPERATIONS[len(STRUCTURAL) :]]
 PLACES = {code: place for place, code in enumerate(CODES, len(STRUCTURAL))}
 FIRST_BINARY = len(STRUCTURAL) + len(UNARY)
 
 MAX_OPERATIONS = 2**20
-"""Maximum number in all functions of a file; rebuilding an operation takes about 5 microseconds and 200 bytes."""
+"""Maximum number of operations in a file; rebuilding an operation takes about 5 microseconds and 200 bytes."""
 MAX_WORK = 2**26
-"""Maximum number in one evaluation with all nested calls, which can be many even in a short file."""
+"""Maximum number of operations in one evaluation with all nested calls, which can be many even in a short file."""
 MAX_ENTRIES = 2**20
 """Maximum number of entries of all arguments and results of the functions of a file."""
 OPAQUE = {"never_inline": True}
-"""Options of functions that are not scalar arithmetic: on scalars, they remain calls."""
+"""Options with which functions that are not scalar arithmetic remain calls when applied to scalar symbols."""
 MAX_DIMENSIONS = 6
-"""Maximum dimension of an interpolated table."""
+"""Maximum number of dimensions of an interpolated table."""
 MAX_DEGREE = 9
 """Maximum degree of a spline."""
 INTEGRATORS = {"RungeKutta": "rk", "Collocation": "collocation", "CvodesInterface": "cvodes", "IdasInterface": "idas"}
@@ -55,11 +55,11 @@ INTEGRATOR_OPTIONS: dict[str, tuple[str, type]] = {
     "reltol": ("SundialsInterface::reltol", float),
     "max_num_steps": ("SundialsInterface::max_num_steps", int),
 }
-"""Integrator options that are stored, with their names in CasADi's debugging output."""
+"""Integrator options that are stored, with their names in CasADi's debugging output and their types."""
 
 
 class FunctionReader:
-    """Builder of functions from records; it rejects anything that a `FunctionWriter` does not write.
+    """Builder of CasADi functions from stored records; it rejects all that a `FunctionWriter` does not write.
 
     Args:
         records: As of a `FunctionWriter`, from an untrusted source.
@@ -97,7 +97,7 @@ class FunctionReader:
             self._work.append(work)
 
     def _rebuild(self, record: Mapping[str, Any], name: str) -> tuple[Any, int]:
-        """Rebuild a function from its operations; also return how many operations one evaluation takes.
+        """Return a function rebuilt from its stored operations, and how many operations one evaluation takes.
 
         It has SX symbols, or MX symbols if it calls other functions: only these differentiate all calls as CasADi does.
         """
@@ -213,7 +213,7 @@ def _floats(values: Any, *, finite: bool = False) -> np.ndarray:
 
 
 def _read_pattern(shape: Any) -> Any:
-    """Return the sparsity pattern of [rows, columns] or [rows, columns, positions of the entries]."""
+    """Return the sparsity pattern stored as [rows, columns] or as [rows, columns, positions of the entries]."""
     if not isinstance(shape, list) or len(shape) not in (2, 3):
         raise ProblemError(f"a shape is expected, not {shape!r:.80}", name="shape")
     rows, columns = (_whole(size, "size", 0, MAX_ENTRIES) for size in shape[:2])
@@ -231,7 +231,7 @@ def _read_pattern(shape: Any) -> Any:
 
 
 def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return the CasADi function `low`, the index of the table interval that contains a number."""
+    """Rebuild CasADi's function `low` from its record: the index of the table interval that contains a number."""
     table, modes = _floats(record["table"], finite=True), ("linear", "exact", "binary")
     count, mode = _whole(record["count"], "count", 0, MAX_ENTRIES), _whole(record["mode"], "mode", 0, 2)
     if len(table) < 2 or (np.diff(table) < 0).any():
@@ -241,7 +241,7 @@ def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return the function that looks up table entries at computed positions; nan outside the table."""
+    """Rebuild from its record a function that looks up table entries at computed positions; nan outside the table."""
     table, x = _floats(record["table"]), ca.MX.sym("x", _whole(record["count"], "count", 0, MAX_ENTRIES))
     if not len(table):
         raise ProblemError("a table is empty", name="table")
@@ -249,14 +249,14 @@ def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _solve(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return the function that solves linear equations."""
+    """Rebuild from its record a function that solves a system of linear equations."""
     size, columns = (_whole(record[what], what, 1, 1024) for what in ("size", "columns"))
     matrix, right = ca.MX.sym("A", size, size), ca.MX.sym("b", size, columns)
     return ca.Function("solve", [matrix, right], [ca.solve(matrix, right)], OPAQUE)
 
 
 def _grids(record: Mapping[str, Any], what: str) -> list[list[float]]:
-    """Return the grid of a table along each dimension."""
+    """Return the stored grid of a table along each dimension, after checks."""
     places, offsets = _floats(record[what], finite=True), _integers(record["offsets"], (None,)).tolist()
     if not 2 <= len(offsets) <= MAX_DIMENSIONS + 1 or offsets[0] != 0 or offsets[-1] != len(places):
         raise ProblemError(f"the offsets of a grid of {len(offsets) - 1} dimensions are inconsistent", name="offsets")
@@ -267,7 +267,7 @@ def _grids(record: Mapping[str, Any], what: str) -> list[list[float]]:
 
 
 def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return a spline of one or several variables."""
+    """Rebuild from its record a B-spline of one or several variables."""
     knots, coefficients = _grids(record, "knots"), _floats(record["coefficients"])
     degrees = [_whole(degree, "degree", 0, MAX_DEGREE) for degree in record["degrees"]]
     modes = [("linear", "exact", "binary")[_whole(mode, "mode", 0, 2)] for mode in record["modes"]]
@@ -285,7 +285,7 @@ def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Return a linear interpolant of a table, or the derivative of one."""
+    """Rebuild from its record a linear interpolant of a table, or the derivative of one."""
     grids, values = _grids(record, "grid"), _floats(record["values"])
     cells = int(np.prod([len(grid) for grid in grids], dtype=object))
     if not len(values) or len(values) % cells or any((np.diff(grid) <= 0).any() for grid in grids):
@@ -295,7 +295,7 @@ def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
-    """Return an integrator of the differential equations of a stored function."""
+    """Rebuild from its record an integrator, whose differential equations are another stored function."""
     equations = functions[_place(_whole(record["equations"], "equations", 0, MAX_ENTRIES), len(functions), "equations")]
     if record["plugin"] not in INTEGRATORS.values():
         raise ProblemError(f"integrator {record['plugin']!r} is unknown", name="plugin", value=record["plugin"])
@@ -340,7 +340,7 @@ ARRAY_NAMES = ("integers", "numbers")
 
 
 def from_record(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, Any, Any, Any]:
-    """Return name, type of symbols, symbol of time, and all declarations of a problem, with new symbols.
+    """Return name, symbol type, time symbol and declarations of a problem rebuilt from its record with new symbols.
 
     Args:
         record: As :func:`to_record` returns it, from an untrusted source.
@@ -388,7 +388,7 @@ def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[
 
 
 def _symbols_in(value: Any) -> Iterator[dict[str, Any]]:
-    """Yield those parts of a record of declarations that describe symbols."""
+    """Yield the entries that describe symbols from a record of declarations."""
     if isinstance(value, dict) and "input" in value:
         yield value
     elif isinstance(value, dict | list):

@@ -31,7 +31,7 @@ __all__ = ["FunctionWriter", "pack_record", "to_record"]
 
 
 class FunctionWriter:
-    """Writer of functions as records; each function is written once, after the functions that it calls.
+    """Writer of CasADi functions as records; each function is written once, after the functions that it calls.
 
     Attributes:
         records: For each function a dictionary of text, numbers, lists and arrays, as `FunctionReader` takes them.
@@ -45,7 +45,7 @@ class FunctionWriter:
         self._alive: list[Any] = []  # keeps functions alive: CasADi reuses the hash of a deleted one
 
     def write(self, function: Any) -> int:
-        """Write a function, unless that has been done, and return the number of its record.
+        """Write a function as a record, unless that has been done, and return the number of the record.
 
         Raises:
             ProblemError: The function, or one that it calls, cannot be written, such as a Python callback.
@@ -76,7 +76,7 @@ class FunctionWriter:
         return self._register(key, len(self.records) - 1)
 
     def _forwarded_to(self, record: dict[str, Any]) -> int | None:
-        """Return the number of the function to which a record only forwards its arguments; else None.
+        """Return the number of the function that a record only calls with its own arguments; else None.
 
         Without this check, each save of a loaded problem would wrap its tables in one more function.
         """
@@ -98,14 +98,14 @@ class FunctionWriter:
         return number
 
     def _leaf(self, record: dict[str, Any]) -> Any:
-        """Store a function as a single record, without its operations; return the function rebuilt from it."""
+        """Store the record of a function that is not scalar arithmetic; return the function rebuilt from the record."""
         function = BUILDERS[record["kind"]](record, ())
         self._alive.append(function)
         self._append(function.__hash__(), record, function)
         return function
 
     def _call_leaf(self, record: dict[str, Any], entries: Sequence[Any], pattern: Any) -> Any:
-        """Call the function of a record with one column, and return the result."""
+        """Store the record of a function of one column, and return the value of this function for given entries."""
         argument = ca.vertcat(*entries) if entries else ca.SX(0, 1)
         return from_entries(pattern, self._leaf(record).call([argument], False, True)[0].nonzeros())
 
@@ -143,7 +143,7 @@ class FunctionWriter:
         return [from_entries(function.sparsity_out(k), entries) for k, entries in enumerate(outputs)]
 
     def _apply(self, function: Any, node: Any, code: int, arguments: Sequence[Any]) -> list[Any]:
-        """Apply one operation to matrices and return the results."""
+        """Apply one operation of a function of matrices to SX matrices, and return the results."""
         if code == ca.OP_CONST:
             return [ca.SX(node.to_DM())]
         if code == ca.OP_CALL:
@@ -177,7 +177,7 @@ class FunctionWriter:
         return list(step.expand().call(list(arguments)))
 
     def _gather(self, node: Any, arguments: Sequence[Any]) -> Any:
-        """Return the entries of a table at computed positions, or a call that does so."""
+        """Return expressions for the entries of a table at computed positions, for a constant table as a call."""
         where, chosen = node.info(), [argument.nonzeros() for argument in arguments[1:]]
         sides = {
             side: [ca.SX(k) for k in range(*(where[side][key] for key in ("start", "stop", "step")))]
@@ -199,7 +199,7 @@ class FunctionWriter:
         return from_entries(node.sparsity(), values)
 
     def _operations(self, function: Any) -> dict[str, Any]:
-        """Return the record of a function of SX symbols."""
+        """Return the record of a function of SX symbols: its scalar operations, constants and calls."""
         nodes: list[Any] = []
         rows: list[tuple[int, int, int]] = []
         constants: list[float] = []
@@ -280,7 +280,7 @@ def _numbers(matrix: Any) -> np.ndarray:
 
 
 def _fields(function: Any, kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Parse values in CasADi's debugging output, given by name and type: `int`, `float` or lists of them.
+    """Return fields of a function from CasADi's debugging output, by name and type: `int`, `float` or lists of them.
 
     The text comes from a function of this process, never from a file.
     """

@@ -39,12 +39,12 @@ def identity(symbol: Any) -> int:
 
 
 def numeric(what: str, value: Any) -> np.ndarray:
-    """Return a value as a flat float array, or raise ProblemError."""
+    """Return a numeric value as a flat float array; raise ProblemError for anything else."""
     return table(what, value).reshape(-1)
 
 
 def table(what: str, value: Any) -> np.ndarray:
-    """Return a value as a float array of its own shape, or raise ProblemError."""
+    """Return a numeric value as a float array of its own shape; raise ProblemError for anything else."""
     try:
         return floats(value.full() if isinstance(value, ca.DM) else value)
     except NOT_NUMBERS as error:
@@ -63,7 +63,7 @@ def constant(expression: Any) -> np.ndarray:
 
 
 def check_finite(what: str, value: np.ndarray) -> None:
-    """Raise ProblemError if an entry is infinite or nan."""
+    """Raise ProblemError if an entry of an array is infinite or nan."""
     if not np.all(np.isfinite(value)):
         raise ProblemError(f"{what} is not finite: {value.tolist()}", value=value.tolist())
 
@@ -102,7 +102,7 @@ BLOCK_SIZES = (512, 32, 8, 1)  # samples per call: one map of all samples takes 
 
 
 class Sampler:
-    """A function of columns that is evaluated at many samples together, in blocks.
+    """A function of column vectors that is evaluated at many samples at once, in blocks of samples.
 
     Args:
         symbols: Arguments of the function, one column each.
@@ -122,7 +122,7 @@ class Sampler:
         self._maps: dict[int, Any] = {}
 
     def __call__(self, *columns: Any) -> list[np.ndarray]:
-        """Return the outputs at M samples. Shape (M, n) each.
+        """Return the outputs of the function at M samples. Shape (M, n) each.
 
         Args:
             columns: The arguments: an array (M, n) that varies over the samples, or (n,) or a number that does not.
@@ -150,7 +150,7 @@ class Sampler:
 def evaluate_in_blocks(
     function: Any, size: int, inputs: np.ndarray, outputs: list[np.ndarray], *, previous: np.ndarray | None = None
 ) -> None:
-    """Call a casadi function of ``size`` columns block by block, and store the results in existing arrays.
+    """Call a casadi function that takes ``size`` samples for block after block, and store the results in given arrays.
 
     Args:
         inputs, outputs: Input and outputs with samples as rows, in whole blocks. Shape (K size, n) each.
@@ -173,6 +173,6 @@ def evaluate_in_blocks(
 
 
 def evaluate_at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
-    """Return the outputs of a casadi function of dense columns at M samples, see :class:`Sampler`."""
+    """Return the outputs of a casadi function of dense columns at given samples, see :class:`Sampler`."""
     symbols = [ca.MX.sym(f"input{i}", function.numel_in(i)) for i in range(function.n_in())]
     return Sampler(symbols, list(function.call(symbols)))(*columns)

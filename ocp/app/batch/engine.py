@@ -1,7 +1,7 @@
 """Run tasks with Dask: on a cluster that is started here, one process for each core, or on a given cluster.
 
-Results are sent to the driver, so the machines need no common folder. A cluster started here uses TLS with a
-certificate of its own: no other user of the machine can send it tasks or read results.
+Results are sent to the driver, the process that runs the batch, so the machines need no common folder. A cluster
+started here uses TLS with a certificate of its own: no other user of the machine can send it tasks or read results.
 
 A worker calls the function with one task after another and reports each result or error. It caches what several tasks
 share, such as a robot or a prepared problem.
@@ -47,7 +47,7 @@ __all__ = [
 Function = Callable[..., Any]
 CACHE_SIZE = 8
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
-"""Errors of the machine, which are independent of the task."""
+"""Error numbers of a full or read-only disk, which do not depend on the task."""
 
 
 class WorkerFailure(OSError):
@@ -57,11 +57,11 @@ class WorkerFailure(OSError):
 # ---- one task ----------------------------------------------------------------------------------------------------
 
 _LOCK = threading.RLock()
-"""Serialises the threads of a worker, because CasADi expressions are not thread-safe."""
+"""Lock that makes the threads of a worker take turns, because CasADi expressions are not thread-safe."""
 
 
 def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: bool, limit_s: float) -> list[Payload]:
-    """Call :func:`attempt` for one job after another; start no job after ``limit_s`` seconds."""
+    """Run jobs (task, guess) one after another in a worker and return their payloads; start none after `limit_s`."""
     began, results = time.perf_counter(), list[Payload]()
     for task, guess in jobs:
         results.append(attempt(function, task, near, guess))
@@ -71,7 +71,9 @@ def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: b
 
 
 def attempt(function: Function, task: str, with_guess: bool, guess: Payload | None) -> Payload:
-    """Call the function with a task, given as text; with `with_guess` also pass the result of its neighbour.
+    """Call the function of a batch with one task, which is given as JSON text.
+
+    If `with_guess` is true, the result of a similar task, `guess`, is the second argument.
 
     Returns:
         The payload of the result, or of the name and message of the function's exception.
@@ -103,7 +105,7 @@ def attempt(function: Function, task: str, with_guess: bool, guess: Payload | No
 
 
 def failure_payload(status: str, error: str, message: str) -> Payload:
-    """Return the payload of a task that ended without a result, with the reason."""
+    """Return the payload that records why a task ended without a result."""
     empty: dict[str, Any] = {"value": None, "files": [], "cost": None, "verdict": None, "seconds": 0.0}
     empty["inputs"] = {"kept": {}}
     return Payload({"status": status, "error": error, "message": message, **empty})
@@ -189,7 +191,7 @@ class EngineSettings:
 
 
 class Job(NamedTuple):
-    """A task to run: its key, its text, and the result of its neighbour."""
+    """A task to run: its key, its JSON text, and the result of a similar task, or None."""
 
     key: str
     task: str
@@ -197,12 +199,12 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Outcome of a job: the payload, or None if it must be sent again.
+    """Outcome of a job: the payload of its result, or None if the job must be sent again.
 
     Attributes:
         key: Key of the task.
-        payload: The payload, or None.
-        deaths: Number of ended workers that had the task, for whatever reason.
+        payload: Payload of the result, or None.
+        deaths: Number of workers that ended, for whatever reason, while they had the task.
     """
 
     key: str
@@ -214,10 +216,10 @@ class Engine:
     """Workers of a Dask cluster; a context manager that cancels or ends their work.
 
     Args:
-        function: Sent to the workers by Dask: by name, or by code if it is defined in the script.
-        near: Whether it takes a neighbour's result.
+        function: Function that Dask sends to the workers: by name, or by code if it is defined in the script.
+        near: Whether the function also takes the result of a similar task.
         cluster: Number of processes to start, or a cluster as returned by :func:`checked_cluster`.
-        settings: Settings.
+        settings: Settings of the workers.
 
     Raises:
         ProblemError: Dask is not installed, no worker starts, or a worker cannot load the function.
@@ -262,7 +264,7 @@ class Engine:
         return self
 
     def _begin(self) -> Any:
-        """Start workers on this machine."""
+        """Start workers on this machine and return their cluster."""
         import dask
 
         configuration: dict[str, Any] = {
@@ -319,7 +321,7 @@ class Engine:
         self._configuration.close()
 
     def _kill_workers(self) -> None:
-        """Kill the workers started here."""
+        """Kill the workers that this engine started."""
         for nanny in self._local_cluster.workers.values():
             nanny.auto_restart = False
         for process in set(multiprocessing.active_children()) - self._foreign_processes:
@@ -346,7 +348,7 @@ class Engine:
         return max(0, self._threads - len(self._running))
 
     def share(self, ready: int) -> int:
-        """Return how many of the waiting jobs to send at once, such that each thread gets several chunks."""
+        """Return how many of the waiting jobs to send together, such that each worker thread gets several chunks."""
         return max(1, min(self._chunk_size, ready // (4 * max(1, self._threads))))
 
     def submit(self, jobs: list[Job]) -> None:
@@ -377,7 +379,7 @@ class Engine:
         return [outcome for future, jobs in finished for outcome in self._outcomes(future, jobs)]
 
     def _outcomes(self, future: Any, jobs: list[Job]) -> list[Outcome]:
-        """Wait for a chunk of jobs and return their outcomes; jobs of a lost worker have no payload."""
+        """Return the outcomes of jobs that were sent together; jobs of a lost worker have no payload."""
         try:
             payloads = [Payload(*each) for each in future.result(timeout=self.settings.patience)]
         except WorkerFailure:
@@ -411,7 +413,7 @@ class Engine:
 
 
 def checked_cluster(cluster: Any) -> Any:
-    """Return a cluster after checks: the address of a scheduler, or a `distributed.Client`, which stays open.
+    """Return a cluster, checked to be the address of a scheduler or a `distributed.Client`, which stays open.
 
     Raises:
         ProblemError: It is neither.

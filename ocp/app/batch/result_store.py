@@ -5,9 +5,9 @@
     results/ab/KEY.0.npz    plans and solutions of its value
     lock                    held by the active driver; the system releases it when the driver ends for any reason
 
-Data are numbers, texts, True, False, None, and lists and dictionaries by name of these. The canonical text of a task
-gives its key. Plans and solutions in a result are stored in files of their own, in the formats of the library. Nothing
-is pickled.
+The driver is the process that runs the batch. Data are numbers, texts, True, False, None, and lists and dictionaries of
+these, with names as keys. The canonical text of a task gives its key. Plans and solutions in a result are stored in
+files of their own, in the formats of the library. Nothing is pickled.
 
 Files are complete or absent. They are not synchronised to the disk: after a loss of power the last ones may be empty or
 truncated, which is detected and counts as missing.
@@ -68,7 +68,8 @@ def as_data(value: Any, where: str, extract: Callable[[Any, tuple[Any, ...]], bo
     Args:
         value: The value.
         where: Name of the value in messages: ``task``, then ``task['x'][2]``.
-        extract: Whether a value inside, at a place (names and indices), is extracted; it is replaced by None.
+        extract: Function of a nested value and its place (names and indices) that returns whether to replace the value
+            by None.
 
     Raises:
         ProblemError: The value contains something that is not data, or a number that is not finite; names the place.
@@ -133,7 +134,7 @@ def key_of(text: str) -> str:
 
 
 def pack_result(value: Any) -> Payload:
-    """Convert the result of a function to a payload, with its cost and its verdict.
+    """Convert the result of a batch's function to a payload, which also states the cost and verdict of the result.
 
     The cost is that of a plan or solution, the ``"cost"`` of a dictionary or that of the only plan in it, or the number
     itself. The verdict is the ``"verdict"`` of a dictionary, or whether the audit of the only plan passes; otherwise
@@ -197,7 +198,7 @@ def unpack_result(payload: Payload) -> Any:
 
 
 def digest_of(path: str) -> str | None:
-    """Return the digest of a file's contents, or None if it cannot be read."""
+    """Return the SHA-256 digest of a file's contents, or None if the file cannot be read."""
     try:
         with open_unlinked(os.path.realpath(path)) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -206,7 +207,7 @@ def digest_of(path: str) -> str | None:
 
 
 def file_of(value: Plan | Solution) -> bytes:
-    """Return the bytes of the file that the `save` method of a value writes."""
+    """Return the contents of the file to which a plan or solution is saved."""
     with tempfile.TemporaryDirectory() as folder:
         value.save(Path(folder) / "result.npz")
         return (Path(folder) / "result.npz").read_bytes()
@@ -231,7 +232,7 @@ RECORD_FIELDS = {
     "neighbour": str | None,
     "inputs": dict,
 }
-"""Fields of a record, with their types."""
+"""Fields of the record of a task's result, and the types of their values."""
 
 
 class ResultStore:
@@ -320,13 +321,13 @@ class ResultStore:
         write_whole(self.folder / HEAD, lambda stream: stream.write(text))
 
     def _has_result(self) -> bool:
-        """Return whether the store has a result."""
+        """Return whether the store has the result of at least one task that succeeded."""
         records = (self.read(key) for key in self.stored_keys())
         return any(record and record["status"] == "done" for record in records)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the lock of the folder; wait if another driver holds it.
+        """Lock the folder for the duration of a `with` block; wait if another driver has locked it.
 
         Raises:
             ProblemError: The file system of the folder has no locks.
@@ -373,7 +374,7 @@ class ResultStore:
         return dict(record)
 
     def write(self, record: dict[str, Any], files: Sequence[bytes]) -> None:
-        """Write a record after its files, replacing links.
+        """Write the files of a record and then the record; replace links of the same names.
 
         Raises:
             OSError: A file cannot be written; no file is then incomplete.
@@ -428,14 +429,14 @@ def load_json(path: Path) -> Any:
 
 
 def finite(text: str) -> float:
-    """Return a number; raise ValueError unless it is finite."""
+    """Return the number that a text contains; raise ValueError unless it is finite."""
     if not isfinite(value := float(text)):
         raise ValueError(f"{text} is not a finite number")
     return value
 
 
 def file_at(place: Path, number: int) -> Path:
-    """Return the path of a record's numbered file."""
+    """Return the path of the file with a given number that belongs to a record, of a plan or a solution."""
     return place.with_suffix(f".{number}.npz")
 
 

@@ -50,7 +50,7 @@ def run_batch(
     Args:
         function: ``function(task)``, at the top level of a module or of the started script (which then calls run_batch
             under ``if __name__ == "__main__":``). It returns data (numbers, texts, True, False, None, lists and
-            dictionaries by name of these; arrays become lists), or plans and solutions, or these among data. Its cost
+            dictionaries of these; arrays become lists), or plans and solutions, or these among data. Its cost
             is that of a plan, the ``"cost"`` of a dictionary, or a single number; its verdict the ``"verdict"`` of a
             dictionary, or whether the audit of a plan passes. An exception makes the result of its task ``failed``, and
             the other tasks continue.
@@ -181,7 +181,7 @@ class _PendingTasks:
                     bar.set_postfix(failed=self.failures, refresh=False)
 
     def _suspect(self, key: str, deaths: int, max_deaths: int) -> None:
-        """Mark a task that ran when a worker died, to run alone; give it up after too many dead workers."""
+        """Mark a task that ran when a worker ended, to run it alone; record it as killed if it ends too many."""
         self.deaths[key] += deaths
         if key == self.isolated and self.deaths[key] >= max_deaths:
             self._end(key, failure_payload("killed", "", f"it ended {self.deaths[key]} workers"))
@@ -204,20 +204,20 @@ class _PendingTasks:
             engine.submit([Job(key, self.texts[key], self._guess(key)) for key in keys])
 
     def _guess(self, key: str) -> Payload | None:
-        """Return the result of a task's nearest neighbour, which serves as its guess."""
+        """Return the stored result of a task's neighbour, which the function takes as its guess, or None."""
         parent = self._neighbour(key)
         record = None if parent is None else self.store.read(parent)
         return None if record is None else self.store.payload(record)
 
     def _neighbour(self, key: str) -> str | None:
-        """Return the key of the nearest neighbour with a result."""
+        """Return the key of the first task with a result along the chain of neighbours of a task, or None."""
         parent = self.parents[key]
         while parent is not None and self.results[parent].status != "done":
             parent = self.parents[parent]
         return parent
 
     def _end(self, key: str, payload: Payload) -> None:
-        """Store the outcome of a task, and release the tasks that wait for it."""
+        """Store the outcome of a task, and mark the tasks that wait for it as ready to run."""
         record = {"key": key, "task": json.loads(self.texts[key]), "neighbour": self._neighbour(key), **payload.record}
         record["inputs"] = {"source": self.source, **record["inputs"]}
         self.store.write(record, payload.files)
@@ -227,7 +227,7 @@ class _PendingTasks:
 
 
 def texts_of(tasks: Any) -> dict[str, str]:
-    """Return the canonical text of each distinct task by its key.
+    """Return the canonical text of each distinct task, keyed by the key of the task.
 
     Raises:
         ProblemError: `tasks` is not a list, or one of them is not data.
@@ -259,7 +259,7 @@ def worker_count(count: int | None) -> int:
 
 
 def names_of(argument: str, names: Any) -> tuple[str, ...]:
-    """Return a tuple of names."""
+    """Return an argument that is a list of names as a tuple; raise ProblemError if it is anything else."""
     if isinstance(names, str) or not isinstance(names, Collection):
         raise ProblemError(f"{argument} must be a list of names, not {names!r}", name=argument, value=names)
     return tuple(require.text(argument, name) for name in names)
@@ -307,12 +307,12 @@ def source_version(function: Any) -> str:
 
 
 def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str | None]:
-    """Return the key of each task's neighbour (None for the first), in an order in which neighbours come first.
+    """Return the neighbour of each task, the similar task whose result is its guess, as keys of tasks.
 
-    The tasks alone determine the neighbours. Ordered by their keys, which looks random, they form generations of 1, 1,
-    2, 4, 8, ... tasks, and the neighbour of a task is the nearest task of all earlier generations. Neighbours thus come
-    closer as the tasks get denser, the tasks of one generation can run in parallel, and no chain is longer than log2 of
-    the number of tasks.
+    The first task has None; neighbours come first in the order of the dictionary. The tasks alone determine the
+    neighbours. Ordered by their keys, which looks random, they form generations of 1, 1, 2, 4, 8, ... tasks, and the
+    neighbour of a task is the nearest task of all earlier generations. Neighbours thus come closer as the tasks get
+    denser, the tasks of one generation can run in parallel, and no chain is longer than log2 of the number of tasks.
 
     Args:
         tasks: Tasks by key.

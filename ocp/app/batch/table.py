@@ -1,4 +1,4 @@
-"""Results of a batch: a table, and the best result of each group."""
+"""Results of a batch of tasks: their table, and the best result of each group of tasks."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class Result:
     """Result of one task of a batch.
 
     Attributes:
-        key: Its name in the folder.
+        key: Name of the result in the folder.
         task: The task.
         status: ``done``; ``failed``: the function raised an exception, or returned nan or something that is not data;
-            ``killed``: it ended at least three workers.
-        cost, verdict: As given by the function, or of the plan that it returned; otherwise None.
+            ``killed``: the task ended at least three workers.
+        cost, verdict: Values that the function returned, or those of the plan that it returned; otherwise None.
         seconds: Wall time of the call.
         error, message: Name and text of the exception; "" if done.
         neighbour: Key of the task whose result was the guess, or None.
@@ -91,7 +91,7 @@ class Result:
 
 
 def row_of(record: Mapping[str, Any], store: ResultStore) -> Result:
-    """Return the result of a record."""
+    """Return the Result that a stored record describes."""
     value = record["value"]
     entries = value if isinstance(value, dict) else {}
     scalars = {name: entry for name, entry in entries.items() if isinstance(entry, str | int | float)}
@@ -122,7 +122,7 @@ class Batch:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of results by status."""
+        """Number of results of each status, keyed by status."""
         return dict(Counter(result.status for result in self.results))
 
     def __str__(self) -> str:
@@ -134,7 +134,7 @@ class Batch:
 
     @property
     def summary(self) -> str:
-        """Numbers of finished and failed tasks, the first reason of failure, and how to repeat them, in one line."""
+        """One line with the numbers of finished and failed tasks, the first error, and how to repeat failed tasks."""
         done = self.counts.get("done", 0)
         counts = f"{self.folder.name}: {len(self)} tasks: {done} done, {len(self) - done} failed"
         first = next((result for result in self.results if result.status != "done"), None)
@@ -149,7 +149,7 @@ class Batch:
             raise BatchError(self.summary, self, name=self.folder.name, value=count, limit=0)
 
     def best(self, by: Group) -> dict[Any, Result]:
-        """Return the lowest-cost result of each group, among the finished ones whose verdict is not False.
+        """Return the lowest-cost result of each group of tasks, among finished results whose verdict is not False.
 
         Args:
             by: Name of an entry of the tasks, or a function of a task; its value, a text or number, is the group.
@@ -237,7 +237,7 @@ def entry(task: Any, name: str) -> Any:
 
 
 def scalar(value: Any) -> Any:
-    """Return a value in a form that fits into a table cell."""
+    """Return a value as the content of a table cell: texts and numbers unchanged, other data as JSON."""
     return value if value is None or isinstance(value, str | int | float) else json.dumps(value, ensure_ascii=False)
 
 

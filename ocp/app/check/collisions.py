@@ -1,4 +1,4 @@
-"""Check the clearance of a motion, proven between the samples, and the distance of its tip from a path."""
+"""Check the clearance of a motion, proven between the samples, and the distance of the robot's tip from a path."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from ocp.tolerances import CLEARANCE_TOLERANCE_M
 __all__ = ["clearance_rows", "path_rows", "prove_clearance", "with_wide_limits"]
 
 MAX_REPORTED_PAIRS = 20
-"""Largest number of pairs in the table."""
+"""Largest number of pairs of bodies that the table lists."""
 
 
 def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
-    """Return the machine with joint limits that contain the motion; prismatic joints get limits if they have none."""
+    """Return the machine with joint limits widened to contain a motion, also those of unlimited prismatic joints."""
     robot = machine.robot
     low, high = (getattr(motion.position.coefficients, side)(axis=(0, 1)) for side in ("min", "max"))
     joints = []
@@ -47,7 +47,10 @@ def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
 
 
 def prove_clearance(scene: CollisionScene, motion: Motion) -> Clearance:
-    """Return proven bounds of each pair's clearance along a motion within its limits, for a stationary base."""
+    """Return the clearance of each pair of bodies along a motion of the joints, and the lower bound that is proven.
+
+    The base is stationary.
+    """
     start, horizon = float(motion.t[0]), float(motion.t[-1] - motion.t[0])
     rates = motion.velocity.greatest
     seconds = np.zeros_like(rates) if motion.acceleration is None else motion.acceleration.greatest
@@ -64,7 +67,7 @@ def prove_clearance(scene: CollisionScene, motion: Motion) -> Clearance:
 
 
 def clearance_rows(scene: CollisionScene, motion: Motion, bases: Array | None) -> tuple[list[Row], list[Fault]]:
-    """Return table rows and faults for the clearance between bodies.
+    """Return the table rows and the faults of a check of the clearance between bodies along a motion.
 
     If the base moves, with configurations `bases` (M, base_size) at the samples, distances are computed at the samples
     and midway between them, without a proof.
@@ -116,7 +119,7 @@ def _distance_text(distance: float) -> str:
 
 
 def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault]) -> list[Fault]:
-    """Return the faults with the time at which the clearance is first violated."""
+    """Return clearance faults that also state the time at which the clearance is first violated."""
     if not faults:
         return []
     worst_times = np.array([fault.time for fault in faults])
@@ -133,7 +136,7 @@ def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault])
 
 
 def _sampled_rows(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
-    """Check the distances at the samples and midway between them; return table rows and faults."""
+    """Check distances between bodies at the samples and midway between them; return table rows and faults."""
     middles = (motion.t[1:] + motion.t[:-1]) / 2
     times = np.concatenate([motion.t, middles])
     joints = motion.position.at(times)
@@ -160,7 +163,7 @@ def _sampled_rows(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[
 def path_rows(
     machine: Machine, motion: Motion, bases: Array | None, path: Waypoints, *, tolerance: float, angle: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Return table rows and faults for the distance of the tip from the path, and for the tool axis.
+    """Return the table rows and the faults of a check of the tip's distance from a path and of the tool axis.
 
     The tip is sampled four times in every interval, and more finely at the largest distance. The path consists of
     straight lines between the waypoints. The angle is that of the z axes, if the waypoints have orientations.
@@ -222,14 +225,14 @@ def path_rows(
 
 
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
-    """Return the table row for a value and its limit, which may be infinite."""
+    """Return the table row for a value and its upper limit, which may be infinite."""
     bounded = bool(np.isfinite(limit))
     verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.INFO
     return Row(name, value, limit if bounded else None, unit, time, verdict)
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:
-    """Return the tool's z axis at path parameters (K,), which are fractional waypoint numbers. Shape (K, 3)."""
+    """Return the required z axis of the tool at path parameters (K,), fractional waypoint numbers. Shape (K, 3)."""
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -239,7 +242,7 @@ def _axes(path: Waypoints, parameter: Array) -> Array:
 
 
 def _interpolate(t: Array, values: Array, times: Array) -> Array:
-    """Interpolate samples linearly in time; quaternions are normalised. Shape (K, n)."""
+    """Return base configurations at times, interpolated linearly between samples, quaternions normalised. (K, n)."""
     interpolated = np.column_stack([np.interp(times, t, column) for column in values.T])
     if values.shape[1] == 7:
         interpolated[:, 3:] /= np.linalg.norm(interpolated[:, 3:], axis=1)[:, None]
@@ -247,9 +250,9 @@ def _interpolate(t: Array, values: Array, times: Array) -> Array:
 
 
 def _distances(points: Array, corners: Array) -> tuple[Array, Array]:
-    """Return the distances of points (K, 3) from the polyline through corners (M, 3), and the nearest positions.
+    """Return distances of points (K, 3) from the polyline through corners (M, 3), and the closest places on it.
 
-    The latter are numbers of the preceding corners plus fractions. Shape (K,) each.
+    The closest point is given by the number of the corner before it plus the fraction of the edge. Shape (K,) each.
     """
     if len(corners) == 1:
         return np.asarray(np.linalg.norm(points - corners[0], axis=1)), np.zeros(len(points))

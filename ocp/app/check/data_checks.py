@@ -1,4 +1,4 @@
-"""Check the data of a trajectory before any limit, and return the motion without the faulty data.
+"""Check the data of a trajectory file before its limits are checked, and return the motion without faulty data.
 
 The checks find unknown and missing joints, values that are not numbers, times that do not increase, units other than
 radians, metres and seconds, jumps, wrapped turns, and mimic joints that do not follow. Each is a fault with name and
@@ -69,21 +69,21 @@ FACTORS = {
     1e-3: "per millisecond",
     -1.0: "of the opposite sign",
 }
-"""Ratios of the velocities in a file to those of its positions, and their likely unit; by 1000: times in ms."""
+"""Ratios of the velocities in a file to the derivatives of its positions, and the unit that each suggests, if any."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of a trajectory.
+    """A fault of a trajectory, such as a violated limit or a jump: what is wrong, where, and by how much.
 
     Attributes:
         kind: "jump", "velocity", "clearance", "suspicion", ...
         name: Joint, pair of bodies, or waypoint; "" if it concerns the whole trajectory.
-        text: Description.
+        text: Description of the fault.
         time: Time of the worst violation, s; None if it holds throughout.
         first: Time of the first violation, s.
-        value, limit: Worst value and what is allowed.
-        unit: Unit of both.
+        value, limit: Worst value and allowed value.
+        unit: Unit of both values.
         line: Line in the file, if the fault is in one line.
     """
 
@@ -109,7 +109,7 @@ class CleanedTrajectory:
     Attributes:
         joints: Indices of its joints in the robot's joint vector. Shape (k,).
         motion: Motion of these joints.
-        faults, notes: Faults, and what was ignored or interpreted.
+        faults, notes: Faults of the data, and remarks on data that were ignored or interpreted.
         base: Configuration of a floating base over time, or None. Shape (M, 3) or (M, 7).
         efforts: Efforts of these joints, or None. Shape (M, k).
         samples: Number of samples in the file.
@@ -126,7 +126,7 @@ class CleanedTrajectory:
 
 PLANAR_BASE = ("base.x", "base.y", "base.angle")
 BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.qz"), PLANAR_BASE)
-"""Columns of the configuration of a floating base."""
+"""Names of the columns of a file that contain the configuration of a floating base, spatial or planar."""
 
 
 def clean_trajectory(
@@ -185,7 +185,7 @@ def clean_trajectory(
 def _columns(
     raw: RawTrajectory, robot: Robot, base: Sequence[str], faults: list[Fault], notes: list[str]
 ) -> tuple[list[int], Indices]:
-    """Match the columns of a file to joints; return the used columns and the indices of their joints."""
+    """Match the columns of a file to the robot's joints; return the indices of the used columns and of their joints."""
     names = robot.joint_names
     joints = [k for k, name in enumerate(names) if name in raw.names]
     missing = [name for name in names if name not in raw.names]
@@ -251,7 +251,7 @@ def _finite(raw: RawTrajectory, used: list[int], joints: Indices, faults: list[F
 
 
 def _count(invalid: Any, raw: RawTrajectory, k: int) -> str:
-    """Describe how many values are invalid and where the first one is."""
+    """Return a text that says how many values are not numbers and where the first of them, sample k, is."""
     count = int(invalid.sum())
     text = f"{count} values are not numbers, the first" if count > 1 else "a value is not a number,"
     return f"{text} at {raw.t[k]:.6g} s (line {raw.lines[k]})"
@@ -273,10 +273,10 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return a plausible time unit below 1 s ("" if there is none), and the largest ratio of velocity to its limit.
+    """Guess from the joint speeds whether times are in a unit below 1 s; return the unit ("" if not) and the speed.
 
-    The share is that of the fastest joint if the times are in seconds. Plausible are samples at 10 kHz or less, and a
-    fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
+    The speed is that of the fastest joint, relative to its limit, if the times are in seconds. Plausible are samples at
+    10 kHz or less, and a fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
     """
     h, usual = np.diff(t), np.where(np.isfinite(velocity), velocity, 1.0)
     used = float((np.abs(np.diff(q, axis=0)) / h[:, None] / usual).max())
@@ -304,7 +304,7 @@ def _in_units(
     limits: tuple[Array, Array, Array],
     faults: list[Fault],
 ) -> tuple[Array, Array | None, Array | None]:
-    """Return positions, velocities and accelerations in rad and m; convert likely degrees and millimetres."""
+    """Return positions, velocities and accelerations in rad and m, converted if they seem to be in degrees or mm."""
     lower, upper, _ = limits
     bound, scale = np.maximum(np.abs(lower), np.abs(upper)), np.ones(len(names))
     margin = 0.05 * np.where(np.isfinite(bound), upper - lower, 1.0)
@@ -334,7 +334,7 @@ def _in_units(
 def _worst_in_degrees(
     t: Array, q: Array, turning: Sequence[int], limits: tuple[Array, Array, Array], margin: Array
 ) -> int | None:
-    """Return the joint that exceeds its limit most in rad if all joints are plausible in degrees; else None.
+    """Return the joint with the largest position if the positions are plausible in degrees but not in rad; else None.
 
     At least half of the moving joints must be impossible in rad. If no joint has position limits, their velocities are
     compared with the velocity limits instead.
@@ -360,7 +360,7 @@ def _worst_in_degrees(
 def _unwrap(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], limits: tuple[Array, ...], notes: list[str]
 ) -> tuple[Array, list[Fault]]:
-    """Remove jumps by full turns from the positions; return them, with a fault for each limited joint that jumped.
+    """Return positions without jumps by full turns, and a fault for each joint with limits that had such a jump.
 
     For a joint with limits, a jump is nearly a whole turn in a step that the joint is too slow for, or that no arm
     makes. It is removed if the limits allow, if necessary after a shift by whole turns.

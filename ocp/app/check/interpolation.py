@@ -45,7 +45,7 @@ class PiecewisePolynomial:
     coefficients: Array
 
     def derivative(self) -> PiecewisePolynomial:
-        """Return the time derivative."""
+        """Return the time derivative of the piecewise polynomials."""
         degree = self.coefficients.shape[1] - 1
         width = np.diff(self.t)[:, None, None]
         return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
@@ -72,7 +72,7 @@ class PiecewisePolynomial:
 
 
 def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
-    """Return maxima of polynomials with Bernstein coefficients (K, d + 1), and their arguments in 0..1. Shape (K,)."""
+    """Return the maxima on [0, 1] of polynomials in Bernstein form (K, d + 1), and their arguments. Shape (K,) each."""
     first, last = coefficients[:, 0], coefficients[:, -1]
     best, argument = np.maximum(first, last), np.where(last > first, 1.0, 0.0)
     tolerance = 1e-10 * np.abs(coefficients).max(axis=1, initial=0.0)  # far below the accuracy of any limit
@@ -96,7 +96,7 @@ def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
 
 
 def _halves(coefficients: Array) -> tuple[Array, Array]:
-    """Return the Bernstein coefficients of both halves (de Casteljau's algorithm). Shape (K, d + 1) each."""
+    """Return the Bernstein coefficients on both halves of [0, 1] (de Casteljau's algorithm). Shape (K, d + 1) each."""
     left, right, row = [coefficients[:, 0]], [coefficients[:, -1]], coefficients
     for _ in range(coefficients.shape[1] - 1):
         row = (row[:, 1:] + row[:, :-1]) / 2
@@ -111,7 +111,8 @@ class MotionQuantity(NamedTuple):
     Attributes:
         pieces: The quantity as polynomials, or the constants between two times that divided differences give.
         blur: Largest error of the quantity due to the digits of the file. Shape (N, n).
-        closed: Whether it is that of the interpolant, at every time; else it holds for any motion through the samples.
+        closed: Whether the quantity is that of the interpolant, at every time; otherwise any motion through the samples
+            has it at some time.
         needed: Largest value, and largest value of the negative, that every motion through the samples needs in each
             interval; infinite if the interpolant itself counts. Shape (N, n) each, or ().
     """
@@ -124,10 +125,10 @@ class MotionQuantity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Joint samples with their interpolation.
+    """Samples of a joint motion and the rule of interpolation between them.
 
     Attributes:
-        t: Increasing, at least two. Shape (M,), s.
+        t: Sample times, increasing, at least two. Shape (M,), s.
         q, v, a: Positions, velocities or None, accelerations or None. Shape (M, n).
         stated: Whether the controller is known to interpolate by this rule, so that the interpolant itself counts.
     """
@@ -161,7 +162,7 @@ class Motion:
 
     @cached_property
     def position(self) -> PiecewisePolynomial:
-        """Positions as polynomials."""
+        """Positions between the samples as piecewise polynomials of time."""
         h = np.diff(self.t)[:, None]
         q, v, a = self.q, self.v, self.a
         if v is None:
@@ -179,12 +180,12 @@ class Motion:
 
     @cached_property
     def velocity(self) -> PiecewisePolynomial:
-        """Velocities as polynomials; piecewise constant if the file has only positions."""
+        """Velocities as piecewise polynomials of time; piecewise constant if the file has only positions."""
         return self.position.derivative()
 
     @cached_property
     def acceleration(self) -> PiecewisePolynomial | None:
-        """Accelerations as polynomials; None for linear interpolation."""
+        """Accelerations as piecewise polynomials of time; None for linear interpolation."""
         return None if self.v is None else self.velocity.derivative()
 
     @cached_property
@@ -194,7 +195,7 @@ class Motion:
         return tuple(none if values is None else half_digits(values) for values in (self.q, self.v, self.a))  # type: ignore[return-value]
 
     def quantity(self, name: str) -> MotionQuantity | None:
-        """Return the "position", "velocity", "acceleration" or "jerk"; None if there are too few samples."""
+        """Return the "position", "velocity", "acceleration" or "jerk" along the motion; None if samples are too few."""
         h = np.diff(self.t)[:, None]
         eq, ev, ea = self.digits
         smooth = {"linear": 0, "cubic": 1, "quintic": 2}[self.rule]
@@ -217,7 +218,7 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return the magnitude that every motion through the samples must reach in each interval.
+        """Return the least peaks of a quantity and its negative that a motion through the samples has in each interval.
 
         Acceleration: a motion between given positions and velocities needs the least if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
@@ -253,7 +254,7 @@ class Motion:
         return peak(1.0), peak(-1.0)
 
     def _differences(self, values: Array, digits: Array, order: int) -> MotionQuantity | None:
-        """Estimate a time derivative by divided differences over as many samples as the rounding errors require."""
+        """Return a time derivative of sampled values by divided differences; None if the samples are too few."""
         if len(self.t) <= order:
             return None
         table, blur = values, np.broadcast_to(digits, values.shape)

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
-"""Checked quantities of a joint, and the ends of their units."""
+"""Checked quantities of a joint, and what their units append to rad or m."""
 
 
 class RowVerdict(StrEnum):
@@ -65,22 +65,22 @@ class RowVerdict(StrEnum):
 
     @classmethod
     def of(cls, failed: Any) -> RowVerdict:
-        """Return the verdict on a value with a limit."""
+        """Return the verdict FAILED or OK on a value that has a limit."""
         return cls.FAILED if failed else cls.OK
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table of a check.
+    """One line of the table of a check: a quantity with its worst value, its limit and the verdict.
 
     Attributes:
         name: Quantity, and joint or bodies.
         value: Worst value, in `unit`.
         limit: Limit, in `unit`; None if there is none.
-        unit: Unit of both.
+        unit: Unit of value and limit.
         time: Time of the worst value, s.
-        verdict: Verdict.
-        note: Method, if it is not obvious.
+        verdict: Verdict on the value.
+        note: Method of the check, if it is not obvious.
     """
 
     name: str
@@ -160,13 +160,15 @@ def audit_rows(audit: Audit) -> list[Row]:
 
 
 class _Side(NamedTuple):
-    """Largest values of a quantity towards its upper or lower limit in every interval, both multiplied by `sign`.
+    """Largest values of a joint's quantity towards its upper or lower limit, one for each interval between samples.
+
+    Values and limit are multiplied by `sign`.
 
     Attributes:
         sign: 1 for the upper limit, -1 for the lower.
         limit: The limit.
-        values: Maxima, at most what every motion through the samples needs. Shape (N,).
-        time: Time of the largest one, s.
+        values: Maxima, at most the values that every motion through the samples needs. Shape (N,).
+        time: Time of the largest value, s.
         eased: Whether the interpolant violates the limit although not every motion through the samples needs to.
     """
 
@@ -243,7 +245,7 @@ def _check_limits(
 def effort_rows(
     cleaned: CleanedTrajectory, robot: Robot, bounds: JointBounds, share: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Check the torques in the file against the torque limits, at the samples."""
+    """Check torques that the file gives at the samples against the torque limits; return table rows and faults."""
     rows: list[Row] = []
     faults: list[Fault] = []
     if cleaned.efforts is None:
@@ -266,7 +268,7 @@ def effort_rows(
 def torque_rows(
     motion: Motion, machine: FixedBase | FreeFloating | Standing, bounds: JointBounds, share: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Return table rows and faults for the torques by inverse dynamics, evaluated five times in every interval.
+    """Return the table rows and the faults of joint torques from inverse dynamics, at five times of every interval.
 
     With linear interpolation they are evaluated at the samples, with velocities and accelerations by differences. A
     floating base moves as the joints drive it, from rest, without gravity.
@@ -313,7 +315,7 @@ def torque_rows(
 
 
 def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.SX:
-    """Return the joint torques on a floating base, which moves so that momentum is conserved. Shape (n, 1)."""
+    """Return the joint torques of a robot whose floating base moves so that momentum is conserved. Shape (n, 1)."""
     base = ca.SX.sym("base", machine.base_size)
     rows = ca.SX(ca.DM.eye(6)[:, machine.twist_rows])
     twist = ca.mtimes(rows, machine.base_twist(base, q, v))
@@ -327,7 +329,7 @@ def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.
 
 
 def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
-    """Return times, positions, velocities and accelerations at which torques are evaluated. Shape (K,), (K, n) each."""
+    """Return times, positions, velocities and accelerations at which to evaluate torques. Shape (K,), (K, n) each."""
     t, h = motion.t, np.diff(motion.t)
     if motion.acceleration is None:
         if len(t) < 3:
@@ -345,7 +347,7 @@ def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
 
 
 def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[list[Row], list[Fault]]:
-    """Return table rows and faults for the zero moment point, the vertical force and the friction."""
+    """Return table rows and faults of a standing machine: vertical ground force, zero moment point, friction."""
     n = machine.joint_size
     q, v, a = (ca.SX.sym(name, n) for name in ("q", "v", "a"))
     reaction = machine.ground_reaction(q, v, a)
@@ -387,7 +389,7 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
 def floating_base_rows(
     machine: FreeFloating, motion: Motion, base: Array | None
 ) -> tuple[Array, list[Row], list[Fault]]:
-    """Return the base configurations at the samples, shape (M, base_size), with table rows and faults.
+    """Return the configurations of a floating base at the samples, shape (M, base_size), with table rows and faults.
 
     If the file gives the base, its momentum is checked; otherwise it moves so that momentum is conserved.
     """
@@ -441,7 +443,7 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
 def momentum_rows(machine: FreeFloating, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
     """Return table rows and faults for the total momentum, which must be constant under the given base motion.
 
-    The velocity of the base is that of central differences.
+    The velocity of the base is computed by central differences.
     """
     if len(motion.t) < 3:
         return [], []

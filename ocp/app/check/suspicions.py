@@ -1,4 +1,4 @@
-"""Detect files whose times or column names probably mean something other than they say.
+"""Detect trajectory files in which the unit of the times or the names of the columns are probably wrong.
 
 A suspicion is not a fault: the motion may be correct as it is. But if the suspicion is true, the robot would execute a
 motion that was not checked. The verdict is therefore undetermined until the unit of the times or the order of the
@@ -22,7 +22,7 @@ __all__ = ["doubtful_times", "exchanged_joints"]
 
 
 def doubtful_times(motion: Motion, velocity: Array) -> list[Fault]:
-    """Return a suspicion if the times look like a unit smaller than seconds, or like sample numbers.
+    """Return a suspicion if times given as seconds look like a smaller unit or like sample numbers; else an empty list.
 
     A smaller unit: the samples are a second or more apart, no joint is faster than 0.5 % of its velocity limit, and the
     motion is plausible in that unit. Sample numbers: 50 or more, spaced by one, and no joint is faster than 10 %.
@@ -42,7 +42,7 @@ def doubtful_times(motion: Motion, velocity: Array) -> list[Fault]:
 
 
 def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool = True) -> list[Fault]:
-    """Return a suspicion if exchanging two joints makes the motion far simpler.
+    """Return a suspicion if the columns of two joints seem exchanged: swapped, they give a far simpler motion.
 
     Either one joint is outside its limits most of the time, and all are inside after the exchange. Or the tip moves
     straight or at constant speed only after the exchange. The latter requires three joints that do not move in

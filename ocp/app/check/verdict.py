@@ -58,14 +58,14 @@ class Check:
         file, robot: Names of the file and of the robot.
         joints: Joints of the motion.
         samples: Number of samples in the file.
-        duration: s.
+        duration: Duration of the motion, s.
         rule: Interpolation: "linear", "cubic" or "quintic".
         rows: All checked quantities.
         faults: Violations.
         suspicions: Other likely meanings of the file; the verdict is undetermined until they are excluded.
         unlimited: Quantities without a limit.
         unchecked: Quantities that were not checked, and why.
-        notes: What was ignored or interpreted.
+        notes: Remarks on data that were ignored or interpreted.
         cleaned: The motion that was checked.
     """
 
@@ -90,7 +90,7 @@ class Check:
 
     @property
     def sentence(self) -> str:
-        """The verdict in one sentence."""
+        """Verdict on the trajectory in one sentence."""
         names = [row.name for row in self.rows if row.verdict is RowVerdict.UNDECIDED]
         but = f"; undetermined: {', '.join(names[:3])}{' ...' if len(names) > 3 else ''}" if names else ""
         unchecked = f"; not checked: {'; '.join(self.unchecked)}" if self.unchecked else ""
@@ -144,7 +144,7 @@ FAULT_ORDER = {
     kind: place
     for place, kind in enumerate(("unknown joint", "missing joint", "times", "not a number", "units", "jump"))
 }
-"""Kinds of faults that explain others, in the order of reporting."""
+"""Ranks of the kinds of faults that are reported first, because they explain other faults."""
 
 
 @dataclass(frozen=True)
@@ -179,14 +179,14 @@ class Interpretation:
 
     @property
     def seconds(self) -> float:
-        """Time unit, s."""
+        """Unit of the times in the file, s."""
         unit = self.time_unit
         return UNITS[unit] if isinstance(unit, str) else 1.0 if unit is None else float(unit)
 
 
 @dataclass(frozen=True)
 class CheckTolerances:
-    """Tolerances of a check.
+    """Tolerances of the check of a trajectory.
 
     Attributes:
         share: Tolerance relative to a limit.
@@ -223,7 +223,7 @@ def check_trajectory(
     tolerances: CheckTolerances = CheckTolerances(),
     progress: Callable[[str], None] = lambda name: None,
 ) -> Check:
-    """Check a joint trajectory of a machine.
+    """Check a joint trajectory of a machine against limits, for collisions, and against the required path of the tip.
 
     Between samples the motion is interpolated as controllers do, see `check.interpolation`. Positions, velocities,
     accelerations and jerks are bounded there at all times, and clearance is proven. Torques, the zero moment point and
@@ -234,14 +234,14 @@ def check_trajectory(
 
     Args:
         machine: The machine, or a robot whose base is fixed at the world's origin.
-        trajectory: As read by `read_trajectory`.
+        trajectory: Trajectory as read by `read_trajectory`.
         limits: Limits that replace those of the robot, and the friction of the ground; None: those of the robot. Power
             is not checked.
         scene: Obstacles and clearance, as in `ocp.plan`. None: the machine's own links; False: no distance is checked.
         path: Waypoints that the tip must follow on straight lines.
         interpretation: How the numbers of the file are interpreted.
         tolerances: Tolerances of limits and of the path.
-        progress: Is called with the name of each stage.
+        progress: Function that is called with the name of each stage.
 
     Raises:
         ProblemError, ModelError: An argument does not fit the machine, or no sample is valid.
@@ -349,7 +349,7 @@ def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
 
 
 def _unlimited_quantities(rows: Sequence[Row]) -> tuple[str, ...]:
-    """Name the quantities that have no limit, with the joints of one kind in one entry."""
+    """Return the names of the quantities that have no limit; those of several joints are one entry."""
     joints: dict[str, list[str]] = {}
     counts: dict[str, int] = {}
     for row in rows:
@@ -369,7 +369,7 @@ class PlanVerdict:
 
     Attributes:
         audit: Audit of the plan against its problem.
-        check: Check of its samples against the machine's limits of joints, velocities and torques.
+        check: Check of the plan's samples against the machine's limits of joints, velocities and torques.
     """
 
     audit: Audit
@@ -382,7 +382,7 @@ class PlanVerdict:
 
     @property
     def sentence(self) -> str:
-        """The verdict in one sentence."""
+        """Verdict on the plan in one sentence."""
         if not self.audit.feasible or self.check.passed:
             return self.audit.sentence
         first, count = self.check.faults[0], len(self.check.faults)
@@ -391,11 +391,11 @@ class PlanVerdict:
 
 
 def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> PlanVerdict:
-    """Return the verdict on a plan.
+    """Return the verdict on a plan: its audit, and the check of its samples against the limits of its machine.
 
     Args:
         plan: The plan.
-        sample: Its samples at the times at which the limits of the machine are checked.
+        sample: Samples of the plan at the times at which the limits of the machine are checked.
         name: Name of the plan.
         settings: Settings of the audit.
     """
@@ -403,7 +403,7 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
 
 
 def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
-    """Check a plan segment by segment, because no acceleration is defined where its rates jump."""
+    """Check the samples of a plan segment by segment, because accelerations are undefined where rates jump."""
     if isinstance(plan, ConsecutivePlans):
         return _worst([_check_segment(piece, sample.t, name) for piece in plan.pieces])
     if isinstance(plan, PathPlan):  # constant rates between waypoints
@@ -416,7 +416,7 @@ def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
 
 
 def _check_segment(piece: Piece, times: Array, name: str) -> Check:
-    """Check one segment of a motion at its ends and at those of the given times that lie inside it."""
+    """Check the samples of one segment of a plan: its ends, and those of the given times that lie between them."""
     plan, local = piece.plan, times - piece.begin
     inside = local[(local > 0) & (local < plan.horizon)]
     sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))
@@ -427,7 +427,10 @@ def _check_segment(piece: Piece, times: Array, name: str) -> Check:
 def _check_samples(
     machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
 ) -> Check:
-    """Check joints, and rates and accelerations if not None, at sample times. Shapes (M,) and (M, n)."""
+    """Check sampled joint positions, and rates and accelerations if not None, against the limits of a robot.
+
+    `values` has the times (M,), positions, rates and accelerations (M, n).
+    """
     raw = RawTrajectory(tuple(robot.joint_names), *values, None, np.arange(1, len(values[0]) + 1), True, (), name)
     if not isinstance(machine, FreeFloating):  # the forces on a standing machine are those of its problem
         frame = machine.world_from_base(())
@@ -452,6 +455,6 @@ def _worst(checks: Sequence[Check]) -> Check:
 
 
 def _severity(row: Row) -> tuple[bool, bool, float]:
-    """Return the sorting key by which rows of one quantity are compared."""
+    """Return the key by which table rows of one quantity are sorted: failed, undetermined, value over limit."""
     size = abs(row.limit) if row.limit else 1.0
     return row.verdict is RowVerdict.FAILED, row.verdict is RowVerdict.UNDECIDED, abs(row.value) / size

@@ -44,7 +44,7 @@ __all__ = ["read_gcode"]
 
 UNITS = {"mm": 1e-3, "inch": 0.0254}
 DEFAULT_GAPS_M = {"mm": 2 * np.sqrt(2) * 1e-5, "inch": 2 * np.sqrt(2) * 2.54e-5}
-"""Difference of an arc's ends in their distance from the centre if numbers are rounded to 0.01 mm or 0.001 inch."""
+"""Difference of an arc's two end radii that is due to numbers rounded to 0.01 mm or 0.001 inch, by unit, m."""
 AXES, OFFSETS, OTHER_AXES = "XYZ", "IJK", "ABCUVW"
 
 
@@ -59,7 +59,7 @@ def read_gcode(
     gap: float | None = None,
     block_delete: bool = False,
 ) -> Program:
-    """Read a G-code program.
+    """Read a G-code file and return its cuts, rapid moves and pauses.
 
     A path extends from one rapid, dwell or stop to the next. It also ends where its direction reverses, and after every
     move in exact path mode (G61). Moves of zero length are dropped. The centre of an arc is corrected for rounding, so
@@ -69,11 +69,11 @@ def read_gcode(
         file: Name of the file.
         unit: "mm" or "inch", valid until the first G20 or G21. None: mm, with a warning if the file gives no unit
             either.
-        feed: m/s, valid until the first F. None: a move without feed is an error.
+        feed: Feed, m/s, valid until the first F. None: a move without feed is an error.
         start: Initial position in the coordinates of the program. Shape (3,), m.
         home: Position of G28, G30 and G53 with zeros, in the coordinates of the program. Shape (3,), m. None: these are
             ignored if nothing has moved before or nothing moves afterwards, and an error otherwise.
-        reversal: "split", or the width (m) of the bulb in which the path turns round: see models.paths.chains.
+        reversal: "split", or the width (m) of the bulb in which the path turns round: see models.paths.path.
         gap: Largest difference (m) of an arc's ends in their distance from the centre that counts as rounding. None:
             0.028 mm or 0.0028 inch, by the unit. A thousandth of the radius also counts as rounding.
         block_delete: Whether lines that begin with `/` are skipped.
@@ -138,7 +138,7 @@ class _Reader:
         self.block = Block(0, "", (), {}, False)
 
     def read(self, lines: Sequence[str]) -> Program:
-        """Return the program of all lines."""
+        """Read the lines of a file and return the program."""
         for block in read_blocks(self.file, lines):
             self.block = block
             if block.skipped:
@@ -245,7 +245,7 @@ class _Reader:
             self._note("G64: P is the tolerance of rounding" if tolerance else "G64: the caller's tolerance applies")
 
     def _set_system(self, code: int) -> None:
-        """Accept a coordinate system, but only one per program."""
+        """Set the work coordinate system; raise ProblemError if the program has already used another one."""
         if self.system is None and not self.moved and not self.moves:
             self.system = code
         if code != (540 if self.system is None else self.system):
@@ -263,7 +263,7 @@ class _Reader:
             self.feed = value * UNITS[self.unit] / 60
 
     def _dwell(self, words: dict[str, float]) -> None:
-        """Add a pause of P seconds."""
+        """Add the pause of a G4, which lasts P seconds."""
         if "P" not in words:
             self._refuse("G4 needs P, the time in s")
         duration = words.pop("P")
@@ -429,7 +429,7 @@ class _Reader:
         return is_end
 
     def _end_path(self) -> None:
-        """Turn the collected moves into cuts."""
+        """Convert the moves collected since the last stop into cuts, and start a new path."""
         if not self.moves:
             return
         self.moved = True

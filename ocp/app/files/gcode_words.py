@@ -47,7 +47,7 @@ __all__ = [
 PLANES = {170: (0, 1, 2), 180: (2, 0, 1), 190: (1, 2, 0)}
 """First axis, second axis and normal of G17, G18, G19: right-handed, so that G3 turns about the normal."""
 RADIUS_SHARE = 1e-3
-"""Relative to the radius: difference of the distances from the centre that is accepted for numbers of few digits."""
+"""Difference of an arc's two end radii, relative to the radius, that is accepted for numbers of few digits."""
 
 
 class ArcError(Exception):
@@ -90,11 +90,11 @@ def arcs_about_center(
     Two are needed if a circle nearly closes but ends nearer to the centre than it starts.
 
     Args:
-        start, end: Shape (3,), m.
-        center: In the plane. Shape (2,), m.
+        start, end: End points of the arc. Shape (3,), m.
+        center: Centre in the plane. Shape (2,), m.
         clockwise: Whether the arc turns clockwise about the normal.
         turns: Number of begun turns: 1 for an arc up to a full circle.
-        plane: First axis, second axis, normal.
+        plane: Indices of the first axis, the second axis and the normal.
         gap: Largest difference of the distances from the centre that counts as rounding, m.
 
     Raises:
@@ -155,14 +155,14 @@ def _arc_of_sweep(
 
 
 def _sweep(first: Array, last: Array, clockwise: bool) -> float:
-    """Return the angle from one vector to another, in (0, 2 pi]."""
+    """Return the angle from one vector to another in the given sense of rotation, in (0, 2 pi]."""
     angle = float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last))
     angle = (-angle if clockwise else angle) % FULL_TURN
     return angle if angle > 1e-6 else FULL_TURN  # a smaller angle means a full circle
 
 
 MOTIONS = (0, 10, 20, 30)
-"""G0, G1, G2, G3."""
+"""Codes of the motions G0, G1, G2 and G3, in tenths."""
 
 GROUPS: dict[int, str] = {
     **dict.fromkeys((*MOTIONS, 330, 331, 382, 383, 384, 385, 730, 760, *range(810, 900, 10), 50, 51, 52, 53), "motion"),
@@ -175,7 +175,7 @@ GROUPS: dict[int, str] = {
     **dict.fromkeys((*range(540, 600, 10), 591, 592, 593), "coordinate system"),
     **dict.fromkeys((400, 410, 411, 420, 421), "cutter compensation"),
 }
-"""Modal groups of G codes (in tenths), of which a line may have one each."""
+"""Modal group of each G code (in tenths); a line may have one code of each group."""
 
 REPOST = "post the program without it"
 UNSUPPORTED_CODES: dict[int, str] = {
@@ -225,7 +225,7 @@ NOT_RUN = "O-words (subroutines, loops, conditions) are not supported; post the 
 
 
 class Block(NamedTuple):
-    """Words (letters with numbers) of one line.
+    """Words (letters with numbers) of one line of G-code.
 
     Attributes:
         number: Line number in the file, from 1.
@@ -243,7 +243,7 @@ class Block(NamedTuple):
 
 
 def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
-    """Yield the blocks that contain words, up to the second `%`.
+    """Yield a Block for each line that contains words, up to the second `%`.
 
     Raises:
         ProblemError: With the line: an invalid word, an unclosed comment, an expression, or a repeated letter.
@@ -322,6 +322,6 @@ def _refuse(file: FileName, number: int, text: str, line: str) -> None:
 
 
 def code_name(tenths: int) -> str:
-    """Return a G code as it is written."""
+    """Return a G code, given in tenths, as it is written: "G90.1" for 901."""
     whole, rest = divmod(tenths, 10)
     return f"G{whole}.{rest}" if rest else f"G{whole}"

@@ -26,7 +26,7 @@ __all__ = ["log_rerun", "read_joint_messages", "write_mcap"]
 
 
 def _with_parts(fields: str, **parts: str) -> str:
-    """Return the definition of a message type with its header, its fields, and the types they use."""
+    """Return the ROS 2 definition of a message type: its header, its fields, and the types that the fields use."""
     parts["std_msgs/Header"] = "builtin_interfaces/Time stamp\nstring frame_id\n"
     parts |= {f"builtin_interfaces/{name}": "int32 sec\nuint32 nanosec\n" for name in ("Time", "Duration")}
     bar = "=" * 80
@@ -59,7 +59,7 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
 
     Args:
         plan: The plan.
-        file: Replaced only when the log is complete.
+        file: Name of the log file, which is replaced only when the log is complete.
         period: Sampling period, s.
         frame: Name of the world frame in the messages.
 
@@ -109,7 +109,7 @@ def _header(stamp: int, frame: str) -> dict[str, Any]:
 
 
 def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) -> tuple[str, list[tuple[int, Any]]]:
-    """Return a topic with the time stamps (ns) and fields of its joint states or joint trajectories.
+    """Read joint states or joint trajectories from a log; return their topic, and time stamp (ns) and fields of each.
 
     A stamp is that of the message's header, or the log time if that is zero.
 
@@ -189,7 +189,7 @@ def _records(stream: IO[bytes]) -> Iterator[Any]:
 
 
 def _decompress(chunk: Any) -> bytes:
-    """Return the decompressed contents of a chunk, limited to its declared size."""
+    """Return the decompressed contents of an MCAP chunk; raise ValueError if they differ from its declared size."""
     data, size = chunk.data, chunk.uncompressed_size
     if chunk.compression == "zstd":
         zstd = import_module("zstandard").ZstdDecompressor(max_window_size=INPUT_LIMITS.log_record_bytes)
@@ -202,7 +202,7 @@ def _decompress(chunk: Any) -> bytes:
 
 
 def _fields(message: Any) -> Any:
-    """Convert a message, or a list of messages, to dictionaries."""
+    """Convert a decoded ROS 2 message, or a list of messages, to dictionaries."""
     if isinstance(message, list):
         return [_fields(each) for each in message] if message and hasattr(message[0], "__slots__") else message
     if not hasattr(message, "__slots__"):
@@ -215,7 +215,7 @@ REQUIRED_NAMES = ("LineStrips3D", "Points3D", "Scalars", "TimeColumn", "log", "s
 
 
 def log_rerun(plan: Plan, rerun: Any, period: float = 0.01, *, entity: str = "plan", timeline: str = "time") -> None:
-    """Log joint positions, velocities and accelerations as scalars, and the tip as a point on its path.
+    """Log a plan to Rerun: joint positions, velocities and accelerations as scalars, the tip as a point on its path.
 
     The entities are `ENTITY/position/JOINT`, `ENTITY/velocity/JOINT`, `ENTITY/acceleration/JOINT`, `ENTITY/tip` and
     `ENTITY/tip_path`, in rad or m, per s and s^2, and in m in world. The caller starts the recording: `import rerun;

@@ -1,4 +1,4 @@
-"""A program of cuts, rapids and pauses as read from a file, and its trajectory."""
+"""A machine-tool program of cuts, rapid moves and pauses as read from a file, and its trajectory."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Cut:
 
     Attributes:
         path: Path of n segments.
-        feeds: Programmed line speed of each segment. Shape (n,), m/s.
+        feeds: Programmed speed along each segment. Shape (n,), m/s.
         tolerances: Deviation allowed for the rounded path in the mode of each segment, nan if the file gives none.
             Shape (n,), m.
         lines: Line number of each segment in the file. Shape (n,).
@@ -81,10 +81,10 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class Rapid:
-    """A straight move between two cuts.
+    """A straight rapid move, usually between two cuts.
 
     Attributes:
-        start, end: Shape (3,), m.
+        start, end: Start and end point. Shape (3,), m.
         line: Line number in the file.
     """
 
@@ -100,12 +100,12 @@ class Rapid:
 
 @dataclass(frozen=True)
 class Pause:
-    """A pause: the tool stands still for some time.
+    """A pause of a program, during which the tool stands still.
 
     Attributes:
-        duration: s; zero if the program waits for the operator.
+        duration: Duration, s; zero if the program waits for the operator.
         line: Line number in the file.
-        why: The code that causes it.
+        why: The code that causes the pause.
     """
 
     duration: float
@@ -142,12 +142,12 @@ class Program:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The paths of the cuts."""
+        """Paths of the cuts of the program."""
         return tuple(cut.path for cut in self.cuts)
 
     @property
     def feeds(self) -> tuple[Array, ...]:
-        """Programmed line speed of each segment of each path, m/s."""
+        """Programmed speed along each segment of each path, m/s."""
         return tuple(cut.feeds for cut in self.cuts)
 
     @property
@@ -230,7 +230,7 @@ class Program:
 
 
 def checked_reversal(owner: str, value: Any) -> Reversal:
-    """Return `value`; raise ProblemError unless it is "split" or a width, m."""
+    """Return the treatment of path reversals; raise ProblemError unless it is "split" or a bulb's width, m."""
     if isinstance(value, str):
         require.choice(f"{owner}: reversal", value, ("split",))
         return "split"
@@ -251,7 +251,7 @@ def _transform(points: Array, position: ArrayInput, orientation: ArrayInput) -> 
 
 
 def smooth_path(path: Path, deviation: ArrayInput, options: dict[str, Any]) -> SmoothPath:
-    """Round the corners of a path within a deviation by models.smooth; raise its errors as ProblemError."""
+    """Return a path with its corners rounded within a deviation; errors of models.smooth become ProblemError."""
     known = {"kind", "shape", "overlap"}
     if unknown := [name for name in options if name not in known]:
         message = f"smooth: unknown option {unknown[0]!r}; known: {', '.join(sorted(known))}"
@@ -266,12 +266,12 @@ class ProgramMotion(NamedTuple):
     """Motion of a program at M sample times.
 
     Attributes:
-        t: Time. Shape (M,), s.
+        t: Sample times. Shape (M,), s.
         section: Index of the section. Shape (M,).
         distance: Path length from the start of the section. Shape (M,), m.
-        position: Shape (M, 3), m.
-        tangent: Unit vector; zero in a pause. Shape (M, 3).
-        speed, acceleration, jerk: Along the path. Shape (M,), m/s, m/s^2, m/s^3.
+        position: Position of the tool. Shape (M, 3), m.
+        tangent: Unit tangent of the path; zero in a pause. Shape (M, 3).
+        speed, acceleration, jerk: Time derivatives of the distance. Shape (M,), m/s, m/s^2, m/s^3.
     """
 
     t: Array
@@ -286,7 +286,7 @@ class ProgramMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TimedProgram:
-    """Trajectory of all sections in sequence, each from rest to rest.
+    """Trajectory of a program: its sections in sequence, each from rest to rest.
 
     Attributes:
         program: The program.

@@ -42,7 +42,7 @@ __all__ = [
 FileName = str | PathLike[str]
 BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 QUOTED_CHARACTERS = 120
-"""A message quotes at most so much of a line."""
+"""Largest number of characters of a line that a message quotes."""
 
 
 def read_lines(
@@ -88,7 +88,7 @@ def read_lines(
 
 
 def line_error(file: Any, number: int, text: str, why: str, *, limit: Any = None) -> ProblemError:
-    """Return the error about a numbered line: its text, what is wrong, and what to do."""
+    """Return the ProblemError about a line of a file, with the line's number and text and the reason `why`."""
     quoted = text.strip()
     quoted = quoted if len(quoted) <= QUOTED_CHARACTERS else quoted[:QUOTED_CHARACTERS] + " ..."
     return ProblemError(f"{file}, line {number}, {quoted!r}: {why}", name=f"line {number}", value=quoted, limit=limit)
@@ -282,8 +282,8 @@ def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None 
     """Return the path to which an output is written, with links resolved.
 
     Args:
-        kind: Key of SUFFIXES.
-        file: Requested name.
+        kind: Kind of the output, a key of SUFFIXES.
+        file: Requested file name.
         folder: Folder in or below which the output must be; None: anywhere.
         force: Whether a file that selfmotion did not write may be overwritten.
 

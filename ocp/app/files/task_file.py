@@ -91,7 +91,7 @@ SHAPES = ("box", "sphere", "capsule", "cylinder", "halfspace", "mesh")
 
 
 def read_obstacles(file: FileName) -> tuple[Shape, ...]:
-    """Return the shapes in a file, in its order.
+    """Read a file of obstacles and return their shapes in the order of the file.
 
     Raises:
         ProblemError: The file is invalid; names the line and what was expected.
@@ -157,7 +157,7 @@ LIMIT_UNITS = {
     "torque": "N m or N",
     "power": "W",
 }
-"""Limits of joints, and their units."""
+"""Quantities that the limits of joints may bound, and their units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +166,8 @@ class Task:
 
     Attributes:
         machine: Robot on its base.
-        task: Task of its tip.
-        options: Keywords of `ocp.plan`.
+        task: Task of the robot's tip.
+        options: Keyword arguments of `ocp.plan`.
         outputs: Files to write, by kind of OUTPUTS, all in or below `output_folder`.
         period: Sampling period of the outputs, s.
         file, urdf: Names of the task file and of the robot's file.
@@ -240,7 +240,7 @@ def _located_errors(entries: TomlTable, name: str | None) -> Iterator[None]:
 
 
 def _machine(entries: TomlTable, urdf: Path) -> Machine:
-    """Read the robot and its base."""
+    """Read the table [robot] and return the robot on its base."""
     tip = entries.text("tip", "the name of the link that carries the tip")
     if not urdf.is_file():
         raise entries.error("urdf", f"there is no file {urdf}; name the robot's URDF, from the task file's folder")
@@ -272,7 +272,7 @@ def _machine(entries: TomlTable, urdf: Path) -> Machine:
 
 
 def _task(entries: TomlTable, folder: Path) -> TipTask:
-    """Read the task of the tip."""
+    """Read the table [path] and return the task of the tip."""
     path = _read_path(entries, folder)
     speed = _path_limit(entries, "speed", "m/s", REQUIRED)
     acceleration = _path_limit(entries, "acceleration", "m/s^2")
@@ -351,7 +351,7 @@ def _cost(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str,
 
 
 def _each(entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str) -> Any:
-    """Return one number for all joints, or one for each, with a default for unnamed joints; None without the entry."""
+    """Return an entry as one number for all joints or an array with a number for each joint; None if it is missing."""
     if name not in entries:
         return None
     if not isinstance(entries.raw(name), dict):

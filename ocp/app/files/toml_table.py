@@ -145,7 +145,7 @@ class TomlTable:
         return [(one, other) for one, other in self._read(name, [], expected, fits)]
 
     def raw(self, name: str, default: Any = None) -> Any:
-        """Return an entry of any type, unchecked."""
+        """Return the entry of this name, which may be of any type, without a check."""
         return self._read(name, default, "", lambda value: True)
 
     def table(self, name: str, expected: str = "a table", default: Any = None) -> TomlTable | None:
@@ -191,7 +191,7 @@ class TomlTable:
 
 
 REQUIRED = object()
-"""Default of entries that must be present."""
+"""Default value that marks an entry as required."""
 
 
 def read_toml(file: FileName) -> TomlTable:

@@ -57,7 +57,7 @@ class RawTrajectory:
             is missing, None if all are.
         lines: Line numbers in the file, or numbers of points or messages, from 1. Shape (M,).
         names_are_joints: Whether the format guarantees that every name is a joint.
-        notes: What was ignored or converted.
+        notes: Remarks on data that were ignored or converted.
         file: Name of the file.
     """
 
@@ -82,7 +82,7 @@ def read_trajectory(
     joints: Sequence[str] = (),
     kind: str | None = None,
 ) -> RawTrajectory:
-    """Read a trajectory from a file.
+    """Read a joint trajectory from a CSV, JSON, YAML or MCAP file.
 
     Args:
         file: .csv or any text, .json, .yaml (needs the package `pyyaml`), .mcap (needs `mcap-ros2-support`).
@@ -122,7 +122,7 @@ def read_trajectory(
 def _read_table(
     file: FileName, columns: Sequence[str] | None, period: float | None, joints: frozenset[str]
 ) -> RawTrajectory:
-    """Read a trajectory from a table."""
+    """Read a joint trajectory from a text table, such as a CSV."""
     numbers, texts = [], []
     for number, text in enumerate(read_lines(file), 1):
         line = text.partition("#")[0]
@@ -332,7 +332,7 @@ def _seconds(file: FileName, number: int, point: Mapping[str, Any]) -> float:
 
 
 def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) -> RawTrajectory:
-    """Return the trajectory of messages: joint states, one per message, or the first joint trajectory."""
+    """Return the trajectory that the messages of a topic give: one joint state each, or the first joint trajectory."""
     notes = []
     first = messages[0][1]
     if "points" in first:

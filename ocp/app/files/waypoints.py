@@ -59,15 +59,15 @@ SKIPPED = ("", "-", "index")
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """Waypoints of a tool.
+    """Waypoints of a tool: positions, and orientations, tool axes or times if the file gives them.
 
     Attributes:
-        positions: Shape (M, 3), m.
+        positions: Positions of the tool. Shape (M, 3), m.
         orientations: Tool orientations, unit quaternions [w, x, y, z], or None. If the file gives only axes, the z axis
             is the tool axis and the roll about it changes as little as possible from row to row, see `free_roll`. Shape
             (M, 4).
         axes: Unit vectors of the tool axis, or None if the file gives none. Shape (M, 3).
-        times: s, increasing, or None. Shape (M,).
+        times: Times, s, increasing, or None. Shape (M,).
         names: Names of the columns that were read.
         ignored: Names of the columns that were not read.
         lines: Line number of each waypoint in the file. Shape (M,).
@@ -94,7 +94,7 @@ class Waypoints:
         A waypoint at the position of the previous one is dropped.
 
         Args:
-            reversal: "split", or the width (m) of the bulb in which the path turns round, see models.paths.chains.
+            reversal: "split", or the width (m) of the bulb in which the path turns round, see models.paths.path.
 
         Raises:
             ProblemError: The tool turns in place, or by half a turn or more between two waypoints (names the line);
@@ -120,7 +120,7 @@ class Waypoints:
         return tuple(path for path, _ in split_at_reversals(lines, checked))
 
     def path(self, *, reversal: Reversal | None = None) -> Path:
-        """Return the only path of `paths`.
+        """Return the straight lines from waypoint to waypoint as one path.
 
         Args:
             reversal: Width (m) of the bulb in which the path turns round where its direction reverses. None: a reversal
@@ -316,7 +316,7 @@ def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[lis
 
 
 def _table(file: FileName, rows: list[tuple[int, str, list[str]]], used: Sequence[bool]) -> Array:
-    """Return the numbers of the used columns; unused columns are zero. Shape (M, columns)."""
+    """Return the rows of the table as numbers, which are zero in columns that are not used. Shape (M, columns)."""
     if not rows:
         raise ProblemError(f"{file}: the file has a header but no waypoint", name="file", value=str(file))
     width = len(used)
@@ -352,7 +352,7 @@ def _quaternions(file: FileName, values: Array, lines: NDArray[np.intp], texts: 
 
 
 def _axes(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
-    """Return unit vectors; raise ProblemError if one is zero."""
+    """Return tool axes as unit vectors; raise ProblemError if an axis is zero."""
     norm = np.linalg.norm(values, axis=1)
     if not (norm > 0).all():
         i = int((norm > 0).argmin())
@@ -367,7 +367,7 @@ def _from_vectors(vectors: Array) -> Array:
 
 
 def _align_signs(quaternions: Array) -> Array:
-    """Choose the sign of each quaternion that makes it nearer to its predecessor."""
+    """Return quaternions with the sign of each chosen to bring it nearest to its predecessor."""
     signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(quaternions * np.cumprod(np.concatenate([[1.0], signs]))[:, None])
 

@@ -1,1 +1,1 @@
-"""Pictures, reports, and pages that play motions."""
+"""Pictures, plots and HTML reports of motions, and HTML pages that play motions."""

@@ -46,9 +46,9 @@ class Curve:
     Attributes:
         group: Curves of one group share a diagram.
         name: Name of the quantity.
-        unit: "" if it has none.
-        values: At the motion's M times. Shape (M,).
-        lower, upper: Limits, infinite if there are none.
+        unit: Unit of the quantity; "" if it has none.
+        values: Values at the motion's M times. Shape (M,).
+        lower, upper: Limits of the quantity, infinite if there are none.
     """
 
     group: str
@@ -63,11 +63,11 @@ class MotionSamples(NamedTuple):
     """Samples of a motion at M times.
 
     Attributes:
-        t: s. Shape (M,).
-        joints, rates: Shape (M, n).
-        accelerations: Shape (M, n), or None if the motion is not smooth enough.
-        base: Shape (M, base_size).
-        base_rates: Shape (M, base_size), or None if they are unknown.
+        t: Times, s. Shape (M,).
+        joints, rates: Joint positions and velocities. Shape (M, n).
+        accelerations: Joint accelerations, shape (M, n), or None if the motion is not smooth enough.
+        base: Base configurations. Shape (M, base_size).
+        base_rates: Their time derivatives, shape (M, base_size), or None if they are unknown.
     """
 
     t: Array
@@ -85,7 +85,7 @@ class GroundContact:
     Attributes:
         corners: Corners of the contact area. Shape (k, 2), m.
         points: Zero moment points at the motion's M times. Shape (M, 2), m.
-        forces: Whether they include external forces.
+        forces: Whether the points take external forces into account.
     """
 
     corners: Array
@@ -111,7 +111,7 @@ def joint_curves(machine: Machine, bounds: JointBounds, samples: MotionSamples) 
 
 
 def _torques(machine: Machine, samples: MotionSamples) -> Array | None:
-    """Return torques by inverse dynamics, shape (M, n); None without accelerations or masses."""
+    """Return the joint torques of a motion by inverse dynamics, shape (M, n); None without accelerations or masses."""
     robot = machine.robot
     if samples.accelerations is None or robot.total_mass == 0:
         return None
@@ -127,7 +127,7 @@ def _torques(machine: Machine, samples: MotionSamples) -> Array | None:
 
 
 def machine_curves(machine: Machine, samples: MotionSamples) -> list[Curve]:
-    """Return curves of manipulability and tip speed, and of the momentum of a floating machine with base rates."""
+    """Return curves of manipulability, tip speed and, of a floating machine whose base velocity is known, momentum."""
     robot, curves = machine.robot, []
     base, joints, rates, base_rates = samples.base, samples.joints, samples.rates, samples.base_rates
     b, q, v = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
@@ -160,7 +160,7 @@ def machine_curves(machine: Machine, samples: MotionSamples) -> list[Curve]:
 def ground_contact(
     machine: Standing, samples: MotionSamples, inside: Sequence[Curve] = ()
 ) -> tuple[GroundContact, list[Curve]]:
-    """Return the zero moment points and a curve of their distance from the edge of the foot.
+    """Return the zero moment points of a standing machine and a curve of their distance from the edge of the foot.
 
     Args:
         machine: The machine.
@@ -200,13 +200,13 @@ ZMP_CONSTRAINT = "zero moment point"
 
 @dataclass(frozen=True)
 class PageSettings:
-    """Resolution of a page.
+    """Resolution and largest size of a page that plays motions.
 
     Attributes:
         per_second, least, most: Samples of a motion per second, and their smallest and largest number.
         poses: Largest number of samples with poses, between which the page interpolates.
         pair_samples: Number of times at which the closest bodies are computed, which is slower.
-        same_cost: Relative: of costs with a smaller final difference only one is shown.
+        same_cost: Relative difference of two final costs below which the curve of only one is shown.
         most_bytes: Largest size of a page.
     """
 
@@ -226,11 +226,11 @@ class ClosestPairs(NamedTuple):
     """The pair of bodies with the smallest clearance margin at each of K times.
 
     Attributes:
-        t: s. Shape (K,).
-        points: Closest points of their cores, in world. Shape (K, 2, 3), m.
-        distances: m. Shape (K,).
+        t: Times, s. Shape (K,).
+        points: Closest points of the cores of both bodies, in world. Shape (K, 2, 3), m.
+        distances: Distances of the bodies, m. Shape (K,).
         required: Required distances. Shape (K,), m.
-        bodies: Their names.
+        bodies: Names of the two bodies at each time.
     """
 
     t: Array
@@ -242,14 +242,14 @@ class ClosestPairs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """A sampled motion.
+    """A sampled motion with everything that is displayed of it.
 
     Attributes:
         name: Name of the motion.
         machine: The machine that moves.
-        t: s. Shape (M,).
-        joints: Shape (M, n).
-        base: Shape (M, base_size).
+        t: Times, s. Shape (M,).
+        joints: Joint positions. Shape (M, n).
+        base: Base configurations. Shape (M, base_size).
         curves: Quantities over time.
         targets: Targets of the tips.
         footing: Contact with the ground; None for a machine that does not stand.
@@ -312,7 +312,7 @@ def animate_solution(
 
     Args:
         solution: The solution.
-        machine: Its joints, and its base, are states of the problem.
+        machine: Machine whose joints, and base if it moves, are states of the problem.
         name: Name of the motion.
         joints, base: Names of these states.
         settings: Settings of the audit.
@@ -382,14 +382,14 @@ def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> 
 
 
 def _interpolate(times: Array, t: Array, values: Array) -> Array:
-    """Return samples interpolated linearly. Shape (K, n)."""
+    """Return `values`, given at times `t`, interpolated linearly at other times. Shape (K, n)."""
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def _animation(
     name: str, machine: Machine, samples: MotionSamples, own_curves: Sequence[Curve], **details: Any
 ) -> Animation:
-    """Return an animation with its own curves and those that every motion has."""
+    """Return the animation of a motion, with the curves of its problem, if any, and those that every motion has."""
     t, relative = samples.t, PAGE_SETTINGS.same_cost
     effort = cumulative_integral(t, (samples.rates**2).sum(axis=1) / 2)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
@@ -411,13 +411,13 @@ def _animation(
 
 
 def _times(horizon: float) -> Array:
-    """Return uniformly spaced times from 0 to the horizon, s."""
+    """Return the uniformly spaced times from 0 to the horizon, s, at which a motion is sampled."""
     count = int(np.clip(np.ceil(PAGE_SETTINGS.per_second * horizon), PAGE_SETTINGS.least, PAGE_SETTINGS.most))
     return np.linspace(0.0, horizon, count + 1)
 
 
 def _torque_like(solution: Solution, joints: str) -> bool:
-    """Return whether the joints of a solution are smooth enough for inverse dynamics."""
+    """Return whether the joint positions of a solution are smooth enough for inverse dynamics."""
     return len(solution.state_interpolant.nodes) > 2 and any(
         name != joints and values.shape[1] == solution.states[joints].shape[1]
         for name, values in solution.states.items()
@@ -425,7 +425,7 @@ def _torque_like(solution: Solution, joints: str) -> bool:
 
 
 def _audit_verdict(solutions: Sequence[Solution], judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
-    """Return the verdict's sentence, result and rows of the audit; without a problem only a sentence."""
+    """Return the attributes of an Animation that describe the audit; only a sentence if a solution has no problem."""
     lost = next((solution.problem_lost for solution in solutions if solution.problem is None), None)
     if lost is not None:
         return {"verdict": f"There is no audit, because the file has no problem: {lost}."}
@@ -435,9 +435,9 @@ def _audit_verdict(solutions: Sequence[Solution], judge: Callable[[], Audit | Pl
 
 
 def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[Curve]:
-    """Return the integral of the problem's running cost and every row of its path constraints as curves.
+    """Return the integral of the problem's running cost and every entry of its path constraints as curves.
 
-    The group of a row is the name of its constraint.
+    The group of an entry is the name of its constraint.
     """
     if solution.problem is None:
         return []
@@ -455,7 +455,7 @@ def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[
 
 
 def _margins(rows: Sequence[Curve]) -> list[Curve]:
-    """Return curves of the smallest margin of each inequality and of the largest error of each equation."""
+    """Return curves of the least margin of each inequality constraint and the largest error of each equation."""
     curves = []
     for name in dict.fromkeys(one.group for one in rows):
         group = [one for one in rows if one.group == name]
@@ -473,7 +473,7 @@ def _closest_pairs(parts: Sequence[tuple[Solution, str, Array]], horizon: float)
     """Return the closest pair of bodies at uniform times of a motion, or None if it is unknown.
 
     Args:
-        parts: As returned by `Plan.solved_parts` for these times.
+        parts: Solutions, suffixes and times as returned by `Plan.solved_parts` for these times.
         horizon: Duration of the motion, s.
     """
     pairs = [

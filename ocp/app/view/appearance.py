@@ -88,12 +88,12 @@ SURFACE_STYLE = SurfaceStyle()
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A surface of one colour.
+    """A surface of triangles that has one colour and is carried by a link.
 
     Attributes:
-        link: Name of the link that carries it.
-        vertices, normals: In the frame of the link. Shape (n, 3) each, m.
-        faces: Indices of its triangles' corners. Shape (m, 3).
+        link: Name of the link that carries the surface.
+        vertices, normals: Vertices (m) and unit normals in the frame of the link. Shape (n, 3) each.
+        faces: Indices of the triangles' corners. Shape (f, 3).
         color: Red, green, blue and opacity, 0 to 1.
     """
 
@@ -109,7 +109,7 @@ class Appearance:
     """Surfaces of a robot.
 
     Attributes:
-        parts: Surfaces.
+        parts: Surfaces of all links.
         missing: Meshes that are not shown, as named in the description, and the reasons.
     """
 
@@ -133,7 +133,7 @@ def appearance_of(
     surfaces: list[tuple[str, Triangles]] = []
     for link in robot.links:
         triangles_of_link = _triangulate(link.visuals, folders, meshes, missing)
-        if not triangles_of_link:  # a link without visuals among others with visuals is a zone rather than a body
+        if not triangles_of_link:  # among links with visuals, a link without is a zone to keep out of
             color = SURFACE_STYLE.zone if has_visuals and not link.visuals else SURFACE_STYLE.grey
             triangles_of_link = _triangulate(link.collisions, folders, meshes, missing, color)
         surfaces += [(link.name, triangles) for triangles in triangles_of_link]
@@ -205,7 +205,7 @@ def _revolution_surface(profile: Array) -> Triangles:
 
 
 def rod(start: Array, end: Array, radius: float) -> Triangles:
-    """Return a round rod between two points."""
+    """Return the surface of a round rod between two points."""
     along = end - start
     length = float(np.linalg.norm(along))
     axis = along / length
@@ -237,7 +237,7 @@ def _rods(robot: Robot, shown: set[str]) -> list[tuple[str, Triangles]]:
 
 
 def _few(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
-    """Coarsen the surfaces until they have at most `most` faces in total."""
+    """Return the surfaces, coarsened until they have at most `most` faces in total."""
     size = SURFACE_STYLE.min_cell
     coarse = surfaces
     while sum(len(mesh.faces) for _, mesh in coarse) > most and size < 1.0:
@@ -260,7 +260,7 @@ def _coarser(mesh: Triangles, size: float) -> Triangles:
 
 
 def _parts(surfaces: list[tuple[str, Triangles]]) -> list[Part]:
-    """Group surfaces by link and colour."""
+    """Return surfaces grouped by link and colour, one Part for each group."""
     parts = []
     for link in dict.fromkeys(name for name, _ in surfaces):
         mesh = join_meshes([triangles for name, triangles in surfaces if name == link])
@@ -273,7 +273,7 @@ def _parts(surfaces: list[tuple[str, Triangles]]) -> list[Part]:
 
 
 def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> Part:
-    """Return a part with vertex normals, which are averaged over adjacent faces except across creases."""
+    """Return a surface as a Part, with vertex normals that are averaged over adjacent faces except across creases."""
     places, where = np.unique(np.round(vertices, 6) + 0.0, axis=0, return_inverse=True)
     faces = where.ravel()[faces]
     one, two, three = (places[faces[:, k]] for k in range(3))
@@ -306,9 +306,9 @@ def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> 
 PLAN = "#0072B2"
 """Colour of the plan, or of the main motion."""
 COMPARED = "#D55E00"
-"""Colour of motions compared with it: the pseudo-inverse, the method of a paper, another plan."""
+"""Colour of motions compared with the plan: the pseudo-inverse, the method of a paper, another plan."""
 LIMIT = "#6E6E6E"
-"""Colour of limits; dashed."""
+"""Colour of limits, which are drawn dashed."""
 FAULT = "#CC79A7"
 """Colour of violations."""
 TIP = "#009E73"
@@ -338,12 +338,12 @@ class Frames:
 
 
 def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
-    """Return the frames of all links, and of the tip if the robot has one.
+    """Return the frames in world of all links, and of the tip if the robot has one, along a motion.
 
     Args:
         machine: The robot on its base.
-        joints: In the order of robot.joint_names. Shape (M, dof).
-        base: Shape (M, base_size); None for a fixed base.
+        joints: Joint positions in the order of robot.joint_names. Shape (M, dof).
+        base: Base configurations, shape (M, base_size); None for a fixed base.
 
     Raises:
         ModelError: A size is wrong.
@@ -368,7 +368,7 @@ def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
 
 
 Solid = tuple[Array, NDArray[np.intp]]
-"""Corners (k, 3), m, and triangles as their indices (f, 3)."""
+"""Surface of a solid: corners (k, 3), m, and triangles as indices of corners (f, 3)."""
 
 
 class Obstacle(NamedTuple):
@@ -376,7 +376,7 @@ class Obstacle(NamedTuple):
 
     Attributes:
         core: Points. Shape (k, 3), m; for a half-space one point of its plane.
-        radius: m.
+        radius: Radius by which the hull is inflated, m.
         normal: Outward normal of a half-space, shape (3,); otherwise None.
         rotations, positions: Frame of the body in world at the times of a motion, shapes (M, 3, 3) and (M, 3), m; None
             if it is static, with points in world.
@@ -389,7 +389,7 @@ class Obstacle(NamedTuple):
     positions: Array | None = None
 
     def solid(self, points: Array) -> Solid:
-        """Return the surface of the body in its own frame; a half-space is drawn as a square near points (k, 3)."""
+        """Return the surface of the obstacle in its own frame; a half-space becomes a square near points (k, 3)."""
         if self.normal is None:
             offsets = np.zeros((1, 3))
             if self.radius > 0:
@@ -408,7 +408,7 @@ class Obstacle(NamedTuple):
 
 
 def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
-    """Return static obstacles of shapes in world."""
+    """Return shapes, given in world, as static obstacles for display."""
     return [
         Obstacle(np.asarray(shape.point, dtype=float)[None], 0.0, np.asarray(shape.normal, dtype=float))
         if isinstance(shape, HalfSpace)
@@ -418,7 +418,7 @@ def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
 
 
 def obstacles_of(parts: Sequence[tuple[Solution, str, Array]]) -> list[Obstacle]:
-    """Return the obstacles in the problems of some solutions.
+    """Return the obstacles that the problems of a motion's solutions declare, for display.
 
     A moving obstacle is attached to a frame that depends on time but on no state.
 
@@ -457,7 +457,7 @@ def obstacles_of(parts: Sequence[tuple[Solution, str, Array]]) -> list[Obstacle]
 
 
 def obstacles_of_plan(plan: Plan, times: Array) -> list[Obstacle]:
-    """Return the obstacles of a plan at increasing times (M,), s."""
+    """Return the obstacles of a plan for display, moving ones with their poses at increasing times (M,), s."""
     if isinstance(plan, PathPlan):
         obstacles = () if plan.constraints is None else plan.constraints.scene.obstacles
         return obstacles_of_shapes(shape for shape in obstacles if not isinstance(shape, MovingObstacle))

@@ -40,7 +40,7 @@ SCRIPTS = ("scene.js", "curves.js", "player.js")
 
 
 class Buffers:
-    """Arrays in one block of bytes, each referred to by its offset."""
+    """Numerical data of a page: arrays in one block of bytes, each referred to by its offset."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -61,7 +61,7 @@ class Page(NamedTuple):
     """A web page that plays a motion.
 
     Attributes:
-        text: HTML.
+        text: HTML of the page.
         missing: Meshes that are not shown, as named in the descriptions, and the reasons.
     """
 
@@ -76,7 +76,7 @@ def build_page(
 
     Args:
         shown: The motions.
-        title: Title; "": the name of the first motion.
+        title: Title of the page; "": the name of the first motion.
         folders: Folders that are searched first for meshes.
         meshes: Whether mesh files are read; otherwise collision shapes are shown.
 
@@ -136,7 +136,7 @@ def _alike(a: Robot, b: Robot) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
-    """Return for each link the moving link, or root, to which it is fixed, and its pose there."""
+    """Return for each link the moving link, or root, to which it is fixed, and its pose in the frame of that link."""
     carriers = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
     for joint in robot.joints:
         if joint.moves:
@@ -153,7 +153,7 @@ def _movers(robot: Robot) -> list[str]:
 
 
 def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, Any]:
-    """Return the surfaces of a robot, expressed in the frames of its moving links."""
+    """Return the description of a robot for the page: its surfaces in the frames of its moving links."""
     carriers, movers = _carriers(robot), _movers(robot)
     parts = []
     for part in appearance.parts:
@@ -170,7 +170,7 @@ def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, 
 
 
 def _surface(vertices: Array, normals: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[str, Any]:
-    """Return a surface with corners quantised to 1/65535 of its bounding box, and normals to 1/127."""
+    """Return the description of a surface for the page: vertices quantised to 1/65535 of its box, normals to 1/127."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     step = np.maximum(high - low, 1e-9) / 65535
     padded = np.zeros((len(vertices), 4))
@@ -187,7 +187,7 @@ def _surface(vertices: Array, normals: Array, faces: NDArray[np.intp], buffers: 
 
 
 def _poses(frames: Frames, names: Sequence[str]) -> Array:
-    """Return positions and quaternions whose signs are continuous over time. Shape (M, k, 7)."""
+    """Return the poses of k frames: positions, and quaternions with signs continuous over time. Shape (M, k, 7)."""
     poses = []
     for name in names:
         quaternions = quaternion_from_rotation(frames.rotations[name])
@@ -285,10 +285,10 @@ HOST = "127.0.0.1"
 
 
 class PageServer:
-    """A server of one page, as a context manager.
+    """HTTP server of one page on this machine, as a context manager.
 
     Attributes:
-        address: Address for the browser.
+        address: Address to open in a browser.
     """
 
     def __init__(self, text: str, port: int = 0) -> None:
@@ -312,7 +312,7 @@ class PageServer:
         self._server.server_close()
 
     def wait(self) -> None:
-        """Wait until Ctrl-C, which is not raised further."""
+        """Wait until Ctrl-C, and catch its KeyboardInterrupt."""
         try:
             Event().wait()
         except KeyboardInterrupt:
@@ -320,7 +320,7 @@ class PageServer:
 
 
 def _start_server(page: bytes, port: int) -> ThreadingHTTPServer:
-    """Return a server for a page on the first free port."""
+    """Return a server for a page on the first free port, which must be started by its caller."""
 
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self) -> None:

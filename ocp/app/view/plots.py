@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
-"""Settings of matplotlib."""
+"""Settings of matplotlib for all figures."""
 STYLE |= {"text.parse_math": False}  # a joint's name may contain a dollar
 DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Line styles of the motions compared with a plan, so that colour is not the only distinction."""
@@ -53,7 +53,7 @@ DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 def draw_curves(
     motion: Motion, bounds: JointBounds, *, names: Sequence[str], units: Sequence[str], faults: Sequence[Any] = ()
 ) -> str:
-    """Return an SVG of position, velocity and acceleration of every joint with its limits and faults."""
+    """Return an SVG with the position, velocity and acceleration of every joint over time, its limits and faults."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(PICTURE_STYLE.width, 0.4 + 1.15 * len(names)), layout="constrained")
@@ -169,7 +169,7 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
     """Plot position, velocity and acceleration of every joint over time, with the robot's limits.
 
     Args:
-        plan: Drawn in blue.
+        plan: Plan, drawn in blue.
         against: Motion to compare with, in orange: a plan, a result of `resolve` or `resolve_accelerations`, a joint
             trajectory; or several by name.
         figure: Empty matplotlib figure to draw into, for example one of pyplot for a window; None: a new one.
@@ -206,7 +206,7 @@ def html_of_plan(plan: Plan) -> str:
 
 
 def _motion_of(plan: Plan) -> Motion:
-    """Return the samples of a plan."""
+    """Return samples of a plan, dense enough for curves, as a Motion."""
     sample = plan.sample(plan.horizon / PICTURE_STYLE.curve_points)
     return Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
 
@@ -244,7 +244,7 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
     """Plot states and controls over time, each entry with its bounds if the solution has its problem.
 
     Args:
-        solution: Drawn in blue.
+        solution: Solution, drawn in blue.
         against: Solution with the same states and controls, result of `resolve` for the same joints, or several by
             name, in orange. The title gives the costs; that of `resolve` is the integral of half the squared joint
             rates.
@@ -300,7 +300,7 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
 
 
 def html_of_solution(solution: Solution) -> str:
-    """Return a solution as HTML for a notebook."""
+    """Return a solution as HTML for a notebook: its summary and its curves."""
     head, *rest = str(solution).splitlines()
     table = f"<pre>{escape(chr(10).join(rest))}</pre>"
     return f'<div style="max-width: 56rem"><p><b>{escape(head)}</b></p>{as_svg(plot_solution(solution))}{table}</div>'
@@ -323,7 +323,7 @@ def _local_widths(name: str, other: Any) -> dict[str, int]:
 
 
 def _local(other: LocalSolution) -> dict[str, Array]:
-    """Return the result of `resolve` as states and controls named as in `minimum_velocity_problem`."""
+    """Return a result of `resolve` as states and controls, named as in `minimum_velocity_problem`."""
     samples = {"base": other.base, "joints": other.joints, "rates": other.joint_rates}
     return {name: values for name, values in samples.items() if values.shape[1]}
 
@@ -359,7 +359,7 @@ def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
 
 
 def _motions_by_name(against: Any) -> dict[str, Any]:
-    """Return the motions to compare a plan with, by name."""
+    """Return the motions that are compared with a plan or solution, keyed by name."""
     if against is None:
         return {}
     if isinstance(against, Mapping):

@@ -31,23 +31,23 @@ class PictureStyle:
         half_field_of_view: Half of the vertical field of view, rad.
         side_samples: Samples along each side of a pixel.
         batch_size: Samples that are processed together, to limit memory.
-        fading: Share of the smaller side of a picture within which the floor fades towards the edge.
+        fading: Fraction of the smaller side of a picture within which the floor fades towards the edge.
         sun: Azimuth to the left of the camera's, and elevation, rad.
         shadow_map: Samples along each side of the shadow map, relative to the pixels along the longer side of the
             picture.
         shadow_blur: Offsets around a sample of the shadow map that are averaged.
         shadow_bias: Distance from a surface at which its shadow is looked up, in samples of the map.
-        behind: A transparent surface closer than this share of its distance to a solid one counts as behind it.
+        behind: Distance from a solid surface, relative to the depth, below which a transparent one counts as behind it.
         tube_sides: Number of sides of a round line.
         line: Radius of a line, relative to the size of the scene.
         poses: Number of times at which the robot is shown.
         curve_points: Number of points of a curve.
         limit_distance: Limits farther from a curve than this many of its ranges are given in words, to keep its shape
             visible.
-        flat: Relative to the largest value of a kind: smaller changes are rounding.
+        flat: Change of a curve, relative to the largest value of its quantity, below which it is a rounding error.
         width: Width of a figure, inches.
         columns: Number of columns in a figure of a solution.
-        entries: Largest number of states and controls in it.
+        entries: Largest number of states and controls in a figure of a solution.
     """
 
     size: tuple[int, int] = (960, 680)
@@ -127,7 +127,7 @@ class Camera(NamedTuple):
         return np.stack([width / 2 + scale * x, height / 2 - scale * y], axis=-1), depth
 
     def rays(self, cells: NDArray[np.intp]) -> Array:
-        """Return rays of depth 1 m through the centres of picture cells, numbered row by row. Shape (k, 3), m."""
+        """Return the rays from the eye, to 1 m depth, through pixels that are numbered row by row. Shape (k, 3), m."""
         width, height = self.size
         row, column = np.divmod(cells, width)
         step = 2 / (PICTURE_STYLE.lens * height)
@@ -139,7 +139,7 @@ class Layer(NamedTuple):
     """Surfaces that are rendered together, in world.
 
     Attributes:
-        parts: Surfaces.
+        parts: Surfaces to render.
         opacity: Below 1 the layer is transparent: only its nearest surface is visible, it casts no shadow, it never
             covers solid surfaces of the first layer, and layers are blended in the given order.
         tint: Red, green and blue that replace the colours of the parts.
@@ -154,10 +154,10 @@ class Floor(NamedTuple):
     """Horizontal ground with a square grid, which fades with the distance from its centre.
 
     Attributes:
-        height: m.
+        height: Height above the origin of world, m.
         middle: x and y of the centre, m.
-        radius: Distance at which it has faded, m.
-        grid: Distance of the lines, m.
+        radius: Distance from the centre at which the floor has faded, m.
+        grid: Distance between the lines of the grid, m.
     """
 
     height: float
@@ -176,11 +176,11 @@ def parts_in_world(appearance: Appearance, frames: Frames, k: int) -> list[Part]
 
 
 def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
-    """Return a round line through points (k, 3), m.
+    """Return the surface of a round tube along a line through points, with which paths are drawn.
 
     Args:
-        points: Centre line.
-        radius: m.
+        points: Points of the centre line. Shape (k, 3), m.
+        radius: Radius of the tube, m.
         color: Red, green, blue.
     """
     line = np.asarray(points, dtype=float)
@@ -215,7 +215,10 @@ def render(
     floor: Floor | None = None,
     side_samples: int = PICTURE_STYLE.side_samples,
 ) -> NDArray[np.uint8]:
-    """Render layers on white; each pixel is the mean of `side_samples` squared samples. Shape (height, width, 3)."""
+    """Render layers of surfaces on a white background and return the picture. Shape (height, width, 3).
+
+    Each pixel is the mean of `side_samples` squared samples.
+    """
     width, height = camera.size
     fine = camera._replace(size=(side_samples * width, side_samples * height))
     solid = _Mesh.of([part for layer in layers if layer.opacity >= 1 for part in layer.parts if part.color[3] >= 1])
@@ -244,7 +247,7 @@ def render(
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
-    """Triangles in world: corners and normals (n, 3) each, faces (f, 3), their colours (f, 3)."""
+    """Triangles in world: corners and normals (n, 3) each, faces as indices of corners (f, 3), their colours (f, 3)."""
 
     corners: Array
     normals: Array
@@ -270,12 +273,12 @@ def _project(camera: Camera, mesh: _Mesh) -> tuple[Array, Array]:
 
 
 def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, NDArray[np.intp]]:
-    """Return the inverse depth and index of the nearest triangle at each cell centre; -inf and -1 if there is none.
+    """Return the inverse depth and index of the nearest triangle at each pixel centre; -inf and -1 if there is none.
 
     Args:
-        places: Corners (f, 3, 2), in cells from the upper left.
+        places: Corners of the triangles (f, 3, 2), in pixels from the upper left.
         near: Inverse depths of the corners (f, 3), linear over a triangle.
-        size: Columns and rows of cells, which are numbered row by row.
+        size: Columns and rows of pixels, which are numbered row by row.
     """
     width, height = size
     depth, number = np.full(height * width, -np.inf), np.full(height * width, -1, dtype=np.intp)
@@ -314,7 +317,7 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
 
 
 def _repeat_numbers(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Return the numbers 0, 1, ..., each repeated `counts` times, and the index of each repetition."""
+    """Return the numbers 0, 1, ..., number i repeated counts[i] times, and the index of each repetition."""
     which = np.repeat(np.arange(len(counts)), counts)
     return which, np.arange(len(which)) - (np.cumsum(counts) - counts)[which]
 
@@ -331,7 +334,7 @@ def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class _Sun:
-    """Directional light: the direction to it (3,), and the depth map of the first surfaces that it meets."""
+    """Directional light (the sun): the direction to it (3,), and the depth map of the first surfaces that it meets."""
 
     to_sun: Array
     axes: Array
@@ -356,7 +359,7 @@ class _Sun:
         return cls(to_sun, axes, low, step, places, height)
 
     def lit(self, points: Array) -> Array:
-        """Return the share of direct light that reaches points (k, 3), from 0 (shadow) to 1."""
+        """Return the fraction of direct light that reaches points (k, 3), from 0 (shadow) to 1."""
         x, y, z = self.axes @ points.T
         column, row = (
             np.floor((coordinate - corner) / self.step).astype(np.int64)
@@ -372,7 +375,7 @@ class _Sun:
 
 
 def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None) -> None:
-    """Draw the floor and the shadows on it into an empty picture."""
+    """Draw the floor, and the shadows on it, into an empty picture."""
     below = np.flatnonzero(camera.rays(np.arange(len(picture)))[:, 2] * (floor.height - camera.eye[2]) > 0)
     ray = camera.rays(below)
     place = camera.eye + ray * ((floor.height - camera.eye[2]) / ray[:, 2])[:, None]
@@ -416,5 +419,5 @@ def _shade(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun
 
 
 def _dot(first: Array, second: Array) -> Array:
-    """Return the scalar products of rows."""
+    """Return the scalar products of corresponding rows of two arrays."""
     return np.asarray(np.einsum("ij,ij->i", first, second))

@@ -1,4 +1,4 @@
-"""Write an HTML report: the verdict in a sentence, pictures, curves with limits, and all rows with units.
+"""Write an HTML report: the verdict in a sentence, pictures, curves with limits, and tables of all checked quantities.
 
 The page loads nothing from another host.
 """
@@ -64,16 +64,16 @@ footer { margin-top: 3rem; font-size: .8rem; opacity: .7 }
 
 @dataclass(frozen=True)
 class Report:
-    """Contents of a report.
+    """Contents of an HTML report on a trajectory or a plan.
 
     Attributes:
-        title, verdict: Texts.
+        title, verdict: Title and verdict, as texts.
         passed: Whether the verdict is good.
-        facts: Short facts.
+        facts: Short facts, such as the duration.
         faults: Descriptions of the faults.
-        picture: A PNG, or b"".
-        plots: An SVG.
-        tables: Titles, and rows.
+        picture: Picture of the motion as a PNG, or b"".
+        plots: Curves of the joints as an SVG.
+        tables: Title and rows of each table.
         notes: Notes below the tables.
     """
 

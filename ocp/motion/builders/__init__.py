@@ -1,1 +1,1 @@
-"""Problem builders, one module for each family of machines and tasks, and the planners that solve them."""
+"""Builders of optimal control problems, a module for each family of machines and tasks, and planners for them."""

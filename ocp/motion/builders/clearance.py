@@ -1,8 +1,8 @@
-"""Clearance constraints: which pairs of bodies the audit checks, and which ones path constraints separate.
+"""Clearance constraints: pairs of bodies whose clearance the audit proves, and pairs that path constraints separate.
 
 The audit proves the clearance of all declared pairs. Path constraints separate only the pairs that were found too
-close: a planner solves, finds these pairs, adds separation constraints and solves again. A motion that is clear anyway
-has no constraints to pay for. The constrained distance is smoothed from below (`models.shapes.distance`), so that its
+close: a planner solves, finds these pairs, adds separation constraints and solves again. A motion without collisions
+needs no such constraints. The constrained distance is smoothed from below (`models.shapes.distance`), so that its
 gradient is continuous where the closest points jump, and has a margin for the excess between the points of the grid.
 """
 
@@ -45,26 +45,26 @@ __all__ = [
 ]  # fmt: skip
 
 CLEARANCE, APART = "clearance", "apart"
-"""Names of the proven clearances and of the separation constraints, followed by the suffix of a stretch of time."""
+"""Prefixes of the names under which proven clearances and separation constraints are declared."""
 ROUNDING = 3e-3
-"""Smoothing width of the constrained distances, m."""
+"""Smoothing width of the distances in separation constraints, m."""
 LOOKS = 6
-"""Largest number of times that a motion is planned because of collisions."""
+"""Largest number of solves of one motion; after each, colliding bodies are separated by further constraints."""
 MARGIN = 5e-5
-"""Least margin of a separated pair, and least increase of a margin that was too small, m."""
+"""Initial separation margin of a pair of bodies beyond its clearance, and least increase of a margin, m."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClearanceConstraints:
-    """Collision scene of a motion, and the pairs that constraints separate.
+    """Collision scene of a motion, and the pairs of bodies that separation constraints keep apart.
 
     Attributes:
         scene: Collision scene of the machine, with the clearance of every pair.
-        margins: Separated pairs, by index, with the distance beyond the clearance that they keep, m. Of meshes it is
-            that of the covers, and negative where these protrude.
+        margins: Distance beyond the clearance that each separated pair keeps, m, by the index of the pair. For meshes
+            it is that of the bodies that cover them, and negative where these protrude.
 
     Raises:
-        ProblemError: The scene is none, a pair does not exist, or a margin is no number.
+        ProblemError: The scene is no CollisionScene, a pair does not exist, or a margin is not a finite number.
     """
 
     scene: CollisionScene
@@ -85,11 +85,11 @@ class ClearanceConstraints:
                 raise ProblemError(words, name="margins", value=pair, limit=len(self.scene.pairs))
 
     def with_pairs(self, pairs: Sequence[int]) -> ClearanceConstraints:
-        """Return the constraints with further pairs of bodies separated."""
+        """Return a copy that also separates further pairs of bodies, given by index."""
         return replace(self, margins={**{int(pair): MARGIN for pair in pairs}, **self.margins})
 
     def with_collisions(self, collisions: Sequence[Collision]) -> ClearanceConstraints:
-        """Return the constraints with the pairs of bodies of these collisions separated.
+        """Return a copy that also separates the pairs of bodies of the given collisions.
 
         Two hulls of meshes are separated by their covers, which protrude and may overlap in every configuration. The
         covers have to gain as much distance as the hulls lack where these are closest.
@@ -98,7 +98,7 @@ class ClearanceConstraints:
         return replace(self, margins={**margins, **self.margins})
 
     def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
-        """Return constraints in which the separation margin of each violating pair is larger by its violation."""
+        """Return a copy with larger separation margins for pairs that violate their clearance, see `widen_margins`."""
         return replace(self, margins=widen_margins(self.margins, self.scene.labels, proofs))
 
     def declare(
@@ -112,12 +112,12 @@ class ClearanceConstraints:
         pace: float = 1.0,
         horizon: float | None = None,
     ) -> None:
-        """Declare the proven clearances and the separation constraints of a machine.
+        """Declare in a problem the clearances that the audit shall prove, and the separation constraints.
 
         Args:
             problem: Problem with the states below.
             base: Name of the state of the base, or the configuration of a fixed base.
-            joints: Name of the state of the joints.
+            joints: Name of the state of the joint positions.
             suffix: Suffix of the declared names.
             begin, pace: The time of the scene is begin + pace times the time of the problem.
             horizon: Horizon of the problem, s; None if it is free, which excludes moving obstacles.
@@ -159,7 +159,7 @@ class ClearanceConstraints:
             problem.path(f"{APART}{suffix}", distances, lower=least, unit="m")
 
     def find_collisions(self, base: Array, joints: Array, times: Array) -> list[Collision]:
-        """Return the pairs closer than the clearance at samples of a motion; see `ocp.motion.local.collisions`."""
+        """Return the pairs of bodies closer than the clearance at samples of a motion; see `local.collisions`."""
         return find_collisions(self.scene, base, joints, times)
 
 
@@ -167,18 +167,18 @@ class Separating(Protocol):
     """Interface of constraints that separate pairs of bodies by margins."""
 
     def widened(self, proofs: Sequence[Clearance]) -> Self:
-        """Return constraints in which the separation margin of each violating pair is larger by its violation."""
+        """Return constraints of the same kind with larger margins for the pairs that violate their clearance."""
 
 
 def widen_margins(
     margins: Mapping[int, float], labels: Sequence[tuple[str, str]], proofs: Sequence[Clearance]
 ) -> dict[int, float]:
-    """Return the margins of pairs, m, each increased by the violation of the pair.
+    """Return the separation margins of pairs of bodies, m, increased where the clearance of a pair is violated.
 
     Args:
         margins: Margins by the index of the pair among the labels.
         labels: Names of the bodies of each pair.
-        proofs: Clearances of an audit; pairs that are no labels are ignored.
+        proofs: Clearances of an audit; pairs that are not among the labels are ignored.
     """
     places = {label: pair for pair, label in enumerate(labels)}
     wider = dict(margins)
@@ -200,11 +200,11 @@ def clearance_of(
     seconds: Array,
     smooth: bool,
 ) -> Clearance:
-    """Prove the clearance of each pair during a motion of a machine on a fixed base among fixed obstacles.
+    """Prove the clearance of each pair of bodies during a motion of a machine on a fixed base among fixed obstacles.
 
     Args:
-        joints: Function of fractions of the horizon (M,) that returns joints (M, n).
-        breaks, horizon, rates, seconds, smooth: Properties of the joints, see `ocp.audit.clearance.Track`.
+        joints: Function of fractions of the horizon (M,) that returns joint positions (M, n).
+        breaks, horizon, rates, seconds, smooth: Properties of this function, see `ocp.audit.clearance.Track`.
 
     Raises:
         ModelError: A prismatic joint has no limits.
@@ -230,7 +230,7 @@ def clearance_of(
 
 
 def _check_limits(scene: CollisionScene, joints: Variable) -> None:
-    """Raise ProblemError if joints may leave the limits within which the scene ignores pairs that cannot collide."""
+    """Raise ProblemError if joints may leave the limits that the scene assumes when it excludes pairs of bodies."""
     robot = scene.machine.robot
     inside = (constant(joints.lower) >= robot.lower) & (constant(joints.upper) <= robot.upper)
     if scene.limits and not inside.all():
@@ -243,14 +243,14 @@ def _check_limits(scene: CollisionScene, joints: Variable) -> None:
 
 
 Constraints = TypeVar("Constraints", bound=Separating | None)
-"""Clearance constraints of a planner, or None."""
+"""Type variable of the clearance constraints of a planner, which may be None."""
 
 
 def solve_with_clearance(clearance_constraints: Constraints, run: Callable[[Constraints], Solution]) -> Solution:
     """Solve repeatedly; after each solve, add separation constraints for the pairs that collide in the solution.
 
     Args:
-        clearance_constraints: Clearance constraints of the first solve; None for none.
+        clearance_constraints: Clearance constraints of the first solve; None for no collision avoidance.
         run: Solves and audits. It raises a SolveError named after a clearance if that is the solution's only failure.
 
     Raises:
@@ -274,12 +274,12 @@ def solve_with_clearance(clearance_constraints: Constraints, run: Callable[[Cons
 
 
 def is_clearance(name: Any) -> bool:
-    """Return whether a constraint name denotes a clearance, with or without the name of a phase."""
+    """Return whether a constraint name denotes a clearance, whether or not the name of a phase precedes it."""
     return str(name).rpartition(".")[2].startswith(CLEARANCE)
 
 
 def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
-    """Return an error about colliding bodies if collisions are the only failure of a solution, else None."""
+    """Return an error about colliding bodies if a solution fails its audit only because of collisions, else None."""
     failures = audit.failures
     if not failures or any(finding.name not in audit.clearances for finding in failures):
         return None
@@ -289,7 +289,7 @@ def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
 
 
 def _evaluate(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
-    """Evaluate an expression of base, joints and time; with MX arguments it becomes the call of an SX function."""
+    """Evaluate a function of base, joint positions and time; with MX arguments, return the call of an SX function."""
     arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
     if not any(isinstance(value, ca.MX) for value in arguments):
         return ca.SX(expression(*arguments))

@@ -1,20 +1,20 @@
-"""Motions that consist of phases of constant jerk, from rest to rest, in closed form and within torque limits.
+"""Rest-to-rest motions of joints in phases of constant jerk, in closed form and within torque limits.
 
 A joint that moves by d from rest to rest within limits V, A and J of velocity, acceleration and jerk is fastest if it
 builds up its acceleration for t_j, keeps it for t_a, and releases it for t_j; then it cruises for t_v, and brakes as it
-sped up. Its peak velocity is a (t_j + t_a) with acceleration a, and
+sped up. With the largest acceleration a that it reaches, its peak velocity is a (t_j + t_a), and
 
     d = peak (2 t_j + t_a + t_v).
 
-A motion of several joints takes at least as long as each joint by itself. `synchronised_motion` attains this bound: on
-a straight motion if the limits of one joint allow the profile of the slowest one to all, else by slowing down each
-joint to the common duration. Without jerk limits the phases have constant acceleration.
+A motion of several joints takes at least as long as each joint by itself. `synchronised_motion` attains this bound: by
+a straight motion in joint space if the limits of all joints allow it, else by slowing down the profile of each joint to
+the common duration. Without jerk limits the phases have constant acceleration.
 
 Without friction, torques of a motion that is slowed down by a factor f are
 
     torque(q, rate / f, acceleration / f^2) = rest(q) + (torque(q, rate, acceleration) - rest(q)) / f^2,
 
-with rest(q) those of gravity alone, so that the least factor within the torque limits follows directly.
+where rest(q) is the gravity torque, so that the least factor within the torque limits follows directly.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ __all__ = [
 ]  # fmt: skip
 
 NODES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
-"""Places of the values in a phase: joints are cubic."""
+"""Interpolation nodes of a phase, as fractions of its duration: joint positions are cubic in time."""
 
 
 @dataclass(frozen=True)
 class ConstantJerkSettings:
-    """Settings of the motions of constant jerk.
+    """Settings of motions in phases of constant jerk.
 
     Attributes:
-        still: Duration of a motion that stays where it is, s, since problems have a positive one.
+        still: Duration of a motion that stays where it is, s, since the horizon of a problem must be positive.
         ramp_share: Time in which joints with neither an acceleration nor a jerk limit reach their largest rate, as a
             share of the time at that rate.
         unlimited_rate: Rate of joints without any of these limits, rad/s or m/s.
-        samples: Samples of each phase at which torques are evaluated.
+        samples: Number of samples of each phase at which torques are evaluated.
         torque_share: Share of the torque limits that is used there, since torques may be larger between the samples.
     """
 
@@ -72,7 +72,7 @@ SETTINGS = ConstantJerkSettings()
 
 
 class _Ramps(NamedTuple):
-    """Fastest profiles from rest to rest: times of the phases, s, and peak velocities. Shape (..., n) each."""
+    """Fastest rest-to-rest velocity profiles: durations of the phases, s, and peak velocities. Shape (..., n) each."""
 
     build_up: Array
     steady: Array
@@ -86,14 +86,14 @@ class _Ramps(NamedTuple):
 
 
 def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) -> _Ramps:
-    """Return the fastest rest-to-rest profiles over distances (..., n); a joint with distance 0 does not move.
+    """Return the fastest rest-to-rest profiles over distances (..., n) of the joints; distance 0 means no motion.
 
-    With peak velocity V, each ramp lasts r = V / a + a / j, or 2 sqrt(V / j) if it does not reach the acceleration a.
+    At peak velocity V and limits a and j, each ramp lasts r = V / a + a / j, or 2 sqrt(V / j) if it does not reach a.
     Both ramps together cover V r. The rest of the distance is covered at V.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         limited = np.isfinite(acceleration)
-        full = np.where(limited, acceleration / jerk, 0.0)  # s until the acceleration is reached
+        full = np.where(limited, acceleration / jerk, 0.0)  # time until the acceleration limit is reached
         short = np.where(np.isfinite(jerk), (distances * np.sqrt(jerk) / 2) ** (2 / 3), np.inf)
         # V^2 / a + V a / j = distance
         root = np.sqrt(full**2 + 4 * distances / acceleration)
@@ -115,18 +115,18 @@ def least_durations(distances: Array, bounds: JointBounds) -> Array:
         bounds: Limits of the joints.
 
     Returns:
-        s; 0 for a joint without limits. Shape (..., n).
+        Durations, s; 0 for a joint without limits. Shape (..., n).
     """
     return _ramps(distances, bounds.velocity, bounds.acceleration, bounds.jerk).duration
 
 
 @dataclass(frozen=True, eq=False)
 class ConstantJerkMotion:
-    """Motion that consists of phases of constant jerk.
+    """Motion of several joints in consecutive phases of constant jerk.
 
     Attributes:
         durations: Durations of the phases, s. Shape (K,).
-        joints, rates, accelerations, jerks: Joints and their derivatives at the start of each phase. Shape (K, n).
+        joints, rates, accelerations, jerks: Joint positions and derivatives where each phase starts. Shape (K, n).
     """
 
     durations: Array
@@ -141,12 +141,12 @@ class ConstantJerkMotion:
         return float(self.durations.sum())
 
     def slower(self, factor: float) -> ConstantJerkMotion:
-        """Return the motion slowed down by a factor."""
+        """Return the same motion with its duration multiplied by a factor."""
         derivatives = self.rates / factor, self.accelerations / factor**2, self.jerks / factor**3
         return ConstantJerkMotion(self.durations * factor, self.joints, *derivatives)
 
     def sampled(self, places: Array) -> tuple[Array, Array, Array]:
-        """Return joints, rates and accelerations at fractions (M,) of each phase. Shape (K, M, n) each."""
+        """Return joint positions, rates and accelerations at fractions (M,) of each phase. Shape (K, M, n) each."""
         t = (self.durations[:, None] * places)[:, :, None]
         joints, rates, accelerations, jerks = (
             each[:, None] for each in (self.joints, self.rates, self.accelerations, self.jerks)
@@ -158,7 +158,7 @@ class ConstantJerkMotion:
         )
 
     def solution(self, problem: Problem, method: str) -> Solution:
-        """Return the motion as a solution, without multipliers, of a `dynamics_problem` without power.
+        """Return the motion as a solution of a `dynamics_problem` without the control "power"; it has no multipliers.
 
         Args:
             problem: The problem.
@@ -211,7 +211,7 @@ class TorqueLimits:
     """Joint torques of a machine on a fixed base, and their limits.
 
     Attributes:
-        limited: Joints with a torque limit. Shape (L,).
+        limited: Indices of the joints with a torque limit. Shape (L,).
         largest: Their limits, N m or N. Shape (L,).
     """
 
@@ -222,11 +222,14 @@ class TorqueLimits:
         self._samplers: dict[bool, Sampler] = {}
 
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> Array:
-        """Return the torques of the limited joints at samples (M, n). Shape (M, L)."""
+        """Return the torques of the joints with a torque limit at M samples of a motion. Shape (M, L)."""
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
     def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
-        """Return the torques (M, L), and their derivatives by joints, rates and accelerations. Shape (M, L, n) each."""
+        """Return the torques (M, L) and their Jacobians with respect to the joint positions, rates and accelerations.
+
+        Shape (M, L, n) each.
+        """
         torques, *slopes = self._sampler(True)(joints, rates, accelerations)
         size = joints.shape[1]
         return torques, [slope.reshape(len(joints), size, -1).swapaxes(1, 2) for slope in slopes]
@@ -240,10 +243,10 @@ class TorqueLimits:
         return self._samplers[linearised]
 
     def slow_down(self, motion: ConstantJerkMotion) -> ConstantJerkMotion:
-        """Return the motion slowed down by the smallest factor with which the torque limits hold at samples.
+        """Return the motion slowed down by the smallest factor at which its samples satisfy the torque limits.
 
         Raises:
-            SolveError: A joint cannot hold the machine at rest somewhere on the path.
+            SolveError: A torque limit is too small to keep the machine at rest somewhere on the path.
         """
         if not len(self.limited):
             return motion
@@ -268,7 +271,7 @@ def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> Const
     It is straight if a straight motion attains the least time.
 
     Args:
-        start, goal: Joints, rad or m. Shape (n,).
+        start, goal: Configurations, rad or m. Shape (n,).
         bounds: Limits of the joints.
     """
     change = goal - start
@@ -281,10 +284,12 @@ def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> Const
 
 
 def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> ConstantJerkMotion:
-    """Return the fastest motion along a path (M, n) that stops at its corners, within limits up to jerk and torque.
+    """Return a motion along a joint path (M, n) that stops at each corner and satisfies the joint and torque limits.
+
+    Each segment is the fastest without torque limits, slowed down to them.
 
     Raises:
-        SolveError: A joint cannot hold the machine at rest somewhere on the path.
+        SolveError: A torque limit is too small to keep the machine at rest somewhere on the path.
     """
     moves = np.append(np.diff(path, axis=0).any(axis=1), True)
     corners = path[moves] if moves.sum() > 1 else path[[0, -1]]
@@ -293,7 +298,10 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:
-    """Return the durations of straight rest-to-rest motions by changes (K, n), s, without torque limits."""
+    """Return the least durations of straight rest-to-rest joint motions, s, without torque limits.
+
+    Shape (K,) for changes of the joint positions of shape (K, n).
+    """
     return np.asarray(_straight_profile(changes, bounds).duration)
 
 
@@ -302,7 +310,7 @@ def _columns(motion: ConstantJerkMotion) -> Sequence[Array]:
 
 
 def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
-    """Return velocity, acceleration and jerk limits, with infinite ones replaced where finite ones are required."""
+    """Return the limits of velocity, acceleration and jerk; infinite ones are replaced if profiles need finite ones."""
     velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
     jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
     velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
@@ -312,12 +320,12 @@ def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Arr
 
 
 def _profiles(distances: Array, bounds: JointBounds) -> _Ramps:
-    """Return the rest-to-rest profile of each joint alone over absolute distances (..., n)."""
+    """Return the fastest rest-to-rest profile of each joint by itself over absolute distances (..., n)."""
     return _ramps(distances, *_effective(distances, bounds))
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the profiles of the path fraction for straight motions by changes (K, n). Shape (K,) each."""
+    """Return the fastest profiles of the covered fraction of straight motions by displacements (K, n). Shape (K,)."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [
@@ -327,7 +335,7 @@ def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
 
 
 def _straight(start: Array, change: Array, bounds: JointBounds) -> ConstantJerkMotion:
-    """Return the fastest straight motion by a change (n,); without a change, a motion that stays for a moment."""
+    """Return the fastest straight joint motion by a displacement (n,); a short rest if the displacement is 0."""
     profile = _straight_profile(change[None], bounds)
     duration = float(profile.duration[0])
     if duration == 0:
@@ -342,10 +350,10 @@ def _joint_phases(start: Array, signs: Array, profiles: _Ramps, duration: float)
     """Return the motion in which each joint follows its own profile, slowed down to a common duration.
 
     Args:
-        start: Joints. Shape (n,).
+        start: Start configuration. Shape (n,).
         signs: Directions of the joints, -1, 0 or 1. Shape (n,).
         profiles: Profiles of the joints. Shape (n,) each.
-        duration: s, at least that of each profile.
+        duration: Common duration, s, at least that of each profile.
     """
     build_up, steady, cruise, peak = profiles
     with np.errstate(divide="ignore", invalid="ignore"):

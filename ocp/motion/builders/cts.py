@@ -1,12 +1,13 @@
-"""Roll of the captive trajectory rig over a whole trajectory, within limits of its rate.
+"""Optimal roll, the redundant angle of the captive trajectory rig, along a whole trajectory with limited roll rate.
 
-The paper resolves each target by itself, with the change of roll since the last target in the index (38); its roll lags
-behind the targets. Here the integral of I1 and of the squared roll rate is minimised over all targets together.
+The paper, Lee, Lee 2017, resolves each target by itself, with the change of roll since the last target in the index
+(38); its roll lags behind the targets. Here the integral of the index I1, see `models.cts.roll`, and of the squared
+roll rate is minimised over all targets together.
 
 The first guess chooses the homotopy class. The rolls of least index of single targets may lie inside an obstacle, or
 jump from one side of it to the other, and from such a guess the solver finds no plan. Therefore dynamic programming
 over a grid of rolls and times finds the roll of least total cost, with penalties for targets out of reach, limits and
-clearance. The result is refined in tubes about itself that become thinner.
+clearance. The result is refined on finer and finer grids about it.
 """
 
 from __future__ import annotations
@@ -36,21 +37,21 @@ from ocp.problem.problem import Problem
 __all__ = ["RollObstacles", "RollSettings", "least_cost_roll", "roll_problem", "spline_targets"]
 
 Targets = Callable[[Any], Any]
-LARGEST_SINE = 1 - 1e-9  # sine of q4 and cosine of q2, just below the end of the reach
+LARGEST_SINE = 1 - 1e-9  # of the sine of q4 and the cosine of q2, just inside the reach
 
 
 @dataclass(frozen=True)
 class RollGuessSettings:
-    """Settings of the first guess: a shortest path through a grid of times and rolls, then through finer grids near it.
+    """Settings of the first guess: a lowest-cost path through a grid of times and rolls, then through finer grids.
 
     Attributes:
-        times: Times of the grid.
+        times: Number of times of the grid.
         price: Cost of a violation, per m, rad or unit of a sine.
         margin: Distance beyond the clearance, in widths of the smooth minimum.
-        rolls: Rolls of the grid in a full turn.
-        tube_side: Rolls of the tube on each side.
-        tube_finer: Refinement factor of each level of the tube.
-        tube_levels: Levels of the tube.
+        rolls: Number of rolls of the grid in a full turn.
+        tube_side: Number of rolls of a finer grid on each side of the last path.
+        tube_finer: Factor by which each finer grid has smaller steps.
+        tube_levels: Number of finer grids.
         largest_roll: Largest distance from the start at which a roll with limits is searched, rad.
         steps_by_rate: Grid steps that the rate limit should allow from one time to the next.
     """
@@ -71,11 +72,11 @@ SEARCH = RollGuessSettings()
 
 @interruptible
 def spline_targets(times: Any, targets: Any) -> Targets:
-    """Return the cubic spline through a table of targets as a function of time, for problems with MX symbols.
+    """Return the cubic spline through a table of tool targets as a function of time, for problems with MX symbols.
 
     Args:
         times: At least 4 increasing times. Shape (samples,), s.
-        targets: Targets. Shape (samples, 5), m and rad.
+        targets: Position, yaw and pitch of the tool. Shape (samples, 5), m and rad.
 
     Raises:
         ProblemError: There are fewer than 4 samples, the times do not increase, or the targets have another shape or
@@ -98,11 +99,11 @@ def spline_targets(times: Any, targets: Any) -> Targets:
 
 @dataclass(frozen=True, eq=False)
 class RollSettings:
-    """Weights and limits of `roll_problem`.
+    """Cost weights, limits and branch of inverse kinematics of `roll_problem`.
 
     Attributes:
-        rate_weight, acceleration_weight: w in s^2 and v in s^4; v keeps the control smooth.
-        rate_limit, acceleration_limit: rad/s and rad/s^2.
+        rate_weight, acceleration_weight: Weights w, s^2, and v, s^4, of the cost; v keeps the control smooth.
+        rate_limit, acceleration_limit: Limits of the roll, rad/s and rad/s^2.
         branch: One of the four branches of inverse kinematics.
         symbols: casadi.MX, or casadi.SX if the targets are plain expressions.
 
@@ -184,8 +185,9 @@ def roll_problem(
     settings: RollSettings | None = None,
     obstacles: RollObstacles | None = None,
 ) -> Problem:
-    """Declare the roll along a trajectory of targets with the least integral of I1 + w rate^2 + v acceleration^2.
+    """Declare the optimal control problem of the rig's roll along a trajectory of tool targets.
 
+    The cost is the integral of I1 + w rate^2 + v acceleration^2, with the index I1 and the weights w and v.
     The states are "roll" (rad) and "rate" (rad/s), the control is "acceleration" (rad/s^2). The path constraints
     "reach" (sin q4 and cos q2), "limits" and "clearance" keep the rig within its reach and joint limits and away from
     obstacles.
@@ -264,7 +266,7 @@ def roll_problem(
     target = _column(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Evaluate an expression of target and roll at all times."""
+        """Insert the target at the problem's time and the roll state into an expression."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
@@ -282,7 +284,7 @@ def roll_problem(
 
 
 def _column(targets: Targets, time: Any) -> Any:
-    """Evaluate the targets at a symbol of time, shape (5, 1); raise ProblemError if the result is invalid."""
+    """Return the target at a symbolic time, shape (5, 1); raise ProblemError if the user's function is invalid."""
     try:
         target = expression(targets(time))
     except RuntimeError:  # interpolants do not take SX symbols
@@ -299,13 +301,13 @@ def _column(targets: Targets, time: Any) -> Any:
 
 
 def _curve(targets: Targets, symbols: Any) -> Any:
-    """Return the targets as a casadi function of time from a function or a table."""
+    """Return the user's function of targets as a casadi Function of time."""
     time = symbols.sym("time")
     return ca.Function("target", [time], [_column(targets, time)])
 
 
 def _violation(value: Any, lower: Any, upper: Any) -> Any:
-    """Return the sum of all violations of lower and upper bounds."""
+    """Return the sum of the amounts by which values exceed their lower and upper bounds."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
 
 
@@ -320,7 +322,7 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll over time that minimises the integral of cost + rate_weight rate^2, on a grid of rolls.
+    """Return the roll over time with the least integral of cost and weighted squared rate, by dynamic programming.
 
     Shape (samples,), rad.
 
@@ -344,7 +346,7 @@ def least_cost_roll(
         rolls = np.linspace(first, last, int(np.ceil((last - first) / step)) + 1) if first < last else np.array([about])
     table = cost(np.repeat(np.arange(count), len(rolls)), np.tile(rolls, count)).reshape(count, -1)
     gain = float(np.median(np.median(table, axis=1) - table.min(axis=1)))  # gain of the best roll over a typical one
-    span = min(t[-1] - t[0], (36 * acceleration_weight / max(gain, 1e-12)) ** 0.25)  # least gain span + 12 v / span^3
+    span = min(t[-1] - t[0], (36 * acceleration_weight / max(gain, 1e-12)) ** 0.25)  # minimises gain span + 12 v/span^3
     if span > 0:
         rate_weight += 12 * acceleration_weight / span**2
     if first_roll is not None:
@@ -374,7 +376,7 @@ def least_cost_roll(
 
 
 def _lowest_cost_path(stage: Array, away: Any, spans: Array, rate_weight: float, rate_limit: float, step: float) -> Any:
-    """Return the roll index at each time on the lowest-cost path, with a penalty beyond the rate limit."""
+    """Return the index of the roll at each time on the lowest-cost path; rates beyond the limit are penalised."""
     weights = np.convolve(np.append(spans, 0), [0.5, 0.5])[: len(stage)]
     weights[[0, -1]] = np.maximum(weights[[0, -1]], spans[[0, -1]] / 2)
     penalty = 1e3 * (np.ptp(stage[np.isfinite(stage)]) + rate_weight + 1e-9)

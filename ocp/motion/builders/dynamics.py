@@ -1,9 +1,9 @@
-"""Motions of fixed and free-floating arms within actuator limits, with accelerations or jerks as the control.
+"""Optimal control problems of fixed and free-floating arms with actuator limits; accelerations or jerks are controls.
 
 The joint torques follow from inverse dynamics (see `torques`). No mass matrix is inverted, and torque limits are
 ordinary path constraints (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
 
-`ocp.motion.builders.dynamics_plan` declares motions to several goals, and with changing loads, as phases.
+`ocp.motion.builders.dynamics_plan` declares problems with several goals, and with changing loads, as phases.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class DynamicsSetup:
 
     Attributes:
         start_velocity, end_velocity: "rest", "free", or the joint velocities at that end, nan where free. Shape (n,),
-            rad/s or m/s. Reaction wheels that hold the momentum of a base at rest turn at the end.
+            rad/s or m/s. Reaction wheels that store the momentum of a base at rest turn at the end.
         start_base: Configuration of the base at the start; home if None. All nan leaves it free, in a phase that is
             joined to another. Shape (base_size,).
         end_base: Configuration of a floating base at the end, nan where free. A quaternion is given as a whole or not
@@ -94,7 +94,7 @@ def dynamics_problem(
     cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
 ) -> Problem:
-    """Declare a motion within actuator limits that minimises effort, energy or time.
+    """Declare the optimal control problem of a motion within actuator limits that minimises effort, energy or time.
 
     The states are "joints", "velocities", "accelerations" if the jerk is the control, and "base" of a floating machine.
     The controls are "accelerations" or "jerks", and "power" (W, the positive actuator power) if energy is weighted or
@@ -106,7 +106,7 @@ def dynamics_problem(
         tasks: A TipTask, or several that are done at once over the whole motion, functions of the time in s. An empty
             sequence for a motion from point to point.
         horizon: Final time, s, or FreeTime(...).
-        start, end: Joints at the start and at the end. Shape (n,), rad or m; nan where free, None if all are free. A
+        start, end: Start and end configurations. Shape (n,), rad or m; nan where free, None if all are free. A
             start is free only in a phase that is joined to another.
         limits: Limits of joints, velocities, accelerations, jerks, torques and power; the robot's own if None.
         cost: Weights of the cost; the squared torques if None.
@@ -165,12 +165,12 @@ class _Ends:
     """Boundary conditions of a motion, checked against the limits; entries that are free are nan.
 
     Attributes:
-        first, last: Joints at the start and at the end. Shape (n,).
+        first, last: Joint positions at the start and at the end. Shape (n,).
         first_rates, last_rates: Joint velocities there. Shape (n,).
         rests: Whether all joints are at rest at the start, and at the end.
         base: Configuration of the base at the start; its guess where it is free.
         joined: Whether joints or base continue from another phase.
-        start: Start of the joints' guess. Shape (n,).
+        start: Joint positions at the start of the guess. Shape (n,).
     """
 
     first: Array
@@ -204,18 +204,18 @@ class _Ends:
 
     @property
     def end(self) -> Array:
-        """Return the joints at the end of the guess; joints with a free end keep their start value. Shape (n,)."""
+        """Joint positions at the end of the guess; those with a free end keep their start value. Shape (n,)."""
         return np.where(np.isnan(self.last), self.start, self.last)
 
     def quintic(self, duration: float, order: int) -> Any:
-        """Return the quintic motion of the joints from rest to rest, or a derivative, as a function of time."""
+        """Return the quintic rest-to-rest motion of the joints, or a derivative of it, as a function of time."""
         shape = QUINTIC.deriv(order) if order else QUINTIC
         begin = self.start if order == 0 else np.zeros(len(self.start))
         return lambda t: begin + (self.end - self.start) * shape(t / duration) / duration**order
 
 
 class _Motion(NamedTuple):
-    """Symbols of a motion: states, controls, and the rate of the base."""
+    """Symbols of a problem's states and controls, and the expression of the rate of the base."""
 
     base: Any
     joints: Any
@@ -228,7 +228,7 @@ class _Motion(NamedTuple):
 def _declare_motion(
     problem: Problem, machine: Motors, ends: _Ends, bounds: JointBounds, duration: float, control: str
 ) -> _Motion:
-    """Declare joints and base with their derivatives, limits and boundary conditions."""
+    """Declare the states and controls of joints and base, with dynamics, limits and boundary conditions."""
     robot, n = machine.robot, machine.joint_size
     scales = _wheel_scales(robot, bounds, duration)
     joints = problem.state(
@@ -276,7 +276,7 @@ def _declare_actuators(
 
 
 def _checked_end(name: str, value: Any, n: int) -> Array:
-    """Return joints or joint velocities at an end; entries that are free are nan. Shape (n,).
+    """Return checked positions or velocities at the start or end of a motion; free entries are nan. Shape (n,).
 
     Raises:
         ProblemError: The value has another size, or is infinite.
@@ -291,10 +291,10 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return typical angles, speeds, accelerations and jerks of reaction wheels; nan for other joints. Shape (4, n).
+    """Return scaling factors for angles, speeds, accelerations and jerks of reaction wheels; nan for other joints.
 
     Rotors are light and turn fast. Their scales are a quarter of the saturation speed and of the motor torque, or what
-    1 N m s and 1 N m cause where these are unlimited.
+    1 N m s and 1 N m cause where these are unlimited. Shape (4, n).
     """
     scales = np.full((4, robot.dof), np.nan)
     for name, inertia in find_wheels(robot).items():
@@ -307,7 +307,7 @@ def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
 
 
 def end_velocities(name: str, value: Any, n: int) -> Array:
-    """Return joint velocities at an end from numbers, "rest" or "free", shape (n,); entries that are free are nan."""
+    """Return joint velocities (n,) at the start or end from numbers, "rest" or "free"; free entries are nan."""
     if isinstance(value, str):
         return np.full(n, 0.0 if require.choice(name, value, ("rest", "free")) == "rest" else np.nan)
     if value is None:
@@ -316,7 +316,7 @@ def end_velocities(name: str, value: Any, n: int) -> Array:
 
 
 def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: Any) -> None:
-    """Fix the configuration of the base at the end; its attitude is fixed by three equations."""
+    """Constrain the configuration of the base at the end of a motion; three equations constrain its attitude."""
     if not machine.base_size:
         raise ProblemError("a fixed base has no end_base", name="end_base", value=end_base)
     goal = _checked_end("end_base", end_base, machine.base_size)
@@ -334,7 +334,7 @@ def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: An
 
 
 def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, motion: _Motion, duration: float) -> None:
-    """Constrain the tip accelerations to the tasks, and declare the pose errors for the audit to watch."""
+    """Constrain the tip accelerations to those of the tasks, and declare the pose errors that the audit checks."""
     base, joints, rates, second, *_ = motion
     if not np.isnan(ends.first).any():
         checked_tasks(equations, ends.base, ends.first, duration)

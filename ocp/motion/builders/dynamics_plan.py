@@ -1,4 +1,4 @@
-"""Solve and audit motions within actuator limits, to one or several goals.
+"""Planners that solve and audit motions within actuator limits to one or several goals.
 
 A plan must satisfy its limits between the nodes of the mesh, too. A smooth plan of least effort needs few intervals. A
 plan of least time switches from limit to limit and gets nodes at its switches. Where a limit is still exceeded
@@ -66,14 +66,14 @@ def dynamics_phases(
     cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
 ) -> Phases:
-    """Declare the motions to consecutive goals as the phases of one problem, which minimises their total cost.
+    """Declare the motions to consecutive goals as phases of one optimal control problem with the least total cost.
 
     Args:
-        machine: Machine on the way to the first goal, unless the goal has its own.
+        machine: Machine during the motion to the first goal, unless the goal has its own.
         goals: At least one, each with joints and a duration; all have the joints of the machine.
-        start: Joints at the start. Shape (n,), rad or m.
+        start: Start configuration. Shape (n,), rad or m.
         total: Duration of all phases together, s, if some have a free time; None leaves it free.
-        limits, cost, setup: Arguments of `dynamics_problem` for all phases. `start_velocity` and `start_base` hold
+        limits, cost, setup: Arguments of `dynamics_problem` for all phases. `start_velocity` and `start_base` apply
             where the first one begins, `end_base` where the last one ends, and clearance in those phases whose machine
             is that of the collision scene. The goals give their velocities themselves.
 
@@ -145,12 +145,12 @@ def checked_goals(goals: Any) -> tuple[Goal, ...]:
 
 
 def phase_names(goals: Sequence[Goal]) -> tuple[str, ...]:
-    """Return the names of the phases that end at goals."""
+    """Return the name of the phase that leads to each goal: that of the goal, or "leg" and a number."""
     return tuple(goal.name or f"leg {k + 1}" for k, goal in enumerate(goals))
 
 
 def machines_of(machine: Motors, goals: Sequence[Goal]) -> tuple[Motors, ...]:
-    """Return the machine of each phase of motions to goals.
+    """Return the machine of each phase of a motion to consecutive goals, which may pick up or put down loads.
 
     Raises:
         ProblemError: The machine changes its joints or its kind of base, or while it moves or has momentum.
@@ -181,7 +181,7 @@ def _rests(goal: Goal) -> bool:
 
 
 def _join(phases: Phases, before: str, after: str, goal: Goal) -> None:
-    """Make the states continuous between two phases, except states that are fixed at both ends."""
+    """Make the states continuous between two phases, except those that the goal between them fixes in both."""
     fixed: dict[str, Any] = {}
     if goal.joints is not None and not np.isnan(np.asarray(goal.joints, dtype=float)).any():
         fixed["joints"] = None
@@ -195,18 +195,18 @@ def _join(phases: Phases, before: str, after: str, goal: Goal) -> None:
 POINTS = Collocation(20, degree=5, scheme="legendre")
 IPOPT = {"max_iter": 300}
 ROWS = r"(?P<phase>[^.;:,\n]*?\.)?(?P<quantity>joints|velocities|accelerations|jerks|torques|power)\[(?P<row>\d+)\]"
-"""Labels of joint rows, with or without the name of a phase."""
+"""Regular expression of constraint labels such as "torques[1]", with or without the name of a phase."""
 
 
 @dataclass(frozen=True)
 class HoldingSettings:
-    """Settings of the search for a plan that satisfies its limits between the nodes.
+    """Settings of the search for a plan that satisfies its limits between the nodes of the mesh.
 
     Attributes:
         meshes: Largest number of meshes, each finer than the one before.
-        splits: Parts of an interval whose tightened limit costs too much. With 3, its cost falls to a ninth.
+        splits: Number of parts of an interval whose tightened limit costs too much; 3 reduce this cost to a ninth.
         excess: Largest excess of a limit between the nodes, in its own unit.
-        cost_increase: Largest relative increase of the cost by tightened limits; above it, switching nodes help more.
+        cost_increase: Largest relative increase of the cost by tightened limits; above it, nodes at switches help more.
     """
 
     meshes: int = 3
@@ -242,7 +242,7 @@ class SolveSettings:
 
     @property
     def ipopt_options(self) -> dict[str, Any]:
-        """IPOPT options, with the defaults of the planner."""
+        """IPOPT options of the user, completed by the defaults of the planner."""
         return {**IPOPT, **(self.options or {})}
 
 
@@ -328,7 +328,7 @@ def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[fl
 
 
 def audit_error(audit: Audit, solution: Solution) -> SolveError:
-    """Return the error about the failure of an audit that exceeds its tolerance most."""
+    """Return an error about that failure of an audit which exceeds its tolerance by the largest factor."""
     worst = max(audit.failures, key=lambda row: row.value / row.limit if row.limit else np.inf)
     words = f"the audit fails: {worst.name} {worst.value:.2g}"
     return SolveError(words, solution, name=worst.name, value=worst.value, limit=worst.limit, time=worst.time)
@@ -343,7 +343,7 @@ def within_limits(
     settings: SolveSettings | None = None,
     guess: Guess = None,
 ) -> Solution:
-    """Return a plan that satisfies its limits also between the nodes and passes its audit; see `solve_dynamics`.
+    """Solve until a plan satisfies its limits between the mesh nodes, too, and passes its audit; see `solve_dynamics`.
 
     Args:
         declare: Declares the problem under clearance constraints.
@@ -437,7 +437,10 @@ def _first_within_limits(
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Yield plans on a mesh that satisfy their limits, or errors; the caller stops at the first good enough plan."""
+    """Yield attempts on one mesh: a label, and a plan that satisfies its limits or else an error.
+
+    The second attempt has nodes at the switches of the first. The caller stops at the first plan that it accepts.
+    """
     warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)
@@ -453,7 +456,7 @@ def _attempts(
 def _tighten_limits(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
-    """Tighten the limits so that they hold between the nodes; return the plan if it costs hardly more, or an error."""
+    """Tighten limits until a plan satisfies them between the nodes; return it, or an error if it costs too much."""
     if largest_excess(problem, plan) <= HOLDING.excess:
         return plan
     own, largest = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.cost_increase * abs(plan.cost)
@@ -468,7 +471,7 @@ def _tighten_limits(
 
 
 def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocation:
-    """Return the next mesh: refined where limits were tightened if only the cost failed, otherwise halved."""
+    """Return a finer mesh: split where tightened limits cost too much, or else with all intervals halved."""
     if plan.bound_tightening is None or failure.solution is not plan or failure.name != "cost":
         return mesh.halve()
     nodes, amounts = plan.control_interpolant.breaks, plan.bound_tightening.max(axis=(0, 2))
@@ -477,7 +480,7 @@ def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocatio
 
 
 def _with_joint_names(error: SolveError, machines: Mapping[str, tuple[Machine, Limits | None]]) -> SolveError:
-    """Return the error with rows named by joints: "torques of 'elbow'" instead of "torques[1]"."""
+    """Return an error that names joints instead of constraint rows: "torques of 'elbow'" for "torques[1]"."""
 
     def joint_label(label: re.Match[str]) -> str:
         phase, quantity, row = label["phase"] or "", label["quantity"], int(label["row"])

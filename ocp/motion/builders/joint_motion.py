@@ -1,4 +1,4 @@
-"""Motions of least joint velocity, with the joint rates as controls: between configurations, and along tasks.
+"""Optimal control problems of least joint velocity, controlled by joint rates: between configurations, and along tasks.
 
 A path of straight motions in joint space at constant speed is a motion of `joint_motion_problem`, with rates that jump
 at its corners. `motion_along` returns it as a solution that can be audited and saved like one of a solver.
@@ -50,15 +50,15 @@ def joint_motion_problem(
     length: bool = False,
     clearance_constraints: ClearanceConstraints | None = None,
 ) -> Problem:
-    """Declare a motion between two configurations of least squared joint rates, or of least length in joint space.
+    """Declare the optimal control problem of least squared joint rates, or of least length, between two configurations.
 
     The state is "joints", the control "rates". With weights w and rates u the cost is the integral of sum(w u^2) / 2,
-    or the length, the integral of sqrt(sum(w u^2)).
+    or the length in joint space, the integral of sqrt(sum(w u^2)).
 
     Args:
         machine: Machine on a fixed base.
         horizon: Final time, s.
-        start, end: Joints, rad or m. Shape (n,).
+        start, end: Configurations, rad or m. Shape (n,).
         limits: Limits of joint positions and rates; the robot's own if None.
         weights: Weights of the squared rates, shape (n,); all 1 if None.
         length: Whether the length is the cost.
@@ -92,9 +92,9 @@ def joint_motion_problem(
 
 
 def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *, length: bool) -> Solution:
-    """Return the motion of a `joint_motion_problem` along a path at constant speed.
+    """Return the motion along a joint path at constant speed as a solution of a `joint_motion_problem`.
 
-    A straight motion is optimal. One with corners has no multipliers: the audit proves whether it is feasible.
+    A straight path is optimal. One with corners has no multipliers: the audit proves only whether it is feasible.
 
     Args:
         problem: The problem.
@@ -116,7 +116,7 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
     ends, middle = np.array([0.0, 1.0]), np.array([0.5])
     states = PiecewisePolynomial(breaks, ends, np.stack([path[:-1], path[1:]], axis=1))
     controls, is_straight = PiecewisePolynomial(breaks, middle, rates[:, None]), len(rates) == 1
-    # the costates of a motion without active constraints: minus the derivative of the running cost by the rates
+    # the costates of a motion without active constraints: minus the rate gradient of the running cost
     speeds = np.linalg.norm(rates * scale, axis=1, keepdims=True)
     duals = -(scale**2) * rates / (np.maximum(speeds, np.finfo(float).tiny) if length else 1.0)
     costates = np.vstack([duals, duals[-1:]])
@@ -147,7 +147,7 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
 
 
 GUESS_STEPS = 64
-"""Steps of the local motion over the horizon, besides the breaks of the tasks."""
+"""Number of steps of the resolved-rate motion that serves as the guess, besides those at breaks of the tasks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,7 @@ class VelocitySetup:
 
     Attributes:
         start_base: Base at the start, shape (base_size,); the machine's base_home() if None.
-        near: Joints from which the guess of a free start begins; from inverse kinematics if None.
+        near: Configuration at which the guess of a free start begins; from inverse kinematics if None.
         guess_damping: Damping of the local motion used as the guess, relative to the root mean square of the singular
             values of the tasks' Jacobian. With small values it is close to the pseudo-inverse; large ones avoid
             singularities and may lead to another extremal.
@@ -189,16 +189,17 @@ def minimum_velocity_problem(
     limits: Limits | None = None,
     setup: VelocitySetup | None = None,
 ) -> Problem:
-    """Declare a motion along tasks with the least integral of half the squared joint rates, 1/2 |x2'|^2 (27).
+    """Declare the optimal control problem of the least integral of half the squared joint rates along tasks.
 
-    The states are "joints" and, on a floating base, "base"; the control is "rates". The path equality is "task",
-    G x2' = v, where v contains the drift of a machine with momentum and the feedback of a pose task. If tasks begin or
-    end during the motion, the names have the number of their stretch of time, see `ocp.motion.builders.tool_motion`.
+    This is problem (27) of Kim and Kim 2011. The states are "joints", x2, and, on a floating base, "base"; the control
+    is "rates". The path equality is "task", G x2' = v with the Jacobian G of the tasks, where v contains the drift of a
+    machine with momentum and the feedback of a pose task. If tasks begin or end during the motion, the names end in the
+    number of the time interval between these events, see `ocp.motion.builders.tool_motion`.
 
     Args:
         machine, tasks: As for `plan`.
         horizon: Final time, s; that of the tasks if None.
-        start: Joints at the start. Shape (joint_size,), rad or m. None leaves them free wherever the tips are at the
+        start: Start configuration. Shape (joint_size,), rad or m. None leaves it free wherever the tips are at the
             beginning of their tasks. With a velocity task the tip is then where it is at `VelocitySetup.near`.
         cyclic: Whether the joints end where they started, after a closed task. The closure that already follows from
             the task is not required twice: the task may deviate by a constant velocity of the size of the
@@ -253,7 +254,7 @@ def minimum_velocity_problem(
 def _attach_guess(
     motion: ToolMotion, base: Array, joints: Array, weights: Array, bounds: JointBounds, damping: float
 ) -> None:
-    """Set the damped local motion through all stretches as the guess of the states and controls of a problem."""
+    """Set the damped resolved-rate motion along the tasks as the guess of a problem's states and controls."""
     motions: list[LocalMotion] = []
     place, at = base[None], joints[None]
     for stretch in motion.stretches:

@@ -1,8 +1,8 @@
-"""Spline of a plan's joints along a path, with the joint torques, for the speed schedule.
+"""Joint positions and torques of a plan as functions of the distance along a path, for scheduling the path speed.
 
-The spline has degree 5, so that the third derivative by the distance, which joint jerks need, is continuous. The
-torques are linear in the line's acceleration a and squared speed v^2. With joints q(s), inverse dynamics tau(q, rate,
-acceleration) without gravity, and rest(q) that of gravity alone,
+The positions are a spline of degree 5, so that its third derivative, which joint jerks need, is continuous. The torques
+are linear in the acceleration a along the path and in the squared speed v^2. With joint positions q(s) at distance s,
+inverse dynamics tau(q, rate, acceleration) without gravity, and rest(q) that of gravity alone,
 
     torque = tau(q, 0, q') a + tau(q, q', q'') v^2 + rest(q).
 """
@@ -41,16 +41,16 @@ ROW_OPERATIONS = {
     ca.OP_COS: np.cos,
     ca.OP_TWICE: lambda operand, out: np.add(operand, operand, out),
 }
-"""NumPy functions for the casadi operations of inverse dynamics: operands, then the output array."""
+"""NumPy functions for the casadi operations of inverse dynamics, called with the operands and the output array."""
 
 
 @dataclass(frozen=True)
 class SplineSettings:
-    """Settings of the joint spline.
+    """Settings of the spline of joint positions along a path.
 
     Attributes:
         path_tolerance: Largest distance of a task from its path, as a share of the path's length.
-        batch: Number of places whose torques are computed together.
+        batch: Number of path points whose torques are computed together.
     """
 
     path_tolerance: float = 1e-6
@@ -61,7 +61,7 @@ SPLINE = SplineSettings()
 
 
 class _Along(NamedTuple):
-    """Joints along a path and their first three derivatives with respect to distance. Shape (M, n) each."""
+    """Joint positions along a path and their first three derivatives with respect to distance. Shape (M, n) each."""
 
     position: Array
     first: Array
@@ -70,7 +70,7 @@ class _Along(NamedTuple):
 
 
 class _Torques(NamedTuple):
-    """Coefficients of the joint torques along a path, inertia a + drag v^2 + rest, by speed v and acceleration a."""
+    """Coefficients of joint torques along a path, inertia a + drag v^2 + rest, at path speed v and acceleration a."""
 
     inertia: Array
     drag: Array
@@ -90,7 +90,7 @@ class PlanLike(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PlannedJoints:
-    """Joints of a machine as functions of the distance along a path, built by `joint_path`.
+    """Joint positions and torques of a machine as functions of the distance along a path, built by `joint_path`.
 
     Attributes:
         machine: Machine of the joints.
@@ -108,7 +108,7 @@ class PlannedJoints:
     forces: _BatchedFunction | None
 
     def at(self, distance: Any) -> _Along:
-        """Return joints and their derivatives at distances from the start. Shape (M,), m.
+        """Return the joint positions and their derivatives at distances along the path. Shape (M,), m.
 
         Raises:
             ProblemError: A distance is nan, or off the path by more than rounding.
@@ -116,7 +116,7 @@ class PlannedJoints:
         return _Along(*self.curves(self._check_distance(distance)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Return the coefficients of the joint torques at distances from the start. Shape (M,), m.
+        """Return the coefficients of the joint torques at distances along the path. Shape (M,), m.
 
         Raises:
             ProblemError: The base of the machine moves, or distances are invalid, see `at`.
@@ -149,13 +149,13 @@ def joint_path(
     samples: int = 400,
     names: Sequence[str] | None = None,
 ) -> PlannedJoints:
-    """Return the joints along a path as a spline, from a plan at constant speed or from samples.
+    """Return joint positions along a path as a spline of the distance, from a plan at constant speed or from samples.
 
     Args:
         machine: Machine of the joints.
         plan: A `Plan` of tasks that run along the whole path at constant speed, in one part or several, with a fixed or
             free horizon. Or a solution with states "joints" at distances proportional to time. Or a tuple of distances
-            (M,) from 0 to the path's length and joints (M, n).
+            (M,) from 0 to the path's length and joint positions (M, n).
         path: Path of the tool.
         samples: Number of samples of a plan or a solution, evenly spaced in time.
         names: Names of the joints; the robot's if None.
@@ -187,7 +187,11 @@ def joint_path(
 
 
 def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
-    """Return distances (M,) and joints (M, n) of a plan; check that its tasks follow the path at constant speed."""
+    """Return path distances (M,) and joint positions (M, n) of a plan whose tasks follow the path at constant speed.
+
+    Raises:
+        ProblemError: They do not follow the path at constant speed.
+    """
     if plan.targets and hasattr(path, "at"):
         t = plan.targets[0].t
         along = path.at(np.clip(length * plan.task_share(t), 0.0, length)).position
@@ -206,7 +210,7 @@ def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple
 
 
 def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, Array]:
-    """Return checked distances (M,) and joints (M, n) of a solution, or of given samples."""
+    """Return checked distances along the path (M,) and joint positions (M, n) of a solution or of given samples."""
     if isinstance(plan, tuple):
         try:
             s, joints = (floats(part) for part in plan)
@@ -235,11 +239,11 @@ def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple
 
 
 class _PiecewisePolynomial:
-    """A spline, stored as one polynomial per interval about the middle of the interval.
+    """Spline that is stored as one Taylor polynomial per interval, about the middle of the interval.
 
     Args:
         breaks: Ends of the intervals. Shape (K + 1,), m.
-        derivatives: Derivatives of order 0 to DEGREE in the middle of each interval, by distance over `unit`. Shape
+        derivatives: Derivatives of order 0 to DEGREE in each middle, with respect to distance / `unit`. Shape
             (DEGREE + 1, K, n).
         unit: Unit of the distance, m.
     """
@@ -247,14 +251,14 @@ class _PiecewisePolynomial:
     def __init__(self, breaks: Array, derivatives: Array, unit: float) -> None:
         self.breaks, self.middle, self.unit = breaks, (breaks[:-1] + breaks[1:]) / 2, unit
         self.derivatives = np.ascontiguousarray(derivatives.transpose(1, 0, 2))
-        # the k-th derivative at x from the middle is the sum of the m-th there times x^(m - k) / (m - k)!
+        # the k-th derivative at x from the middle is the sum of the m-th in the middle times x^(m - k) / (m - k)!
         orders = np.arange(DEGREE + 1) - np.arange(DERIVATIVES + 1)[:, None]
         self.power = np.maximum(orders, 0)
         self.weight = np.array([[1 / factorial(m) if m >= 0 else 0.0 for m in row] for row in orders.tolist()])
         self.weight /= unit ** np.arange(DERIVATIVES + 1)[:, None]
 
     def __call__(self, distance: Array) -> Array:
-        """Return values and three derivatives at distances (M,). Shape (4, M, n)."""
+        """Return the values and first three derivatives of the spline at distances (M,). Shape (4, M, n)."""
         interval = np.clip(np.searchsorted(self.breaks, distance, side="right") - 1, 0, len(self.middle) - 1)
         x = (distance - self.middle[interval]) / self.unit
         powers = x[:, None] ** np.arange(DEGREE + 1)
@@ -266,7 +270,7 @@ class _BatchedFunction:
 
     def __init__(self, function: Any) -> None:
         self.sizes = [function.size1_out(k) for k in range(function.n_out())]
-        # rows: the function's own memory, its inputs, its outputs, its constants
+        # rows of the table: the function's own memory, its inputs, its outputs, its constants
         size = [function.size1_in(k) for k in range(function.n_in())]
         offsets = np.cumsum([function.sz_w(), *size, *self.sizes]).tolist()
         inputs, outputs, self.rows = offsets[: len(size)], offsets[len(size) : -1], offsets[-1]
@@ -293,7 +297,7 @@ class _BatchedFunction:
                 row[target[0]] = target[0]
 
     def __call__(self, *inputs: Array) -> list[Array]:
-        """Return the outputs at inputs of shape (M, n) each."""
+        """Return the outputs of the function for M inputs at once; each argument is an array of shape (M, n)."""
         columns = np.concatenate([value.T for value in inputs])
         count = columns.shape[1]
         results = np.empty((sum(self.sizes), count))
@@ -311,7 +315,7 @@ class _BatchedFunction:
         return [part.T for part in np.split(results, np.cumsum(self.sizes)[:-1])]
 
     def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Return a table with a row for each intermediate value, and the instructions that work on these rows."""
+        """Return an array with a row for each intermediate value of the function, and instructions on these rows."""
         table = np.zeros((self.rows + len(self.constants), SPLINE.batch))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)
@@ -319,7 +323,7 @@ class _BatchedFunction:
 
 
 def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
-    """Return the interpolating spline through samples as one polynomial per interval."""
+    """Return the interpolating spline of joint positions (M, n) at distances (M,)."""
     # in units of the length, which keeps the derivatives of the fit in range
     unit = float(s[-1])
     fit = ca.interpolant("fit", "bspline", [(s / unit).tolist()], joints.ravel().tolist(), {"degree": [DEGREE]})
@@ -332,7 +336,10 @@ def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
 
 
 def _forces(machine: Machine) -> _BatchedFunction | None:
-    """Return the function (q, q', q'') -> torque coefficients (inertia, drag, rest); None for a moving base."""
+    """Return the function that computes the coefficients of joint torques along a path; None for a moving base.
+
+    Its inputs are joint positions and their first two derivatives with respect to distance, its outputs `_Torques`.
+    """
     if not isinstance(machine, FixedBase):
         return None
     q, first, second = (ca.SX.sym(name, machine.joint_size) for name in ("q", "first", "second"))
@@ -342,7 +349,7 @@ def _forces(machine: Machine) -> _BatchedFunction | None:
         base = machine.world_from_base(ca.DM(0, 1))
         return inverse_dynamics(machine.robot, q, rate, acceleration, gravity=gravity, world_from_base=base)
 
-    # gravity in the third alone makes the first two cheaper
+    # gravity only in the third call makes the first two cheaper
     values = ca.cse(
         [ca.densify(each) for each in (torque(still, first), torque(first, second), torque(still, still, GRAVITY))]
     )

@@ -9,8 +9,8 @@ path's segments, where the mesh has nodes. With line speed v, acceleration a and
 
 From rest the jerk is constant over a first short distance d (and over a last one, mirrored): there v = j t^2/2, a = j
 t, d = j t^3/6, so that a = 2 v^2/(3 d), j = a v/(3 d), t = 3 d/v. The problem begins at the end of this distance, so
-that v stays positive and the problem is regular for every method. Held jerks on the mesh of the problem contain the
-reference.
+that v stays positive and the problem is regular for every method. The reference is one of the motions with constant
+jerk in each interval of the mesh.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Settings of the mesh refinement.
+    """Settings of the mesh refinement in `solve_minimum_time`.
 
     Attributes:
-        demand: Largest relative excess of a limit in an interval.
-        defect: Largest error of integration in an interval, relative to its distance and to the top speed.
+        demand: Largest accepted relative excess of a limit in an interval.
+        defect: Largest accepted error of integration in an interval, relative to its distance and to the top speed.
         parts: Largest number of parts of an interval in one refinement.
     """
 
@@ -86,11 +86,11 @@ class TimingProblem:
 
     @property
     def method(self) -> Collocation:
-        """Collocation with constant jerk in each interval, with which no quantity overshoots between points."""
+        """Collocation with constant jerk in each interval, so that quantities do not overshoot between its points."""
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:
-        """Return the motion of a solution, which has constant jerk in each interval.
+        """Return the speed profile of a solution, with constant jerk in each interval.
 
         Raises:
             ProblemError: The jerk of the solution is not constant in its intervals.
@@ -120,19 +120,19 @@ class TimingProblem:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Distances at both ends over which the jerk is constant, m."""
+        """Lengths of the first and last parts of the path, over which the jerk is constant, m."""
         return _ends(self.reference, self.span)
 
 
 @dataclass(frozen=True, eq=False)
 class Fastest:
-    """Fastest motion along a path.
+    """Fastest motion along a path, with its minimum-time problem and solution.
 
     Attributes:
         schedule: Motion as from ocp.motion.schedule, without a list of dips.
         solution: Solution on the last mesh.
         timing: Problem with that mesh.
-        demand: Largest demand over its limit, on a grid ten times finer; 1 is at the limit.
+        demand: Largest ratio of a limited quantity to its limit, on a grid ten times finer.
     """
 
     schedule: Schedule
@@ -200,7 +200,7 @@ def minimum_time_problem(
     guess: Schedule | None = None,
     intervals: int = 200,
 ) -> TimingProblem:
-    """Declare the problem that `solve_minimum_time` solves, for solution by any method.
+    """Declare the minimum-time problem along a path that `solve_minimum_time` solves, for solution by any method.
 
     The path constraints are "asked speed" (the line speed's limit), "centripetal acceleration", "joint velocity",
     "joint acceleration" and "joint jerk", each over its limit and only if limited. The boundary constraints are "start
@@ -223,7 +223,7 @@ def minimum_time_problem(
     path_columns(path, limits, limited, path.sample_distances())  # raises if anything is not finite
     reference = reference_motion(path, limits, limited) if guess is None else guess.profile
     if guess is not None and limited is not None:
-        check_smooth(path, limits, limited)  # raises if no motion satisfies the limits, like a schedule
+        check_smooth(path, limits, limited)  # raises, like a schedule, if no motion satisfies the limits
     whole = reference.duration
     phases = np.diff(reference.t)
     span = (min(phases[0], whole / intervals), whole - min(phases[-1], whole / intervals))
@@ -251,7 +251,10 @@ def _declare(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the problem over a span of theta, in scaled units; `along` returns reference speed and path columns."""
+    """Declare the minimum-time problem over a span of the path parameter theta, in scaled units.
+
+    `along` is the function of theta that returns the reference speed and the values of `path_columns`.
+    """
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
     speeds = np.asarray(path.by_piece(limits.speed))
@@ -292,7 +295,10 @@ def _declare(
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Return the ratios of quantities to their limits by name; `values` are reference speed and path columns."""
+    """Return the ratios of centripetal acceleration and joint rates, accelerations and jerks to their limits, by name.
+
+    `values` are the reference speed and the values of `path_columns`; v, a, j are path speed, acceleration and jerk.
+    """
     demands: dict[str, Any] = {}
     if np.isfinite(limits.centripetal):
         demands["centripetal acceleration"] = v**2 * values[2] / limits.centripetal
@@ -313,7 +319,7 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 
 
 def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
-    """Return the number of parts into which each interval is to be split, as the error falls with its square."""
+    """Return into how many parts each interval is to be split, since its error decreases with its length squared."""
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
     distance_error, speed_error = distance / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
@@ -325,7 +331,7 @@ def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
-    """Return the distances that the reference motion covers before and after a span of its time, m."""
+    """Return the distances that the reference motion covers before and after a given span of its time, m."""
     # the jerk is constant there; the cube is accurate near the end, a difference of distances is not
     left = reference.duration - span[1]
     return float(reference.jerk[0] * span[0] ** 3 / 6), float(reference.jerk[-1] * left**3 / 6)

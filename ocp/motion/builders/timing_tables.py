@@ -1,8 +1,8 @@
-"""Reference motion, mesh and path tables of the minimum-time problem in builders.timing.
+"""Reference motion, mesh and tabulated path quantities of the minimum-time problem in builders.timing.
 
 The time of the reference motion is the path parameter of builders.timing. The quantities of the path that limit the
 speed become smooth casadi functions of it, polynomials between the joins of the path. Samples lie between the places
-where a derivative of the path jumps, and cells are halved until their polynomials agree with the path to
+where a derivative of the path jumps, and intervals are halved until their polynomials agree with the path to
 `TABLES.accuracy`.
 """
 
@@ -44,19 +44,19 @@ __all__ = [
 ]
 
 Columns = Callable[[Array], Array]
-"""Function of times (M,) that returns values (M, m)."""
+"""Type of a function of times (M,) that returns C path quantities at these times. Shape (M, C)."""
 
 
 @dataclass(frozen=True)
 class TableSettings:
-    """Settings of the path tables and of the mesh.
+    """Settings of the tabulated path quantities and of the mesh.
 
     Attributes:
         degree: Degree of the polynomials of a table.
-        accuracy: Largest error of a column, relative to its largest value.
-        smallest_cell: Width of a cell that is not halved further, relative to the whole.
-        halvings: Largest number of halvings of a cell.
-        points: Points of an interval at which demands are evaluated, ten times those of the collocation and the node.
+        accuracy: Largest error of a tabulated quantity, relative to its largest value.
+        smallest_cell: Width of an interval that is not halved further, relative to the whole.
+        halvings: Largest number of halvings of an interval.
+        points: Points of an interval at which ratios to limits are evaluated, ten for each collocation point and node.
         beside_jump: Distance of nodes from a jump of the path's derivatives, relative to the whole time.
         same_node: Distance of nodes that count as one, relative to the whole time.
     """
@@ -74,13 +74,13 @@ TABLES = TableSettings()
 
 
 def table(columns: Columns, breaks: Array) -> Any:
-    """Return a casadi Function time -> values (m, 1) by polynomials of degree 7 on cells between `breaks`.
+    """Return a casadi Function of time that approximates path quantities by piecewise polynomials of degree 7.
 
-    At a break its value is that of the cell that begins there.
+    Intervals between `breaks` are halved as far as necessary. At a break the interval that begins there applies.
     """
     nodes = (
         1 - np.cos(np.pi * (np.arange(TABLES.degree + 1) + 0.5) / (TABLES.degree + 1))
-    ) / 2  # inside the cell, off the breaks
+    ) / 2  # inside the interval, off the breaks
     between = (nodes[1:] + nodes[:-1]) / 2
     fit = np.linalg.inv(_bernstein(nodes))
     start, width = breaks[:-1], np.diff(breaks)
@@ -106,7 +106,7 @@ def table(columns: Columns, breaks: Array) -> Any:
     starts, cells = (np.concatenate(parts) for parts in zip(*finished, strict=True))
     order = np.argsort(starts)
     cells = cells[order]
-    # a constant cell behind the end, which belongs to no other cell
+    # a constant polynomial behind the end, which belongs to no other interval
     cells = np.concatenate([cells, np.repeat(cells[-1:, -1:], TABLES.degree + 1, axis=1)])
     ends = np.concatenate([starts[order], [breaks[-1], 2 * breaks[-1] - breaks[0]]])
     knots = np.repeat(ends, TABLES.degree + 1).tolist()
@@ -117,14 +117,14 @@ def table(columns: Columns, breaks: Array) -> Any:
 
 
 def speed_limit(path: PathLike, limits: LineLimits, s: Array) -> Array:
-    """Return the limit of the line speed at distances (M,). Shape (M,), m/s."""
+    """Return the limit of the speed along a path at distances (M,) from its start. Shape (M,), m/s."""
     return np.asarray(path.by_piece(limits.speed)[segment_index(path.bounds, s)])
 
 
 def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array) -> Array:
-    """Return speed limit, curvature, and three joint derivatives by distance, at distances (M,).
+    """Return speed limit, curvature, and first three derivatives of the joint positions at distances (M,) along a path.
 
-    The curvature is zero if the centripetal acceleration is not limited. Shape (M, m).
+    The curvature is zero if the centripetal acceleration is not limited. Shape (M, C).
 
     Raises:
         ProblemError: A curvature or a joint is not finite, or the joints have a wrong shape.
@@ -138,7 +138,7 @@ def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s
 
 
 def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: LineMotion) -> Array:
-    """Return the largest ratio of all limited quantities of a motion to their limits. Shape (M,).
+    """Return the largest ratio of a limited quantity to its limit at each sample of a motion along a path. Shape (M,).
 
     Where the path's derivatives jump, the values after the jump count.
     """
@@ -155,7 +155,7 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 
 def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Return each quantity's ratio to its limit at line speed v = 1, and the exponent p of its growth with v^p.
+    """Return the ratios of limited quantities to their limits at unit speed along a path, and their exponents of speed.
 
     The rows are the centripetal acceleration, then velocity, acceleration and jerk of each joint. Shapes (C, M), (C,).
     """
@@ -172,9 +172,9 @@ def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates 
 
 
 def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> Array:
-    """Return the ratios of joint acceleration q'' v^2 + q' a, and of jerk q''' v^3 + 3 q'' v a + q' j, to their limits.
+    """Return the ratios of joint accelerations and jerks to their limits at M samples of a motion along a path.
 
-    Shape (2 n, M).
+    They are q'' v^2 + q' a and q''' v^3 + 3 q'' v a + q' j at path speed v, acceleration a, jerk j. Shape (2 n, M).
     """
     v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
     _, largest, jerks = limits.of_joints(rates.first.shape[1])
@@ -184,7 +184,7 @@ def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> 
 
 
 def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
-    """Return the largest ratio to a limit in each interval of a profile, on both sides of jumps. Shape (K,)."""
+    """Return the largest ratio of a limited quantity to its limit in each interval of a speed profile. Shape (K,)."""
     inside = (np.arange(TABLES.points) + 0.5) / TABLES.points
     inside[0], inside[-1] = 1e-9, 1 - 1e-9
     motion = profile.at((profile.t[:-1, None] + np.diff(profile.t)[:, None] * inside).ravel())
@@ -194,14 +194,14 @@ def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | 
 
 
 def _bernstein(x: Array) -> Array:
-    """Return the Bernstein polynomials of a table's degree at x. Shape (len(x), degree + 1)."""
+    """Return the Bernstein polynomials of degree `TABLES.degree` at points x. Shape (len(x), degree + 1)."""
     return np.stack(
         [comb(TABLES.degree, i) * x**i * (1 - x) ** (TABLES.degree - i) for i in range(TABLES.degree + 1)], axis=1
     )
 
 
 def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
-    """Return the motion of a schedule or, if there is none, a slower motion that surely satisfies all limits."""
+    """Return the speed profile of a schedule along a path or, if it fails, a slower one that satisfies all limits."""
     try:
         return schedule(path, limits, joints=joints).profile
     except ProblemError:
@@ -222,7 +222,7 @@ def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | Non
 
 
 def distinct(values: Array, tolerance: float) -> Array:
-    """Return sorted values without those within a tolerance of the previous one; the last one is kept."""
+    """Return values in increasing order without those within a tolerance of the previous one; the last one is kept."""
     ordered = np.sort(values)
     ordered = ordered[np.concatenate([[True], np.diff(ordered) > tolerance])]
     ordered[-1] = values.max()
@@ -230,7 +230,7 @@ def distinct(values: Array, tolerance: float) -> Array:
 
 
 def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, float], intervals: int) -> Array:
-    """Return nodes, as fractions of a span of reference time, with at least `intervals` in the whole time.
+    """Return the mesh nodes of the minimum-time problem as fractions of its span of reference time.
 
     Args:
         reference: Reference motion; the changes of its jerk become nodes.
@@ -256,7 +256,7 @@ def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, flo
 
 
 def subdivide(nodes: Array, parts: NDArray[np.intp]) -> Array:
-    """Return nodes (N + 1,) with each interval divided into equal parts (N,)."""
+    """Return the nodes of a mesh (N + 1,) whose intervals are divided into given numbers of equal parts (N,)."""
     first = np.cumsum(parts) - parts
     step = np.arange(parts.sum()) - np.repeat(first, parts)
     return np.append(np.repeat(nodes[:-1], parts) + np.repeat(np.diff(nodes) / parts, parts) * step, nodes[-1])

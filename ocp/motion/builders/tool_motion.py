@@ -1,8 +1,8 @@
-"""Tool motions of least joint velocity, with each task in its own interval of time.
+"""Optimal control problems of least joint velocity along tool tasks, each in its own interval of time.
 
 The cost is the integral of half the weighted squared joint rates, problem (27) of Kim and Kim 2011. The horizon is
-split into stretches in which the same tasks are active. The stretches are states side by side, each scaled to the whole
-horizon of the problem at its own pace, and the end of each is tied to the start of the next. A task that begins or ends
+split into stretches, intervals in which the same tasks are active. Each stretch has its own states, scaled to the whole
+horizon of the problem at its own pace, and its end is tied to the start of the next one. A task that begins or ends
 during the motion thus needs boundary conditions only, which every method and the audit support.
 """
 
@@ -36,9 +36,9 @@ from ocp.tolerances import ROUNDING_SHARE
 __all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "ToolMotionSetup", "stretches_of", "tool_motion_problem"]
 
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
-"""Names in free time: the time as a state, and the derivatives of joints and time by the tasks' own time."""
+"""Names in a free-time problem: time as a state, and derivatives of joint positions and time in the tasks' time."""
 ERRORS, START_ERRORS = "task errors", "start errors"
-"""Names of the scaled velocity errors of a relaxed task, and of its pose errors at a free start."""
+"""Names of the scaled velocity errors of a relaxed task and of its pose errors at a free start configuration."""
 
 
 @dataclass(frozen=True)
@@ -64,15 +64,15 @@ FEEDBACK = FeedbackSettings()
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Part of the horizon in which the same tasks are active.
+    """Interval of the horizon in which the same tasks are active.
 
     Attributes:
-        begin, end: s.
+        begin, end: Start and end time, s.
         tasks: Indices of the active tasks.
         equations: Their equations; None if there are none and the machine is free.
         new: Whether each of these tasks begins here. Shape (len(tasks),).
         breaks: Times between begin and end at which the tasks are less smooth. Shape (k,), s.
-        nodes: Those of them at which a mesh needs nodes for joint rates that do the tasks. Shape (m,), s.
+        nodes: Those of them at which a mesh needs nodes so that joint rates can do the tasks. Shape (j,), s.
         suffix: Suffix of the names of its states and controls.
     """
 
@@ -93,7 +93,7 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """Problem of `tool_motion_problem` and the stretches of its motion.
+    """Optimal control problem of a tool motion, and the stretches in which its tasks are active.
 
     Attributes:
         problem: Problem with the states "joints" and, on a floating base, "base", and the control "rates", with the
@@ -109,7 +109,7 @@ class ToolMotion:
     breaks: Array
 
     def guess(self, motions: Sequence[LocalMotion], number: int) -> dict[str, Any]:
-        """Return a guess of the problem from the local motion with index `number`."""
+        """Return an initial guess of the problem from resolved-rate motions, that of index `number` in each stretch."""
         guess: dict[str, Any] = {}
         for stretch, part in zip(self.stretches, motions, strict=True):
             t = (part.t - stretch.begin) * (self.horizon / stretch.duration)
@@ -122,7 +122,7 @@ class ToolMotion:
 
 
 def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> tuple[Stretch, ...]:
-    """Divide the horizon into stretches with the same tasks, with the pose feedback limited to what a mesh can follow.
+    """Divide the horizon into stretches with the same active tasks, and limit the pose feedback to suit their meshes.
 
     Raises:
         ProblemError: A task begins or ends outside the horizon.
@@ -166,14 +166,14 @@ class ToolMotionSetup:
 
     Attributes:
         base: Configuration of the base at the start. Shape (base_size,).
-        start: Joints at the start, rad or m. Where they are nan, or None, the start is free, and the tips must be where
+        start: Start configuration, rad or m. Where it is nan, or None, the start is free, and the tips must be where
             their tasks begin. Shape (joint_size,).
-        reference: Joints that satisfy the tasks at the start. A cyclic task is checked there, and with a free start a
-            velocity task starts with the tip there. Shape (joint_size,).
+        reference: Configuration that satisfies the tasks at the start. A cyclic task is checked there, and with a free
+            start a velocity task starts with the tip there. Shape (joint_size,).
         cyclic: Whether the joints end where they start.
         weights: Weights of the squared joint rates. Shape (joint_size,).
         bounds: Limits of joint positions and rates.
-        time_cost: Cost of a second, if the tasks may be executed more slowly. The horizon of the problem is then the
+        time_cost: Cost per second if the tasks may be executed more slowly. The horizon of the problem is then the
             tasks' own, with the further state CLOCK, the time, and the controls SLOPES, the derivatives of the joints,
             and PACE, that of the time, at least 1. None keeps the tasks' own time.
         actuation: Options of a motion with accelerations (jerks) as the control, within the limits of the actuators;
@@ -199,12 +199,12 @@ class ToolMotionSetup:
 
     @property
     def free(self) -> bool:
-        """Whether the start configuration is free, apart from the start poses of the tasks."""
+        """Whether a joint position at the start is not prescribed, so that only the tasks constrain it there."""
         return self.start is None or bool(np.isnan(self.start).any())
 
 
 def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: ToolMotionSetup) -> ToolMotion:
-    """Declare a motion along tasks that minimises the integral of half the weighted squared joint rates.
+    """Declare the optimal control problem of a motion along tasks with least weighted squared joint rates.
 
     Args:
         machine: Machine on a fixed or floating base.
@@ -246,7 +246,7 @@ def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: T
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """An optimal control problem that is being declared, with data shared by all its stretches."""
+    """Optimal control problem under construction, with the data that all its time intervals share."""
 
     problem: Problem
     machine: Machine
@@ -259,11 +259,11 @@ class _Motion:
         return self.stretches[-1].end
 
     def pace(self, stretch: Stretch) -> float:
-        """Return the ratio of the stretch's time to the problem's time."""
+        """Return the time of a stretch that passes per unit of the problem's time, by which its dynamics are scaled."""
         return stretch.duration / self.horizon
 
     def states(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare the joints of a stretch, and its base if that moves, as states."""
+        """Declare the joint positions of a stretch as states, and its base configuration if the base moves."""
         machine, begins, ends = self.machine, stretch is self.stretches[0], stretch is self.stretches[-1]
         place: Any = np.zeros(0)
         if machine.base_size:
@@ -277,7 +277,7 @@ class _Motion:
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
 
     def velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
-        """Declare velocities as states; return velocities, accelerations and the running cost."""
+        """Declare the joint velocities of a stretch as states; return velocities, accelerations and running cost."""
         assert self.setup.actuation is not None
         begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.setup.actuation.rests))
         cost = self.setup.actuation.cost or Cost(weights=self.setup.weights)
@@ -287,7 +287,7 @@ class _Motion:
         return declare_actuators(self.problem, self.machine, self.horizon, (place, joints), **options)
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare velocities by which relaxed tasks may deviate; return them and their cost, or 0, 0 if not relaxed."""
+        """Declare the velocities by which relaxed tasks may deviate; return them and their cost, 0 if none may."""
         assert stretch.equations is not None
         if not self.setup.relaxed or not stretch.equations.size:
             return 0, 0
@@ -305,10 +305,10 @@ class _Motion:
 
 
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
-    """Declare one stretch of a motion with several stretches.
+    """Declare the states, controls and constraints of one stretch, an interval with the same tasks, in fixed time.
 
-    `known` has the slopes of the positions that the stretch before fixes at its end, see `_slopes`, or is None. Returns
-    the states that continue in the next stretch, the running cost, and the slopes of the positions fixed here.
+    `known` has the Jacobian of the positions that the stretch before fixes at its end, see `_slopes`, or None. Return
+    the states that continue in the next stretch, the running cost, and the Jacobian of the positions fixed here.
     """
     problem, machine, bounds, pace = motion.problem, motion.machine, motion.setup.bounds, motion.pace(stretch)
     begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]
@@ -327,7 +327,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
         required = np.ones(stretch.equations.size, dtype=bool)
         slopes = _slopes(stretch, motion.setup.base, motion.setup.reference)
         if known is not None:
-            rest = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known  # not led there before
+            rest = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known  # not fixed before
             required = ~(np.linalg.norm(rest, axis=1) <= ROUNDING_SHARE * np.linalg.norm(slopes, axis=1))
         derivatives = None
         if second is not None:
@@ -347,11 +347,11 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
 
 
 def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
-    """Declare the problem of `tool_motion_problem` with free time, which is a state over the task time s.
+    """Declare the problem of a tool motion whose tasks may be executed more slowly, with the time t as a state.
 
-    With q' = dq/ds and z = dt/ds the cost is the integral of (time_cost + q. W q. / 2) dt = (time_cost z + q' W q'/(2
-    z)) ds, which is convex in q' and z. The tasks, J q' = v(s), and the rate limits, |q'| <= v z, are linear in them.
-    With accelerations as the control, z is a state, and q' = z q.
+    The independent variable is the tasks' own time s. With q' = dq/ds, z = dt/ds, rates u = q'/z and weights W the cost
+    is the integral of (time_cost + u W u/2) dt = (time_cost z + q' W q'/(2 z)) ds, which is convex in q' and z. Tasks,
+    J q' = v(s), and rate limits V, |q'| <= V z, are linear. With accelerations as controls, z is a state.
     """
     machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.setup.bounds
     if len(stretches) > 1 or stretches[0].equations is None:
@@ -395,7 +395,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
 
 def _closure(motion: _Motion) -> Any:
-    """Declare and return a constant deviation velocity of a closed task, by which the joint path can close, too.
+    """Declare and return a constant velocity by which a closed task may deviate so that the joint path can close.
 
     If the joints return, a closed task returns by itself. Both conditions would contradict each other by the error of
     the discretisation; so the task may deviate by a velocity of that size.
@@ -426,11 +426,11 @@ def _declare_tasks(
     required: NDArray[np.bool_] | None = None,
     derivatives: Sequence[tuple[Any, Any]] | None = None,
 ) -> None:
-    """Declare the task constraints of a stretch in the symbols of base, joints and rates.
+    """Declare the task constraints of a stretch; `symbols` are its base configuration, joint positions and rates.
 
     `closure` is the deviation of a closed task. If `free`, the tasks that begin here must be at their start poses,
-    except in rows that are not `required`, (size,), to which the stretch before leads. With `derivatives`, of states by
-    the time of the tasks, the base last, accelerations constrain the tasks, and tasks begin with their velocities, too.
+    except in rows that are not `required`, (size,), to which the stretch before leads. With `derivatives` (of states
+    in task time, the base last), accelerations constrain the tasks, and tasks begin with their velocities, too.
     """
     problem, equations, suffix, (base, joints, rates) = motion.problem, stretch.equations, stretch.suffix, symbols
     assert equations is not None
@@ -482,9 +482,9 @@ def _declare_tasks(
 
 
 def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
-    """Return the derivatives of a stretch's task rows with respect to base and joints, at a random configuration.
+    """Return the Jacobian of task coordinates with respect to base and joints at a random configuration.
 
-    A rank found there holds everywhere but on a set of measure zero. Shape (size, base_size + joint_size).
+    A rank found there applies everywhere but on a set of measure zero. Shape (size, base_size + joint_size).
     """
     equations: Any = stretch.equations
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))

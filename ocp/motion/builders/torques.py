@@ -1,4 +1,4 @@
-"""Joint torques of a machine, and motions whose controls are accelerations: limits of actuators, and costs.
+"""Joint torques of a machine, and actuator limits and costs of motions whose controls are accelerations.
 
 The joint torques follow from inverse dynamics,
 
@@ -36,12 +36,12 @@ LENGTH_RATE = 1e-2
 at 0.5 rad/s, and by LENGTH_RATE at rest."""
 
 Motors = FixedBase | FreeFloating
-"""Machines that are moved by the torques of their joints alone."""
+"""Type of the machines whose motion the joint torques alone determine."""
 
 
 @dataclass(frozen=True)
 class JointFriction:
-    """Friction in the joints.
+    """Viscous and smoothed Coulomb friction in the joints of a machine.
 
     Attributes:
         viscous: Viscous coefficient, one number or one for each joint, N m s/rad or N s/m.
@@ -63,7 +63,7 @@ class JointFriction:
             raise ProblemError("friction: slip must be positive", name="slip", value=self.slip, limit=0.0)
 
     def torques(self, rates: Any) -> Any:
-        """Return the joint torques that overcome the friction. Shape (n, 1)."""
+        """Return the joint torques that overcome the friction at given joint rates. Shape (n, 1)."""
         n = rates.numel()
         viscous = ca.DM(require.broadcast("friction: viscous", self.viscous, n, "joints", sign="nonnegative"))
         coulomb = ca.DM(require.broadcast("friction: coulomb", self.coulomb, n, "joints", sign="nonnegative"))
@@ -78,11 +78,11 @@ def joint_torques(
     wrenches: Sequence[Wrench] = (),
     gravity: Any = None,
 ) -> Any:
-    """Return the joint torques (forces of prismatic joints) of a motion. Shape (n, 1), N m or N.
+    """Return the joint torques (forces of prismatic joints) that a motion requires. Shape (n, 1), N m or N.
 
     Args:
         machine: Machine on a fixed base, or floating freely.
-        motion: Configuration of the base, joints, their rates and accelerations. Shapes (base_size, 1) and (n, 1).
+        motion: Base configuration, joint positions, rates and accelerations. Shapes (base_size, 1) and (n, 1).
             Symbols for a floating machine, because they are differentiated.
         friction: Friction in the joints; None for none.
         wrenches: External wrenches, on a fixed base only.
@@ -141,7 +141,7 @@ def declare_actuators(
     pace: Any,
     suffix: str = "",
 ) -> tuple[Any, Any, Any]:
-    """Declare velocities and accelerations within their limits; return them and the running cost (per second).
+    """Declare joint velocities and accelerations within actuator limits; return them and the running cost per second.
 
     The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
     "power" where these are limited or weighted.
@@ -150,7 +150,7 @@ def declare_actuators(
         problem: Problem with a horizon.
         machine: The machine.
         horizon: Horizon of the problem, s.
-        place: Base and joints as symbols.
+        place: Base configuration and joint positions as symbols.
         bounds: Limits of the joints and of the actuators.
         actuation: Cost, smoothness, and whether the joints are at rest where these states start and end.
         pace: Seconds of the motion in a second of the problem.
@@ -193,12 +193,12 @@ def weights_torques(cost: Cost) -> bool:
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
-    """Return the running cost of a motion (per second), without the costs of time and positive power.
+    """Return the running cost of a motion per second, without the costs of time and positive power.
 
     Args:
         machine: The machine.
         cost: Weights of the cost.
-        motion: Base, joints, rates and accelerations as symbols.
+        motion: Base configuration, joint positions, rates and accelerations as symbols.
         jerks, torques: Used if they are weighted. Shape (n, 1).
     """
     (base, joints, rates, second), n = motion, machine.joint_size
@@ -229,7 +229,7 @@ def positive_power(problem: Problem, powers: Any, bounds: JointBounds, suffix: s
 
 
 def limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, *, suffix: str = "") -> None:
-    """Declare the path constraint of the joints whose torque is limited."""
+    """Declare the torque limits of a robot's joints, where these are finite, as a path constraint."""
     if rows := np.flatnonzero(np.isfinite(largest)).tolist():
         bounds = {"lower": -largest[rows], "upper": largest[rows]}
         problem.path(f"torques{suffix}", torques[rows], unit=robot.effort_unit, **bounds)

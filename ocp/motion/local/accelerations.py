@@ -1,6 +1,6 @@
 """Instantaneous redundancy resolution of a standing machine at acceleration level (Yoo et al. 2004).
 
-Each law builds q'' task by task: the least accelerations that do a task and leave the earlier tasks unchanged,
+Each law builds the joint accelerations task by task: the least that do a task and leave the earlier tasks unchanged,
 equations (20), (22), (26), (33)-(34) corrected. Pinning the zero moment point leaves an inverted pendulum, which falls
 while the stability index stays 1. Every simulation therefore reports vertical ground force, zero moment point, joint
 limits and rates, and stops with a reason if the foot lifts off or the motion diverges.
@@ -43,8 +43,8 @@ class Layer:
     """Secondary objective: a configuration index to be improved by the freedom that tasks and zero moment point leave.
 
     Attributes:
-        index: ``joint_limits``, p1 (23), to be decreased; ``manipulability`` of the rows of the tasks, p2 (27), to be
-            increased.
+        index: ``joint_limits``, p1 of equation (23) of Yoo et al. 2004, to be decreased; ``manipulability`` of the rows
+            of the tasks, p2 of (27), to be increased.
         demand: Negative to decrease p1, positive to increase p2.
         form: ``assigned``: the second derivative of the index equals the demand, (25)-(26), (29)-(33); takes one degree
             of freedom, with unbounded accelerations where the index is stationary. ``gradient``: demand times the
@@ -91,10 +91,10 @@ class Stabiliser:
 
 @dataclass(frozen=True, eq=False)
 class AccelerationOptions:
-    """Options of a law and of its simulation.
+    """Options of a resolved-acceleration law and of its simulation.
 
     Attributes:
-        zmp: Target (x, y) of the zero moment point for all laws but the first, m, in the directions in which motion
+        zmp: Target (x, y) of the zero moment point, not for ``pseudo_inverse``, m, in the directions in which motion
             moves it, or a function of CasADi time that returns it; the machine's most stable point if None.
         layers: Configuration indices that the remaining freedom improves, in this order after the law, (23)-(34).
         stabiliser: Gains of the stabilised law.
@@ -151,14 +151,14 @@ class _TaskHierarchy:
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add a task, rows q'' = target, with the least change of the accelerations so far."""
+        """Add a task, rows q'' = target for joint accelerations q'', with the least change of those so far."""
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
         self.projector = self.projector - ca.mtimes(inverse, projected)
 
     def add_free(self, direction: Any) -> None:
-        """Add an acceleration vector, projected onto the remaining null space."""
+        """Add joint accelerations, projected onto the null space of all tasks so far."""
         self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
@@ -191,15 +191,15 @@ def accelerations(
     external: External | None = None,
     options: AccelerationOptions | None = None,
 ) -> Any:
-    """Return the joint accelerations that a law commands. Shape (n, 1).
+    """Return the joint accelerations that a redundancy resolution law commands. Shape (n, 1).
 
     Args:
         machine: The machine.
         equations: Equations of the tasks.
-        law: ``pseudo_inverse``: the tasks alone. ``augmented``: tasks and zero moment point together, (20).
-            ``null_space``: the zero moment point in the null space of the tasks, (21)-(22). ``stabilised``: like
-            augmented, with the centre of mass commanded in their null space.
-        state: Time, joints and joint velocities, symbols of one kind.
+        law: ``pseudo_inverse``: the tasks alone. ``augmented``: tasks and zero moment point together,
+            equation (20). ``null_space``: the zero moment point in the null space of the tasks, (21)-(22).
+            ``stabilised``: like augmented, with the centre of mass commanded in their null space.
+        state: Time, joint positions and joint velocities, symbols of one kind.
         external: External wrenches as a function of time and tip position.
         options: Target of the zero moment point, layers, gains and damping; `AccelerationOptions()` if None.
     """
@@ -237,10 +237,10 @@ def accelerations(
 
 
 def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
-    """Return rows and values of a task that commands the acceleration of the centre of mass.
+    """Return matrix and right side of a task of the joint accelerations that stabilises the centre of mass.
 
-    `right` is C of (18), minus the moment of weight and wrenches about the place: it vanishes for a centre of mass at
-    y*, and -C / (M g) is the distance of the centre of mass beyond y*.
+    `right` is C of equation (18), minus the moment of weight and wrenches about `place`, y*: it vanishes for a centre
+    of mass at y*, and -C / (M g) is the distance of the centre of mass beyond y*.
     """
     a, b, c = gains.poles
     k2, k1, k0 = a + b + c, a * b + b * c + c * a, a * b * c / machine.weight
@@ -295,7 +295,7 @@ class AccelerationSolution:
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Failures of the motion; () if there are none.
+        """Names of the failures of the motion; () if there are none.
 
         ``lift_off``, ``divergence``, ``breakdown`` as for Stop; ``leaves_foot``: the zero moment point leaves the
         support; ``joint_limits``; ``leaves_path``: a tip leaves its pose by more than 1e-3 (m or rad).
@@ -342,7 +342,7 @@ def resolve_accelerations(
         machine: A Standing machine.
         tasks: A TipTask, or several that are done at once.
         horizon: Final time, s.
-        start: Joints at the start, shape (n,), rad or m, or a `Start` with the joints and their velocities.
+        start: Start configuration, shape (n,), rad or m, or a `Start` with the joints and their velocities.
         law: ``pseudo_inverse``, ``augmented`` (20), ``null_space`` (21)-(22) or ``stabilised``.
         external: External wrenches as a function of time and tip position.
         step: Step of the integration and between samples, s.
@@ -392,7 +392,7 @@ def resolve_accelerations(
 
 
 class _Simulation:
-    """Integrator of the state (q, q') with fixed steps, many steps in one call."""
+    """Integrator of joint positions and velocities under a law, with fixed steps, many of them in one call."""
 
     def __init__(self, law: Any, n: int, step: float, options: AccelerationOptions) -> None:
         self.step, self._law, self._n = step, law, n
@@ -415,7 +415,7 @@ class _Simulation:
         self._many: dict[int, Any] = {}
 
     def advance(self, time: float, state: Array, count: int) -> Array:
-        """Return the states after each of `count` steps, nan from where the integration fails. Shape (count, 2 n)."""
+        """Return the states after each of `count` steps, nan after the integration fails. Shape (count, 2 n)."""
         times = time + self.step * np.arange(count)
         if count not in self._many:
             self._many[count] = self._once.mapaccum("steps", count)
@@ -442,7 +442,7 @@ class _Recorder:
         self.state = np.zeros(0)
 
     def add(self, times: Array, states: Array) -> Stop | None:
-        """Evaluate and record samples; return a Stop for the first sample that fails, else None."""
+        """Evaluate and record samples of the motion; return a Stop for the first one that fails, else None."""
         n = states.shape[1] // 2
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))

@@ -1,4 +1,4 @@
-"""All IK solutions of an arm within its limits: which joints are solved for, which are sampled, and whole turns.
+"""All inverse kinematics solutions of an arm within its limits: joints to solve for, sampled joints and full turns.
 
 Six joints are solved for at once, in closed form or by elimination. Tasks that leave the orientation of the tip open
 and arms of fewer joints are brought to that form by revolute joints that the arm does not have, between its last joint
@@ -24,12 +24,12 @@ from ocp.motion.local.elimination import elimination_of
 __all__ = ["ArmSolver", "arm_solver", "sample_shares"]
 
 STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
-"""Steps of the sampled parameters between samples, as shares of their ranges; irrational, so that none repeats."""
+"""Steps of the sampled parameters between samples, as fractions of their ranges; irrational, so that none repeats."""
 
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """Settings of the choice of redundant joints.
+    """Settings of the choice of the redundant joints that are sampled.
 
     Attributes:
         max_samples: Largest number of sampled parameters.
@@ -54,19 +54,19 @@ ARM = ArmSettings()
 
 
 def sample_shares(first: int, count: int, dimension: int) -> Array:
-    """Return `count` samples of a low-discrepancy sequence from index `first` on. Shape (count, dimension)."""
+    """Return samples in [0, 1) of a low-discrepancy sequence, from index `first` on. Shape (count, dimension)."""
     return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
 
 
 @dataclass(frozen=True, eq=False)
 class ArmSolver:
-    """Solver of all inverse kinematics of an arm within its limits. Use `arm_solver` to build it.
+    """Solver of all inverse kinematics solutions of an arm within its limits. Use `arm_solver` to build it.
 
     Attributes:
         chain: Chain of the arm.
         solvers: Solvers of six joints, or four of a SCARA, for several choices of the sampled joints; the
             best-conditioned one first. Their chains have further joints at the end.
-        auxiliary: Numbers of the auxiliary joints, which must stay at zero.
+        auxiliary: Indices of the auxiliary joints, which must stay at zero.
         lower, upper: Limits of the joints, infinite for unlimited ones. Shape (n,).
     """
 
@@ -77,7 +77,7 @@ class ArmSolver:
     upper: Array
 
     def redundant_positions(self, solver: PoseSolver, shares: Array) -> Array:
-        """Convert fractions (M, k) of the ranges of the redundant joints to their positions."""
+        """Convert fractions of the ranges of a solver's redundant joints to joint positions. Shapes (M, k)."""
         joints = list(solver.redundant)
         if not joints:
             return shares[:, :0]
@@ -90,7 +90,7 @@ class ArmSolver:
     def solve(
         self, solver: PoseSolver, positions: Array, rotations: Array, redundant: Array, *, turns: bool = True
     ) -> tuple[Solutions, NDArray[np.bool_]]:
-        """Return all isolated solutions at M poses within the limits, and flags of poses where some may be missing.
+        """Return all isolated IK solutions within the limits at M poses, and flags of poses where some may be missing.
 
         Revolute joints are shifted by whole turns in all ways that keep the limits; unlimited ones are between -pi and
         pi. Joints that do not move the tip are at 0.
@@ -114,7 +114,7 @@ class ArmSolver:
         return self._within_limits(solutions._replace(joints=solutions.joints[:, :n]), turns), doubtful
 
     def _within_limits(self, solutions: Solutions, turns: bool) -> Solutions:
-        """Return the solutions within the limits, repeated for all full turns of joints that stay within them."""
+        """Return the IK solutions within the limits, repeated for all full turns of joints that stay within them."""
         windows, order = self._windows, list(self.chain.order)
         start, shiftable = windows.low if turns else windows.middle, windows.shiftable
         joints = solutions.joints.copy()
@@ -132,7 +132,7 @@ class ArmSolver:
 
     @cached_property
     def _windows(self) -> _Windows:
-        """Intervals of one full turn within the joint ranges, into which solutions are shifted."""
+        """Intervals of one full turn within the joint ranges, into which the angles of solutions are shifted."""
         below, above, revolute = np.isfinite(self.lower), np.isfinite(self.upper), self.chain.revolute
         both, lower, upper = below & above & revolute, self.lower - ARM.excess, self.upper + ARM.excess
         low = np.where(below, lower, upper - TURN)
@@ -158,8 +158,8 @@ class _Windows(NamedTuple):
         lower, upper: Limits, beyond which lies only rounding. Shape (n,).
         lowest, highest: Limits of the joints that move the tip. Shape (n,).
         low, middle: Lower ends of the lowest windows, and of those in the middle of the limits. Shape (s,).
-        shiftable: Numbers of the joints that have a limit. Shape (s,).
-        several: Numbers of the joints that can make a whole turn within the limits.
+        shiftable: Indices of the joints that have a limit. Shape (s,).
+        several: Indices of the joints that can make a whole turn within the limits.
     """
 
     lower: Array
@@ -173,7 +173,7 @@ class _Windows(NamedTuple):
 
 
 def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = None) -> ArmSolver | None:
-    """Return the solver of an arm; None if no choice of six joints has a regular kinematic problem.
+    """Return the inverse kinematics solver of an arm; None if there is no choice of joints that can be solved for.
 
     Args:
         chain: Chain of the arm.
@@ -208,7 +208,7 @@ def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = No
 
 
 def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
-    """Return how well conditioned the inverse kinematics are for each choice of redundant joints.
+    """Return how well conditioned inverse kinematics is for each choice of redundant joints; larger is better.
 
     This is the geometric mean, at random configurations, of the least singular value of the Jacobian of the others.
     """

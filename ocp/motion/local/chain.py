@@ -1,4 +1,4 @@
-"""The serial chain from the world to a tip: its joint axes, and Newton's method to whole poses of the tip.
+"""Serial chain from the world to a tip: its joint axes, and Newton's method for its inverse kinematics.
 
 At the zero configuration each joint k has an axis in the world, a unit screw xi_k. The pose of the tip is the product
 of exponentials e_1 .. e_n H with e_k = exp(xi_k q_k) and the pose H at zero (Brockett 1984). A revolute screw satisfies
@@ -29,7 +29,7 @@ TURN = 2 * np.pi
 
 @dataclass(frozen=True)
 class NewtonSettings:
-    """Settings of Newton's method; lengths are relative to the size of the arm.
+    """Settings of Newton's method for inverse kinematics; lengths are relative to the size of the arm.
 
     Attributes:
         steps: Largest number of steps.
@@ -63,7 +63,7 @@ NEWTON = NewtonSettings()
 
 
 class Motion(NamedTuple):
-    """Rigid motions v -> turn v + shift of M samples. Shapes (M, 3, 3), (M, 3)."""
+    """Rigid motions of M samples: rotation matrices `turn` (M, 3, 3) and translations `shift` (M, 3)."""
 
     turn: Array
     shift: Array
@@ -73,7 +73,7 @@ class Motion(NamedTuple):
         return Motion(self.turn[chosen], self.shift[chosen])
 
     def after(self, first: Motion) -> Motion:
-        """Return the composition: first the given motions, then these."""
+        """Return the composition of motions: first the given ones, then these."""
         return Motion(self.turn @ first.turn, self.at(first.shift))
 
     def rotate(self, vectors: Array) -> Array:
@@ -92,7 +92,7 @@ class Motion(NamedTuple):
 
 
 class SymbolicAxis(NamedTuple):
-    """Axis of a joint as expressions: its unit direction and a point on it. Shapes (3, 1)."""
+    """Axis of a joint as CasADi expressions: its unit direction and a point on it. Shapes (3, 1)."""
 
     direction: Any
     point: Any
@@ -100,7 +100,7 @@ class SymbolicAxis(NamedTuple):
 
     @classmethod
     def of(cls, direction: Array, point: Array, revolute: bool) -> SymbolicAxis:
-        """Return a symbolic axis from numeric direction and point."""
+        """Return a joint axis as constant CasADi expressions, which symbolic motions can then transform."""
         return cls(expression(direction), expression(point), revolute)
 
     def moved(self, motion: Frame) -> SymbolicAxis:
@@ -108,26 +108,29 @@ class SymbolicAxis(NamedTuple):
         return self._replace(direction=ca.mtimes(motion.rotation, self.direction), point=motion.point(self.point))
 
     def frame(self, position: Any) -> Frame:
-        """Return the rigid motion that a joint position causes."""
+        """Return the rigid motion about or along the axis that a joint position causes."""
         if not self.revolute:
             return Frame(ca.DM.eye(3), self.direction * position)
         turn = rotation(self.direction, position)
         return Frame(turn, self.point - ca.mtimes(turn, self.point))
 
     def angle(self, start: Any, end: Any) -> Any:
-        """Return the angle by which the joint rotates a vector towards another."""
+        """Return the angle about the axis that turns a vector towards another, rad."""
         across = start - ca.dot(start, self.direction) * self.direction
         return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
 
     def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
-        """Return constant, cosine and sine coefficients of fixed . R(sign angle) vector. Shape (1, 3)."""
+        """Return the coefficients of 1, cosine and sine in the scalar product of a fixed and a rotated vector.
+
+        The product is fixed . R(sign angle) vector, with the rotation R about the axis. Shape (1, 3).
+        """
         constant = ca.dot(fixed, self.direction) * ca.dot(self.direction, vector)
         sine = sign * ca.dot(fixed, cross(self.direction, vector))
         return ca.horzcat(constant, ca.dot(fixed, vector) - constant, sine)
 
 
 def compose(first: Frame, second: Frame) -> Frame:
-    """Return the composition of two motions, of which the second is applied first."""
+    """Return the composition of two rigid motions, of which the second is applied first."""
     return Frame(ca.mtimes(first.rotation, second.rotation), first.point(second.position))
 
 
@@ -137,10 +140,10 @@ def inverse(frame: Frame) -> Frame:
 
 
 class Solutions(NamedTuple):
-    """Solutions of the inverse kinematics at M poses.
+    """Solutions of the inverse kinematics of an arm at M poses of its tip.
 
     Attributes:
-        pose: Pose of each solution. Shape (K,).
+        pose: Index of the pose of each solution. Shape (K,).
         joints: Joint positions, those of revolute free joints between -pi and pi. Shape (K, n).
         singular: Which solutions are so near a singularity that others may hide there. Shape (K,), bool.
     """
@@ -163,7 +166,7 @@ class Chain:
         axes, points: Directions of the axes of all joints, and points on them. Shapes (n, 3), m.
         revolute: Which joints are revolute; the others are prismatic. Shape (n,), bool.
         position, rotation: Pose of the tip. Shapes (3,), (3, 3).
-        order: Numbers of the joints that move the tip, from the base to the tip.
+        order: Indices of the joints that move the tip, from the base to the tip.
         size: Largest distance of an axis from the tip, m.
     """
 
@@ -177,7 +180,7 @@ class Chain:
 
     @classmethod
     def of(cls, machine: Machine) -> Chain | None:
-        """Return the chain to a machine's tip; None if its base moves, or if a joint of the chain is a follower."""
+        """Return the chain from world to tip of a machine; None if its base moves, or a joint in it mimics another."""
         robot = machine.robot
         path = () if robot.tip is None else [joint for joint in robot.path_to(robot.tip_link) if joint.moves]
         if machine.base_size or any(joint.mimic is not None for joint in path):
@@ -206,12 +209,15 @@ class Chain:
 
     @cached_property
     def home(self) -> Frame:
-        """Pose of the tip at the zero configuration, as constants."""
+        """Pose of the tip at the zero configuration, as constant CasADi expressions."""
         return Frame(expression(self.rotation), expression(self.position))
 
     @cached_property
     def _tip_function(self) -> Sampler:
-        """Function (joints, rows of goal rotation, goal position) -> pose error, Jacobian and pose of the tip."""
+        """Function of joint positions and a goal pose that returns pose error, Jacobian and pose of the tip.
+
+        The rotations are given and returned row by row.
+        """
         joints, turn, shift = ca.SX.sym("q", len(self.axes)), ca.SX.sym("turn", 9), ca.SX.sym("shift", 3)
         frame, moved = Frame(ca.DM.eye(3), ca.DM(3, 1)), list[SymbolicAxis]()
         for j in self.order:
@@ -233,12 +239,12 @@ class Chain:
         return Sampler([joints, turn, shift], outputs)
 
     def poses(self, joints: Array) -> tuple[Array, Array]:
-        """Return the poses of the tip at joints (K, n). Shapes (K, 3), (K, 3, 3)."""
+        """Return positions (K, 3) and rotations (K, 3, 3) of the tip at joint positions (K, n)."""
         _, _, positions, rotations = self._tip_function(joints, np.zeros(9), np.zeros(3))
         return positions, rotations.reshape(-1, 3, 3)
 
     def linearize(self, joints: Array, free: Sequence[int], goal: Motion) -> tuple[Array, Array]:
-        """Return pose errors (K, 6) at joints (K, n), and the tip's Jacobian by the free joints (K, 6, m).
+        """Return pose errors (K, 6) at joint positions (K, n), and Jacobians (K, 6, m) with respect to the free joints.
 
         The errors are the rotation as the axial vector 2 sin(angle) / 2, or (3, 3, 3) beyond a right angle, and the
         displacement as a share of the size of the arm.
@@ -250,12 +256,12 @@ class Chain:
         return errors, jacobians.transpose(0, 2, 1)
 
     def refine(self, pose: NDArray[np.intp], joints: Array, free: Sequence[int], goal: Motion) -> Solutions:
-        """Refine candidates by Newton's method in the free joints; return the distinct solutions.
+        """Refine rough IK solutions by Newton's method in the free joints; return the distinct solutions.
 
         Args:
-            pose: Pose of each candidate. Shape (K,).
-            joints: Candidates. Shape (K, n).
-            free: Numbers of the free joints; the others keep their positions.
+            pose: Index of the pose of each rough solution. Shape (K,).
+            joints: Rough solutions. Shape (K, n).
+            free: Indices of the free joints; the others keep their positions.
             goal: Poses of the tip in the world, M of them.
         """
         joints, numbers = joints.copy(), np.array(free, dtype=int)
@@ -277,18 +283,18 @@ class Chain:
         return self.distinct(Solutions(pose[good], joints[good], _are_singular(jacobians[good])), free, goal)
 
     def union(self, first: Solutions, second: Solutions, free: Sequence[int], goal: Motion) -> Solutions:
-        """Return the distinct solutions of two sets."""
+        """Return the union of two sets of IK solutions, without repetitions."""
         if not len(first.pose):
             return second
         parts = (np.concatenate(pair) for pair in zip(first, second, strict=True))
         return self.distinct(Solutions(*parts), free, goal)
 
     def distinct(self, solutions: Solutions, numbers: Sequence[int], goal: Motion) -> Solutions:
-        """Return the distinct solutions, sorted by pose, with angles between -pi and pi.
+        """Return the distinct IK solutions, sorted by pose, with angles between -pi and pi.
 
         Args:
             solutions: The solutions.
-            numbers: Numbers of the joints that distinguish solutions.
+            numbers: Indices of the joints that distinguish solutions.
             goal: Poses of the tip, M of them.
         """
         pose, joints, singular = solutions
@@ -330,7 +336,7 @@ def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _damped_steps(jacobian: Array, missed: Array) -> Array:
-    """Return the steps of Newton's method, damped at singularities. Shapes (K, 6, m), (K, 6) to (K, m)."""
+    """Return the joint steps of Newton's method, damped at singularities. Shapes (K, 6, m), (K, 6) to (K, m)."""
     transposed, error = jacobian.transpose(0, 2, 1), missed[:, :, None]
     if jacobian.shape[2] < 6:
         normal = transposed @ jacobian + NEWTON.damping * np.eye(jacobian.shape[2])
@@ -340,7 +346,7 @@ def _damped_steps(jacobian: Array, missed: Array) -> Array:
 
 
 def _are_singular(jacobians: Array) -> NDArray[np.bool_]:
-    """Return which of the Jacobians (K, 6, m) have a singular value below the limit.
+    """Return which of the Jacobians (K, 6, m) have a singular value below that of regular solutions.
 
     The product of the five others is at most (|J|^2 / 5)^(5 / 2), so that the determinant tells most regular ones.
     """

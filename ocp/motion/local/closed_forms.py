@@ -39,10 +39,10 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class NearbySettings:
-    """Settings of the search at poses near those for which solutions may be missing.
+    """Settings of the search for missing solutions at poses near those for which some may be missing.
 
     Attributes:
-        pairs: Number of pairs of poses.
+        pairs: Number of pairs of poses near each.
         distance: Their typical distance, rad and share of the size of the arm.
         seed: Seed of their directions.
     """
@@ -61,7 +61,7 @@ class PoseSolver(ABC):
 
     Attributes:
         chain: The chain.
-        redundant: Numbers of the joints whose positions are given.
+        redundant: Indices of the joints whose positions are given.
     """
 
     chain: Chain
@@ -74,19 +74,19 @@ class PoseSolver(ABC):
 
     @abstractmethod
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return solutions at M poses; at regular poses these are all solutions.
+        """Return IK solutions at M poses of the tip, all of them at regular poses.
 
         Args:
             tips: Poses of the tip in the world.
             redundant: Positions of the redundant joints. Shape (M, len(self.redundant)).
 
         Returns:
-            The solutions; for which poses it is to be confirmed that they are all; and for which some may be missing.
-            Shapes (M,), bool.
+            The solutions; masks of the poses where it must be confirmed that these are all, and of those where some may
+            be missing. Shapes (M,), bool.
         """
 
     def solve(self, positions: Array, rotations: Array, redundant: Array) -> tuple[Solutions, Mask]:
-        """Return all isolated solutions at M poses, and flags of poses where some may be missing. Shape (M,).
+        """Return all isolated IK solutions at M poses, and flags of poses where some may be missing. Shape (M,).
 
         Where they may be, and at singularities, solutions at poses nearby are candidates too: isolated solutions depend
         continuously on the pose, and of a family some members are found.
@@ -109,7 +109,7 @@ class PoseSolver(ABC):
         return solutions, doubtful
 
     def _nearby(self, tips: Motion) -> Iterator[Motion]:
-        """Yield pairs of poses near the given ones, on opposite sides of them."""
+        """Yield poses near the given ones, in pairs on opposite sides, at which missing solutions may be found."""
         rng = np.random.default_rng(NEARBY.seed)
         for _ in range(NEARBY.pairs):
             turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
@@ -118,15 +118,15 @@ class PoseSolver(ABC):
                 yield Motion(tips.turn @ rotation, tips.shift + sign * self.chain.size * shift)
 
     def solutions(self, positions: Array, rotations: Array, redundant: Array) -> tuple[NDArray[np.intp], Array]:
-        """Return all isolated solutions: the index of the pose, (K,), and the joints, (K, n); see `solve`."""
+        """Return the pose indices (K,) and joint positions (K, n) of all isolated IK solutions; see `solve`."""
         solutions, _ = self.solve(positions, rotations, redundant)
         return solutions.pose, solutions.joints
 
 
 TINY = 1e-300
-"""Added to lengths that divide, so that zeros give no exception."""
+"""Number that is added to divisors, so that a zero causes no exception."""
 SIX, SCARA = 6, 4
-"""Numbers of joints of the arms with closed forms, without redundant joints."""
+"""Numbers of non-redundant joints of the arms that have closed forms."""
 
 
 @dataclass(frozen=True)
@@ -155,14 +155,14 @@ class ClosedForm(PoseSolver):
 
     Attributes:
         kind: "meeting" or "parallel", by the axes of three of its joints, or "scara".
-        triple: Numbers of these joints.
+        triple: Indices of these joints.
     """
 
     kind: str
     triple: tuple[int, ...]
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return solutions at M poses; families of solutions may be incomplete. See `PoseSolver.solve_regular`."""
+        """Return IK solutions at M poses; families of solutions may be incomplete. See `PoseSolver.solve_regular`."""
         arguments = np.concatenate([redundant, tips.turn.reshape(-1, 9), tips.shift], axis=1)
         count, families = len(arguments), np.zeros(len(arguments), dtype=bool)
         if self.kind == "scara":
@@ -183,7 +183,7 @@ class ClosedForm(PoseSolver):
         return self.chain.refine(pose, joints, self.free, tips), np.zeros_like(families), families
 
     def _loop(self) -> _SymbolicLoop:
-        """Return the closure equation of the free joints, rotated so that the three special axes come last."""
+        """Return the loop closure equation of the free joints, opened so that its meeting or parallel axes are last."""
         chain = self.chain
         symbols, fixed = ca.SX.sym("pose", len(self.redundant) + 12), Frame(ca.DM.eye(3), ca.DM(3, 1))
         points, axes = chain.points.copy(), list[SymbolicAxis]()
@@ -202,7 +202,7 @@ class ClosedForm(PoseSolver):
         return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
 
     def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
-        """Return the solutions as one column, with the free joints of each in their order."""
+        """Return the solutions, lists of joint positions in `order`, as one column in the order of the free joints."""
         return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
 
     @cached_property
@@ -218,7 +218,10 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function of a pose -> pairs of angles of joints x and z, their residuals and their conditioning."""
+        """Function of a tip pose that returns angle pairs of the first and third joint, residuals and conditioning.
+
+        The joints are x and z of the loop in the order of `_loop`.
+        """
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
         offsets = (x.point - y.point) / size, (z.point - y.point) / size
@@ -243,7 +246,10 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function of a pose and angles of x and z -> two solutions, excess over the reach, lever arm of y."""
+        """Function that completes a tip pose and an angle pair of `_pair_function` to two solutions of all free joints.
+
+        Further outputs are the excess over the reach and the lever arm of joint y, which is between x and z.
+        """
         symbols, (x, y, z, *triple), order, goal = self._loop()
         angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"
         before, after = z.frame(angles[1]), compose(inverse(x.frame(angles[0])), goal)
@@ -259,12 +265,12 @@ class ClosedForm(PoseSolver):
 
 
 class _SymbolicLoop(NamedTuple):
-    """The closure equation of an arm as expressions: the product of its joint motions equals a goal pose.
+    """Loop closure equation of an arm as expressions: the product of its joint motions equals a goal pose.
 
     Attributes:
         symbols: Positions of the redundant joints, rows of the rotation of the tip, its position. Shape (k + 12,).
         axes: Axes of the joints.
-        order: Numbers of the joints.
+        order: Indices of the joints.
         goal: The goal.
     """
 
@@ -275,11 +281,11 @@ class _SymbolicLoop(NamedTuple):
 
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
-    """Return the closed forms of a chain, one for each choice of redundant joints with which one exists.
+    """Return the closed-form solvers of a chain, one for each choice of redundant joints that admits one.
 
     Args:
         chain: The chain.
-        lockable: Numbers of the joints that may be redundant; None: all.
+        lockable: Indices of the joints that may be redundant; None: all.
     """
     if len(chain.order) == SCARA:
         return _scara_forms(chain)
@@ -287,7 +293,7 @@ def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[C
 
 
 def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
-    """Return the closed form of a chain of four joints if they are those of a SCARA, else no form."""
+    """Return a tuple with the closed-form solver of a four-joint chain if it is a SCARA, else an empty tuple."""
     revolute = tuple(j for j in chain.order if chain.revolute[j])
     prismatic = [j for j in chain.order if not chain.revolute[j]]
     if len(prismatic) != 1 or _kind_of(chain, revolute) != "parallel":
@@ -302,7 +308,7 @@ def is_scara(chain: Chain) -> bool:
 
 
 def _six_joint_forms(chain: Chain, lockable: tuple[int, ...]) -> tuple[ClosedForm, ...]:
-    """Return closed forms of chains with six free revolute joints, one for each choice of redundant joints."""
+    """Return closed-form solvers with six free revolute joints, one for each choice of redundant joints."""
     n, forms = len(chain.order), list[ClosedForm]()
     for redundant in combinations(lockable, n - SIX) if n >= SIX else ():
         if not chain.revolute[[j for j in chain.order if j not in redundant]].all():
@@ -314,7 +320,7 @@ def _six_joint_forms(chain: Chain, lockable: tuple[int, ...]) -> tuple[ClosedFor
 
 
 def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
-    """Classify three consecutive axes: "parallel", "meeting" (in a point), or "" for neither."""
+    """Classify three consecutive joint axes: "parallel", "meeting" (in a point), or "" for neither."""
     axes, points = chain.axes, chain.points
     if not chain.revolute[list(triple)].all():
         return ""
@@ -389,10 +395,10 @@ def _rotation(angle: Any) -> Any:
 
 
 def _close_roots(f: Harmonics) -> Any:
-    """Return eight angles that include all roots of a trigonometric polynomial; double roots become close pairs. (8, 1)
+    """Return eight angles that include all roots of a trigonometric polynomial; double roots become close pairs.
 
     Of two roots close to each other the general method may find only one. The parabola of the same value, slope and
-    curvature there has both.
+    curvature there has both. Shape (8, 1).
     """
     size = TINY + sum(map(ca.fabs, f))
     f = Harmonics(*(part / size for part in f))
@@ -408,16 +414,16 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Solve cosine cos(q) + sine sin(q) = value: return m and h such that the two roots are m + h and m - h.
+    """Return the mean of the two roots of a linear equation in cosine and sine, and half their difference.
 
-    Without a root, return the angle that comes nearest to the value.
+    The equation is cosine cos(q) + sine sin(q) = value. Without a root, return the angle nearest to a solution.
     """
     share = value / ca.fmax(ca.hypot(cosine, sine), TINY)
     return ca.atan2(sine, cosine), ca.acos(ca.fmin(ca.fmax(share, -1.0), 1.0))
 
 
 def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
-    """Return two solutions of three joints with meeting axes (a rotation) or parallel axes (a planar motion).
+    """Return two solutions of three joints with meeting axes (goal rotation) or parallel axes (goal planar motion).
 
     The second result is the share by which the motion exceeds what the axes can do; the solutions are then the nearest.
     """

@@ -55,7 +55,7 @@ class Collision(NamedTuple):
 
 
 def scene_hulls(scene: CollisionScene) -> dict[str, Hull]:
-    """Return the bodies and obstacles of a scene by name."""
+    """Return the shapes of the bodies and obstacles of a collision scene as convex hulls, by name."""
     return {
         body.name: Hull(
             body.frame, body.shape.core, body.shape.swept_radius, getattr(body.shape, "normal", np.zeros(0))
@@ -73,7 +73,7 @@ def distances_along(
     cutoff: float = np.inf,
     pairs: Sequence[int] | None = None,
 ) -> Array:
-    """Return the distances of all pairs of bodies at samples of a motion; larger ones are cut off. Shape (M, n), m.
+    """Return the distances of all pairs of bodies at samples of a motion, exact up to a cutoff. Shape (M, n), m.
 
     The penetration depth of a pair with a mesh or a cylinder is an estimate.
 
@@ -94,7 +94,7 @@ def distances_along(
 
 
 def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:
-    """Return the pairs closer than the clearance, each at its closest sample, in order of severity.
+    """Return the pairs of bodies closer than the clearance, each at its closest sample, the closest pair first.
 
     The arguments are those of `distances_along`.
     """
@@ -120,7 +120,10 @@ def _cover_distance(scene: CollisionScene, pair: int, base: Array, joints: Array
 
 
 def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
-    """Return the frames of bodies as a function of (base, joints, time), and all pairs of bodies; both are cached."""
+    """Return the function for the body frames of a scene and the evaluator of its pair distances, both cached.
+
+    The arguments of the function are base, joints and time.
+    """
     cached: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
     if cached is None:
         machine = scene.machine
@@ -134,7 +137,7 @@ def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
 
 
 def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -> CollisionScene:
-    """Return a collision scene; raise ProblemError if it is of another machine or treats joint limits otherwise."""
+    """Return a collision scene; raise ProblemError if it is of another machine or assumes limits that do not apply."""
     if require.instance("scene", value, CollisionScene).machine is not machine:
         words = "scene belongs to another machine; build it from this one: CollisionScene(machine, ...)"
         raise ProblemError(words, name="scene", value=value)
@@ -152,7 +155,7 @@ class SlidingSettings:
     Attributes:
         steps: Largest number of steps.
         difference: Step of the finite differences, rad or m: the root of the rounding error of distances, 1e-10 m.
-        longest: Longest step of any joint, rad or m.
+        longest: Longest step of a joint, rad or m.
         damping: Damping relative to the size of the gradients.
         spare: Distance in excess of the clearance, so that correcting the tips does not use up the clearance, m.
     """
@@ -183,10 +186,10 @@ def slide_apart(
     Args:
         scene: Collision scene of the machine.
         base: Base configuration. Shape (base_size,).
-        joints: Configurations that do the task. Shape (K, n).
+        joints: Configurations that satisfy the task. Shape (K, n).
         time: Time, s.
         jacobian: Jacobian of the task at a configuration (n,). Shape (m, n).
-        back: Configurations (K, n) -> nearby configurations that do the task again.
+        back: Function from configurations (K, n) to nearby ones that satisfy the task again.
         lower, upper: Limits of the joints. Shape (n,).
 
     Returns:
@@ -215,7 +218,7 @@ def slide_apart(
 
 
 def _step(jacobian: Array, distances: Array, gradients: Array, target: float) -> Array:
-    """Return a joint step (n,) that separates close pairs and, to first order, leaves the tips in place."""
+    """Return a joint step (n,) that separates close bodies and, to first order, leaves the tips in place."""
     close = distances < target
     projector = np.eye(jacobian.shape[1]) - np.linalg.pinv(jacobian) @ jacobian
     rows = gradients[:, close].T @ projector

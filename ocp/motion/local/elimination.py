@@ -1,4 +1,4 @@
-"""All IK solutions of any six joints at a pose, by elimination (Raghavan and Roth 1993, Manocha and Canny 1994).
+"""All inverse kinematics solutions of any six joints, by elimination (Raghavan, Roth 1993; Manocha, Canny 1994).
 
 Six joint motions close a loop, e_x e_y e_z e_a e_b e_c = G. The last, revolute joint c moves neither the points nor the
 direction of its axis, so that a point p on it and its direction l satisfy
@@ -33,15 +33,18 @@ from ocp.motion.local.closed_forms import SIX, Mask, PoseSolver
 __all__ = ["Elimination", "elimination_of", "solve_opening"]
 
 SAMPLES = 2 * np.pi / 3 * np.arange(3)
-"""Angles h that determine the coefficients of 1, cos h and sin h."""
+"""Angles h at which a function is sampled to find its coefficients of 1, cos h and sin h."""
 NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
-"""Maps a vector w to the matrix of w x, row by row."""
+"""Matrix that maps a vector to the entries of its cross product matrix, row by row."""
 COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPLES)], axis=1))
 
 
 def _half_angle_products() -> Array:
-    """Return products of (1, cos h, sin h) and (cos h/2, sin h/2) by half-angle terms. Shape (3, 2, 4)."""
+    """Return the products of full-angle and half-angle terms as coefficients of half-angle terms. Shape (3, 2, 4).
+
+    The terms are 1, cos h, sin h; cos h/2, sin h/2; and the latter two with cos 3h/2, sin 3h/2.
+    """
     products = np.zeros((3, 2, 4))
     products[0] = np.eye(2, 4)
     products[1] = [[0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]]
@@ -88,24 +91,24 @@ ELIMINATION = EliminationSettings()
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the scalar products of vectors."""
+    """Return the scalar products of arrays of vectors."""
     return np.asarray(np.vecdot(a, b))
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return the vector products of vectors, faster than numpy for small arrays."""
+    """Return the vector products of arrays of vectors, faster than numpy for small arrays."""
     return np.asarray(a[..., NEXT] * b[..., AFTER] - a[..., AFTER] * b[..., NEXT])
 
 
 def axial(turn: Array) -> Array:
-    """Return the vectors 2 sin(angle) axis of rotations. Shapes (M, 3, 3) to (M, 3)."""
+    """Return the axial vectors of rotations, 2 sin(angle) times the axis. Shapes (M, 3, 3) to (M, 3)."""
     return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
 
 
 class Axis(NamedTuple):
-    """Axes of joints: unit directions (M, 3), points (M, 3), and whether the joint is revolute or prismatic.
+    """Axis of a joint at M poses: unit directions (M, 3), points on it (M, 3), and whether the joint is revolute.
 
-    A single row, (1, 3), holds for all poses.
+    A single row, (1, 3), applies to all poses.
     """
 
     direction: Array
@@ -113,15 +116,15 @@ class Axis(NamedTuple):
     revolute: bool = True
 
     def take(self, chosen: NDArray[np.intp]) -> Axis:
-        """Return the axes with the given indices."""
+        """Return the axis at the poses with the given indices."""
         return self if len(self.point) == 1 else Axis(self.direction[chosen], self.point[chosen], self.revolute)
 
     def moved(self, motion: Motion) -> Axis:
-        """Return the axes transformed by a rigid motion."""
+        """Return the axis transformed by rigid motions, one for each pose."""
         return Axis(motion.rotate(self.direction), motion.at(self.point), self.revolute)
 
     def by(self, position: Array) -> Motion:
-        """Return the rigid motions of the joints for given positions (M,)."""
+        """Return the rigid motions that the joint causes at given joint positions (M,)."""
         if not self.revolute:
             return Motion(np.broadcast_to(np.eye(3), (len(position), 3, 3)), self.direction * position[:, None])
         skew = (self.direction @ SKEW).reshape(-1, 3, 3)
@@ -131,10 +134,10 @@ class Axis(NamedTuple):
 
 
 class LoopOpening(NamedTuple):
-    """Choice of the joint at which the kinematic loop is opened, and of the joints for the roles x, y, z, a, b, c.
+    """Choice of the joint at which the kinematic loop is opened, and of the roles of the joints in the elimination.
 
     Attributes:
-        first: Number of the joint x; the others follow in the order of the loop.
+        first: Index of the joint x; the others follow in the order of the loop.
         rank: Number of independent products of x and y at a regular pose.
         roles: Which of z, a, b is the eigenvalue, which has products with half-angles, and which remains.
     """
@@ -145,7 +148,7 @@ class LoopOpening(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """Closure equations of six joints at M poses, opened at a joint: the motions of x, y, z, a, b, c give the goal."""
+    """Loop closure equations of six joints at M poses, opened at a joint: the product of their motions is the goal."""
 
     joints: list[Axis]
     goal: Motion
@@ -156,7 +159,7 @@ class _Candidates(NamedTuple):
     """Candidate solutions that result from one opening of the loop.
 
     Attributes:
-        pose: Pose of each candidate. Shape (K,).
+        pose: Index of the pose of each candidate. Shape (K,).
         free: Positions of the free joints. Shape (K, 6).
         least: How many solutions each pose has at least, from simple real eigenvalues. Shape (M,).
         mixed: Which poses have multiple real eigenvalues. Shape (M,), bool.
@@ -181,7 +184,7 @@ class Elimination(PoseSolver):
     openings: tuple[LoopOpening, ...]
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return solutions at M poses; at regular poses these are all solutions, see `PoseSolver.solve_regular`.
+        """Return IK solutions at M poses, all of them at regular poses; see `PoseSolver.solve_regular`.
 
         Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
         number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
@@ -204,19 +207,19 @@ class Elimination(PoseSolver):
         return solutions, mixed, doubtful
 
     def prescribe(self, redundant: Array) -> Array:
-        """Return joint vectors with given positions of the redundant joints (M, k), others at 0. Shape (M, n)."""
+        """Return configurations with given positions of the redundant joints (M, k), others at 0. Shape (M, n)."""
         joints = np.zeros((len(redundant), len(self.chain.axes)))
         joints[:, list(self.redundant)] = redundant
         return joints
 
     def refine(self, pose: NDArray[np.intp], free: Array, prescribed: Array, goal: Motion) -> Solutions:
-        """Refine candidates for the free joints (K, m) at poses (K,) by Newton's method; return the solutions."""
+        """Refine rough positions of the free joints (K, m) at poses (K,) by Newton's method; return the solutions."""
         joints = prescribed[pose]
         joints[:, self.free] = free
         return self.chain.refine(pose, joints, self.free, goal)
 
     def loop(self, prescribed: Array, goal: Motion) -> tuple[list[Axis], Motion]:
-        """Return the axes of the free joints, and the motion that they must produce for given redundant joints."""
+        """Return the axes of the free joints, and the motion that they must produce at given redundant positions."""
         chain, fixed, axes = self.chain, Motion(np.eye(3)[None], np.zeros((1, 3))), list[Axis]()
         for j in chain.order:
             axis = Axis(chain.axes[[j]], chain.points[[j]], bool(chain.revolute[j])).moved(fixed)
@@ -229,7 +232,7 @@ class Elimination(PoseSolver):
 
 
 def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | None:
-    """Return the elimination solver of six joints of a chain; None if no opening has a regular eigenvalue problem.
+    """Return the elimination solver of six joints of a chain; None if all its eigenvalue problems are singular.
 
     At random configurations the openings are sorted by the condition of their problems. The first ones are taken that
     find the most of these configurations again, and the most solutions.
@@ -276,7 +279,7 @@ def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
 
 
 def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
-    """Eliminate joints x and y: return the singular vectors and ranks of their equations, and the remaining equations.
+    """Separate the first two joints of a loop: return singular vectors and ranks of their terms, and the other terms.
 
     Shapes (M, 15, 15), (M,), (M, 15, 3, 3, 3), the last (1, ...) if it is the same for all poses.
     """
@@ -296,7 +299,7 @@ def _reverse_axis(axis: Axis) -> Axis:
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return the line coordinates after joint motions, as coefficients of products of cosines and sines.
+    """Return the coordinates of a line after joint motions, as coefficients of products of cosines and sines.
 
     Args:
         axes: Axes of the joints, the one that moves the line element first in front.
@@ -335,7 +338,10 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
-    """Return the matrices of the eigenvalue problem: coefficients of 1, cos h and sin h. Shape (M, 3, 12, 12)."""
+    """Return the coefficient matrices of the polynomial eigenvalue problem of an opening. Shape (M, 3, 12, 12).
+
+    They belong to 1, cos h and sin h of the joint that has the eigenvalue.
+    """
     count, _, rows = annihilators.shape
     equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
     equations = equations.reshape(count, rows, 3, 3, 3).transpose(0, 1, *(2 + role for role in roles))
@@ -349,9 +355,9 @@ def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]
 
 
 def _companions(matrices: Array) -> tuple[Array, Array, Array]:
-    """Return companion matrices for tan((h - pole) / 2), their poles, and reciprocal condition numbers there.
+    """Return companion matrices of polynomial eigenvalue problems, their poles, and reciprocal condition numbers.
 
-    Shapes (M, 24, 24), (M,), (M,).
+    The eigenvalues are tan((h - pole) / 2) of an angle h. Shapes (M, 24, 24), (M,), (M,).
     """
     count, poles = len(matrices), np.array(ELIMINATION.poles)
     one, cosine, sine = (matrices[:, None, k] for k in range(3))
@@ -382,7 +388,7 @@ def _inverses(matrices: Array) -> Array:
 
 
 def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpening) -> _Candidates:
-    """Return candidate solutions from the real eigenvalues, single or double, of one opening of the loop."""
+    """Return candidate IK solutions from the real eigenvalues, single or double, of one opening of the loop."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)
     matrices = _matrices(singular_vectors[:, :, opening.rank :], remaining, opening.roles)
@@ -409,7 +415,7 @@ def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpen
 
 
 def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
-    """Return angles g and h from eigenvectors (K, 4, 3), which are products of a function of g and one of h.
+    """Return the two angles of eigenvectors (K, 4, 3), whose entries are products of functions of each angle.
 
     The third result is the largest deviation from such products, of which the largest is 1.
     """
@@ -432,7 +438,7 @@ def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
 
 
 def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
-    """Return the positions (K, 6) of all joints of a loop from those of the middle joints z, a and b (K, 3).
+    """Return the positions (K, 6) of all joints of a loop from those of its third, fourth and fifth joint (K, 3).
 
     The motions of x and y are found from e_x^-1 (G p, G l) = e_y (p', l'), which is linear in their cosines and sines.
     """

@@ -1,4 +1,4 @@
-"""All IK configurations of an arm at poses of its tip, with what is known about their completeness."""
+"""All inverse kinematics solutions (IK configurations) of an arm at poses of its tip, and whether they are complete."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ class Incompleteness(Flag):
 
 @dataclass(frozen=True, eq=False)
 class IkConfigurations:
-    """IK configurations of an arm at N poses; each reaches its pose up to rounding.
+    """IK configurations of an arm at N poses of its tip; each reaches its pose up to rounding.
 
     Attributes:
         joints: Configurations of all poses. Shape (K, n), rad or m.
-        pose: Number of the pose of each configuration, increasing. Shape (K,).
+        pose: Index of the pose of each configuration, increasing. Shape (K,).
         parameters: Names of the sampled parameters: joints, and "roll" or others for open angles of the tip.
         reasons: Why configurations may be missing, for each pose.
     """
@@ -82,7 +82,7 @@ class IkConfigurations:
         return np.array([not reason for reason in self.reasons], dtype=bool)
 
     def at(self, pose: int) -> Array:
-        """Return the configurations at a pose. Shape (k, n)."""
+        """Return the configurations at the pose with a given index. Shape (k, n)."""
         first, last = np.searchsorted(self.pose, [pose, pose + 1])
         return self.joints[first:last]
 
@@ -91,7 +91,7 @@ class IkConfigurations:
 
 
 def idle_positions(lower: Array, upper: Array) -> Array:
-    """Return positions for joints without effect: the middle of the range, or the allowed value nearest to 0."""
+    """Return positions for joints that move no tip: the middle of the range, or the allowed value nearest to 0."""
     with np.errstate(invalid="ignore"):
         middle = (lower + upper) / 2
     return np.asarray(np.where(np.isfinite(middle), middle, np.clip(0.0, lower, upper)))
@@ -124,7 +124,7 @@ class IkSolver:
             link, point: Link of the tip, and its origin in the frame of the link, (3,), m; None: the tip of the robot.
             free: Part of the orientation that the task leaves free. ROLL: the angle about `tool_axis`; CONE: also the
                 direction of this axis, within a cone; ROTATION: all.
-            tool_axis: In the frame of the tip. Shape (3,).
+            tool_axis: Tool axis in the frame of the tip. Shape (3,).
             within: Half-angle of the cone, rad, between 0 and pi.
             limits: Whether the position limits of the robot apply.
             samples: Number of samples of the parameters, if there are any.
@@ -156,11 +156,11 @@ class IkSolver:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the sampled parameters."""
+        """Names of the parameters that are sampled: redundant joints and angles that the task leaves open."""
         return self.prepared.parameters(self.prepared.arm.solvers[0])
 
     def __call__(self, positions: ArrayInput, rotations: ArrayInput) -> IkConfigurations:
-        """Return the configurations at one pose or N poses of the tip.
+        """Return the IK configurations at one pose or N poses of the tip.
 
         Args:
             positions: Positions in the world. Shape (3,) or (N, 3), m.
@@ -231,7 +231,7 @@ class PreparedArm:
     def solve(
         self, solver: PoseSolver, positions: Array, rotations: Array, shares: Array, *, turns: bool = True
     ) -> tuple[Array, NDArray[np.intp], tuple[Incompleteness, ...]]:
-        """Return configurations (K, n), their poses (K,), and for each of N poses why some may be missing.
+        """Return IK configurations (K, n), indices of their poses (K,), and why some may be missing at each of N poses.
 
         Args:
             solver: One of the solvers of the arm.
@@ -271,11 +271,14 @@ class PreparedArm:
 
     @cached_property
     def _idle(self) -> NDArray[np.bool_]:
-        """Mask of the joints that have no effect on the tip. Shape (n,)."""
+        """Mask of the joints that do not move the tip. Shape (n,), bool."""
         return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
 
     def _rotations(self, shares: Array) -> Array:
-        """Return rotations of the tip in its own frame for fractions (0 to 1) of the free angles. Shape (S, 3, 3)."""
+        """Return sampled rotations of the tip in its own frame that the task leaves free. Shape (S, 3, 3).
+
+        `shares` (S, 1) or (S, 3) are fractions of full turns of roll and azimuth, and of the area of the cone's cap.
+        """
         rolled = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
             return np.asarray(rolled.as_matrix())
@@ -289,7 +292,7 @@ class PreparedArm:
 
 
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
-    """Return positions (N, 3) and rotations (N, 3, 3) after checks."""
+    """Return tip positions (N, 3) and rotations (N, 3, 3) after checks; raise ProblemError if they are invalid."""
     places, turns = np.asarray(positions, dtype=float), np.asarray(rotations, dtype=float)
     single = places.ndim == 1
     places, turns = (places[None], turns[None]) if single else (places, turns)
@@ -306,7 +309,7 @@ def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
 
 
 class IkBranches:
-    """IK configurations of one pose task at samples of its free parameters. Use `ik_branches` to create it.
+    """Solver of all IK configurations of a pose task at samples of its free parameters. Use `ik_branches` to create it.
 
     Attributes:
         arm: The prepared arm.
@@ -320,7 +323,7 @@ class IkBranches:
     def configurations(
         self, targets: Array, count: int, number: int = 0, *, turns: bool = True, choices: int | None = None
     ) -> IkConfigurations:
-        """Return configurations of all branches within the limits; unlimited joints are between -pi and pi.
+        """Return IK configurations of all branches within the limits; unlimited joints are between -pi and pi.
 
         Args:
             targets: Targets of the equations. Shape (size,).
@@ -360,7 +363,7 @@ class IkBranches:
 
 
 def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranches | None:
-    """Return the IK branches of a task; None if task or machine has no solver.
+    """Return the solver of all IK branches of a pose task; None if there is none for this task or machine.
 
     Args:
         equations: Equations of one pose of the tip of an arm in the world: the whole pose, a position and a direction
@@ -394,7 +397,7 @@ def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranc
 def ik_configurations(
     machine: Machine, task: TipTask, *, time: float = 0.0, limits: bool = True, samples: int = 36
 ) -> IkConfigurations:
-    """Return IK configurations of an arm on all branches of a pose task, and whether they are all.
+    """Return IK configurations of an arm on all branches of a pose task, and whether they are complete.
 
     For many poses of one arm, prepare an `IkSolver`.
 

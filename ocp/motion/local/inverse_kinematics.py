@@ -1,4 +1,4 @@
-"""Inverse kinematics under joint limits: all branches where an arm has a solver of them, else from many starts.
+"""Inverse kinematics within joint limits: on all branches if an arm has a solver, else from many initial guesses.
 
 Damped Gauss-Newton (Levenberg 1944, Marquardt 1963) from many starts at once, with bounds by projection: joints at a
 limit that a step would violate are fixed in that step. All starts share one mapped CasADi function.
@@ -104,7 +104,7 @@ class IkSolution:
     """Solution of inverse kinematics: joint positions at a target pose.
 
     Attributes:
-        joints: Shape (joint_size,), rad or m.
+        joints: Joint positions. Shape (joint_size,), rad or m.
         quality: Manipulability of the task times the least distance of a joint from its limits, as a share of half its
             range: 0 at a limit or a singularity.
         pose_error: Largest remaining pose error of all tasks, m or rad.
@@ -242,7 +242,9 @@ def inverse_kinematics_at(
     near: Array | None = None,
     options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
-    """Return IK solutions on a fixed base for known targets, from random starts only; see `inverse_kinematics`.
+    """Return IK solutions of a fixed-base machine by iterations from initial guesses, without listing branches.
+
+    `targets` are the numerical targets of the equations; see also `inverse_kinematics`.
 
     Raises:
         Unreachable: No start leads to the pose.
@@ -254,7 +256,7 @@ def inverse_kinematics_at(
 
 @dataclass(frozen=True)
 class _MultiStart:
-    """Solver that iterates from many starts towards the pose tasks at one time."""
+    """Iterative solver of pose tasks at one time, from many initial guesses at once."""
 
     equations: TaskEquations
     base: Array
@@ -264,7 +266,9 @@ class _MultiStart:
     options: IkOptions = IK_OPTIONS
 
     def solve(self, first: Array, random: int) -> list[IkSolution]:
-        """Return the solutions from starts (K, n), best first; unlimited angles of the last `random` are wrapped.
+        """Return the distinct solutions to which initial guesses (K, n) lead, best first.
+
+        Unlimited angles of the last `random` ones are wrapped.
 
         Raises:
             Unreachable: There is no solution.
@@ -282,7 +286,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return known solutions of all branches, (K, n), and how many random starts are needed for missing ones."""
+        """Return solutions (K, n) on all branches if a solver exists, and the number of random guesses still needed."""
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count
@@ -295,14 +299,14 @@ class _MultiStart:
         return joints, count - len(joints)
 
     def iterate(self, joints: Array) -> tuple[Array, Array]:
-        """Return joints (K, n) and largest pose errors (K,) to which the iterations from given joints lead."""
+        """Iterate from configurations (K, n); return the final ones and their largest pose errors (K,)."""
         fixed = ca.DM(self.base), ca.DM(self.targets)
         function = self.equations.pose_residual_function
         options: Any = {"tolerance": self.options.tolerance, "iterations": int(self.options.iterations), "fixed": fixed}
         return gauss_newton(function, joints, self.lower, self.upper, **options)
 
     def rank(self, joints: Array, errors: Array) -> list[IkSolution]:
-        """Return the distinct solutions among candidates, in order of preference."""
+        """Return the distinct solutions among configurations, by decreasing quality."""
         solved, lower, upper = np.flatnonzero(errors <= self.options.tolerance), self.lower, self.upper
         if not solved.size:
             return []
@@ -325,7 +329,7 @@ class _MultiStart:
 
 
 def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, *, near: Any = None, seed: int) -> Array:
-    """Return start configurations: those of `near`, then `count` random ones between the limits. Shape (K, n)."""
+    """Return initial guesses: those of `near`, then `count` random ones within the joint limits. Shape (K, n)."""
     size, rng = machine.joint_size, np.random.default_rng(seed)
     prismatic = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
     span = np.where(prismatic, IK_SETTINGS.slide_spread, np.pi)
@@ -354,11 +358,11 @@ def gauss_newton(
     iterations: int,
     fixed: Sequence[Any] = (),
 ) -> tuple[Array, Array]:
-    """Run damped Gauss-Newton iterations from starts; return joints (K, n) and largest residuals (K,).
+    """Run damped Gauss-Newton iterations from several starts; return joint positions (K, n) and residuals (K,).
 
     Args:
-        function: CasADi Function of the joints and `fixed` -> (residual, its Jacobian).
-        starts: Starts. Shape (K, n).
+        function: CasADi Function of the joint positions and `fixed` that returns a residual and its Jacobian.
+        starts: Initial configurations. Shape (K, n).
         lower, upper: Limits of the joints. Shape (n,).
         tolerance: Largest residual of a solution.
         iterations: Largest number of iterations.
@@ -399,7 +403,7 @@ def gauss_newton(
 def distinct_solutions(
     solutions: list[IkSolution], revolute: NDArray[np.bool_], apart: float = IK_OPTIONS.apart
 ) -> list[IkSolution]:
-    """Return one representative of each group of solutions within `apart`; angles are compared modulo full turns."""
+    """Return IK solutions that differ by at least `apart` in a joint; angles are compared modulo full turns."""
     distinct: list[IkSolution] = []
     kept = np.zeros((len(solutions), len(revolute)))
     for solution in solutions:
@@ -412,7 +416,7 @@ def distinct_solutions(
 
 
 def spread_points(points: Array, count: int) -> NDArray[np.intp]:
-    """Return the indices of `count` mutually distant points (K, n): each is the farthest from those before it."""
+    """Return the indices of `count` mutually distant points of (K, n): each is the farthest from those before."""
     chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
     while len(chosen) < count:
@@ -424,7 +428,7 @@ def spread_points(points: Array, count: int) -> NDArray[np.intp]:
 def _closest_collisions(
     solutions: list[IkSolution], scene: CollisionScene, base: Array, time: float
 ) -> list[Collision | None]:
-    """Return for each solution its closest pair of bodies below the clearance, or None."""
+    """Return for each IK solution its closest pair of bodies if that violates the clearance, else None."""
     collisions = (find_collisions(scene, base[None], solution.joints[None], np.array([time])) for solution in solutions)
     return [next(iter(each), None) for each in collisions]
 
@@ -432,7 +436,7 @@ def _closest_collisions(
 def _collision_free(
     solutions: list[IkSolution], collisions: list[Collision | None], scene: CollisionScene, time: float
 ) -> list[IkSolution]:
-    """Return the collision-free solutions.
+    """Return the collision-free IK solutions.
 
     Raises:
         Unreachable: There are none.
@@ -463,10 +467,10 @@ def unreachable_error(
     upper: Array,
     misses: tuple[float, float],
 ) -> Unreachable:
-    """Return the error for a pose without solution, with the smallest pose error that was reached.
+    """Return the error that inverse kinematics found no solution, with the smallest pose error that was reached.
 
     Args:
-        misses: Distance, m, and angle, rad, of the nearest miss.
+        misses: Distance, m, and angle, rad, of the nearest configuration from the target.
     """
     names = [part.task.link or part.tip.robot.tip_link for part in equations.bound]
     limited = np.flatnonzero((joints <= lower) | (joints >= upper))
@@ -486,6 +490,6 @@ def unreachable_error(
 
 
 def describe_miss(distance: float, angle: float) -> str:
-    """Describe a pose error by its distance, m, and angle, rad, without a part at rounding level."""
+    """Describe a pose error by its distance, m, and angle, rad; leave out one that is only rounding."""
     parts = [(distance, "m"), (angle, "rad")]
     return " and ".join(f"{value:.3g} {unit}" for value, unit in parts if value > 1e-9 * (distance + angle)) or "0 m"

@@ -34,7 +34,7 @@ from ocp.problem.values import Sampler, symbols_of
 __all__ = ["LocalMotion", "LocalSolution", "RateOptions", "least_rates", "resolve", "track_tasks"]
 
 MAX_INTEGRATOR_STEPS = 20000
-"""Between two samples; a smooth motion takes some tens."""
+"""Largest number of integrator steps between two samples; a smooth motion takes some tens."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class LocalSolution:
         return f"<LocalSolution of {self.t[-1]:.6g} s, {self.joints.shape[1]} joints: cost {self.cost[-1]:.6g}{end}>"
 
     def at(self, time: float) -> dict[str, Array]:
-        """Interpolate "base" and "joints" cubically and "joint_rates" linearly; end values are kept beyond the ends."""
+        """Interpolate the motion at a time: "base" and "joints" cubically, "joint_rates" linearly, constant outside."""
         time = float(np.clip(time, self.t[0], self.t[-1]))
         rates = np.array([np.interp(time, self.t, column) for column in self.joint_rates.T])
         if len(self.t) == 1:
@@ -102,7 +102,7 @@ class RateOptions:
     Attributes:
         weights: Positive weights of the squared joint rates that are minimised. Shape (joint_size,); all 1 if None.
         damping: 0 for the pseudo-inverse G# = G' (G G')^-1; otherwise G' (G G' + damping^2 1)^-1, which stays bounded
-            where the Jacobian loses rank, at the price of a task error.
+            where the Jacobian G loses rank, at the price of a task error.
         tolerance: Absolute and relative tolerance of the integrator (cvodes, Adams).
 
     Raises:
@@ -129,15 +129,16 @@ def resolve(
     scene: CollisionScene | None = None,
     options: RateOptions | None = None,
 ) -> LocalSolution:
-    """Compute a motion along tasks by resolved-rate control, x2' = G# v, with the motion of the base, (26) with u = 0.
+    """Compute a motion along tasks by resolved-rate control, with the least joint rates at each time.
 
-    The drift of the machine at rest and the feedback of pose tasks are part of v.
+    The joint rates are G# v, see `RateOptions`: equation (26) of Kim and Kim 2011 with u = 0. The drift of the machine
+    at rest and the feedback of pose tasks are part of v.
 
     Args:
         machine: Any machine of `models`, on a fixed or a floating base.
         tasks: Tasks of its tips; several are done at once.
         horizon: Final time, s; that of the tasks if None.
-        start: Joints at the start, shape (joint_size,), or a `Start` with the joints and the base.
+        start: Start configuration, shape (joint_size,), or a `Start` with the joints and the base.
         samples: Number of equidistant times to report, or the increasing times themselves from 0 to the horizon.
         scene: Collision scene of the machine; the distances of its bodies are reported at the samples and have no
             effect.
@@ -176,14 +177,14 @@ def resolve(
 
 
 def least_rates(jacobian: Any, velocity: Any, damping: float = 0.0, weights: Any = None) -> Any:
-    """Return the least joint rates for a task velocity v, G' (G G' + damping^2 1)^-1 v. Shape (n, k).
+    """Return the least joint rates for a task velocity, by the damped pseudo-inverse. Shape (n, k).
 
-    With weights W^-1 G' (G W^-1 G' + damping^2 1)^-1 v, W their diagonal matrix.
+    They are W^-1 G' (G W^-1 G' + damping^2 1)^-1 v, W the diagonal matrix of the weights.
 
     Args:
         jacobian: Rows of the task, G. Shape (m, n), m <= n.
         velocity: v, or several as columns. Shape (m, k).
-        damping: In units of the Jacobian.
+        damping: Damping, in units of the Jacobian.
         weights: Positive weights of the squared joint rates. Shape (n,).
     """
     weighted = jacobian.T if weights is None else ca.mtimes(ca.diag(1 / ca.DM(weights)), jacobian.T)
@@ -212,7 +213,7 @@ def _sample_times(samples: Any, horizon: float) -> Array:
 
 
 class _Model:
-    """Differential equations of (base, joints) and reported outputs, as CasADi functions of (time, state)."""
+    """Differential equations of a resolved-rate motion of base and joints, and its outputs, as CasADi functions."""
 
     def __init__(self, equations: TaskEquations, weights: Array, damping: float, symbols: Any) -> None:
         machine = equations.machine
@@ -237,7 +238,7 @@ class _Model:
         return _cvodes(problem, start, times, tolerance)
 
     def one_interval(self, tolerance: float) -> Any:
-        """Return an integrator from time p[0] over p[1] seconds, for any interval between samples."""
+        """Return an integrator for any interval between samples, which starts at time p[0] and lasts p[1] seconds."""
         span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
         rates = ca.Function("at", [self.time, self.state], [self.ode, self.running])
         ode, running = rates(span[0] + fraction * span[1], self.state)
@@ -246,7 +247,7 @@ class _Model:
 
 
 def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: float) -> Any:
-    """Return the integrator of a problem from `start` to the times."""
+    """Return a CVODES integrator of differential equations from the time `start` to given times."""
     options: dict[str, Any] = {"tolerance": tolerance, "max_steps": MAX_INTEGRATOR_STEPS, "start": start}
     return integrator("motion", problem, times.tolist(), **options)
 
@@ -285,7 +286,7 @@ def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> t
 def _report(
     machine: Machine, model: _Model, times: Array, states: Array, costs: Array, tolerance: float, stopped: str | None
 ) -> LocalSolution:
-    """Return the solution with all reported outputs."""
+    """Evaluate all outputs along integrated states and return them as a `LocalSolution`."""
     rates = np.array(model.rate.map(len(times))(times[None, :], states.T)).T
     tip, jacobians, error = (np.array(value) for value in model.outputs.map(len(times))(times[None, :], states.T))
     base_size, size = machine.base_size, error.size // len(times)
@@ -305,22 +306,22 @@ def _report(
 
 
 def _manipulabilities(jacobians: Array) -> Array:
-    """Return sqrt(det(G G')) as the product of the singular values. Shapes (M, m, n) to (M,)."""
+    """Return the manipulabilities of Jacobians, the products of their singular values. Shapes (M, m, n) to (M,)."""
     return np.asarray(np.linalg.svd(jacobians, compute_uv=False).prod(axis=-1))
 
 
 CORRECTIONS = 2
-"""Corrections of the poses after each step; the second one leaves about the fourth power of the error."""
+"""Number of pose corrections after each step; the second one leaves about the fourth power of the error."""
 
 
 @dataclass(frozen=True, eq=False)
 class LocalMotion:
-    """K local motions at M times, computed by resolved-rate control.
+    """K motions at M times from local redundancy resolution (resolved-rate control).
 
     Attributes:
         t: Times. Shape (M,), s.
-        base: Shape (K, M, base_size).
-        joints: Shape (K, M, joint_size), within the limits.
+        base: Base configurations. Shape (K, M, base_size).
+        joints: Joint positions, within the limits. Shape (K, M, joint_size).
         rates: Mean joint rates from each time to the next; the last ones are repeated. Shape (K, M, joint_size).
         cost: Integral of half the weighted squared joint rates. Shape (K,).
         pose_error: Largest pose error, m and rad; infinite if a motion diverges. Shape (K,).
@@ -337,11 +338,11 @@ class LocalMotion:
 
     @classmethod
     def stationary(cls, times: Array, base: Array, joints: Array) -> LocalMotion:
-        """Return motions that stay at their configurations.
+        """Return motions that stay at given configurations.
 
         Args:
-            times: Shape (M,), s.
-            base, joints: Shapes (K, base_size) and (K, joint_size).
+            times: Times. Shape (M,), s.
+            base, joints: Configurations. Shapes (K, base_size) and (K, joint_size).
         """
         count, samples = len(joints), len(times)
         rates, zeros = np.zeros((count, samples, joints.shape[1])), np.zeros(count)
@@ -363,7 +364,7 @@ class LocalMotion:
         return cls(motions[0].t, *(np.concatenate([getattr(motion, name) for motion in motions]) for name in names))
 
     def straight_to(self, joints: Array) -> LocalMotion:
-        """Return motions on straight lines in joint space from the given starts to joints (K, joint_size)."""
+        """Return straight motions in joint space from where these motions start to configurations (K, joint_size)."""
         share = ((self.t - self.t[0]) / (self.t[-1] - self.t[0]))[:, None]
         displacement = (joints - self.joints[:, 0])[:, None]
         rates = np.repeat(displacement / (self.t[-1] - self.t[0]), len(self.t), axis=1)
@@ -390,8 +391,8 @@ def track_tasks(
 
     Args:
         equations: Equations of the tasks.
-        joints: Joints at the first time. Shape (K, joint_size).
-        base: Base at the first time. Shape (K, base_size).
+        joints: Joint positions at the first time. Shape (K, joint_size).
+        base: Base configurations at the first time. Shape (K, base_size).
         times: Increasing times, s. Shape (M,).
         weights: Weights of the squared joint rates. Shape (joint_size,).
         damping: Relative to the root mean square of the singular values of the Jacobian of the tasks.
@@ -425,7 +426,7 @@ def track_tasks(
         return matrix, right, error, np.where(np.isfinite(errors_along), errors_along, np.inf)
 
     def move_base(step: Array, duration: float) -> Array:
-        """Return the base (K, base_size) after steps of the joints and a duration of drift."""
+        """Return the base configurations (K, base_size) after steps of the joints and a duration of drift."""
         if motion is None:
             return base_now
         drift = np.array(motion(base_now.T, joints_now.T, np.zeros_like(joints_now).T)).T
@@ -466,7 +467,7 @@ def track_tasks(
 
 
 def _cone_function(equations: TaskEquations) -> Any:
-    """Return the CasADi function (base, joints, targets) -> cosines in cones, and their gradients by the joints."""
+    """Return the CasADi function (base, joints, targets) of the cosines that cone tasks limit, and their gradients."""
     machine = equations.machine
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
     targets = ca.SX.sym("targets", equations.target_function().numel_out())
@@ -480,7 +481,7 @@ def _cone_function(equations: TaskEquations) -> Any:
 def _damped_rates(
     matrix: Array, velocities: Array, weights: Array, damping: float, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the least weighted rates (K, n) for task velocities (K, m); joints that would leave their limits stop."""
+    """Return the least joint rates (K, n) for task velocities (K, m); joints that would leave their limits stop."""
     finite: Any = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(velocities).all(axis=1)
     matrix, velocities = np.where(finite[:, None, None], matrix, 0.0), np.where(finite[:, None], velocities, 0.0)
     size = np.sqrt((matrix**2).sum(axis=(1, 2)) / max(matrix.shape[1], 1))

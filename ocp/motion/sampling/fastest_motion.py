@@ -1,7 +1,7 @@
 """Locally fastest motions among obstacles within velocity, acceleration, jerk and torque limits, by linear programs.
 
-The joints are a B-spline of the share of the duration T, cubic if a jerk is limited, else quadratic. Derivatives by
-this share are splines too, with control points that are linear in those of the joints. A spline stays within the
+Joint positions are a B-spline of the fraction of the duration T, cubic if a jerk is limited, else quadratic. Its
+derivatives are splines too, with control points that are linear in its own. A spline stays within the
 range of its control points (de Boor 2001, chapter XI), so that the limits of velocity, acceleration and jerk hold at
 all times if
 
@@ -38,7 +38,7 @@ __all__ = ["FastestMotionSettings", "MotionLimits", "fastest_motion_near"]
 
 @dataclass(frozen=True)
 class FastestMotionSettings:
-    """Settings of the fastest motions.
+    """Settings of `fastest_motion_near`: spline, constraints, trust region and linear programs.
 
     Attributes:
         intervals: Number of intervals of the spline between the short ones at both ends.
@@ -113,9 +113,9 @@ class MotionLimits:
 def fastest_motion_near(
     limits: MotionLimits, path: Array, settings: FastestMotionSettings = FastestMotionSettings()
 ) -> ConstantJerkMotion:
-    """Return a locally fastest motion near a path, with the same first and last joints as the path.
+    """Return a locally fastest motion near a joint path, from its start to its end configuration.
 
-    A motion from rest to rest keeps the torque limits between the knots, too: it is slowed down where it does not.
+    A motion from rest to rest satisfies the torque limits between the knots, too: it is slowed down if it does not.
 
     Args:
         limits: Limits, clearance and rates at the ends.
@@ -144,7 +144,8 @@ def fastest_motion_near(
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
     """Solve linear programs in sequence; return the fastest feasible motion and the last trust region.
 
-    It is the last motion if none is feasible. The sequence ends when the duration decreases by less than `least_gain`.
+    Without a feasible motion, return the last one. The sequence ends when a step decreases the duration by less than
+    `least_gain`.
 
     Raises:
         TimeLimitReached: The time limit has passed before one was feasible.
@@ -178,13 +179,13 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Iterate of the search: a motion, with its constraints linearised there.
+    """Iterate of the sequential linear programs: a motion, with its constraints linearised there.
 
     Attributes:
         points: Control points. Shape (K, n).
         duration: T, s.
-        rows, usages: Derivatives of the usages of all limits by the free control points and by log T, and the usages:
-            the limit is kept up to 1. Shape (R, F + 1) and (R,).
+        rows, usages: Derivatives of the usages with respect to the free control points and log T, and the usages,
+            ratios of quantities to their limits. Shape (R, F + 1) and (R,).
         allowed: Largest usage at which the motion counts as feasible, by row. Shape (R,).
     """
 
@@ -204,16 +205,16 @@ class _State:
         return self.excess == 0
 
     def merit(self, penalty: float) -> float:
-        """Return the merit of the iterate: logarithm of the duration plus penalty times excess."""
+        """Return the merit function of the iterate: logarithm of the duration plus penalty times excess."""
         return float(np.log(self.duration)) + penalty * self.excess
 
 
 _Rows: TypeAlias = tuple[Any, Array, Array, float]
-"""Derivatives of usages by all control points and by log T, the usages, and the excess that is allowed."""
+"""Linearised limits: derivatives with respect to control points and log T, ratios to the limits, allowed excess."""
 
 
 class _Search:
-    """Sequential linear programming for the fastest motion in a spline basis."""
+    """Sequential linear programming for the locally fastest motion in a spline basis."""
 
     def __init__(self, limits: MotionLimits, path: Array, settings: FastestMotionSettings) -> None:
         self.limits, self.settings, bounds = limits, settings, limits.bounds
@@ -260,14 +261,14 @@ class _Search:
         return np.asarray(breaks / breaks[-1])
 
     def _values(self, places: Array, order: int) -> Any:
-        """Return the matrix that maps control points to values of a derivative at fractions (M,). Shape (M, K)."""
+        """Return the matrix from control points to a spline derivative at M fractions of the duration. Shape (M, K)."""
         knots = self.knots[order : len(self.knots) - order]
         return scipy.interpolate.BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
 
     def _fix_ends(self) -> None:
-        """Set the control points that the end conditions determine to `fixed` + T `moving`; the others are free.
+        """Determine the control points that the start and end conditions fix; the others are free.
 
-        A joint is at rest at an end, or has a given velocity there and no acceleration.
+        They are `fixed` + T `moving`. A joint is at rest at an end, or has a given velocity there and no acceleration.
         """
         free = np.ones((self.count, self.size), dtype=bool)
         self.fixed, self.moving = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
@@ -284,7 +285,10 @@ class _Search:
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
     def guess(self, path: Array) -> tuple[Array, float]:
-        """Return control points along a path, and a duration that keeps the rate limits from rest to rest."""
+        """Return control points along a joint path, and the shortest duration at which they satisfy the joint limits.
+
+        The limits are those of velocity, acceleration and jerk.
+        """
         p, ramp = self.degree, self.settings.ramp
         at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
         top = 1 / (1 - ramp)
@@ -318,7 +322,7 @@ class _Search:
         return _State(points, duration, matrix.tocsr(), np.concatenate(usages), allowed)
 
     def _derivative_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
-        """Yield the constraint rows of velocity, acceleration and jerk, each in both directions."""
+        """Yield the linearised limits of velocity, acceleration and jerk, each in both directions."""
         for order in range(1, self.degree + 1):
             limited = np.flatnonzero(np.isfinite(self.largest[order - 1]))
             if not len(limited):
@@ -332,14 +336,14 @@ class _Search:
                 yield sign * matrix, by_duration, sign * usages, LIMIT_TOLERANCE
 
     def _clearance_rows(self, points: Array) -> _Rows:
-        """Return the constraint rows of pairs of bodies that are near each other at samples."""
+        """Return the linearised clearance constraints of bodies that are near each other at samples of the motion."""
         margin, basis = self.settings.margin, self._values(self.places, 0)
         at, _, distance, gradient = self.limits.motions.near_pairs(basis @ points, self.settings.reach)
         matrix = self._row_matrix(basis[at], -gradient / margin)
         return matrix, np.zeros(len(at)), 2 - distance / margin, 0.5
 
     def _torque_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
-        """Yield the constraint rows of the torques at the knots, in both directions."""
+        """Yield the linearised limits of the torques at the knots, in both directions."""
         torques, share = self.limits.torques, self.settings.torque_share
         first, second = self.at_torques[1] @ points / duration, self.at_torques[2] @ points / duration**2
         values, slopes = torques.linearise(self.at_torques[0] @ points, first, second)
@@ -354,7 +358,10 @@ class _Search:
             yield sign * matrix, sign * by_duration.ravel(), sign * (values * scale).ravel(), (1 - share) / 2
 
     def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
-        """Return constraint rows for the control points, from basis values (R, K) and derivatives by joints (R, n)."""
+        """Return the Jacobian of constraints with respect to control points from that with respect to joints (R, n).
+
+        `basis` has the values of the K basis functions at the sample of each constraint. Shape (R, K).
+        """
         weights = scipy.sparse.coo_array(basis)
         row = np.repeat(weights.row, self.size)
         column = (weights.col[:, None] * self.size + np.arange(self.size)).ravel()

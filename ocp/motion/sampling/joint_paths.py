@@ -92,14 +92,14 @@ class StraightMotions:
             self._levers, self._turns = self.scene.levers.joints, self.scene.levers.joint_turns
 
     def collisions(self, joints: Array) -> list[Collision]:
-        """Return the pairs closer than the clearance in a configuration (n,), in order of severity."""
+        """Return the pairs of bodies closer than the clearance in a configuration (n,), the closest first."""
         if self.scene is None:
             return []
         collisions = find_collisions(self.scene, np.zeros(0), joints[None], np.zeros(1))
         return [collision for collision in collisions if collision.distance < self._required]
 
     def near_pairs(self, joints: Array, reach: float) -> tuple[Indices, Indices, Array, Array]:
-        """Return the pairs closer than clearance plus `reach`, m, in configurations (M, n).
+        """Return the pairs of bodies closer than clearance plus `reach`, m, in configurations (M, n).
 
         Returns:
             Configuration and pair of each, their distance beyond the clearance, m, shape (K,) each, and its gradient,
@@ -147,7 +147,7 @@ class StraightMotions:
         clear: NDArray[np.bool_],
         intervals: tuple[Indices, Array, Array],
     ) -> None:
-        """Bound distances on ever shorter intervals, and unset `clear` for motions that may collide.
+        """Bound distances of bodies on ever shorter intervals, and unset `clear` for motions that may collide.
 
         Args:
             lines: Starts and ends of the motions.
@@ -209,7 +209,7 @@ class StraightMotions:
 
 @dataclass(frozen=True)
 class ShorteningSettings:
-    """Settings of the shortening.
+    """Settings of `shorten`, which replaces parts of paths by random shortcuts.
 
     Attributes:
         batch: Number of random shortcuts that are tried at once.
@@ -225,12 +225,12 @@ class ShorteningSettings:
 
 
 def path_length(path: Array, scale: Array) -> float:
-    """Return the length of a path (M, n) in the metric |scale * dq|."""
+    """Return the length of a joint path (M, n) if displacements dq have the length |scale * dq|."""
     return float(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1).sum())
 
 
 def points_along(path: Array, scale: Array, shares: Array) -> Array:
-    """Return the configurations at fractions (K,) of the length of a path (M, n). Shape (K, n)."""
+    """Return the configurations at fractions (K,) of the length of a joint path (M, n). Shape (K, n)."""
     places = _places(path, scale)
     return np.column_stack([np.interp(shares * places[-1], places, column) for column in path.T])
 
@@ -281,12 +281,12 @@ def same_class(motions: StraightMotions, first: Array, second: Array, scale: Arr
 
 
 def _places(path: Array, scale: Array) -> Array:
-    """Return the arc length at each configuration of a path. Shape (M,)."""
+    """Return the arc length from the start at each configuration of a joint path. Shape (M,)."""
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1)))
 
 
 def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Callable[[Array], Array]) -> Array:
-    """Return the lowest-cost path from first to last corner through some of the corners, free of collisions.
+    """Return the lowest-cost collision-free path from the first to the last corner through some of the others.
 
     Args:
         motions: Proofs of clearance.
@@ -333,7 +333,7 @@ def _cut(motions: StraightMotions, path: Array, scale: Array, random: np.random.
 
 @dataclass(frozen=True)
 class LengthSettings:
-    """Settings of the optimisation of the path length.
+    """Settings of `optimise_length`, which minimises the length of a path locally.
 
     Attributes:
         motion: Length of the straight motions, in the metric of the path.
@@ -408,7 +408,7 @@ def optimise_length(
 
 
 def _resample(motions: StraightMotions, path: Array, scale: Array, count: int) -> Array:
-    """Divide the path into motions of similar length that are proven collision-free; keep corners if necessary.
+    """Divide a path into straight motions of similar length, proven collision-free; keep corners if necessary.
 
     It is the old path if the motions cannot be proven, since halves of a proven motion need not be.
     """
@@ -433,7 +433,7 @@ def _step(
     inertia: float,
     settings: LengthSettings,
 ) -> Array:
-    """Return the step of the chain (m + 1, n) to the least energy under linearised constraints."""
+    """Return the step of a path (m + 1, n) that minimises a bound of its length under linearised constraints."""
     inner, n = len(chain) - 2, chain.shape[1]
     places = np.empty((2 * len(chain) - 1, n))
     places[::2], places[1::2] = chain, (chain[:-1] + chain[1:]) / 2
@@ -464,7 +464,7 @@ def _step(
 
 
 def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
-    """Return the point of the polyhedron rows z >= least, which contains 0, that is nearest to a target."""
+    """Return the point nearest to a target in the polyhedron of points z with rows z >= least, which contains 0."""
     needed = least - rows @ target
     active = np.flatnonzero(needed > -np.inf)
     if not len(active) or needed.max() <= 0:
@@ -480,7 +480,7 @@ def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
 
 
 def _clear_step(motions: StraightMotions, chain: Array, moved: Array, smallest: float) -> tuple[Array, Array]:
-    """Reduce each step of the chain until its motions are collision-free; return chain and step fractions."""
+    """Shorten the steps of a path until its straight motions are collision-free; return path and step fractions."""
     shares = np.ones(len(chain))
     while True:
         trial = chain + shares[:, None] * (moved - chain)

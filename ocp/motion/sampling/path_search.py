@@ -37,11 +37,11 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class RandomTreeSettings:
-    """Settings of the random trees.
+    """Settings of the growth of random trees.
 
     Attributes:
         batch: Number of random configurations towards which a tree grows at once.
-        longest: Longest edge, as a share of the diagonal of the sampled box.
+        longest: Longest edge, as a share of the diagonal of the sampled range of configurations.
     """
 
     batch: int = 16
@@ -54,7 +54,7 @@ class TreeSearch:
 
     Attributes:
         motions: Proofs of clearance.
-        lower, upper: Box from which configurations are sampled; it holds start and goals. Shape (n,), rad or m.
+        lower, upper: Range from which configurations are sampled; it contains start and goals. Shape (n,), rad or m.
         scale: Distances are lengths of scale * dq. Shape (n,).
         settings: Settings.
     """
@@ -67,13 +67,13 @@ class TreeSearch:
 
 
 class _Tree:
-    """Tree of configurations, each with the index of its parent."""
+    """Random tree of configurations, each with the index of its parent."""
 
     def __init__(self, roots: Array) -> None:
         self.nodes, self.parents = roots.copy(), np.full(len(roots), -1)
 
     def add(self, nodes: Array, parents: Indices) -> Indices:
-        """Add nodes and return their indices."""
+        """Add configurations as nodes of the tree and return their indices."""
         first = len(self.nodes)
         self.nodes, self.parents = np.vstack([self.nodes, nodes]), np.append(self.parents, parents)
         return np.arange(first, len(self.nodes))
@@ -97,8 +97,8 @@ def connect(
     """Return a path of proven collision-free straight motions from the start to a goal; None if none is found.
 
     Args:
-        search: Proofs of clearance, box and metric.
-        start: Shape (n,). goals: Shape (K, n).
+        search: Proofs of clearance, sampled range and metric.
+        start: Start configuration, (n,). goals: Goal configurations, (K, n).
         random: Source of the samples.
         most_samples: Number of random configurations after which the search ends.
 
@@ -160,14 +160,14 @@ def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step
 
 @dataclass(frozen=True)
 class PathSearchSettings:
-    """Settings of the search for paths.
+    """Settings of `find_paths`: random searches, shortening and optimisation.
 
     Attributes:
         classes: Number of random searches after the first one that finds a path, each as long as that.
         first, attempts: Number of samples of the first search, and of searches. Every second one has twice as many
             samples as those before: the duration of a search varies so much that restarts shorten it.
         most_paths: Largest number of paths, one for each class, the shortest first.
-        shortening, optimisation: Settings of both.
+        shortening, optimisation: Settings of `shorten` and `optimise_length`.
     """
 
     classes: int = 1
@@ -202,13 +202,13 @@ def find_paths(
     seed: int,
     settings: PathSearchSettings = PathSearchSettings(),
 ) -> list[JointPath]:
-    """Return collision-free paths from a start to goals, sorted by length; empty if none was found.
+    """Return collision-free joint paths from a start to goals, sorted by length; empty if none was found.
 
     If the straight motion to the nearest goal is clear, no path is shorter, and only straight motions are returned.
 
     Args:
-        search: Proofs of clearance, sampled box and metric.
-        start: Shape (n,). goals: Shape (K, n). Both keep the clearance.
+        search: Proofs of clearance, sampled range and metric.
+        start: Start configuration, (n,). goals: Goal configurations, (K, n). Both keep the clearance.
         limits: Lower and upper limits of the joints. Shape (n,) each.
         seed: Seed of the random searches.
         settings: Settings.

@@ -1,8 +1,9 @@
-"""Grids along a path that resolve its limits.
+"""Grids of nodes along a path, fine enough to resolve how its limits vary with distance.
 
-The bounds between the segments of the path are nodes. Intervals are halved until every row at the fastest steady speed
-varies almost linearly between nodes. They also last only a fraction of the time in which the acceleration builds up, so
-that the jerk can change at the right time. Towards rest, where v ~ s^(2/3), they shrink in proportion to the distance.
+The bounds between the segments of the path are nodes. Intervals are halved until every limit row at the fastest steady
+speed varies almost linearly between nodes. They also last only a fraction of the time in which the acceleration builds
+up, so that the jerk can change at the right time. Towards rest, where v ~ s^(2/3), they shrink in proportion to the
+distance.
 """
 
 from __future__ import annotations
@@ -33,14 +34,15 @@ __all__ = ["Grid", "coarse_grid", "make_grid", "reachable_bounds"]
 
 @dataclass(frozen=True)
 class GridSettings:
-    """Settings of the grids; shares are relative.
+    """Settings of the grids of nodes along a path, at which limits are evaluated.
 
     Attributes:
         halvings: Largest number of halvings of an interval of the first grid.
-        shortest: Share of the path below which a segment is merged with the next, and an interval is not halved.
-        uneven, uneven_speed: Largest interpolation error of a row between two nodes, over its limit; that of the rows
-            of speed, which are enforced at nodes only.
-        cells, segments: Intervals of the first grid in each cell of a blend, and at least on all segments together.
+        shortest: Fraction of the path length below which a segment is merged with the next, and no interval is halved.
+        uneven, uneven_speed: Largest interpolation error between two nodes of a limited quantity, over its limit, and
+            of a limit of speed, which is enforced at nodes only.
+        cells, segments: Number of intervals of the first grid in each cell (part) of a blend, and least number on all
+            segments together.
         closest: Ratio of neighbouring intervals below which their node is dropped, unless segments meet there.
         build_up, ramp: Duration of an interval over the time in which the acceleration builds up, or, if longer, over
             that in which the top speed is reached.
@@ -77,10 +79,10 @@ class Grid:
 
     Attributes:
         path, limits, joints: As of the schedule.
-        distance: Nodes, from 0 to the length of the path. Shape (N + 1,), m.
+        distance: Distances of the nodes, from 0 to the length of the path. Shape (N + 1,), m.
         requested: Requested speed in each interval. Shape (N,), m/s.
-        jumps: Nodes where segments of the path meet. Shape (B,).
-        before: Distances just before these. Shape (B,), m.
+        jumps: Indices of the nodes where segments of the path meet. Shape (B,).
+        before: Distances just before these nodes. Shape (B,), m.
         sharp: Whether any jerk is limited.
     """
 
@@ -96,7 +98,7 @@ class Grid:
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
         """Return the limit rows at start and end of each interval between two nodes. Shape (N,) each.
 
-        They are evaluated on request: all rows of a long path would fill the memory.
+        The rows are evaluated on request: all those of a long path would fill the memory.
         """
         at = np.flatnonzero((self.jumps > first) & (self.jumps <= last))
         places = np.concatenate([self.distance[first : last + 1], self.before[at]])
@@ -113,13 +115,13 @@ class Grid:
 
 
 class _Cells(NamedTuple):
-    """Intervals that are short enough to resolve the limits. Shape (N,) each.
+    """N intervals of a path that are short enough to resolve its limits, with bounds of the motion in each interval.
 
     Attributes:
-        begin: Beginnings of the intervals, m.
+        begin: Distances at which the intervals begin. Shape (N,), m, as of the others.
         top: Fastest steady speeds, m/s.
         rates: Upper bounds of the acceleration of any motion, m/s^2.
-        acceleration, jerk: Largest values of the line at rest, m/s^2 and m/s^3.
+        acceleration, jerk: Largest acceleration and jerk along the path at rest, m/s^2 and m/s^3.
     """
 
     begin: Array
@@ -130,7 +132,7 @@ class _Cells(NamedTuple):
 
 
 def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> Grid:
-    """Return the grid of a path on which its limits are resolved.
+    """Return a grid of nodes along a path that is fine enough to resolve its limits.
 
     Args:
         path, limits: As of the schedule.
@@ -167,8 +169,8 @@ def _halve_intervals(
 
     Args:
         path, limits, joints: As for `make_grid`.
-        s: Places. Shape (M + 1,), m.
-        requested: Bounds of the segments of the path, and the speed in each.
+        s: Distances of the positions. Shape (M + 1,), m.
+        requested: Bounds of the segments of the path, and the requested speed in each segment.
     """
     rows = limit_rows(path, limits, joints, s)
     _check_rest(rows, s, limit_names(limits, joints))
@@ -194,7 +196,7 @@ def _halve_intervals(
 
 
 def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
-    """Return a coarse grid that is fine enough to find where limits are active."""
+    """Return a coarse grid of nodes along a path that is fine enough to find where limits are active."""
     bounds = np.asarray(path.bounds, dtype=float)
     s = np.unique(np.concatenate([path.sample_distances(SETTINGS.cells, 1), bounds]))
     requested = np.asarray(path.by_piece(limits.speed)[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
@@ -202,7 +204,7 @@ def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
 
 
 def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:
-    """Raise ProblemError if a limit is violated at rest, as when a torque cannot hold the load."""
+    """Raise ProblemError if a limit is violated at rest, for example if a torque limit does not support the load."""
     usages = np.abs(rows.acceleration[:, :, 2])
     at, row = np.unravel_index(int(usages.argmax()), usages.shape)
     if usages[at, row] >= 1:
@@ -212,14 +214,14 @@ def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:
 
 
 def _separate(places: Array, nodes: Array) -> Array:
-    """Return the positions in order, without those that are too close to a node or to each other."""
+    """Return positions on a path in order, without those that are too close to a node or to each other."""
     s = np.unique(places)
     for _ in range(3):
         gap = np.diff(s)
         longer_gap = np.maximum(np.append(gap, 0.0), np.insert(gap, 0, 0.0))
         close = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf)) < SETTINGS.closest * longer_gap
         close &= ~np.isin(s, nodes)
-        close[1:] &= ~close[:-1]  # of two that are close one stays
+        close[1:] &= ~close[:-1]  # of two close positions one stays
         if not close.any():
             break
         s = s[~close]
@@ -227,14 +229,14 @@ def _separate(places: Array, nodes: Array) -> Array:
 
 
 def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Array:
-    """Return the fastest steady speed in each interval, m/s."""
+    """Return the fastest constant speed that limits and requested speed permit in each interval. Shape (N,), m/s."""
     steady = rows.steady()[0]
     here = requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)]
     return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), here))
 
 
 def _uneven_intervals(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
-    """Return which intervals have limit rows that are not linear enough, at the fastest steady speed. Shape (N,)."""
+    """Return in which intervals limits vary too nonlinearly with distance at the fastest steady speed. Shape (N,)."""
     sides = left, middle, right
     kinds = (
         # by the squared speed, as the rows of speed are in the program
@@ -252,12 +254,12 @@ def _uneven_intervals(left: Rows, middle: Rows, right: Rows, top: Array) -> NDAr
 def reachable_bounds(
     distance: Array, caps: Array, *, left: Rows, right: Rows, at_rest: tuple[bool, bool]
 ) -> tuple[Array, Array]:
-    """Return upper bounds of squared speeds at nodes (N + 1,) and of accelerations in intervals (N,).
+    """Return upper bounds of the squared speeds at nodes (N + 1,) and of the accelerations in intervals (N,).
 
     Args:
-        distance: Nodes. Shape (N + 1,), m.
-        caps: Greatest squared speed at each. Shape (N + 1,).
-        left, right: Rows at both ends of each interval. Shape (N,).
+        distance: Distances of the nodes. Shape (N + 1,), m.
+        caps: Greatest permitted squared speed at each node. Shape (N + 1,).
+        left, right: Limit rows at both ends of each interval. Shape (N,).
         at_rest: Whether the motion begins and ends at rest.
     """
     rates = _acceleration_bounds(left, right, caps[:-1], caps[1:])
@@ -276,7 +278,7 @@ def _acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> 
 
 
 def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
-    """Return the highest squared speeds at nodes that caps and acceleration bounds of the intervals allow."""
+    """Return the highest squared speeds that can be reached at nodes under speed caps and acceleration bounds."""
     gain = np.concatenate([[0.0], np.cumsum(2 * rates * np.diff(distance))])
     squares = caps.copy()
     squares[[i for i, rest in zip((0, -1), at_rest, strict=True) if rest]] = 0.0
@@ -286,7 +288,7 @@ def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tupl
 
 
 def _time_nodes(cells: _Cells, length: float) -> Array:
-    """Split intervals so that motion passes them quickly, the more so near both ends; return the nodes."""
+    """Return the nodes of a grid whose intervals the motion passes in a short time, refined towards both ends."""
     _, top, rates, acceleration, jerk = cells
     s = np.append(cells.begin, length)
     caps = np.minimum(np.append(top, np.inf), np.insert(top, 0, np.inf)) ** 2

@@ -1,10 +1,11 @@
-"""Limits of a schedule, and their rows in the speed v, acceleration a and jerk j of the line at places of a path.
+"""Limits of a schedule, as inequalities in the speed v, acceleration a and jerk j along a path at points of the path.
 
     speed          k v <= 1
     acceleration   -1 <= p a + q v^2 + r <= 1
     jerk           |p j + q v a + r v^3| <= 1
 
-Joint velocities, accelerations and jerks give (q'), (q', q'') and (q', 3 q'', q''') over their limits. Centripetal
+A row is one such inequality; "line" in a name means the motion along the path. Joint velocities, accelerations and
+jerks give (q'), (q', q'') and (q', 3 q'', q'''), derivatives with respect to distance, over their limits. Centripetal
 acceleration and the turn rate of the tool limit the speed. Torques m(s) a + b(s) v^2 + c(s) give (m, b, c) over their
 limits. Acceleration and jerk of the tool (`ToolLimits`) give those of its coordinates.
 """
@@ -30,11 +31,11 @@ __all__ = [
 ]  # fmt: skip
 
 BLOCK_SIZE = 20_000
-"""Places whose limits are evaluated at once, which bounds the memory of a long path."""
+"""Largest number of points of a path whose limits are evaluated at once, to bound the memory for a long path."""
 
 
 class PathLike(Protocol):
-    """Interface of a path for schedules, which models.paths.SmoothPath provides."""
+    """Interface that a schedule needs of a path; models.paths.SmoothPath provides it."""
 
     @property
     def length(self) -> float: ...
@@ -47,7 +48,7 @@ class PathLike(Protocol):
 
 
 class JointRates(Protocol):
-    """Joint positions along a path and their first three derivatives by distance. Shape (M, n) each."""
+    """Joint positions along a path and their first three derivatives with respect to distance. Shape (M, n) each."""
 
     @property
     def position(self) -> Array: ...
@@ -60,7 +61,10 @@ class JointRates(Protocol):
 
 
 class TorqueRates(Protocol):
-    """Joint torques along a path by speed v and acceleration a: inertia a + drag v^2 + rest. Shape (M, n) each."""
+    """Coefficients of the joint torques, inertia a + drag v^2 + rest, for speed v and acceleration a along a path.
+
+    Shape (M, n) each.
+    """
 
     @property
     def inertia(self) -> Array: ...
@@ -71,9 +75,9 @@ class TorqueRates(Protocol):
 
 
 class JointPath(Protocol):
-    """Interface of joints as a function of distance, which models.scara_along and ocp.joint_path provide.
+    """Interface of joint positions as functions of the distance along a path.
 
-    With torque limits it also has `torques(distance) -> TorqueRates`.
+    models.scara_along and ocp.joint_path provide it. With torque limits it also has `torques(distance) -> TorqueRates`.
     """
 
     @property
@@ -106,7 +110,7 @@ class ToolLimits:
     """Limits of acceleration (m/s^2) and jerk (m/s^3) of the tool along each world axis, and of its turn rate.
 
     Attributes:
-        acceleration, jerk: Symmetric. Shape (3,), or one number for all axes.
+        acceleration, jerk: Symmetric limits. Shape (3,), or one number for all axes.
         turn_rate: Largest angular speed, rad/s.
 
     Raises:
@@ -129,12 +133,12 @@ class ToolLimits:
 
 @dataclass(frozen=True, eq=False)
 class LineLimits:
-    """Limits of the speed schedule along a path: of the line, the tool and the joints.
+    """Limits of a schedule: of speed, acceleration and jerk along the path, of the tool and of the joints.
 
     Attributes:
-        speed: Requested line speed, m/s: one number, or one for each segment of the task.
-        acceleration: Peak acceleration of the line, m/s^2. See `peak_acceleration` for a mean one.
-        jerk: Jerk of the line, m/s^3; infinite for none, the acceleration may then jump.
+        speed: Requested speed along the path, m/s: one number, or one for each segment of the task.
+        acceleration: Peak acceleration along the path, m/s^2. See `peak_acceleration` for a mean one.
+        jerk: Largest jerk along the path, m/s^3; infinite for none, the acceleration may then jump.
         centripetal: Largest speed^2 x curvature, m/s^2.
         joints: Joint limits, or None.
         tool: Tool limits, or None.
@@ -170,7 +174,7 @@ class LineLimits:
         return np.asarray(self._of_joints(count, ("torque",))[0])
 
     def _of_joints(self, count: int, names: tuple[str, ...]) -> Array:
-        """Return the limits with these names for `count` joints, after checks."""
+        """Return the joint limits of the kinds `names` for `count` joints, after checks. Shape (len(names), count)."""
         joints = self.joints or JointLimits()
         rows = []
         for name in names:
@@ -183,7 +187,7 @@ class LineLimits:
 
 
 def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, zero: bool = False) -> None:
-    """Raise ProblemError unless a limit is positive, of at most `dimensions` dimensions, and finite if required.
+    """Raise ProblemError unless a limit is positive, of at most `dimensions` array dimensions, and finite if required.
 
     With `zero` it may also be 0.
     """
@@ -208,7 +212,7 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, ze
 
 
 def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> JointPath | None:
-    """Check path, limits and joints; return the joints if they are limited, else None.
+    """Check the arguments of a schedule; return the joints along the path if they are limited, else None.
 
     Raises:
         ProblemError: Path, limits or joints have the wrong type, or there are joint limits without joints.
@@ -256,7 +260,7 @@ def check_joints(joints: JointPath) -> None:
 
 
 def rates_along(joints: JointPath, distance: Array) -> JointRates:
-    """Return joints and their derivatives by distance at distances (M,), after checks.
+    """Return joint positions and their derivatives with respect to distance at distances (M,), after checks.
 
     Raises:
         ProblemError: A shape is not (M, n), or a value is not finite.
@@ -285,7 +289,7 @@ def rates_along(joints: JointPath, distance: Array) -> JointRates:
 
 
 def curvature_along(path: PathLike, distance: Array) -> Array:
-    """Return the curvature at distances (M,), 1/m; raise ProblemError if it has a wrong shape or is not finite."""
+    """Return a path's curvature at distances (M,), 1/m; raise ProblemError if it has a wrong shape or is not finite."""
     value = np.asarray(path.curvature(distance), dtype=float)
     if value.shape != np.shape(distance):
         message = f"the path's curvature has shape {value.shape}, expected {np.shape(distance)}"
@@ -298,7 +302,7 @@ def curvature_along(path: PathLike, distance: Array) -> Array:
 
 
 def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
-    """Return the coefficients of the joint torques at distances (M,), after checks.
+    """Return the coefficients of the joint torques at distances (M,) along a path, after checks.
 
     Raises:
         ProblemError: The joints have no torques, a shape is not (M, n), or a value is not finite.
@@ -317,7 +321,7 @@ def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
 
 
 def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Array]:
-    """Return tangent, curvature vector and its rate, and tool turn rate per distance, at (M,). Shape (M, 3) each."""
+    """Return tangent, curvature vector, its derivative, and rotation of the tool per distance. Shape (M, 3) each."""
     missing = [name for name in ("at", "turn") if not callable(getattr(path, name, None))]
     if missing:
         message = f"tool limits need a path with places and turns, as models.smooth makes it; it has no {missing[0]}"
@@ -344,7 +348,7 @@ def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -
 
 
 class Rows(NamedTuple):
-    """Coefficients of all limits at S positions on a path.
+    """Coefficients of all limits, as inequalities in speed, acceleration and jerk, at S points of a path.
 
     Attributes:
         speed: k of each row. Shape (S, K), s/m.
@@ -357,11 +361,11 @@ class Rows(NamedTuple):
     jerk: Array
 
     def take(self, places: NDArray[np.intp] | slice) -> Rows:
-        """Return the coefficients at some of the places."""
+        """Return the coefficients at a subset of the points."""
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
     def steady(self) -> tuple[Array, NDArray[np.intp]]:
-        """Return the greatest steady speed at each position, m/s, and the index of its limit. Shape (S,) each."""
+        """Return the greatest constant speed at each point, m/s, and the index of its active limit. Shape (S,) each."""
         with np.errstate(divide="ignore", invalid="ignore"):
             available = 1 - np.sign(self.acceleration[:, :, 1]) * self.acceleration[:, :, 2]
             speeds = np.concatenate(
@@ -379,7 +383,7 @@ class Rows(NamedTuple):
 
     @property
     def total(self) -> int:
-        """Number of limit rows at a position."""
+        """Number of limits at each point of the path."""
         return sum(kind.shape[1] for kind in self)
 
     def usage(self, motion: LineMotion) -> Array:
@@ -421,7 +425,7 @@ def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[s
 
 
 def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
-    """Return the number of torque rows, which are the last of the acceleration rows."""
+    """Return the number of limits of torques, which are the last of the acceleration limits in `Rows`."""
     if joints is None or not np.isfinite(limits.torques(len(joints.names))).any():
         return 0
     return len(joints.names)
@@ -430,7 +434,7 @@ def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
 def limit_rows(
     path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array, *, torques: bool = True
 ) -> Rows:
-    """Return the limit coefficients at distances (S,) along a path, with zero for torques unless `torques`.
+    """Return the coefficients of all limits at distances (S,) along a path, zero for those of torques unless `torques`.
 
     Raises:
         ProblemError: Curvature or joints are not finite, as at a singular arm, or have a wrong shape.
@@ -449,7 +453,7 @@ def limit_rows(
 
 
 def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
-    """Return the limit coefficients at distances of at most one block."""
+    """Return the coefficients of all limits at no more than `BLOCK_SIZE` distances along a path."""
     speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _names_by_kind(limits, joints))
     if not s.size:
         return Rows(speed[:, :, 0], acceleration, jerk)

@@ -1,4 +1,4 @@
-"""Time schedules of paths: the requested line speed wherever the limits allow it, and smooth reductions elsewhere.
+"""Time schedules of paths: the requested speed along a path wherever limits permit it, smooth reductions elsewhere.
 
 On long paths where centripetal acceleration alone reduces the speed, the schedule consists of stretches of constant
 speed joined by ramps. The maximum velocity curve, sqrt(limit / curvature), is sampled on a grid that is refined where
@@ -39,7 +39,7 @@ __all__ = ["Dip", "Schedule", "plan_below_velocity_curve", "schedule"]
 
 @dataclass(frozen=True)
 class ScheduleSettings:
-    """Settings of the schedules.
+    """Settings of the planning of schedules, and of the maximum velocity curve.
 
     Attributes:
         curve_halvings: Largest number of halvings of an interval of the velocity curve, whose minima are sharp.
@@ -47,11 +47,13 @@ class ScheduleSettings:
         leaving: Relative reduction accepted near the ends of a stretch that is long enough.
         long_path: Number of segments from which a path with centripetal limits alone uses ramps, at a fiftieth of the
             work.
-        speed_error: Relative error of the permitted speed between two places of the velocity curve, which is
+        speed_error: Relative error of the permitted speed between two samples of the velocity curve, which is
             subtracted.
-        speed_change: Largest relative change of it between two places; the lower value holds between them.
+        speed_change: Largest relative change of the permitted speed between two samples; the lower value applies
+            between them.
         spread: Largest ratio of permitted speeds in a stretch of one speed.
-        zone_rounds, thorough_from: Largest number of rounds, and the round from which every place gets its own speed.
+        zone_rounds, thorough_from: Largest number of rounds, and the round from which every interval gets its own
+            speed.
     """
 
     curve_halvings: int = 12
@@ -69,7 +71,7 @@ SETTINGS = ScheduleSettings()
 
 
 def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
-    """Return a motion from rest to rest that stays below the maximum velocity curve and the line limits.
+    """Return a motion from rest to rest below the maximum velocity curve and within the limits along the path.
 
     Raises:
         ProblemError: The curvature is not finite, or no plan below the curve is found.
@@ -106,7 +108,7 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
 def _refine_distances(
     path: PathLike, limits: LineLimits, s: Array, bounds: Array, of_pieces: Array
 ) -> tuple[Array, Array, Array]:
-    """Refine the distances for `_velocity_curve` over some pieces of the path until they resolve it."""
+    """Refine sample distances on given segments of a path until they resolve the maximum velocity curve."""
 
     def permitted_at(places: Array) -> Array:
         with np.errstate(divide="ignore"):
@@ -150,14 +152,14 @@ def _unresolved_intervals(
 
 
 def _constant_zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
-    """Merge neighbouring intervals with the same speed into zones."""
+    """Merge neighbouring intervals of a path with the same speed into zones (stretches with constant limits)."""
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(speed))])
     same = np.ones(len(starts))
     return Zones(s[np.append(starts, len(speed))], speed[starts], limits.acceleration * same, limits.jerk * same)
 
 
 def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, everywhere: bool) -> bool:
-    """Lower zone speeds, in place, where a profile is too fast; return whether a speed was lowered."""
+    """Lower the speeds of intervals, in place, where a profile is too fast; return whether a speed was lowered."""
     speeds = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // BLOCK_SIZE + 1)])
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
@@ -190,10 +192,10 @@ class Dip:
     Attributes:
         start, end: Distances along the path, m.
         cause: The active limit, for example "centripetal acceleration" or "joint 'elbow' velocity".
-        requested, permitted: Requested line speed and lowest steady speed that the limits permit there, m/s; equal if
-            the limit is active on a ramp only.
-        speed: Lowest line speed of the schedule there, m/s.
-        acceleration, jerk: Largest values of the line there, m/s^2 and m/s^3.
+        requested, permitted: Requested speed along the path and lowest steady speed that the limits permit there, m/s;
+            equal if the limit is active on a ramp only.
+        speed: Lowest speed of the schedule there, m/s.
+        acceleration, jerk: Largest acceleration and jerk along the path there, m/s^2 and m/s^3.
     """
 
     start: float
@@ -220,10 +222,10 @@ class Schedule:
 
     Attributes:
         path: The path.
-        limits: Its limits.
+        limits: Limits of the schedule.
         profile: Distance and speed over time.
-        dips: Stretches that are slower than requested, with the cause.
-        joints: The joints along the path, if they were limited.
+        dips: Parts of the path on which the motion is slower than requested, with the cause.
+        joints: The joints along the path, if they were given.
     """
 
     path: PathLike
@@ -264,12 +266,12 @@ class Schedule:
 
 @interruptible
 def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = None, strict: bool = False) -> Schedule:
-    """Plan the line speed along a path from rest to rest in the least time that the limits allow.
+    """Plan the speed along a path from rest to rest in the least time that the limits allow.
 
-    If only speed, acceleration and jerk of the line are active, the result is one jerk-limited motion, at the requested
-    speed between its ramps and through the blends. Where that violates another limit, the stretch around the place is
-    planned again under all limits: by exact passes without jerk limits, else by convex programs. All limits hold
-    between the nodes too, to 0.1 %. Long paths without limits of joints or tool use ramps.
+    If only speed, acceleration and jerk along the path are active, the result is one jerk-limited motion, at the
+    requested speed between its ramps and through the blends. Where that violates another limit, the stretch around the
+    violation is planned again under all limits: by exact passes without jerk limits, else by convex programs. All
+    limits are satisfied between the nodes too, to 0.1 %. Long paths without limits of joints or tool use ramps.
 
     Args:
         path: A models.paths.SmoothPath, or any PathLike.
@@ -305,7 +307,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
 
 def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
-    """Return the speed profile of the line where that satisfies all limits, else the fastest motion."""
+    """Return `line_profile`, or the fastest motion under all limits where it violates one or if it is None."""
     count = len(grid.requested)
     if line_profile is None:
         return fastest_profile(Stretch(grid, 0, count))
@@ -362,9 +364,10 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
 
 
 def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float) -> list[tuple[int, int]]:
-    """Return first and last nodes of the stretches to plan again, which end at steady speeds or path ends.
+    """Return the first and last nodes of the stretches of a path that must be planned again.
 
-    They extend beyond the violated intervals by `extent` times the length of a ramp to rest.
+    They end at steady speeds or path ends, beyond the violated intervals by `extent` times the length of a ramp to
+    rest.
     """
     count, s, limits = len(violated), grid.distance, grid.limits
     motion = profile.at_distance(s)
@@ -401,7 +404,7 @@ def _reaches_speed_at_ends(grid: Grid, motion: SpeedProfile, first: int, last: i
 
 
 def _cut_profile(profile: SpeedProfile, begin: float, end: float) -> SpeedProfile:
-    """Return the part of a profile between two distances."""
+    """Return the part of a speed profile between two distances along the path."""
     first, last = (profile.at_distance([place]) for place in (begin, end))
     inside = (profile.t > first.t[0]) & (profile.t < last.t[0])
     t, s, v, a = (
@@ -415,7 +418,7 @@ def _cut_profile(profile: SpeedProfile, begin: float, end: float) -> SpeedProfil
 
 
 def _find_dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Dip, ...]:
-    """Return the stretches below the requested speed whose active limit is not one of the line."""
+    """Return the parts of a path on which a limit other than those of the line reduces the requested speed."""
     middle = profile.at_distance((grid.distance[:-1] + grid.distance[1:]) / 2)
     line_rows = [k for k, name in enumerate(names) if name.startswith("line ")]
     cause, steady = np.zeros(len(grid.requested), dtype=np.intp), np.zeros(len(grid.requested))

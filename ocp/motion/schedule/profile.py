@@ -1,4 +1,4 @@
-"""Distance and line speed over time, piecewise of constant jerk."""
+"""Distance and speed along a path over time, in segments of constant jerk."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Array = NDArray[np.float64]
 
 
 class LineMotion(NamedTuple):
-    """Motion of the line along a path at M times.
+    """Motion along a path at M times: the distance covered, and its time derivatives.
 
     Attributes:
         t: Time. Shape (M,), s.
         distance: Distance along the path. Shape (M,), m.
-        speed, acceleration, jerk: Its derivatives. Shape (M,), m/s, m/s^2, m/s^3.
+        speed, acceleration, jerk: Time derivatives of the distance. Shape (M,), m/s, m/s^2, m/s^3.
     """
 
     t: Array
@@ -49,7 +49,7 @@ def segment_index(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "r
 
 
 def _checked_values(value: ArrayLike, upper: float, name: str, problem: str) -> Array:
-    """Return numbers clipped to [0, upper]; raise ProblemError if one is outside by more than rounding."""
+    """Return numbers, clipped to [0, upper]; raise ProblemError if one lies outside by more than rounding."""
     try:
         # a contiguous array occupies its memory; a broadcast view could claim any size
         plain = isinstance(value, np.ndarray) and value.dtype == float and value.flags.c_contiguous
@@ -69,11 +69,12 @@ def _checked_values(value: ArrayLike, upper: float, name: str, problem: str) -> 
 
 @dataclass(frozen=True, eq=False)
 class SpeedProfile:
-    """Consecutive segments of constant jerk.
+    """Motion along a path as consecutive segments of constant jerk.
 
     Attributes:
-        t, distance, speed, acceleration: At the start of each segment, and at the end of the last. Shape (K + 1,).
-        jerk: Of each segment. Shape (K,), m/s^3.
+        t, distance, speed, acceleration: Values at the start of each segment, and at the end of the last.
+            Shape (K + 1,), s, m, m/s, m/s^2.
+        jerk: Jerk of each segment. Shape (K,), m/s^3.
 
     Raises:
         ProblemError: A shape is wrong, a value is not finite, or times or distances decrease.
@@ -104,7 +105,7 @@ class SpeedProfile:
 
     @property
     def duration(self) -> float:
-        """Duration, s."""
+        """Duration of the motion, s."""
         return float(self.t[-1])
 
     def at(self, time: ArrayLike) -> LineMotion:
@@ -122,7 +123,7 @@ class SpeedProfile:
         return motion
 
     def at_distance(self, distance: ArrayLike) -> LineMotion:
-        """Return the motion at distances (M,) from the start, m; at a position of rest, when it is reached.
+        """Return the motion at distances (M,) from the start, m; where it rests, at the time of arrival.
 
         Raises:
             ProblemError: A distance is nan, or off the path by more than rounding.
@@ -142,9 +143,9 @@ class SpeedProfile:
         return self.at(np.concatenate([self.t, self.t[:-1][inside] + zero[inside]]))
 
     def function(self) -> Any:
-        """Return the CasADi function time (s) -> (distance, speed, acceleration, jerk), with its tables as MX.
+        """Return the CasADi Function of distance, speed, acceleration and jerk over time (s).
 
-        Times outside are clipped to the ends.
+        Its tables are MX constants. Times outside are clipped to the ends.
         """
         time = ca.MX.sym("time")
         inside = ca.fmin(ca.fmax(time, 0.0), self.duration)
@@ -158,7 +159,7 @@ class SpeedProfile:
         return ca.Function("profile", [time], outputs, ["time"], ["distance", "speed", "acceleration", "jerk"])
 
     def _motion(self, segment: NDArray[np.intp], t: Array) -> LineMotion:
-        """Return the motion at times (M,) after the starts of given segments (M,)."""
+        """Return the motion at times (M,), s, counted from the starts of given segments (M,)."""
         s, v, a, j = self.distance[segment], self.speed[segment], self.acceleration[segment], self.jerk[segment]
         distance, speed, acceleration = integrate_jerk(v, a, j, t)
         return LineMotion(self.t[segment] + t, s + distance, np.maximum(speed, 0.0), acceleration, j)
@@ -192,13 +193,14 @@ class SpeedProfile:
 
 
 def profile_through(distance: Array, speed: Array, acceleration: Array) -> SpeedProfile:
-    """Return a profile through nodes: two segments of constant jerk between nodes, one beside a node at rest.
+    """Return the speed profile through given nodes, with two segments of constant jerk between neighbouring nodes.
 
-    Over a distance h, T follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, which two jerks of T/2 each satisfy.
+    Beside a node at rest both have the same jerk. Over a distance h, the time T follows from
+    h = (v0 + v1)/2 T - (a1 - a0)/12 T^2, which two jerks of T/2 each satisfy.
 
     Args:
-        distance, speed, acceleration: At the nodes, in order; where the first or last speed is 0, the acceleration is
-            that of constant jerk, 0. Shape (N + 1,).
+        distance, speed, acceleration: Values at the nodes, in order; where the first or last speed is 0, the
+            acceleration is that of constant jerk, 0. Shape (N + 1,).
     """
     h, mean = np.diff(distance), (speed[:-1] + speed[1:]) / 2
     change = np.diff(acceleration)
@@ -218,7 +220,7 @@ def profile_through(distance: Array, speed: Array, acceleration: Array) -> Speed
 
 
 def join_profiles(parts: Sequence[SpeedProfile]) -> SpeedProfile:
-    """Concatenate profiles; each begins where the previous one ends."""
+    """Concatenate speed profiles, each of which begins where the previous one ends."""
     if len(parts) == 1:
         return parts[0]
     starts = np.concatenate([[0.0], np.cumsum([part.duration for part in parts])])

@@ -1,4 +1,4 @@
-"""Minimum time over a stretch of a path by sequential convex programming in the squared speed, with one interior point.
+"""Minimum time over a stretch of a path: convex programming in the squared speed by one interior-point iteration.
 
 With x = v^2 as a function of the distance s, a = x'/2 and j = v x''/2, so that
 
@@ -40,7 +40,7 @@ __all__ = ["INTERIOR", "Program", "ProgramSettings", "Spline", "SplineRows", "le
 
 @dataclass(frozen=True)
 class ProgramSettings:
-    """Settings of the interior-point method; shares are relative, complementarity is relative to the time.
+    """Settings of the interior-point method for the fastest motion; complementarity is relative to the travel time.
 
     Attributes:
         steps: Largest number of steps.
@@ -76,15 +76,15 @@ INTERIOR = ProgramSettings()
 
 
 class SplineRows(NamedTuple):
-    """Constraint rows c . (x, x', x'') <= bound or, for jerk limits, <= bound x^(-1/2).
+    """Constraints on the squared speed x and its first two derivatives with respect to distance, M rows.
 
     Attributes:
-        interval: Interval of the place. Shape (M,).
-        fraction: Place in the interval, in [0, 1]. Shape (M,).
-        root: Place in the interval of the x of x^(-1/2). Shape (M,).
-        of: Coefficients of x, x' and x''. Shape (M, 3).
-        bound: Shape (M,).
-        jerk: Whether the bound is one of jerk, times x^(-1/2). Shape (M,).
+        interval: Interval in which each row holds. Shape (M,).
+        fraction: Position in the interval at which it holds, in [0, 1]. Shape (M,).
+        root: Position in the interval of the x of x^(-1/2). Shape (M,).
+        of: Coefficients c in c . (x, x', x'') <= bound. Shape (M, 3).
+        bound: Upper bound of each row. Shape (M,).
+        jerk: Whether the row is a limit of jerk, c . (x, x', x'') <= bound x^(-1/2). Shape (M,).
     """
 
     interval: NDArray[np.intp]
@@ -96,7 +96,7 @@ class SplineRows(NamedTuple):
 
 
 class Spline:
-    """Quadratic spline of the squared speed x over nodes, shape (N + 1,), m, with N + 2 coefficients."""
+    """Quadratic spline of the squared speed x along a path, with N + 2 coefficients for N + 1 nodes (m)."""
 
     def __init__(self, nodes: Array) -> None:
         self.nodes, self.h = nodes, np.diff(nodes)
@@ -105,7 +105,7 @@ class Spline:
         self.share = before / self.width
 
     def part(self, at: NDArray[np.intp]) -> Spline:
-        """Return the spline with a subset of the coefficients, which then count as neighbours."""
+        """Return the spline with a subset of the coefficients, treated as if they were neighbours."""
         part, last = copy(self), len(self.h)
         part.h = self.h[np.minimum(at[:-2], last - 1)]
         nodes = np.minimum(at[:-1], last)
@@ -113,16 +113,16 @@ class Spline:
         return part
 
     def at_nodes(self, b: Array) -> tuple[Array, Array]:
-        """Return x and x' at the nodes. Shape (N + 1,) each."""
+        """Return the squared speed and its derivative with respect to distance at the nodes. Shape (N + 1,) each."""
         step = np.diff(b)
         return b[:-1] + self.share * step, 2 * step / self.width
 
     def through(self, x: Array, slope: Array) -> Array:
-        """Return the spline's coefficients from x and x' at the nodes. Shape (N + 1,) each."""
+        """Return the spline's coefficients from squared speeds and their derivatives at the nodes (N + 1,)."""
         return np.append(x - self.share * self.width * slope / 2, x[-1])
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
-        """Return (x, x', x'') in intervals as linear functions of their three coefficients. Shape (3, 3, M)."""
+        """Return the matrices from spline coefficients of intervals to x, x', x'' at points there. Shape (3, 3, M)."""
         h, share = self.h[interval], self.share[interval]
         inside = fraction * h
         first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
@@ -136,15 +136,15 @@ class Spline:
 
 
 class Program(NamedTuple):
-    """Minimum-time program of a stretch of a path.
+    """Minimum-time optimisation problem for a stretch of a path.
 
     Attributes:
-        spline: Squared speed.
-        rows: Its constraints.
-        upper: Upper bounds of its coefficients; infinite for none. Shape (N + 2,).
-        rest: Distances (m) from rest to its beginning and from its end to rest, with constant jerk and x ~ s^(4/3); 0
-            where it does not begin or end at rest.
-        fixed: Fixed coefficients: the outer two where it begins or ends in motion.
+        spline: Spline of the squared speed.
+        rows: Constraints on the spline.
+        upper: Upper bounds of the spline coefficients; infinite for none. Shape (N + 2,).
+        rest: Distances (m) from rest to the beginning and from the end of the spline to rest, with constant jerk and
+            x ~ s^(4/3); 0 where the motion does not begin or end at rest.
+        fixed: Indices of fixed coefficients: the outer two where the stretch begins or ends in motion.
     """
 
     spline: Spline
@@ -154,7 +154,7 @@ class Program(NamedTuple):
     fixed: NDArray[np.intp]
 
     def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
-        """Return the program of some intervals (B,), with fixed motion between them, and the coefficients' indices."""
+        """Return the program of given intervals (B,), with fixed motion elsewhere, and its coefficients' indices."""
         count = len(self.spline.h)  # stretches are concatenated, with two intervals without rows between them
         cuts = np.flatnonzero(np.diff(free) > 1)
         first, last = free[np.append(0, cuts + 1)], free[np.append(cuts, len(free) - 1)] + 1
@@ -181,7 +181,7 @@ class Program(NamedTuple):
 
 
 class _EndConditions:
-    """End conditions on the coefficients: some are fixed, and one follows from its neighbour at rest."""
+    """End conditions of the motion: fixed spline coefficients, and at rest a coefficient that follows its neighbour."""
 
     def __init__(self, program: Program) -> None:
         n, h, (first, last) = len(program.upper), program.spline.h, program.rest
@@ -190,7 +190,7 @@ class _EndConditions:
         self.fixed = np.union1d(program.fixed, np.array([outer for outer, *_ in self.sides], dtype=np.intp))
 
     def start(self, b: Array) -> Array:
-        """Return coefficients that satisfy the end conditions."""
+        """Return the coefficients ``b`` changed so that they satisfy the end conditions."""
         b = b.copy()
         for outer, inner, ratio in self.sides:
             b[outer] = ratio * b[inner]
@@ -212,7 +212,7 @@ class _EndConditions:
         """Return the diagonals of a Hessian for `_BandSolver`, reduced to the free coefficients.
 
         Args:
-            main, beside, apart: Its diagonals by all coefficients, changed in place. Shape (n,), (n - 1,), (n - 2,).
+            main, first, second: Diagonals for all coefficients, changed in place. Shape (n,), (n - 1,), (n - 2,).
         """
         n = len(main)
         for outer, inner, ratio in self.sides:
@@ -230,7 +230,7 @@ class _EndConditions:
 
 
 class _BandSolver:
-    """Solver of symmetric positive definite systems with five diagonals, given by three. Shape (3, n).
+    """Solver of linear systems with a symmetric positive definite matrix of five diagonals, given as three (3, n).
 
     Raises:
         LinAlgError: The equations are not positive definite, for example when only rounding errors remain.
@@ -258,7 +258,7 @@ class _Constraints:
     Attributes:
         count: Number of intervals.
         interval: Interval of each constraint. Shape (M,).
-        gradients: Gradients of the rows by the three coefficients of their interval. Shape (3, M - `alone`).
+        gradients: Derivatives of the rows with respect to their interval's three coefficients. Shape (3, M - `alone`).
     """
 
     def __init__(self, program: Program) -> None:
@@ -273,7 +273,7 @@ class _Constraints:
         basis, of = spline.basis(interval, rows.fraction[order]), rows.of[order].T
         self.linear = of[0] * basis[0] + of[1] * basis[1] + of[2] * basis[2]
         self.gradients = self.linear.copy()
-        self.jerk = int(len(order) - rows.jerk.sum())  # the first of these
+        self.jerk = int(len(order) - rows.jerk.sum())  # first jerk limit
         self.square = spline.basis(interval[self.jerk :], rows.root[order[self.jerk :]])[0]
         self.sharp = self.bound[self.alone + self.jerk :].copy()
         self.bound[self.alone + self.jerk :] = 0.0
@@ -310,14 +310,14 @@ class _Constraints:
         return self._all_values(change, _weighted_sum(self.gradients, self._coefficients(change)))
 
     def weighted_gradients(self, values: Array) -> Array:
-        """Return the gradients of all constraints, weighted by values and summed. Shape (N + 2,)."""
+        """Return the weighted sum of the gradients of all constraints, for given weights. Shape (N + 2,)."""
         out = self._spread(self.gradients * values[self.alone :])
         out[1:-1] -= values[: self.count]
         out[self.bounded] += values[self.count : self.alone]
         return out
 
     def squares(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return the weighted sum of outer products of gradients by its diagonals. Shapes (N + 2,), (N + 1,), (N,)."""
+        """Return the diagonals of the weighted sum of outer products of gradients. Shapes (N + 2,), (N + 1,), (N,)."""
         g = self.gradients
         pulled = g * values[self.alone :]
         main = self._spread(g * pulled)
@@ -326,15 +326,15 @@ class _Constraints:
         return main, self._spread([g[0] * pulled[1], g[1] * pulled[2]]), self._spread([g[0] * pulled[2]])
 
     def _coefficients(self, b: Array) -> list[Array]:
-        """Return the three spline coefficients of each row's interval."""
+        """Return the three spline coefficients of the interval of each limit row."""
         return [b[k : self.count + k].take(self.row_interval) for k in range(3)]
 
     def _all_values(self, b: Array, rows: Array) -> Array:
-        """Return the values of all constraints from the values of the rows."""
+        """Return the values of all constraints from spline coefficients ``b`` and the values of the limit rows."""
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
     def _spread(self, values: Iterable[Array]) -> Array:
-        """Sum values over the rows of each interval, and add the k-th sums to the k-th coefficient of the interval.
+        """Sum values over the limit rows of each interval, and add the k-th sums to its k-th spline coefficient.
 
         Shapes (M - `alone`,) each to (N + number of values - 1,).
         """
@@ -345,7 +345,7 @@ class _Constraints:
         return out
 
     def longest(self, rates: Array, share: float, of_positive: float) -> Array:
-        """Return step lengths of at most 1, one per interval, which vary slowly along the path. Shape (N,).
+        """Return step lengths of at most 1 for the intervals, which vary slowly along the path. Shape (N,).
 
         Args:
             rates: Relative rates of change of values that stay positive. Shape (M,).
@@ -360,19 +360,19 @@ class _Constraints:
         steps = 1 / np.maximum(-worst / share, 1.0)
         if not (steps < 1).any():
             return np.ones(self.count)
-        # the least of a block and its neighbours: then no interpolated value exceeds that of either block
+        # the least step of a block and its neighbours: then no interpolated step exceeds that of either block
         padded = np.concatenate([steps[:1], steps, steps[-1:]])
         least = np.minimum(np.minimum(padded[:-2], padded[2:]), steps)
         return np.asarray(np.interp(np.arange(self.count), self.middles, least))
 
 
 def _weighted_sum(weights: Array, values: list[Array]) -> Array:
-    """Return the sum of three weights times values."""
+    """Return the sum of three arrays of values, each multiplied by its weights."""
     return np.asarray(weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2])
 
 
 def least_time(program: Program, start: Array, *, accuracy: float, center: float) -> Array:
-    """Return the coefficients of the fastest motion by an interior-point method. Shape (N + 2,).
+    """Return the spline coefficients of the fastest motion by an interior-point method. Shape (N + 2,).
 
     Args:
         program: Program of the stretch.
@@ -476,7 +476,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
 
 def _violations(gap: Array, slack: Array, size: Array, count: int) -> Array:
-    """Return the relative violations that slacks leave; zero for the first `count` rows, which always hold."""
+    """Return the relative violations of constraints that slacks leave; zero for the first `count`, always satisfied."""
     violation = (gap + slack) / size
     violation[:count] = 0.0
     return np.asarray(violation)

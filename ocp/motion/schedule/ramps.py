@@ -1,4 +1,4 @@
-"""Jerk-limited ramps of the line speed, and exact passes where no jerk is limited.
+"""Jerk-limited ramps of the speed along a path, and time-optimal passes where no jerk is limited.
 
 A ramp changes the speed with zero acceleration at both ends. This module has its time and distance, its inverse (the
 speed within reach), and the fastest motion between two speeds over a distance. A zone is a stretch with constant limits
@@ -33,17 +33,17 @@ __all__ = [
 Phases = tuple[tuple[float, float], ...]
 """Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
 Memory = MutableMapping[tuple[float, ...], Phases]
-"""Cache of motions by their limits and ends."""
+"""Cache of computed motions, by distance, end speeds and limits."""
 
 REACH_MARGIN = 1e-6
-"""Share of the length of a zone reserved when the speeds at its ends are chosen, so that a motion exists."""
+"""Share of the length of a zone reserved when the speeds at its ends are chosen, so that it has a feasible motion."""
 
 
 class Zones(NamedTuple):
     """Consecutive stretches of a path, each with its own constant limits.
 
     Attributes:
-        bounds: Distances at which the zones begin, and the end. Shape (Z + 1,), m.
+        bounds: Distances at which the zones begin, and at which the last one ends. Shape (Z + 1,), m.
         speed, acceleration, jerk: Limits in each zone. Shape (Z,).
     """
 
@@ -114,8 +114,8 @@ def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
 def fastest_motion(distance: float, first: float, last: float, limits: tuple[float, float, float]) -> Phases:
     """Return the fastest motion over a distance (m) between two speeds, with zero acceleration at both ends.
 
-    ruckig computes it, in units of the distance and of the time to cover it at top speed. If its result does not close,
-    as for distances that are barely enough, the same profile is built from two ramps.
+    ruckig computes it, in units of the distance and of the time to cover it at top speed. If its result misses the
+    distance or the final speed, as for distances that are barely enough, the profile is built from two ramps.
 
     Args:
         distance: m; at least the ramp_distance of the change of speed.
@@ -145,7 +145,7 @@ def fastest_motion(distance: float, first: float, last: float, limits: tuple[flo
 
 
 def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
-    """Return whether a motion has its distance and final speed, with all speeds within the limits."""
+    """Return whether phases of constant jerk reach the given distance and final speed at admissible speeds."""
     s, v, a = 0.0, first, 0.0
     error = ROUNDING_SHARE * top
     for t, j in phases:
@@ -176,7 +176,7 @@ def _two_ramps(distance: float, first: float, last: float, top: float, accelerat
 
 
 def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
-    """Return the quickest change of the speed by `change` (m/s)."""
+    """Return the phases of constant jerk that change the speed by `change` (m/s) in the least time."""
     size, sign = abs(change), 1.0 if change > 0 else -1.0
     if size == 0:
         return ()
@@ -190,7 +190,7 @@ def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
 
 
 def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
-    """Return the fastest line speed from rest to rest, with zero acceleration at the bounds of zones.
+    """Return the fastest speed profile from rest to rest, with zero acceleration where zones of constant limits meet.
 
     A backward and a forward pass find the speeds at the bounds; each zone is then the fastest motion between them. The
     result is time-optimal for one zone, and for several up to the condition of zero acceleration at their bounds.
@@ -219,7 +219,7 @@ def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
 
 
 def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
-    """Return the motions through all zones as one profile, for given speeds at their bounds. Shape (Z + 1,), m/s."""
+    """Return the motions through all zones as one speed profile, for given speeds at the zone bounds (Z + 1,), m/s."""
     counts = np.array([len(phases) for phases in motions])
     durations, jerks = np.array([phase for phases in motions for phase in phases]).reshape(-1, 2).T
     if not durations.size or not np.isfinite(durations).all():
@@ -241,16 +241,16 @@ def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
 
 
 def _limit_speed(speed: float, other_end: float, length: float, limits: tuple[float, float, float]) -> float:
-    """Return the greater speed at the ends of a zone, lowered to what can be reached from the other end."""
+    """Return the speed at one end of a zone (a stretch with constant limits), lowered to what the other end permits."""
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
 def reachability_passes(distance: Array, caps: Array, *, p: Array, q: Array, low: Array, high: Array) -> Array:
-    """Return the greatest squared speeds at nodes, from rest to rest, by passes in both directions. Shape (N + 1,).
+    """Return the greatest squared speeds at path nodes (N + 1,) from rest to rest, by a backward and a forward pass.
 
     Args:
-        distance: Nodes. Shape (N + 1,), m.
-        caps: Greatest squared speed at each. Shape (N + 1,).
+        distance: Distances of the nodes. Shape (N + 1,), m.
+        caps: Greatest permitted squared speed at each node. Shape (N + 1,).
         p, q, low, high: low <= p u + q x <= high in each interval, x at its first node. Shape (N, R).
 
     Raises:
@@ -290,7 +290,7 @@ def reachability_passes(distance: Array, caps: Array, *, p: Array, q: Array, low
 
 
 def _feasible_squares(p: Array, q: Array, low: Array, high: Array, caps: Array) -> tuple[Array, Array]:
-    """Return bounds of the squared speeds for which an interval's rows allow some acceleration. Shape (N,) each."""
+    """Return the bounds (N,) of the squared speed between which each interval permits some acceleration."""
     floor, ceiling = np.zeros(len(p)), caps.copy()
     count = p.shape[1]
     with np.errstate(divide="ignore", invalid="ignore"):

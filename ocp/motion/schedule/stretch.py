@@ -1,10 +1,10 @@
-"""The fastest motion over a stretch of a path under all limits.
+"""The fastest motion over a stretch (a part of a path) under all limits.
 
-A rough motion, under the rows at one place of every interval, shows the few rows that matter. These are enforced at
-both ends of the interval and where they are used most. The motion under them is evaluated between the nodes: a violated
-row is enforced there too; if it already was, the bounds of the interval are lowered by the violation. This is repeated
-until no row is violated, in the end only for the few intervals that still are and their neighbours. Long stretches are
-solved in windows; each comes to rest at its end, so that a motion beyond the next seam is known to exist.
+A rough motion, under the limit rows at one point of every interval, shows the few rows that matter. These are enforced
+at both ends of the interval and where they are used most. The motion under them is evaluated between the nodes: a
+violated row is enforced there too; if it already was, the bounds of the interval are lowered by the violation. This is
+repeated until no row is violated, in the end only for the few intervals that still violate one and their neighbours.
+Long stretches are solved in windows; each comes to rest at its end, so that a motion beyond the next seam exists.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ from ocp.tolerances import ROUNDING_SHARE
 __all__ = ["ACTIVE_SHARE", "fastest_profile"]
 
 ACTIVE_SHARE = 0.98
-"""Share of a limit above which it counts as active; rows below it in every motion are left out at first."""
+"""Share of a limit above which it counts as active; limits that stay below it in every motion are left out at first."""
 
 
 @dataclass(frozen=True)
 class StretchSettings:
-    """Settings of the fastest motion; shares are relative.
+    """Settings of the search for the fastest motion over a stretch of a path; shares are relative.
 
     Attributes:
-        rounds: Largest number of rounds of tightening.
-        accuracies: Relative accuracy of the time of a window in each round, no finer than the rows still change; the
-            last value serves all later rounds.
+        rounds: Largest number of rounds of tightening the limits.
+        accuracies: Relative accuracy of the travel time of a window in each round, no finer than the enforced limits
+            still change; the last value serves all later rounds.
         around, few: Intervals on either side of a violated one that are planned again with it; only these are planned
             if their share is at most `few`.
-        window, overlap: Intervals of a window, which bounds the memory, and those at its end that the next one plans
-            again.
-        seam: Share of the bounds that a window uses behind its seam, so that the next one has freedom.
+        window, overlap: Number of intervals of a window, which bounds the memory, and of those at its end that the next
+            one plans again.
+        seam: Share of the limits that a window uses beyond the start of the next one, so that the next has freedom.
         start, again: Initial squared speed over that of a fastest steady motion with bounded acceleration, and over
             that of the solution of a similar program.
         again_inside: Further factor if that start fails.
@@ -81,10 +81,10 @@ SETTINGS = StretchSettings()
 
 
 def fastest_profile(stretch: Stretch) -> SpeedProfile:
-    """Return the fastest motion over a stretch, with distances along the path.
+    """Return the fastest motion over a stretch of a path, with distances from the start of the path.
 
     Raises:
-        ProblemError: No motion keeps the limits, with the place.
+        ProblemError: No motion keeps the limits, with the distance at fault.
     """
     if not stretch.grid.sharp:
         return _solve_window(Window.build(stretch, stretch.first, stretch.last, stretch.ends), stretch.last, None)[0]
@@ -106,15 +106,15 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
 def _solve_window(
     window: Window, seam: int, before: EnforcedRows | None
 ) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
-    """Return the motion of a window up to the start of the next one, with limits tightened as far as necessary.
+    """Return the fastest motion over a window (intervals that are solved at once) up to the start of the next one.
 
     Args:
         window: The window.
-        seam: Node at which the next window begins, or the last.
-        before: Rows enforced in the previous window behind its seam.
+        seam: Node at which the next window begins, or the last node.
+        before: Limit rows enforced in the previous window beyond its seam.
 
     Returns:
-        The motion, squared speed and slope at the seam, and the rows enforced behind it.
+        The motion, squared speed and slope at the seam, and the limit rows enforced beyond it.
     """
     enforced = EnforcedRows.build(window)
     if before is not None:
@@ -130,14 +130,17 @@ def _solve_window(
 
 
 def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> tuple[Array, Array | None]:
-    """Tighten limits until a motion satisfies them; return squared speeds and, with jerk limits, slopes at nodes.
+    """Tighten limits until a motion satisfies the original ones; return its squared speeds and, if needed, slopes.
 
-    If few intervals still violate them, these are planned again with their neighbours, between fixed motions.
+    If few intervals still violate limits, these are planned again with their neighbours, between fixed motions.
 
     Args:
         window, seam: As for `_solve_window`.
-        enforced: Enforced rows and margins, changed in place.
+        enforced: Enforced limit rows and margins, changed in place.
         checked: Number of intervals, from the first, that must keep the limits.
+
+    Returns:
+        Squared speeds at the nodes, and their slopes if jerks are limited, else None.
     """
     every = np.arange(window.last - window.first)
     sharp = window.grid.sharp
@@ -200,21 +203,21 @@ def _without_jerk(window: Window, margins: Margins) -> Array:
 
 
 def _row_speed_caps(window: Window) -> Array:
-    """Return the squared speeds that speed limits allow at nodes, using both neighbouring intervals."""
+    """Return the greatest squared speeds that the speed limits on both sides of each node permit."""
     left, right = (window.rows[k].speed.max(axis=1, initial=0.0) for k in (0, -1))
     with np.errstate(divide="ignore"):
         return np.asarray(np.maximum(np.append(left, 0.0), np.insert(right, 0, 0.0)) ** -2.0)
 
 
 def _node_minimum(of_intervals: Array) -> Array:
-    """Return the smaller value of the two intervals that meet at each node."""
+    """Return the smaller of the values of the two intervals that meet at each node."""
     return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 
 def _with_jerk(
     window: Window, enforced: EnforcedRows, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
 ) -> Motion:
-    """Return squared speeds and slopes at the nodes of a window by a convex program."""
+    """Return the squared speeds and their slopes at the nodes of a window if jerks are limited, by a convex program."""
     begin, end, ends, grid, nodes = window.first, window.last, window.ends, window.grid, window.nodes
     left, middle, right = (window.rows[k] for k in (0, 2, 4))
     at_rest = ends[0][0] == 0, ends[1][0] == 0
@@ -297,10 +300,10 @@ def _resolve(program: Program, known: Array, accuracy: float) -> Array:
 
 
 def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: Ends) -> Array:
-    """Return initial squared speeds below the greatest ones (N + 1,) that jerk limits allow from rest.
+    """Return an initial guess of the squared speeds at nodes (N + 1,) that approximately keeps the jerk limits.
 
-    From rest x^(3/4) grows by the square root of 9/2 of the jerk times the distance; a known motion may slow down
-    likewise.
+    From rest, squared speed to the power 3/4 grows by the square root of 9/2 of the jerk times the distance; a known
+    motion may slow down likewise.
     """
     steady = np.minimum(left.steady()[0], right.steady()[0])
     y = (SETTINGS.start * np.minimum(most, _node_minimum(steady) ** 2)) ** 0.75
@@ -315,7 +318,7 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
 
 
 def _rest_jerk(near: Rows, far: Rows, width: float, side: int, shares: Array) -> float:
-    """Return the greatest jerk of the first (side 0) or last interval, at whose outer end the motion rests."""
+    """Return the greatest jerk that limits permit in the first (side 0) or last interval, beside a point of rest."""
     of = [near.jerk[0], far.jerk[0]] if side == 0 else [near.jerk[-1], far.jerk[-1]]
     sign, share = 1.0 - 2.0 * side, shares[0 if side == 0 else -1]
     ratio = 0.0
@@ -335,14 +338,14 @@ def _spline_rows(
     speeds: Array,
     in_motion: tuple[bool, bool],
 ) -> SplineRows:
-    """Return the enforced rows of a program, and speeds at its nodes and where speeds were tightened.
+    """Return the enforced limits as constraint rows on a spline, with speed limits at nodes and where tightened.
 
     Args:
-        places: Rows where intervals begin, inside them, and where they end. Shape (N,) each.
-        held: Which of them are enforced, at the `HELD` places. Shape (4, 2, N, K + L + P).
-        caps, implied: Greatest squared speed at nodes by the rows of speed, and by coefficient bounds. Shape (N + 1,).
-        shares: Shares of the bounds, in the intervals.
-        speeds: Speed ratios at the `HELD` places, see `EnforcedRows`. Shape (4, N).
+        places: Limit rows where intervals begin, inside them, and where they end. Shape (N,) each.
+        held: Which of them are enforced, at the `HELD` positions. Shape (4, 2, N, K + L + P).
+        caps, implied: Greatest squared speed at nodes by the speed limits, and by coefficient bounds. Shape (N + 1,).
+        shares: Shares of the limits that each interval may use.
+        speeds: Speed ratios at the `HELD` positions, see `EnforcedRows`. Shape (4, N).
         in_motion: Whether the program begins and ends with a known motion, whose own rows are left out.
     """
     count, first = len(caps) - 1, places[0].speed.shape[1]
@@ -374,16 +377,17 @@ def _spline_rows(
 
 
 def _jerk_place(inside: float) -> float:
-    """Return the position in an interval at which the spline's jerk x''/2 v equals that of its half.
+    """Return where in an interval the spline's jerk equals the constant jerk of the final motion in the same half.
 
-    With a = a0 + x''/2 (s - s0), two jerks over half the time T each lead to the speed and acceleration at its end if
-    they are x''/2 (v0 + a0 T / 6) and x''/2 (v0 + a0 5 T / 6), up to terms of second order.
+    With squared speed x, the spline's jerk is x''/2 v. With a = a0 + x''/2 (s - s0), two jerks over half the time T
+    each lead to the speed and acceleration at its end if they are x''/2 (v0 + a0 T / 6) and x''/2 (v0 + a0 5 T / 6),
+    up to terms of second order.
     """
     return 1 / 6 if inside < 0.5 else 5 / 6
 
 
 def _speed_ratios(spline: Spline, b: Array) -> Array:
-    """Return the ratios of speeds at the `HELD` positions to those at their `_jerk_place`. Shape (4, N)."""
+    """Return the ratios of a spline's speeds at the `HELD` positions to those at their `_jerk_place`. Shape (4, N)."""
     x, slope = spline.at_nodes(b)
     second = np.diff(slope) / spline.h
 
@@ -396,19 +400,19 @@ def _speed_ratios(spline: Spline, b: Array) -> Array:
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
-    """Return the rows that bound squared speeds, multiplied by `of`, by one."""
+    """Return the constraint rows by which squared speeds in intervals, multiplied by `of`, are at most one."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
     return SplineRows(interval, fraction, fraction, coefficients, np.ones(len(of)), none)
 
 
 def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -> NDArray[np.bool_]:
-    """Return which acceleration and jerk limits a motion may reach. Shape (N, K + L + P).
+    """Return which acceleration and jerk limits any motion may reach in each interval. Shape (N, K + L + P).
 
     Args:
-        rows: Rows in N intervals.
-        up: Greatest squared speed of any motion. Shape (N,).
+        rows: Limit rows in N intervals.
+        squares: Greatest squared speed of any motion. Shape (N,).
         rates: Greatest acceleration. Shape (N,).
-        shares: Shares of the bounds.
+        shares: Shares of the limits that each interval may use.
     """
     a, j, top = np.abs(rows.acceleration), np.abs(rows.jerk), np.sqrt(squares)
     acceleration = a[:, :, 0] * rates[:, None] + a[:, :, 1] * squares[:, None] + a[:, :, 2]

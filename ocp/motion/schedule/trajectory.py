@@ -25,12 +25,12 @@ KINDS = ("positions", "velocities", "accelerations")
 
 @dataclass(frozen=True, eq=False)
 class JointTrajectory:
-    """Joint trajectory, sampled over time.
+    """Joint positions, velocities and accelerations, sampled over time.
 
     Attributes:
         names: Names of the n joints.
         t: Increasing times from the start, s. Shape (M,).
-        positions, velocities, accelerations: Shape (M, n), rad or m, and per s, s^2.
+        positions, velocities, accelerations: Shape (M, n) each, rad or m, and per s, s^2.
 
     Raises:
         ProblemError: A shape is wrong, a value is not finite, times do not increase, or names repeat.
@@ -65,14 +65,14 @@ class JointTrajectory:
         return f"<JointTrajectory of {', '.join(self.names)} at {len(self.t)} times, {self.t[0]:g} to {self.t[-1]:g} s>"
 
     def write_csv(self, path: str | FilePath[str]) -> None:
-        """Write time, and position, velocity and acceleration of each joint, as CSV in full precision."""
+        """Write the times, and the positions, velocities and accelerations of all joints, as CSV in full precision."""
         head = ["t", *(f"{column_name(name)}.{kind}" for kind in KINDS for name in self.names)]
         rows = np.column_stack([self.t, self.positions, self.velocities, self.accelerations])
         write_text(path, "\n".join([",".join(head), *(",".join(map(repr, row)) for row in rows.tolist()), ""]))
 
     @classmethod
     def read_csv(cls, path: str | FilePath[str]) -> JointTrajectory:
-        """Read a file that write_csv has written, bit for bit; raise ProblemError for any other file."""
+        """Read a file written by write_csv without loss of precision; raise ProblemError for any other file."""
         try:
             text = read_regular(checked_path(path), MAX_FILE_BYTES).decode()
         except (OSError, ValueError) as error:
@@ -129,7 +129,7 @@ class JointTrajectory:
 
 
 def _numbers(what: str, value: Any) -> Array:
-    """Return a value as an array; raise ProblemError if it is not numeric."""
+    """Return a value as an array of floats; raise ProblemError if it is not numeric."""
     try:
         return floats(value)
     except NOT_NUMBERS as error:
@@ -137,9 +137,9 @@ def _numbers(what: str, value: Any) -> Array:
 
 
 def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, Array, Array]:
-    """Return joints, velocities, accelerations and jerks for a motion along the path. Shape (M, n) each.
+    """Return joint positions, velocities, accelerations and jerks for a motion along a path. Shape (M, n) each.
 
-    q' v, q'' v^2 + q' a, q''' v^3 + 3 q'' v a + q' j.
+    Rates are q' v, q'' v^2 + q' a and q''' v^3 + 3 q'' v a + q' j; q' is the derivative with respect to distance.
     """
     require.instance("motion", motion, LineMotion)
     rates = rates_along(joints, motion.distance)
@@ -150,10 +150,10 @@ def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, A
 
 
 def joint_trajectory(schedule: Schedule, joints: JointPath, period: float) -> JointTrajectory:
-    """Return the joints every `period` s over a whole schedule; raise ProblemError for an invalid period.
+    """Return the joint trajectory of a whole schedule, sampled every `period` s; raise ProblemError for a bad period.
 
-    Times are whole nanoseconds, those of the ROS message, and the joints are those at these times. The last time is the
-    first one at or after the end, at rest.
+    Times are whole nanoseconds, those of the ROS message, and the joint positions are those at these times. The last
+    time is the first one at or after the end, at rest.
     """
     require.instance("schedule", schedule, Schedule)
     check_joints(joints)

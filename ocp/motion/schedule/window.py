@@ -1,4 +1,4 @@
-"""Windows of a grid that are solved at once: their rows, those that are enforced, and the usage of limits."""
+"""Windows (parts of a path grid that are solved at once): limit rows, enforced rows, and how much of limits is used."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ __all__ = [
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """Settings of the windows; shares are relative to the limits.
+    """Settings by which limits are enforced and checked in a window of a path grid; shares are relative to the limits.
 
     Attributes:
-        room: Share of the limits reserved for what happens between the places where rows are enforced: half of the
+        room: Share of the limits reserved for what happens between the positions where they are enforced: half of the
             promised accuracy of 1e-3.
-        near: Once a motion is known, rows that use less than this share in an interval and beside it are left out.
-        lowered: Largest factor by which a bound is lowered in a round.
-        bend: Share of the limits by which a row may deviate from a parabola before more places are evaluated.
-        vertex_usage: Share of a bound used at one of three places above which the vertex between them is evaluated: a
-            parabola exceeds the greatest of three values by a quarter at most.
+        near: Once a motion is known, limits of which it uses less than this share in an interval and beside it are left
+            out.
+        lowered: Largest factor by which a limit is lowered in a round.
+        bend: Share of the limits by which a row may deviate from a parabola before more positions are evaluated.
+        vertex_usage: Share of a limit used at one of three positions above which the vertex between them is evaluated:
+            a parabola exceeds the greatest of three values by a quarter at most.
         fine: Parts into which an interval is split for that evaluation; even, so that the middle is an end of one.
     """
 
@@ -44,14 +45,14 @@ class WindowSettings:
 SETTINGS = WindowSettings()
 
 INSIDE = (0.25, 0.5, 0.75)
-"""Places in each interval where rows are evaluated between its ends, as shares of its length."""
+"""Positions inside each interval at which limits are evaluated, as fractions of its length."""
 HELD = (0, 1, 3, 4)
-"""Places, ends included, where rows are enforced: not the middle, where the jerk of the motion may change."""
+"""Indices of the positions (0, *INSIDE, 1) at which limits are enforced: not the middle, where the jerk may change."""
 
 Ends: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
-"""Squared speed and its slope by distance, at the beginning and at the end."""
+"""Squared speed and its derivative with respect to distance, at the beginning and at the end of a stretch."""
 Motion: TypeAlias = tuple[Array, Array]
-"""Squared speeds and their slopes at nodes. Shape (N + 1,) each."""
+"""Squared speeds and their derivatives with respect to distance (slopes) at nodes. Shape (N + 1,) each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +61,8 @@ class Stretch:
 
     Attributes:
         grid: The whole grid.
-        first, last: Nodes.
-        ends: Squared speed and its slope at either; rest where the path ends. Shape (2, 2).
+        first, last: Indices of the two nodes.
+        ends: Squared speed and its slope at either node; rest where the path ends. Shape (2, 2).
     """
 
     grid: Grid
@@ -72,13 +73,13 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Window(Stretch):
-    """Part of a stretch that is solved as one program.
+    """Part of a stretch of a path grid that is solved as one program.
 
     Attributes:
-        rows: Rows where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
-        bends: Largest errors of parabolas through the rows of acceleration and of jerk at three of these places. Shape
-            (N, L, 3) and (N, P, 3).
-        close: Cache of rows at a finer spacing, by interval of the grid and whether with torques.
+        rows: Limit rows where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
+        bends: Largest errors of parabolas through the limit rows of acceleration and of jerk at three of these
+            positions. Shape (N, L, 3) and (N, P, 3).
+        close: Cache of limit rows at a finer spacing, by interval of the grid and whether with torques.
     """
 
     rows: tuple[Rows, ...] = ()
@@ -87,7 +88,7 @@ class Window(Stretch):
 
     @classmethod
     def build(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
-        """Return the window of a stretch between two nodes."""
+        """Return the window of a stretch between two nodes, with its limit rows evaluated."""
         grid = stretch.grid
         begin, h = grid.distance[first:last], np.diff(grid.distance[first : last + 1])
         left, right = grid.ends(first, last)
@@ -126,7 +127,7 @@ class Window(Stretch):
 
     @property
     def nodes(self) -> Array:
-        """Distances of the nodes. Shape (N + 1,), m."""
+        """Distances of the window's nodes along the path. Shape (N + 1,), m."""
         return self.grid.distance[self.first : self.last + 1]
 
 
@@ -154,10 +155,11 @@ class EnforcedRows:
     """Limit rows that are enforced in a window, and the margins of the limits.
 
     Attributes:
-        margins: Shares of the bounds, lowered where bounds are violated although their rows are enforced there.
-        times: Number of reductions.
-        held: Rows enforced at the `HELD` places of each interval, upwards and downwards. Shape (4, 2, N, K + L + P).
-        speeds: Speeds at these places over those that the jerk there is proportional to. Shape (4, N).
+        margins: Usable shares of the limits, lowered where limits are violated although they are enforced there.
+        times: Number of reductions of each margin.
+        held: Which rows are enforced at the `HELD` positions of each interval, upwards and downwards.
+            Shape (4, 2, N, K + L + P).
+        speeds: Speeds at these positions over those to which the jerk there is proportional. Shape (4, N).
         inherited: Number of intervals taken over from the previous window.
     """
 
@@ -169,7 +171,7 @@ class EnforcedRows:
 
     @classmethod
     def build(cls, window: Window) -> EnforcedRows:
-        """Return the initial set of enforced rows of a window."""
+        """Return the initial set of enforced limit rows of a window, which is empty."""
         count, rows = window.last - window.first, window.rows[0]
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
@@ -177,16 +179,16 @@ class EnforcedRows:
         return cls(margins, times, held, np.ones((len(HELD), count)))
 
     def part(self, first: int, last: int) -> EnforcedRows:
-        """Return the rows of the intervals from `first` up to `last`, as views of the same memory."""
+        """Return the enforced rows of the intervals from `first` up to `last`, as views of the same memory."""
         part = slice(first, last)
         return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
 
     def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
-        """Enforce rows close to their bounds, also in neighbouring intervals, and one jerk limit in each interval.
+        """Enforce limits that a motion nearly reaches, also in neighbouring intervals, and one jerk limit per interval.
 
         Args:
             used, values: Usage of the limits, see `limit_usage`.
-            jerks: Coefficients of the jerk in its rows. Shape (N, P).
+            jerks: Coefficients of the jerk in the jerk limits. Shape (N, P).
         """
         close = used > SETTINGS.near
         close[:, 1:] |= close[:, :-1].copy()
@@ -196,7 +198,7 @@ class EnforcedRows:
         self.hold_jerk(jerks)
 
     def release(self, values: Array, jerks: Array, seam: int) -> None:
-        """Release rows far from their bounds, but keep at least one jerk limit in each interval.
+        """Stop enforcing limits that a motion stays well below, but keep at least one jerk limit in each interval.
 
         Intervals shared with the previous or next window keep all rows.
         """
@@ -205,13 +207,13 @@ class EnforcedRows:
         self.hold_jerk(jerks)
 
     def hold_jerk(self, jerks: Array) -> None:
-        """Enforce at least one jerk limit in every interval; without one the second derivative is unbounded there."""
+        """Enforce at least one jerk limit in every interval, to bound the second derivative of the squared speed."""
         first = self.held.shape[3] - jerks.shape[1]
         sign, free = np.nonzero(~self.held[:, :, :, first:].any(axis=(0, 3)))
         self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce rows (2, N, K + L + P) where their usage is largest; return which were enforced before."""
+        """Enforce given limit rows (2, N, K + L + P) where they are used most; return which already were enforced."""
         already = np.zeros(rows.shape, dtype=bool)
         sign, at, row = np.nonzero(rows)
         place = (values[:, at, row] * (1 - 2 * sign)).argmax(axis=0)
@@ -220,7 +222,7 @@ class EnforcedRows:
         return already
 
     def lower(self, used: Array, held: NDArray[np.bool_], rows: Rows, seam: int) -> None:
-        """Tighten the bounds of violated rows that are enforced already, by more at each call.
+        """Tighten the violated limits that are already enforced, by more at each call.
 
         Args:
             used: Usage of the limits. Shape (2, N, K + L + P).
@@ -237,13 +239,13 @@ class EnforcedRows:
             margin[at] /= np.minimum(1 + (ratio[at] - 1 + SETTINGS.room / 2) * 2.0 ** times[at], SETTINGS.lowered)
             times[at] += 1
             if margin.ndim == 2:
-                # the next window starts on this motion with these margins and must keep them at all places
+                # the next window starts on this motion with these margins and must keep them at all positions
                 inherited = at[0] >= seam
                 self.held[:, :, at[0][inherited], a + at[1][inherited]] = True
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
-    """Return the motion with given squared speeds (with jerk limits also slopes) at the first nodes of a stretch."""
+    """Return the speed profile with given squared speeds and, with jerk limits, slopes at a stretch's first nodes."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     v = np.sqrt(x)
     if slope is not None:
@@ -255,9 +257,9 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProf
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return the usage of limits in some intervals (B,): the largest in each direction, and at `HELD` positions.
+    """Return the share of each limit that a motion uses in given intervals (B,): the largest, and at `HELD` positions.
 
-    Shapes (2, N, K + L + P) and (4, N, K + L + P), zero in the other intervals.
+    Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 
     In either half of an interval each row is interpolated by a parabola through three places, whose vertex counts too.
     Where the interpolation error may matter, and if `closely`, more places are evaluated.
@@ -327,14 +329,14 @@ def limit_usage(
 
 
 def _parabola_errors(rows: list[Array]) -> Array:
-    """Return the largest errors of parabolas through three of five equidistant values of rows. Shape (N, L, 3)."""
+    """Return the largest errors of parabolas through three of five equidistant row coefficients. Shape (N, L, 3)."""
     a, b, c, d, e = rows
     # the third difference gives the cubic term; a parabola misses at most 1/(9 sqrt 3) of it
     return np.asarray(np.maximum(np.abs(d - a + 3 * (b - c)), np.abs(e - b + 3 * (c - d))) / (9 * np.sqrt(3)))
 
 
 def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
-    """Return the rows that hold at three positions but may be violated between them. Shape (N, K + L + P)."""
+    """Return which limits may be exceeded by interpolation error between evaluated positions. Shape (N, K + L + P)."""
     v, a, j = (
         np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
         for kind in ("speed", "acceleration", "jerk")
@@ -357,9 +359,9 @@ def _fine_usage(
     Args:
         window, profile: As for `limit_usage`.
         intervals: The intervals. Shape (B,).
-        f: Places in them where the jerk changes. Shape (B,).
+        f: Positions in them, 0..1, at which the jerk changes. Shape (B,).
         known: Usage at their beginning, before and after that change, and at their end. Shape (4, B, R).
-        torques: Whether those of torques are evaluated.
+        torques: Whether the limits of torques are evaluated.
     """
     parts, half = SETTINGS.fine, SETTINGS.fine // 2
     places = window.nodes[intervals] + np.arange(1, parts)[:, None] / parts * np.diff(window.nodes)[intervals]
@@ -381,7 +383,7 @@ def _fine_usage(
 
 
 def _vertex(values: Array, places: list[Array]) -> Array:
-    """Return the vertex of the parabola through three values, if it lies between them, else the first value."""
+    """Return the extreme value of the parabola through three values if it lies between them, else the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,1 +1,1 @@
-"""Tip tasks of a machine: targets over time, their equations and checks, and rules of the zero moment point."""
+"""Tip tasks of a machine: their targets over time, equations and checks, and rules for the zero moment point."""

@@ -28,11 +28,11 @@ class CheckSettings:
     """Sampling and tolerances of the checks of tasks.
 
     Attributes:
-        track_samples: Samples of a track.
-        closure_samples: Samples of a closed track: an odd number, for Simpson's rule.
+        track_samples: Number of samples of a track, a target over time.
+        closure_samples: Number of samples of a closed track: odd, for Simpson's rule.
         closed: Largest gap of a closed path, m and rad.
-        ignorable: Relative change below which a joint counts as without effect.
-        ignorable_samples: Random configurations in which that is evaluated.
+        ignorable: Relative change of the required joint rates below which a joint position counts as without effect.
+        ignorable_samples: Number of random configurations in which that is evaluated.
         rounding: Tolerance of a joint limit, relative to the range between the limits; without one, to the limit, and
             absolute (rad or m) for limits below 1.
         still: Largest task velocity where the joints are to be at rest, m/s and rad/s.
@@ -51,7 +51,7 @@ CHECKS = CheckSettings()
 
 
 def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
-    """Return the horizon, s; None means the time at which the last task ends.
+    """Return the horizon of a motion, s; if it is not given (None), the time at which the last task ends.
 
     Raises:
         ProblemError: The horizon is not positive, or it is None and no task has a duration.
@@ -66,7 +66,9 @@ def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
 
 
 def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Array, Array]:
-    """Return checked joints (joint_size,) and base (base_size,) at the start, by default the machine's base_home().
+    """Return the joint positions (joint_size,) and the base configuration (base_size,) at the start, after checks.
+
+    The base is by default the machine's base_home().
 
     Raises:
         ProblemError: Wrong sizes, a value that is not finite, or a quaternion that is not of unit length.
@@ -90,11 +92,11 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
 
 
 def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
-    """Return joints at an end of a motion, nan where free, with excesses by rounding clipped to the limits. Shape (n,).
+    """Return joint values (n,) at an end of a motion, clipped to their limits if they exceed these by rounding only.
 
     Args:
-        joints, lower, upper: Joints, or their velocities, and the limits. Shape (n,).
-        label: Name of the joints in errors, for example "end_joints".
+        joints, lower, upper: Joint positions, or velocities, nan where free, and their limits. Shape (n,).
+        label: Name of the values in errors, for example "end_joints".
         names: Names of the joints.
         hint: End of the error message: what to do.
 
@@ -114,7 +116,7 @@ def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, nam
 
 
 def checked_weights(weights: Any, size: int) -> Array:
-    """Return weights of the squared joint rates, ones if None; raise ProblemError if one is not positive. (size,)"""
+    """Return weights (size,) of the squared joint rates, ones if None; raise ProblemError if one is not positive."""
     if weights is None:
         return np.ones(size)
     array = require.array("weights", weights, (size,), meaning="one for each joint")
@@ -178,7 +180,7 @@ def checked_tasks(
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
-    """Return the name of a task whose rows are linearly dependent up to rounding; None if there is none."""
+    """Return a name for the tasks if their rows are linearly dependent in a configuration up to rounding, else None."""
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
@@ -186,10 +188,10 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joints have no effect on the joint rates that tasks and base require. Shape (n,).
+    """Return which joint positions have no effect on the joint rates that tasks and base require. Shape (n,), bool.
 
     Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
-    and the cones of tool axes do not depend on such a joint.
+    and the cones of tool axes do not depend on such a joint position.
     """
     machine, rng, n = equations.machine, np.random.default_rng(0), equations.machine.joint_size
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, n, n))
@@ -213,7 +215,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the twist rows of a single task, or the indices of the stacked rows of several."""
+    """Return how errors number the rows of the tasks: by twist component for a single task, else by position."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -221,24 +223,24 @@ def _rows_by_name(equations: TaskEquations) -> list[int]:
 
 
 def _frame(part: BoundTask) -> str:
-    """Return the name of the link that a task moves."""
+    """Return the name of the link whose frame a task moves."""
     return part.task.link or part.tip.robot.tip_link
 
 
 def _sample_targets(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
-    """Return `count` equidistant times, and the targets at these times, one column each."""
+    """Return `count` equidistant times from 0 to the horizon, and the targets at these times, one column each."""
     times = np.linspace(0.0, horizon, count)
     return times, np.array(equations.target_function().map(count)(times[None, :]))
 
 
 def _parts(equations: TaskEquations, values: Array) -> list[tuple[BoundTask, Array]]:
-    """Return each task with its rows of the targets."""
+    """Return each task with its own rows of the stacked targets of all tasks."""
     ends = np.cumsum([target_size(part.task) for part in equations.bound])
     return list(zip(equations.bound, np.split(values, ends[:-1]), strict=True))
 
 
 def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> None:
-    """Raise ProblemError if an orientation is not a rotation."""
+    """Raise ProblemError if a target orientation is not a rotation matrix at one of the times."""
     for part, targets in _parts(equations, values):
         if part.task.orientation is not None:
             rotations = targets[-12:-3].T.reshape(-1, 3, 3)
@@ -252,14 +254,14 @@ def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> N
 
 def _has_full_rank(jacobian: Array) -> bool:
     """Return whether the rows of a Jacobian are linearly independent."""
-    if not jacobian.size:  # tasks of cones alone
+    if not jacobian.size:  # all tasks are cones
         return True
     values = np.linalg.svd(jacobian, compute_uv=False)
     return bool(np.isfinite(values).all() and values[-1] > 1e-9 * values[0])
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if a closed task does not return to its start, as far as targets show that.
+    """Raise ProblemError if a task of a cyclic motion does not return to its start, as far as its targets show that.
 
     Poses are checked by their targets, velocities by their integrals.
     """
@@ -305,7 +307,7 @@ def check_rest(equations: TaskEquations, *times: float | None) -> None:
 
 
 def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
-    """Raise ProblemError if target positions are farther from the first joint than the arm is long."""
+    """Raise ProblemError if a target position is farther from the first joint than the arm is long."""
     for part in equations.bound:
         task = part.task
         if task.position is None or task.axes != "world" or task.relative_to is not None or part.tip.base_size:
@@ -402,7 +404,7 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
 
 
 def _rate_rows(task: TipTask) -> list[int]:
-    """Return which entries of a pose task's targets are velocities, by index."""
+    """Return the indices of the velocities among the entries of a pose task's targets."""
     tracks = [(task.position, [3, 4, 5], 6), (task.orientation, [9, 10, 11], 12), (task.direction, [3, 4, 5], 6)]
     rows, at = [], 0
     for track, entries, size in tracks:
@@ -420,7 +422,7 @@ def _integral(values: Array, step: float) -> Array:
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:
-    """Return the angle, rad, of the rotation that an angular velocity in world axes, (3, samples), causes."""
+    """Return the angle of the net rotation, rad, from samples of an angular velocity in world axes, (3, samples)."""
     rotation = np.eye(3)
     # fourth-order Magnus expansion over two steps at a time
     for k in range(0, CHECKS.closure_samples - 1, 2):
@@ -436,7 +438,7 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities to prescribe at an end at rest, nan where free. Shape (n,).
+    """Return the joint velocities to prescribe where a motion starts or ends at rest: 0, or nan if free. Shape (n,).
 
     A tip whose velocity or acceleration is prescribed comes to rest by itself. As many joints as the tasks have such
     rows then follow from the others, and prescribing their rest too would be redundant. The joints that move the tip

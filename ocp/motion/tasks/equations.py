@@ -1,4 +1,4 @@
-"""Equations of tip tasks in the joint rates, J u = b, with drift and feedback in b, or in their derivatives, J u' = c.
+"""Equations of tip tasks, J u = b in the joint rates u with drift and feedback in b, or J u' = c in their derivatives.
 
 The latter are the former differentiated along the motion. Everything that depends on time alone is in the column of
 targets; everything else is a function of configuration and targets, written element by element on SX symbols.
@@ -49,7 +49,7 @@ __all__ = ["TaskEquations", "bind", "task_errors"]
 
 @dataclass(frozen=True, eq=False)
 class TaskEquations:
-    """Stacked equations of all tasks of a machine. Use `bind` to create them.
+    """Stacked equations of all tip tasks of a machine. Use `bind` to create them.
 
     Attributes:
         machine: The machine.
@@ -66,7 +66,7 @@ class TaskEquations:
 
     @property
     def pose_rows(self) -> NDArray[np.bool_]:
-        """Mask of the rows that belong to pose tasks. Shape (size,), bool."""
+        """Mask of the task rows that belong to pose tasks. Shape (size,), bool."""
         return np.repeat([part.task.is_pose for part in self.bound], [part.task.size for part in self.bound])
 
     @cached_property
@@ -83,7 +83,7 @@ class TaskEquations:
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Return the units of the rows, for example "rad/s, m/s" for `residual`.
+        """Return the units of the task rows as text, for example "rad/s, m/s" for the velocity residual.
 
         Args:
             pose, velocity: Time units of the rows of pose and of velocity tasks: "" for `error`, "/s^2" for
@@ -142,7 +142,7 @@ class TaskEquations:
 
     @on_scalars
     def jacobian(self, base: Any, joints: Any) -> Any:
-        """Return the Jacobian J of all tasks by the joint rates u. Shape (size, joint_size)."""
+        """Return the Jacobian J of all tasks with respect to the joint rates u. Shape (size, joint_size)."""
         rows = []
         for part in self.bound:
             columns = relative_twist(part, base, joints, part.tip.tip_jacobian(base, joints), rates=None)
@@ -186,7 +186,7 @@ class TaskEquations:
         """
         tolerances = self.tolerances
         gaps = np.repeat([part.task.start_gap for part in self.bound], [part.task.size for part in self.bound])
-        gaps = np.where(gaps > TipTask.start_gap, gaps, 0.0)  # the default closes nothing
+        gaps = np.where(gaps > TipTask.start_gap, gaps, 0.0)  # the default gap is not closed
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         twist, deviations = self.twist(base, joints, rates), dict[str, dict[str, Any]]()
         for posed, angular, name, unit in (
@@ -206,13 +206,13 @@ class TaskEquations:
 
     @property
     def tolerances(self) -> Array:
-        """Tolerances of the rows, m and rad. Shape (size,)."""
+        """Accepted pose errors of the task rows, m and rad. Shape (size,)."""
         pairs = np.repeat([part.task.tolerance for part in self.bound], [part.task.size for part in self.bound], axis=0)
         return np.asarray(np.where(self.turning, *pairs.T[::-1]))
 
     @property
     def turning(self) -> NDArray[np.bool_]:
-        """Mask of the angular rows. Shape (size,), bool."""
+        """Mask of the angular rows among all task rows. Shape (size,), bool."""
         angular: list[bool] = []
         for task in (part.task for part in self.bound):
             angular += [*([True, True] if task.tilts else []), *(row in ANGULAR for row in task.chosen)]
@@ -241,7 +241,7 @@ class TaskEquations:
 
     @on_scalars
     def manipulability(self, base: Any, joints: Any) -> Any:
-        """Return sqrt(det(J J')) of the rows of all tasks (Yoshikawa 1985). Shape (1, 1)."""
+        """Return the manipulability sqrt(det(J J')) for the Jacobian J of all tasks (Yoshikawa 1985). Shape (1, 1)."""
         return manipulability_of(self.jacobian(base, joints))
 
     @on_scalars
@@ -256,7 +256,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Return pose minus target in pose rows, and `residual` in velocity rows. Shape (size, 1)."""
+        """Return pose minus target in the rows of poses, and `residual` in those of velocities. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         return ca.vertcat(*((-error if is_pose else residual)[i] for i, is_pose in enumerate(self.pose_rows)))
 
@@ -325,7 +325,7 @@ class TaskEquations:
 
     @property
     def cone_angles(self) -> Array:
-        """Half-angles of the cones of `cone_cosines`, rad. Shape (k,)."""
+        """Half-angles of the cones in which tool axes must stay, see `cone_cosines`, rad. Shape (k,)."""
         return np.array([part.task.within for part in self.bound if part.task.within is not None], dtype=float)
 
     def _cosine(self, part: BoundTask, base: Any, joints: Any, target: Any) -> Any:
@@ -336,7 +336,7 @@ class TaskEquations:
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the pose error by which velocity tasks at a free start deviate from the reference configuration.
+        """Return the pose errors of the tips of velocity tasks at a start, relative to a reference configuration.
 
         For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
         """
@@ -352,7 +352,7 @@ class TaskEquations:
         return ca.vertcat(*rows)
 
     def _with_targets(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
-        """Yield each task with its own targets."""
+        """Yield each task with its own part of the stacked targets."""
         at = 0
         for part in self.bound:
             size = target_size(part.task)
@@ -366,7 +366,7 @@ class TaskEquations:
         return np.array(self.function.map(count)(bases.T, positions.T, targets)[2]).reshape(-1, count).T
 
     def _along(self, t: Any, base: Any, joints: Any) -> tuple[Array, Array, Any]:
-        """Return base (M, base_size), joints (M, joint_size) and targets (one column each) along a motion."""
+        """Return base (M, base_size) and joint positions (M, joint_size) along a motion, and targets as M columns."""
         times, positions = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
         bases = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
         return bases, positions, self.target_function().map(len(times))(times[None, :])
@@ -386,14 +386,14 @@ class TaskEquations:
 
     @cached_property
     def function(self) -> Any:
-        """CasADi Function (base, joints, targets) -> (J, b, pose error, pose residual)."""
+        """CasADi Function of the task equations: (base, joints, targets) -> (J, b, pose error, pose residual)."""
         symbols = self._symbols
         rows = [of_targets(*symbols) for of_targets in (self.right, self.error, self.pose_residual)]
         return ca.Function("task", symbols, [self.jacobian(*symbols[:2]), *rows], {"cse": True})
 
     @cached_property
     def pose_residual_function(self) -> Any:
-        """CasADi Function (joints, base, targets) -> (pose residual, its Jacobian by the joints)."""
+        """CasADi Function (joints, base, targets) -> (pose residual, its Jacobian with respect to the joints)."""
         base, joints, targets = self._symbols
         residual = self.pose_residual(base, joints, targets)
         jacobian = ca.densify(ca.jacobian(residual, joints))
@@ -407,7 +407,7 @@ class TaskEquations:
 
     @property
     def _symbols(self) -> tuple[Any, ...]:
-        """Symbols of base, joints and targets."""
+        """Symbols of base configuration, joint positions and targets."""
         targets = sum(target_size(part.task) for part in self.bound)
         sizes = {"base": self.machine.base_size, "joints": self.machine.joint_size, "targets": targets}
         return tuple(ca.SX.sym(name, size) for name, size in sizes.items())
@@ -441,7 +441,7 @@ class TaskEquations:
 
 
 def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
-    """Return a position target with all three coordinates; those that the task lacks are zero. Shape (3, 1)."""
+    """Return a position target with all three coordinates, zero where the task prescribes none. Shape (3, 1)."""
     short = task.along_reference and len(task.linear) < 3
     shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
     value = track_expression(track, time, shapes, what=name, begin=task.begin)
@@ -453,7 +453,7 @@ def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
 
 
 def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
-    """Return the equations of one or several tasks of a machine.
+    """Return the equations of one or several tip tasks of a machine.
 
     If the robot has no tip, the machine of the equations has the frame of the first task as its tip.
 
@@ -486,8 +486,8 @@ def task_errors(
 
     Args:
         t: Times, s. Shape (M,).
-        joints: Shape (M, joint_size).
-        base: Shape (M, base_size), or None on a fixed base.
+        joints: Joint positions. Shape (M, joint_size).
+        base: Base configurations. Shape (M, base_size), or None on a fixed base.
 
     Returns:
         Shape (M, rows of all tasks).

@@ -23,7 +23,7 @@ class Start:
     """Start of a motion: configuration and velocity of a machine.
 
     Attributes:
-        joints: Joints, rad or m, shape (n,); None: searched.
+        joints: Joint positions, rad or m, shape (n,); None: searched.
         base: Configuration of a floating base, shape (base_size,); None: the machine's base_home().
         velocity: "rest", "free", or the joint velocities, shape (n,), rad/s or m/s; for goals, since the tasks of a tip
             determine the velocities at their start.
@@ -35,10 +35,10 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Return a start, its checked joints (n,) or None if they are free, and its base (base_size,).
+        """Return a start, its checked joint positions (n,) or None if free, and its base configuration (base_size,).
 
         Args:
-            value: A start, joints, or None.
+            value: A start, joint positions, or None.
 
         Raises:
             ProblemError: As `checked_configuration`.
@@ -50,13 +50,13 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Return a start whose joints are given, its checked joints (n,), and its base (base_size,).
+        """Return a start whose joint positions must be given, and these (n,) and its base (base_size,) after checks.
 
         Args:
-            value: A start with joints, or joints.
+            value: A start with joint positions, or joint positions.
 
         Raises:
-            ProblemError: The joints are missing; or as `checked_configuration`.
+            ProblemError: The joint positions are missing; or as `checked_configuration`.
         """
         start = value if isinstance(value, cls) else cls(value)
         return start, *checked_configuration(machine, start.joints, start.base)
@@ -64,19 +64,19 @@ class Start:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Goal:
-    """End of a motion or of a part of it, given by joints or by a pose of the tip.
+    """End of a motion or of a part of it, given by joint positions or by a pose of the tip.
 
     Attributes:
-        joints: Joints, nan where free. Shape (n,), rad or m.
+        joints: Joint positions, nan where free. Shape (n,), rad or m.
         tip: Link whose pose is meant; None for the tip of the robot.
         position: Position of the tip in world. Shape (3,), m.
-        orientation: Its orientation in world: quaternion [w, x, y, z] or rotation matrix.
+        orientation: Orientation of the tip in world: quaternion [w, x, y, z] or rotation matrix.
         direction: Direction of the tool axis in world, with a free roll about it, in place of an orientation. Shape
             (3,).
         within: Half-angle of the cone about the direction in which the tool axis may lie, rad.
         tool_axis: Tool axis in the tip's frame. Shape (3,).
         region: Box or sphere in world in which the tip may lie, in place of a position.
-        velocity: "rest", "free", or the joint velocities there, nan where free. Shape (n,), rad/s or m/s.
+        velocity: "rest", "free", or the joint velocities at the goal, nan where free. Shape (n,), rad/s or m/s.
         base: Configuration of a floating base at the end, nan where free. Shape (base_size,).
         duration: Duration of this part of a motion with several goals, s, or FreeTime(...); None: the horizon.
         machine: Machine on the way to this goal, for example with a load; None for that of the part before.
@@ -138,7 +138,7 @@ class Goal:
 
     @property
     def task(self) -> TipTask:
-        """Task that keeps the tip at the goal, or at the centre of its region."""
+        """Tip task with the pose of the goal as constant target, or with the centre of its region."""
         center = self.position if self.region is None else self.region.position
         return TipTask(
             position=center,
@@ -160,8 +160,8 @@ class Waypoints:
         step: Largest displacement of each joint between waypoints, rad or m; one number or one per joint.
         reconfigurations: "forbidden", or "counted": if no path goes through all waypoints, find the fewest
             reconfigurations, and among these the least cost. In a reconfiguration, the arm leaves the path at a
-            waypoint and returns at the next one in any configuration; it costs nothing and is not planned. With at most
-            one free direction.
+            waypoint and returns at the next one in any configuration; it costs nothing and is not planned. Only with at
+            most one redundant degree of freedom.
     """
 
     positions: ArrayInput
@@ -175,10 +175,12 @@ PER_JOINT = ("effort", "acceleration")
 
 @dataclass(frozen=True, eq=False)
 class Cost:
-    """Weights of the cost of a motion, an integral over its time plus `time` times its duration T:
+    """Weights of the cost of a motion, a sum of an integral over time and a term proportional to the duration.
 
         J = time T + integral of (velocity/2 sum(w q'^2) + effort sum(tau^2) + length sqrt(sum(w q'^2))
             + acceleration sum(q''^2) + jerk sum(q'''^2) + energy sum(max(tau q', 0)) + turning |omega|^2) dt
+
+    with duration T, joint positions q, joint torques tau and angular velocity omega of the base.
 
     Attributes:
         velocity: Weight of half the squared joint velocities.
@@ -220,7 +222,7 @@ class Cost:
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Names of the terms whose weights are not zero."""
+        """Names of the terms of the cost whose weights are not zero."""
         return tuple(name for name in (*self._single, *PER_JOINT) if np.any(np.asarray(getattr(self, name))))
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Cost:

@@ -22,10 +22,10 @@ __all__ = [
 ]  # fmt: skip
 
 PARALLEL = 1e-12
-"""Cosine below which an edge of the support is parallel to a direction."""
+"""Cosine of the angle between the normal of a support edge and a direction below which the edge is parallel to it."""
 
 ROUNDING_M = 1e-9
-REFERENCE_SAMPLES = 201  # times at which a reference is checked
+REFERENCE_SAMPLES = 201  # number of times at which a reference is checked
 
 
 def is_finite(value: Any) -> bool:
@@ -56,7 +56,10 @@ class InFoot:
 
 @dataclass(frozen=True)
 class IndexAtLeast:
-    """Rule that the stability index, (5)-(6), is at least `value` in x and y, with the point inside the support."""
+    """Rule that the stability index, equations (5) and (6) of the paper, is at least `value` in x and y.
+
+    The zero moment point also stays inside the support polygon.
+    """
 
     value: float
 
@@ -66,7 +69,7 @@ class IndexAtLeast:
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return lower and upper corner (x, y) of the region in which the index is high enough. Shape (2,) each, m."""
+        """Return lower and upper corner (x, y) of the region of points that satisfy the rule. Shape (2,) each, m."""
         radius = machine.half_widths * np.sqrt(1 - self.value)
         return machine.most_stable_point - radius, machine.most_stable_point + radius
 
@@ -127,7 +130,7 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return those support edges, moved inwards by the margin, that a rule does not already guarantee.
+    """Return the support edges, moved inwards by the margin, that a rule for the zero moment point does not guarantee.
 
     Returns:
         Inward normals n and offsets o: n . point >= o. Shapes (k, 2) and (k,).
@@ -147,10 +150,10 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return distances of the zero moment point from `foot_edges` that motion can change. Shape (k, 1), m.
+    """Return those distances of the zero moment point from `foot_edges` that depend on the motion. Shape (k, 1), m.
 
     Args:
-        machine, zmp: The machine and its rule.
+        machine, zmp: The machine and the rule for its zero moment point.
         point: The zero moment point of the motion. Shape (2, 1).
         external: Whether there are external wrenches, which may move the point in any direction.
 
@@ -196,7 +199,7 @@ def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool)
 
 
 def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
-    """Raise ProblemError if a rule has the wrong type, or cannot be satisfied inside the support."""
+    """Raise ProblemError if a rule for the zero moment point has the wrong type or is infeasible inside the support."""
     if not isinstance(zmp, ZmpRule):
         words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
         raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))
@@ -220,7 +223,7 @@ def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
 
 
 LIMITED = ("velocity", "acceleration", "jerk", "torque", "power")
-"""Limits that are one number for each joint, or one for all."""
+"""Names of the limits that are given as one number for each joint, or one for all."""
 
 
 class JointBounds(NamedTuple):
@@ -243,7 +246,7 @@ class JointBounds(NamedTuple):
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of joints and ground contact.
+    """Limits of a motion: of the joints, of their actuators and of the ground contact.
 
     None means the limit of the robot description, which has none for acceleration, jerk and power. Many URDF files give
     0 for an unknown velocity or torque limit; 0 is read as unlimited.
@@ -287,7 +290,7 @@ class Limits:
             raise ProblemError(words, name="friction", value=self.friction, limit=0.0)
 
     def least_force(self, machine: Standing) -> float:
-        """Least vertical ground force, N."""
+        """Return the least permitted vertical ground force on a standing machine, N."""
         return 0.1 * machine.weight if self.vertical_force is None else float(self.vertical_force)
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Limits:
@@ -339,7 +342,7 @@ def unknown_limits(robot: Robot, kind: str) -> list[str]:
 
 
 def _numbers(value: Any) -> Array:
-    """Return a limit as a flat array; a value that is not numeric becomes a single 0."""
+    """Return a limit as a flat array; a value that is not numeric becomes a single 0, which is no valid limit."""
     try:
         numbers = floats(value).ravel()
         return numbers if numbers.size else np.zeros(1)

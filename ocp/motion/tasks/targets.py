@@ -42,7 +42,7 @@ NODES = NodeSettings()
 
 
 class Target(NamedTuple):
-    """Target frame of a task at M times; entries that the task does not prescribe are nan.
+    """Target frame of a tip task at M times; entries that the task does not prescribe are nan.
 
     Attributes:
         t: Times, s. Shape (M,).
@@ -65,7 +65,9 @@ def targets_along(
     joints: Array,
     shown_times: Array | None = None,
 ) -> tuple[Target, ...]:
-    """Return the target poses of all pose tasks along a motion, on which targets relative to a link depend.
+    """Return the target poses of all pose tasks along a given motion of the machine.
+
+    Targets that are relative to a link depend on this motion.
 
     Args:
         machine: The machine that does the tasks.
@@ -103,7 +105,7 @@ def targets_along(
 
 
 def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
-    """Return the breaks at which a mesh requires nodes to represent the targets, both ends included.
+    """Return the times at which a mesh requires nodes to represent the targets of tasks, both ends included.
 
     Between two nodes, the interpolants of the targets at the points of an interval deviate by no more than `NODES`
     allows. Intervals with larger deviations are bisected at the break nearest to their middle. A path of many short
@@ -140,7 +142,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def _largest_errors(equations: TaskEquations, values: Array) -> Array:
-    """Return the largest interpolation error of each target entry, from samples (M, size). Shape (size,)."""
+    """Return the permitted interpolation error of each entry of the targets, from samples (M, size). Shape (size,)."""
     largest, at = np.full(values.shape[1], NODES.pose_error), 0
     for bound in equations.bound:
         task = bound.task
@@ -153,7 +155,7 @@ def _largest_errors(equations: TaskEquations, values: Array) -> Array:
 
 
 def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]:
-    """Return rotations (M, 3, 3) and positions (M, 3) of a machine's tip."""
+    """Return rotations (M, 3, 3) and positions (M, 3) of a machine's tip in world at given configurations."""
     b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
     pose: Any = machine.tip_pose(b, q)
     function = ca.Function("frames", [b, q], [pose.rotation, pose.position])

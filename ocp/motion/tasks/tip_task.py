@@ -1,4 +1,4 @@
-"""Tasks of a frame of the machine: rows of its twist, or a pose that it tracks over time.
+"""Tasks of a frame of the machine: prescribed components (rows) of its twist, or a pose that it tracks over time.
 
 Pose tasks are differentiated to velocities, with the pose error fed back so that it does not accumulate (Baumgarte
 1972): task twist = twist of the target + gain x pose error. The functions of a `BoundTask` are expressions of this
@@ -26,7 +26,7 @@ from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 __all__ = ["Axes", "Roll", "TipTask", "Velocity", "retime_task"]
 
 Velocity: TypeAlias = Any
-"""A track with one entry for each row of the task."""
+"""Prescribed velocity: a constant or a function of time, with one entry for each row of the task."""
 Axes: TypeAlias = Literal["world", "base", "tip", "reference"]
 Roll: TypeAlias = Literal["free", "given"]
 
@@ -35,11 +35,11 @@ ANGULAR, LINEAR = (0, 1, 2), (3, 4, 5)
 
 @dataclass(frozen=True, eq=False)
 class TipTask:
-    """Task of one frame of a robot: a `velocity`, or a pose by `position`, and `orientation` or `direction`.
+    """Task of one frame of a robot: a prescribed velocity, or a pose (position, and orientation or tool direction).
 
-    Tracks are differentiated with respect to their time symbol; a track with a method `rate` is asked for its rate
-    instead. A list of tasks stacks them: one for each arm, or one that keeps the base from rotating (rows 0, 1, 2 of
-    the root link, velocity zero: reactionless motion).
+    Functions of time (tracks) are differentiated with respect to their time symbol; a track with a method `rate` is
+    asked for its rate instead. A list of tasks stacks them: one for each arm, or one that keeps the base from rotating
+    (rows 0, 1, 2 of the root link, velocity zero: reactionless motion).
 
     Attributes:
         rows: Rows of the twist that the task prescribes: angular 0..2, linear 3..5, along `axes`. Required with
@@ -200,12 +200,12 @@ class TipTask:
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Rows of the twist that the task prescribes, apart from the two tilt rows of a direction."""
+        """Indices 0..5 of the twist components that the task prescribes; those of a tool direction are not included."""
         return tuple(self.rows or ())
 
     @property
     def linear(self) -> list[int]:
-        """Position coordinates 0..2 that the rows prescribe, in order."""
+        """Indices 0..2 of the position coordinates that the task prescribes, in the order of its rows."""
         return [row - 3 for row in self.chosen if row in LINEAR]
 
     @property
@@ -215,12 +215,12 @@ class TipTask:
 
     @property
     def tilts(self) -> bool:
-        """Whether the task has two tilt rows for its direction; it has none if the axis may move in a cone."""
+        """Whether the task prescribes the direction of the tool axis, by two rows; not if a cone is permitted."""
         return self.direction is not None and self.within is None
 
     @property
     def size(self) -> int:
-        """Number of rows, including those of the tilt."""
+        """Number of rows (scalar equations) of the task, including the two of a prescribed tool direction."""
         return len(self.chosen) + (2 if self.tilts else 0)
 
     @property
@@ -258,7 +258,7 @@ class BoundTask(NamedTuple):
 
 
 def target_size(task: TipTask) -> int:
-    """Return the number of entries of a task in the column of targets."""
+    """Return the number of entries that a task has in the stacked column of the targets of all tasks."""
     if task.velocity is not None:
         return task.size
     sizes = [(task.position, 6), (task.orientation, 12), (task.direction, 6)]
@@ -266,7 +266,10 @@ def target_size(task: TipTask) -> int:
 
 
 def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
-    """Split targets of a pose task: (position, velocity), (rotation or direction, angular velocity), or None each."""
+    """Split the targets of a pose task into (position, velocity) and (rotation or direction, angular velocity).
+
+    Either part is None if the task does not prescribe it.
+    """
     translation, at = None, 0
     if task.position is not None:
         translation, at = (targets[0:3], targets[3:6]), 6
@@ -287,7 +290,8 @@ def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates
 
     Args:
         twist: Twist of the tip, (6, 1), or the columns of its Jacobian.
-        rates: Joint rates of a single twist; None for the joint Jacobian, "base" for that by the base twist.
+        rates: Joint rates of a single twist; None for the Jacobian with respect to the joint rates, "base" for that
+            with respect to the base twist.
     """
     if part.reference is None:
         return twist
@@ -302,7 +306,7 @@ def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates
 
 
 def task_rows(part: BoundTask, base: Any, joints: Any, twist: Any) -> Any:
-    """Return the rows of a task for a twist, or for columns of twists, in world axes."""
+    """Return the components that a task prescribes of a twist in world axes, or of columns of twists."""
     task = part.task
     angular, linear = twist[0:3, :], twist[3:6, :]
     rotation = None
@@ -330,7 +334,7 @@ def _tool_normals(task: TipTask) -> Any:
 
 
 def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the pose error as a twist in world axes: (sine of the angle about its axis, displacement)."""
+    """Return the pose error, target minus pose, in world axes: (sine of the angle about its axis, displacement)."""
     position_target, goal = split_targets(part.task, targets)
     pose, reference = part.tip.tip_pose(base, joints), reference_pose(part, base, joints)
     angular, linear = ca.DM(3, 1), ca.DM(3, 1)
@@ -367,7 +371,7 @@ def pose_in_reference(part: BoundTask, base: Any, joints: Any) -> tuple[Any, Any
 
 @on_scalars
 def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the pose error in the rows of the task."""
+    """Return the pose error in the rows (prescribed components) of the task."""
     return task_rows(part, base, joints, pose_error(part, base, joints, targets))
 
 
@@ -382,7 +386,7 @@ def is_holonomic(part: BoundTask) -> Array:
 
 
 def movable_angular_rows(part: BoundTask) -> list[int]:
-    """Return the angular rows, in world axes, that joints can move."""
+    """Return the world axes, 0..2, about which the joints can rotate the tip."""
     base, joints = ca.SX.sym("base", part.tip.base_size), ca.SX.sym("joints", part.tip.joint_size)
     jacobian = part.tip.tip_jacobian(base, joints)
     return [row for row in ANGULAR if not all(entry.is_zero() for entry in ca.horzsplit(jacobian[row, :]))]
@@ -415,7 +419,7 @@ def angular_velocity(rotation: Any, rate: Any) -> Any:
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return row combinations that base motion about a fixed centre of mass does not change. Shape (m, k).
+    """Return combinations of task rows that base motion with a fixed centre of mass does not change. Shape (m, k).
 
     Raises:
         ProblemError: The momentum moves the centre of mass, and the joints cannot return.
@@ -443,7 +447,7 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return orthonormal combinations of the first `count` rows that depend on the other rows. Shape (count, k)."""
+    """Return orthonormal combinations (count, k) of a Jacobian's first `count` rows that depend on its other rows."""
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)

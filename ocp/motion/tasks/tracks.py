@@ -1,4 +1,4 @@
-"""Tracks of the frame of a task: lines between poses, motions along paths, and changes of their time parameter.
+"""Tracks (target positions and orientations of a task over time): lines between poses, and motions along paths.
 
 A track is a constant or a function of CasADi time. A track with a method `rate` returns its own rate where a symbolic
 derivative with respect to time would be wrong or undefined: at the bounds of the segments of a path and at its ends.
@@ -32,7 +32,7 @@ Track: TypeAlias = Any
 _Result = TypeVar("_Result")
 
 MAX_ROTATION_RAD = np.pi - 1e-3
-"""rad, between the poses of a line: the axis of half a turn is ambiguous."""
+"""Largest rotation between the two poses of a line, since the axis of half a turn is ambiguous."""
 
 
 class PoseLine(NamedTuple):
@@ -177,7 +177,7 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
 
 
 def reparametrize(track: Track, clock: Callable[[Any], Any]) -> Track:
-    """Convert a function of a path parameter to a function of time; constants remain unchanged.
+    """Convert a track from a function of a path parameter to a function of time; constants remain unchanged.
 
     Args:
         clock: CasADi function time (s) -> parameter.
@@ -226,7 +226,7 @@ def track_expression(
     what: str = "track",
     begin: float = 0.0,
 ) -> Any:
-    """Return a constant, or a function of time, as a dense expression of the symbol `time`.
+    """Return a track, a constant or a function of time, as a dense expression of the symbol `time`.
 
     Args:
         track: A constant, or a function: CasADi time -> CasADi matrix, array, or a list of expressions.
@@ -271,5 +271,5 @@ def _call_track(track: Callable[[Any], Any], time: Any, what: str) -> Any:
         return track(time)
     except (RuntimeError, NotImplementedError, ProblemError, ModelError):
         raise
-    except Exception as error:  # of the function's own
+    except Exception as error:  # raised by the function itself
         raise ProblemError(f"{what}: the function fails: {error!r}", name=what, value=track) from error

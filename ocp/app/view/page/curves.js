@@ -2,7 +2,7 @@
 
 const SPACE = "http://www.w3.org/2000/svg";
 const WIDE = 240, TALL = 96, LEFT = 42, RIGHT = 6, TOP = 6, BOTTOM = 14;
-const LEAST = 0.02;  // least range of a chart relative to its largest value, so that rounding is not shown
+const LEAST = 0.02;  // least range of a diagram relative to its largest value, so that rounding is not shown
 const OPEN = ["Cost", "The motion", "Standing", "Momentum", "Joints"];
 
 function shape(kind, attributes, parent) {

@@ -1,4 +1,4 @@
-// The player: what the page holds, the time that it shows, and which motions, alone, over each other or side by side.
+// The player: the data of the page, the time shown, and the motions shown: one alone, two superimposed or side by side.
 
 const COLORS = {plan: [0, 0.447, 0.698], other: [0.835, 0.369, 0], target: [0, 0.62, 0.451], near: [0.8, 0.475, 0.655],
   solid: [0.43, 0.43, 0.43, 0.55], grid: [0.5, 0.5, 0.5, 0.28]};
@@ -64,7 +64,7 @@ class Motion {
     return low;
   }
 
-  at(time) {  // poses of all that moves, straight between the sampled times
+  at(time) {  // poses of all moving frames, interpolated linearly between the samples
     const k = this.before(this.t, time), size = 7 * this.width;
     const share = Math.max(0, Math.min(1, (time - this.t[k]) / (this.t[k + 1] - this.t[k] || 1)));
     for (let i = 0; i < size; i++)
@@ -94,7 +94,7 @@ class Player {
     this.seek(0);
   }
 
-  frame() {  // the camera around all that is seen
+  frame() {  // aim the camera at everything that is shown
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
     const take = (point) => point.forEach((value, k) => {
       if (Number.isFinite(value)) { low[k] = Math.min(low[k], value); high[k] = Math.max(high[k], value); }
@@ -127,7 +127,7 @@ class Player {
     this.grid = floats ? null : this.scene.line(new Float32Array(lines));
   }
 
-  get visible() {  // motions that are seen, and in what colour
+  get visible() {  // the motions that are shown, and the kind of colour of each
     const alone = this.mode === "alone" || this.motions.length < 2;
     const kinds = this.first && (alone || !this.second) ? ["other", "plan"] : ["plan", "other"];
     const shown = [this.first, this.second].map((number, k) => ({motion: this.motions[number], kind: kinds[k]}));
@@ -213,7 +213,7 @@ class Player {
       if (motion.footing) this.drawPush(motion, time, COLORS[kind]);
       if (shown.near && motion.near && !faint) this.drawNear(motion.near, time);
     }
-    for (const {motion, kind} of visible.slice(1)) {  // over the other as a veil, through which it is seen
+    for (const {motion, kind} of visible.slice(1)) {  // the compared motion, transparent over the first
       const pose = motion.at(Math.min(this.time, motion.horizon));
       scene.drawFaint(() => this.drawRobot(motion, pose, (color) => [...this.tinted(color, COLORS[kind]).slice(0, 3), 0.45]));
     }

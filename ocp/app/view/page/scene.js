@@ -90,7 +90,7 @@ class Scene {
     return {program, at: Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]))};
   }
 
-  surface(data, arrays) {  // a part's vertices, normals and faces, kept by the graphics card
+  surface(data, arrays) {  // store the vertices, normals and faces of a surface in the graphics card
     const gl = this.gl, array = gl.createVertexArray();
     gl.bindVertexArray(array);
     const put = (data, kind) => {
@@ -111,7 +111,7 @@ class Scene {
     return {array, count: faces.length, kind, low: data.low, grain: data.step};
   }
 
-  line(segments, dynamic) {  // of pairs of points, six numbers each
+  line(segments, dynamic) {  // store line segments: pairs of points, six numbers each
     const gl = this.gl, array = gl.createVertexArray(), buffer = gl.createBuffer();
     gl.bindVertexArray(array);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.corners);
@@ -135,7 +135,7 @@ class Scene {
     line.count = segments.length / 6;
   }
 
-  look(low, high) {  // at a box
+  look(low, high) {  // aim the camera at a box
     const size = Math.hypot(...high.map((value, k) => value - low[k]));
     this.home = {...this.home, at: high.map((value, k) => (value + low[k]) / 2), far: 1.25 * Math.max(size, 0.1)};
     this.reset();
@@ -158,7 +158,7 @@ class Scene {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
-  part(number, count) {  // of the canvas, from the left
+  part(number, count) {  // draw into one of `count` parts of the canvas, numbered from the left
     const gl = this.gl, width = this.canvas.width / count, height = this.canvas.height;
     gl.viewport(Math.round(number * width), 0, Math.round(width), height);
     this.size = [width / 2, height / 2];
@@ -191,7 +191,7 @@ class Scene {
     gl.drawElements(gl.TRIANGLES, surface.count, surface.kind, 0);
   }
 
-  drawFaint(draw) {  // what draw draws, as one veil: the nearest surface of it alone, behind what is at the same place
+  drawFaint(draw) {  // draw transparently: only the nearest surface, behind solid ones at the same place
     const gl = this.gl;
     gl.enable(gl.POLYGON_OFFSET_FILL);
     gl.polygonOffset(2, 8);
@@ -215,7 +215,7 @@ class Scene {
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
   }
 
-  listen() {  // drag turns, with shift or another button it shifts, two fingers do both, the wheel zooms
+  listen() {  // dragging turns; with shift or another button it shifts; two fingers do both; the wheel zooms
     const canvas = this.canvas, fingers = new Map();
     const shift = (dx, dy) => {
       const scale = this.camera.far / canvas.clientHeight * 0.66;

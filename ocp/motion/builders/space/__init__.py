@@ -1,1 +1,1 @@
-"""Problems of arms in space: the capture of a tumbling body."""
+"""Optimal control problems of robot arms in space: the capture of a tumbling body."""

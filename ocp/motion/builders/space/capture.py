@@ -1,6 +1,7 @@
-"""Capture of a tumbling body: approach, grasp and detumbling, two phases of one problem.
+"""Capture of a tumbling body: approach, grasp and detumbling as two phases of one optimal control problem.
 
-Chaser and target both float. The target has no joints and no external forces act on it. Its pose alone is a state,
+Chaser and target both float. The target has no joints and no external forces act on it. Its pose alone is a state
+(attitude R, centre of mass c), with constant inertia I, mass m, angular momentum L and linear momentum P:
 
     R' = [R I^-1 R^T L x] R,    c' = P / m,
 
@@ -63,7 +64,7 @@ POINTS = Collocation(8, degree=4, scheme="legendre")
 
 @dataclass(frozen=True)
 class Cone:
-    """Approach cone: region of the chaser's tip near the grasp, in the grasped frame.
+    """Approach cone: region in which the chaser's tip stays near the grasp, in the grasped frame.
 
     Attributes:
         direction: Direction from the grasp to the approaching tip, in the grasped frame. Shape (3,).
@@ -97,7 +98,7 @@ class Cone:
         require.positive("cone: depth", self.depth)
 
     def inside(self, place: Expression) -> Expression:
-        """Return a function of the tip position that is positive inside the cone, m. Shape (1, 1).
+        """Return a constraint value that is positive if a tip position is inside the cone, m. Shape (1, 1).
 
         Args:
             place: Position of the tip in the grasped frame. Shape (3, 1), m.
@@ -141,7 +142,7 @@ class Capture:
         cone: Approach cone. The tip starts at twice its length or farther, or inside it.
         grasp: Load limits of the hand during detumbling.
         friction: Friction in the joints of the chaser.
-        end: Joints at the end of the detumbling. Shape (n,), nan where free, for example for wheels.
+        end: Joint positions at the end of the detumbling. Shape (n,), nan where free, for example for wheels.
         rest: Whether base and joints, except wheels, are at rest at the end.
     """
 
@@ -173,7 +174,7 @@ def capture_problem(
     cost: Cost | None = None,
     clearance_constraints: ClearanceConstraints | None = None,
 ) -> Phases:
-    """Declare approach, grasp and detumbling with the least total cost.
+    """Declare the optimal control problem of approach, grasp and detumbling with the least total cost.
 
     The phases "approach" and "detumble" have the states and controls of `dynamics_problem`. The configuration of the
     target is the state "target" of the first, and follows from that of the chaser in the second. Wheel angles count
@@ -183,7 +184,7 @@ def capture_problem(
         chaser: Chaser with its arm, and wheels among its joints (`models.with_wheels`). Its momentum is that at the
             start, spinning wheels included.
         capture: The capture.
-        start: Joints of the chaser at the start, shape (n,), rad or m, or a `Start` with base and velocities.
+        start: Joint positions of the chaser, shape (n,), rad or m, or a `Start` with base and velocities.
         limits, cost: Arguments of `dynamics_problem` for both phases.
         clearance_constraints: Collision avoidance of the chaser during the approach, without the target.
 
@@ -260,7 +261,7 @@ def chained_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> tuple[Solution, Solution]:
-    """Solve the approach alone, then the detumbling from its end, which costs more than `solve_capture`.
+    """Solve the approach by itself, then the detumbling from its end; this costs more than `solve_capture`.
 
     Args, Raises: As for `solve_capture`.
 
@@ -341,12 +342,12 @@ class _Capture:
 
     @property
     def arm_weights(self) -> Array:
-        """Weights that are 1 for arm joints and 0 for reaction wheels, whose angles restart from zero. Shape (n,)."""
+        """Factors of joint positions between the phases: 0 for wheels, whose angles restart at 0, else 1. (n,)"""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
     def approach(self) -> Problem:
-        """Declare the first phase, with the target's motion and the approach cone."""
+        """Declare the problem of the approach, with the pose of the target as a state and the cone as a constraint."""
         chaser, target, duration = self.chaser, self.capture.target, self.capture.approach
         problem = dynamics_problem(
             chaser,
@@ -392,7 +393,7 @@ class _Capture:
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
 
     def declare_second_phase(self, start: Mapping[str, Array] | None) -> Problem:
-        """Declare the second phase, from the end of an approach or, with a free start, to be joined to one."""
+        """Declare the problem of the detumbling, which starts in a given state or, without one, in a free state."""
         pair, capture = self.pair, self.capture
         wheels, rest = find_wheels(pair.robot), capture.rest
         still = np.array([np.nan if name in wheels else 0.0 for name in pair.robot.joint_names])
@@ -428,7 +429,7 @@ class _Capture:
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base at a time from its attitude and the joints, since the centre of mass moves uniformly.
+        """Return the base configuration at a time from its attitude, the joint positions and the moving centre of mass.
 
         The position of the centre of mass and the norm of the quaternion are conserved by the dynamics. Continuity of
         them would be a condition that no control influences, and would leave the second-order conditions undetermined.
@@ -442,14 +443,14 @@ class _Capture:
         return ca.vertcat(place, attitude)
 
     def guess_approach(self, problem: Problem) -> None:
-        """Set the guess of an approach."""
+        """Set the initial guess of the states and controls of an approach."""
         cone = self.capture.cone
         out = np.zeros(3) if cone is None else cone.length * cone.direction
         guess_approach(problem, self.chaser, self.capture.target, self.start, out=out)
 
 
 def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return joints, velocities and base at the end of the approach's guess."""
+    """Return joint positions, joint velocities and base configuration at the end of the guess of an approach."""
     end = np.array([guessed_horizon(problem)])
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]
     joints, rates, base = (np.asarray(guess(end)).ravel() for guess in guesses)
@@ -457,7 +458,7 @@ def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
 
 
 def _of_unit_length(machine: FreeFloating, base: Any) -> Any:
-    """Return the base configuration with a quaternion of unit length."""
+    """Return the base configuration with its quaternion, if there is one, scaled to unit length."""
     if machine.base == "planar":
         return base
     return ca.vertcat(base[:3], base[3:] / ca.norm_2(base[3:]))

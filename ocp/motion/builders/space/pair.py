@@ -1,6 +1,7 @@
-"""Chaser and target of a capture: both as one machine, bounds that reject impossible captures, and the first guess.
+"""Chaser and target of a capture: their model as one machine, tests for impossible captures, and the first guess.
 
-The twists match at the grasp, so that there is no impact. The momentum of the pair about its common centre of mass is
+The twists match at the grasp, so that there is no impact. The linear momentum of the pair, and the angular momentum
+about its common centre of mass, are
 
     P = P1 + P2,    L = L1 + L2 + (c2 - c1) x (m1 P2 - m2 P1) / (m1 + m2).
 
@@ -9,9 +10,9 @@ generalized Jacobian from its start onto the path of the grasped frame, first be
 axis. After the grasp the arm slows down evenly while the wheels take the momentum. The guesses obey the dynamics.
 
 Two bounds hold for any motion of the chaser. The grasp may be out of reach of the arm. And the momentum of both may
-exceed what the wheels hold: a wheel holds h a along its axis a with |h| <= I w, and no more than its motor gives it in
-the time. The base can turn to align the momentum with any of its axes; hence the largest norm of the sum of all h a
-counts.
+exceed what the wheels store: a wheel of inertia I and speed limit w stores h a along its axis a with |h| <= I w, and no
+more than its motor gives it in the time. The base can turn to align the momentum with any of its axes; hence the
+largest norm of the sum of all h a counts.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def pair_momentum(
 
     Args:
         base, target_base: Configurations of both bases. Shape (base_size,).
-        joints: Joints of the chaser. Shape (n,).
+        joints: Joint positions of the chaser. Shape (n,).
     """
     rows = ca.DM.eye(6)[:, chaser.twist_rows]
     own = rows @ ca.vertcat(chaser.conserved_momentum)
@@ -106,13 +107,13 @@ def pair_momentum(
 
 
 def motion_of(problem: Problem) -> tuple[Any, Any, Any]:
-    """Return the state symbols of a problem: base, joints and velocities."""
+    """Return the symbols of a problem's states: base configuration, joint positions and joint velocities."""
     states = problem.declared.states
     return states["base"].symbol, states["joints"].symbol, states["velocities"].symbol
 
 
 def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> tuple[Any, Any]:
-    """Return the force and the moment about the tip that the hand exerts on the target, world axes. Shape (3, 1).
+    """Return the force and the moment about the tip that the hand exerts on the target, in world axes. Shape (3, 1).
 
     They are the rates of the target's momentum, m c'' and (I w)' about its centre of mass.
     """
@@ -129,7 +130,7 @@ def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> 
 
 
 Guesses = dict[str, Any]
-"""Functions of time by the names of states and controls."""
+"""Type of an initial guess: functions of time by the names of states and controls."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,7 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
 
 
 def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:
-    """Set the guess of the approach; a free duration becomes the shortest one in which the tip can reach the grasp.
+    """Set the guess of the approach; a free duration is guessed such that the tip can reach the grasp, if possible.
 
     Args:
         start: State of the capture; free velocities are guessed as zero.
@@ -204,7 +205,7 @@ def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating,
 
 
 class _TipTracker:
-    """Tracker that moves the tip of a machine along a path, step by step."""
+    """Tracker of a tip path by the damped pseudo-inverse of the generalized Jacobian, step by step."""
 
     def __init__(self, problem: Problem, machine: FreeFloating, rates: Array) -> None:
         n, robot = machine.joint_size, machine.robot
@@ -222,7 +223,7 @@ class _TipTracker:
         self.fastest = constant(states["velocities"].upper)
 
     def follow(self, times: Array, path: tuple[Array, Array], joints: Array, base: Array) -> tuple[float, Guesses]:
-        """Track a path with the tip at constant wheel speeds; return the final error, m and rad, and the guesses."""
+        """Track a tip path at constant wheel speeds; return the final pose error, m and rad, and the guess."""
         places, turns = path
         step = times[1]
         speed = self.rates.copy()
@@ -248,7 +249,7 @@ class _TipTracker:
 
 
 def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
-    """Return rotation vector and translation between two poses, in world axes. Shape (6,)."""
+    """Return rotation vector and translation from an actual to a desired pose, in world axes. Shape (6,)."""
     return np.concatenate(
         [scipy.spatial.transform.Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()]
     )
@@ -257,7 +258,7 @@ def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
 def _tip_path(
     chaser: FreeFloating, target: FreeFloating, times: Array, bases: Array, start: tuple[Array, Array], out: Array
 ) -> tuple[Array, Array]:
-    """Return positions (M, 3) and rotations (M, 3, 3) of the tip along the approach, from rest to the grasp."""
+    """Return tip positions (M, 3) and rotations (M, 3, 3) for the guess of an approach, from rest to the grasp."""
     b = ca.SX.sym("b", target.base_size)
     pose = target.tip_pose(b, ca.DM(0, 1))
     pose_at = ca.Function("pose", [b], [pose.position, ca.vec(pose.rotation)])
@@ -330,7 +331,7 @@ def _stepper(machine: FreeFloating) -> Any:
 
 
 def _motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
-    """Return guesses, as functions of time, from samples of joints, velocities and base."""
+    """Return a guess as functions of time from samples of joint positions, joint velocities and base."""
     second = np.gradient(velocities, times, axis=0)
     tables = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
     return {name: _curve(times, samples) for name, samples in tables.items()}
@@ -342,7 +343,7 @@ def _curve(times: Array, samples: Array) -> Any:
 
 
 def guessed_horizon(problem: Problem) -> float:
-    """Return the horizon or, if it is free, its guess, s."""
+    """Return the horizon of a problem or, if it is free, its guess, s."""
     horizon = problem.declared.horizon
     assert horizon is not None
     return float(constant(horizon.lower)[0]) if horizon.guess is None else float(horizon.guess)
@@ -361,7 +362,7 @@ def set_guess(problem: Problem, duration: float, guesses: Guesses) -> None:
 
 
 ROUNDING = 1e-9
-"""Relative tolerance, and tolerance of a momentum, N m s."""
+"""Rounding tolerance of the tests for impossible captures: relative, and absolute for a momentum, N m s."""
 
 
 class State(NamedTuple):
@@ -382,7 +383,7 @@ class State(NamedTuple):
 
 
 def wheel_capacity(machine: FreeFloating, bounds: JointBounds, start: State, frictionless: bool = True) -> float:
-    """Return the largest angular momentum that the wheels of a chaser can hold while its base rests, N m s.
+    """Return the largest angular momentum that the wheels of a chaser can store while its base is at rest, N m s.
 
     Args:
         bounds: Limits of its joints.
@@ -474,7 +475,7 @@ def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
 
 
 def _longest(robot: Robot, link: str, point: object) -> float:
-    """Return an upper bound of a point's distance from the root, m; inf if a prismatic joint has no limits."""
+    """Return an upper bound of a link point's distance from the root, m; inf if a prismatic joint has no limits."""
     length = float(np.linalg.norm(np.asarray(point, dtype=float)))
     for joint in robot.path_to(link):
         slides = max(abs(joint.lower), abs(joint.upper)) if joint.kind == "prismatic" else 0.0

@@ -1,4 +1,4 @@
-"""Solve and audit standing motions and steps.
+"""Planners that solve and audit the motions of standing machines and their steps.
 
 `solve_standing` tries formulations and meshes until a plan passes its audit, or reports every attempt.
 
@@ -43,7 +43,7 @@ __all__ = ["Attempt", "guess_in_time", "solve_standing", "solve_steps"]
 
 COARSE = Collocation(4, degree=2, scheme="legendre")
 COARSE_IPOPT = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
-"""IPOPT options that give durations to a percent."""
+"""IPOPT options of the coarse solves, which determine durations to a percent."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class PaceSettings:
         price: Cost of doubling a duration, over that of accelerations and rates of 1 rad in that time.
         guess: Guess of a duration, over the requested one.
         longest: Upper bound of a duration, over the requested one.
-        samples: Samples of a phase at which active limits are searched.
-        active: Distance from a limit, over the row's range along the motion, at which the limit counts as active.
+        samples: Number of samples of a phase at which active limits are searched.
+        active: Distance of a quantity from its limit, over its range along the motion, at which this counts as active.
         names: Largest number of limits named in a message.
     """
 
@@ -77,7 +77,7 @@ PACE = PaceSettings()
 def guess_in_time(
     steps: Steps, start: Any, step_options: Mapping[str, Any], options: Mapping[str, Any]
 ) -> dict[str, Any] | None:
-    """Return a guess for `steps_problem` with the requested durations, from a coarse mesh; None without one.
+    """Return a guess for `steps_problem` with the requested durations, solved on a coarse mesh; None if that fails.
 
     Args:
         step_options: Cost and limits of steps_problem.
@@ -117,7 +117,7 @@ def guess_in_time(
 
 
 def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]) -> Phases:
-    """Declare the steps with durations that may be longer than `seconds`; weights are scaled to the mean duration."""
+    """Declare `steps_problem` with durations that may exceed those requested, `seconds`, at a price."""
     phases = [
         replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.guess * each))
         if (each := seconds.get(name)) is not None
@@ -161,7 +161,7 @@ def _check_conflicts(problem: Phases, coarse: Solution) -> None:
 def _too_fast(
     problem: Phases, coarse: Solution, seconds: Mapping[str, float], spans: Mapping[str, float]
 ) -> SolveError:
-    """Return the error that the steps require more time, with the phases and their active limits."""
+    """Return the error that steps need more time than requested, with the phases concerned and their active limits."""
     late = sorted(seconds, key=lambda name: -spans[name] / seconds[name])
     late = [name for name in late if spans[name] > (1 + PACE.error) * seconds[name]]
     lines = [
@@ -176,7 +176,7 @@ def _too_fast(
 
 
 def _active_limits(problem: Phases, coarse: Solution, phase: str) -> str:
-    """Describe which limits are active in a phase, and for what share of it."""
+    """Describe which limits are active in a phase of a coarse solution, and for what share of its duration."""
     form = Formulation.of(problem)
     at = np.linspace(0.0, 1.0, PACE.samples)
     x, u = coarse.state_interpolant(at), coarse.control_interpolant(at)
@@ -200,11 +200,11 @@ def _active_limits(problem: Phases, coarse: Solution, phase: str) -> str:
 
 
 POINTS = Collocation(20, degree=5, scheme="legendre")
-"""Controls at the points, for smooth plans, which are certified on few intervals."""
+"""Mesh with controls at the collocation points, for smooth plans, which pass the audit with few intervals."""
 LINEAR = MultipleShooting(50, control="linear")
-"""Controls linear between the nodes, for plans that switch between limits, such as those of least time."""
+"""Mesh with controls linear between the nodes, for plans that switch between limits, such as those of least time."""
 STEPS = Collocation(12, degree=3, scheme="legendre")
-"""Mesh of each phase of steps."""
+"""First mesh of each phase in `solve_steps`."""
 MESHES = 3
 """Largest number of meshes of each formulation, each twice as fine as the one before."""
 POSE_TOLERANCE = 1e-5
@@ -216,12 +216,12 @@ Trial = tuple[Level | None, Collocation | MultipleShooting]
 
 @dataclass(frozen=True)
 class Attempt:
-    """Result of one solve of an attempted formulation and mesh.
+    """Result of one solve with a certain formulation and mesh.
 
     Attributes:
         name: Formulation, mesh, and whether bounds were tightened.
         solution: Plan, or last iterate; None if there is neither.
-        failure: Reason why it is no plan; None if it is one.
+        failure: Reason why the solution is no plan; None if it is one.
         exceeded: Whether its only failures are inequalities exceeded between the points of the grid.
         collision: Error that bodies collide, if that is its only failure.
     """
@@ -245,7 +245,7 @@ def solve_standing(
     setup: StandingSetup | None = None,
     settings: SolveSettings | None = None,
 ) -> Solution:
-    """Solve `standing_problem` and audit the plan; try formulations until the plan of one is accepted.
+    """Solve `standing_problem` and audit the plan; try several formulations until a plan is accepted.
 
     The first plan is returned that passes its audit with pose errors below 1e-5 (m, rad) everywhere. Accelerations at
     the collocation points are tried first, or, if the final time is free, accelerations linear between the nodes. Jerks
@@ -333,7 +333,7 @@ def _first_accepted(
     judge: _Judge,
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
-    """Return the first plan that is accepted, among the formulations and meshes of `solve_standing`.
+    """Try formulations and meshes in turn, and return the first plan that is accepted; see `solve_standing`.
 
     Raises:
         SolveError, ProblemError: As `solve_standing`; at once if collisions are all that is wrong with a plan.
@@ -367,7 +367,7 @@ def _first_accepted(
 
 
 def _formulations(control: str, free_time: bool, method: Collocation | None) -> list[Trial]:
-    """Return the formulations to try, each with its first mesh, in order of promise."""
+    """Return the formulations to try, each with its first mesh, the most promising one first."""
     at_points: Trial = ("acceleration" if control == "acceleration" else "position", method or POINTS)
     if method is not None:
         return [("position", method) if method.control == "held" else at_points]
@@ -413,11 +413,11 @@ def _tip(level: Level | None) -> str:
 
 @dataclass(frozen=True)
 class _Judge:
-    """Audits the results of solves, and accepts or rejects them.
+    """Function object that audits the result of a solve and accepts or rejects it.
 
     Attributes:
         tolerances: Tolerances of the audit.
-        pose_error: Returns an error for a plan that passes its audit but leaves its tasks, else None.
+        pose_error: Function that returns an error for a plan that passes its audit but leaves its tasks, else None.
     """
 
     tolerances: Mapping[str, float] | None
@@ -455,7 +455,7 @@ def _pose_error(
 
 
 def _is_inequality(problem: Problem, finding: str) -> bool:
-    """Return whether a finding is about bounds, or about a path constraint without equalities."""
+    """Return whether an audit finding concerns bounds, or a path constraint that has inequalities only."""
     rows = problem.declared.path.get(finding)
     if rows is None:
         return finding.startswith("bounds of ")

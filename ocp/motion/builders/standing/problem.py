@@ -73,12 +73,12 @@ __all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_co
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the cost, an integral over the motion plus `time` times the free final time.
+    """Weights of the cost of `standing_problem`: an integral over the motion, plus `time` times a free final time.
 
     Attributes:
         acceleration, velocity, jerk: Weights of the sums of squares over the joints.
-        joint_limits: Weight of the joint-limit index p1 (23).
-        manipulability: Weight of minus the manipulability p2 (27) of the tasks' rows.
+        joint_limits: Weight of the joint-limit index p1, equation (23) of Yoo et al. 2004.
+        manipulability: Weight of minus the manipulability p2 of the tasks' rows, equation (27) there.
         time: Weight of a free final time, 1/s.
     """
 
@@ -100,14 +100,14 @@ class StandingSetup:
 
     Attributes:
         start_velocity, end_velocity: Whether the joints are at "rest" there, or "free" to move.
-        end: Joints at the end, nan where free; all are free if None. Shape (n,), rad or m.
+        end: Joint positions at the end, nan where free; all are free if None. Shape (n,), rad or m.
         external: External wrenches as a function of time and tip position, for example `tip_spring`.
         control: "acceleration" or "jerk".
         along: Argument of the tasks: "time", or "parameter" from 0 to 1 with velocities per unit of it. A free final
             time needs "parameter", or tasks that suit any horizon.
-        tip_level: What the path constraint "tip" holds. "position": the poses (m; sines of angles), and the velocities
-            of velocity tasks. "acceleration": the derivative of the velocities (m/s^2, rad/s^2), which alone can close
-            a gap at the start; what is left of the gap at the end still moves the joints.
+        tip_level: What the path constraint "tip" constrains. "position": the poses (m; sines of angles), and the
+            velocities of velocity tasks. "acceleration": the derivative of the velocities (m/s^2, rad/s^2), which alone
+            can close a gap at the start; what is left of the gap at the end still moves the joints.
         clearance_constraints: Collision avoidance, see `ocp.motion.builders.clearance`; None for none.
         symbols: casadi.SX, or casadi.MX if a task, `external` or a reference calls an interpolant.
     """
@@ -163,7 +163,7 @@ def standing_problem(
     limits: Limits | None = None,
     setup: StandingSetup | None = None,
 ) -> Problem:
-    """Declare a standing motion of lowest cost along tip tasks.
+    """Declare the optimal control problem of a standing machine that does tip tasks at the lowest cost.
 
     The states are "joints", "velocities", and "accelerations" if the jerk is the control. The controls are
     "accelerations" or "jerks". With tasks along a parameter there are the states "path" from 0 to 1 and "path_rate" >=
@@ -180,7 +180,7 @@ def standing_problem(
         machine: Standing machine.
         tasks: A TipTask, or several that are done at once, functions of the time in s or of the path parameter.
         horizon: Final time, s, or FreeTime(...).
-        start: Joints at the start. Shape (n,), rad or m.
+        start: Start configuration. Shape (n,), rad or m.
         zmp: Where the zero moment point may be; by default the rule of the limits. InFoot(margin), IndexAtLeast(value),
             Pinned(point), Following(reference) or Anywhere().
         weights: Weights of the parts of the cost.
@@ -295,7 +295,7 @@ def _constrain_tips(
 
 
 def declare_horizon(problem: Problem, horizon: float | FreeTime) -> Any:
-    """Declare a fixed or free horizon and return it."""
+    """Declare the fixed or free final time of a problem and return it."""
     if isinstance(horizon, FreeTime):
         return problem.horizon(lower=horizon.lower, upper=horizon.upper, guess=horizon.guess)
     return problem.horizon(float(horizon))
@@ -346,7 +346,7 @@ def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, An
 
 
 def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
-    """Return the cost of `standing_problem` for motion samples, by the trapezoidal rule and without jerks."""
+    """Return the cost of `standing_problem` for a sampled motion, by the trapezoidal rule and without jerks."""
     w = weights or Weights()
     running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
     running += w.velocity * (motion.joint_velocities**2).sum(axis=1)
@@ -362,7 +362,7 @@ def _constrain_ground(
     zmp: ZmpRule,
     limits: Limits,
 ) -> None:
-    """Declare the path constraints on the ground reaction."""
+    """Declare the path constraints of ground force, friction and zero moment point."""
     reaction = machine.ground_reaction(*motion, wrenches)
     force = reaction[3:6]
     problem.path("vertical force", force[2], lower=limits.least_force(machine), unit="N")

@@ -1,7 +1,7 @@
-"""Motions over changing support at sampled times, planned or resolved by the pseudo-inverse.
+"""Sampled motions of legged machines over changing support, planned or resolved by the pseudo-inverse.
 
 `StepsMotion` has the loads of the feet, the zero moment point and the joint torques of a motion. `steps_motion` samples
-a plan of `steps_problem`. `resolve_steps` tracks the same footholds with the least joint rates at every instant, as a
+a plan of `steps_problem`. `resolve_steps` tracks the same footholds with the least joint rates at every time, as a
 baseline: it ignores what the ground can bear. The machine falls where the zero moment point leaves the soles, or where
 a sole would have to pull.
 """
@@ -35,17 +35,18 @@ SAMPLES = 101
 
 @dataclass(frozen=True, eq=False)
 class StepsMotion:
-    """Motion of a machine over its stances at M times; the time at which two phases meet occurs twice.
+    """Motion of a legged machine through its stances (sets of feet on the ground) at M times.
 
-    The loads of all feet but the first are given, for example planned. The first foot bears the rest.
+    The time at which two phases meet occurs twice. The loads of all feet but the first are given, for example planned.
+    The first foot bears the rest.
 
     Attributes:
         steps: Machine and its stances.
         t: Times. Shape (M,), s.
         phase: Index of the phase of each time. Shape (M,).
-        joints, joint_velocities, joint_accelerations, joint_torques: In the robot's order. Shape (M, n).
+        joints, joint_velocities, joint_accelerations, joint_torques: In the robot's joint order. Shape (M, n).
         root_position, root_rotation: Frame of the robot's root link in world. Shapes (M, 3), m, and (M, 3, 3).
-        center_of_mass: In world. Shape (M, 3), m.
+        center_of_mass: Its position in world. Shape (M, 3), m.
         loads: By foot: moment about the origin of its sole's frame, and force, in world axes; zero in the air. Shape
             (M, 6), N m and N.
         sole_position, sole_rotation: By foot: frame of its sole in world. Shapes (M, 3), m, and (M, 3, 3).
@@ -78,7 +79,7 @@ class StepsMotion:
         return np.asarray(by_phase[self.phase.astype(int)], dtype=bool)
 
     def center_of_pressure(self, foot: str) -> Array:
-        """Return the center of pressure in the frame of a sole, (x, y); nan in the air. Shape (M, 2), m."""
+        """Return the center of pressure (x, y) of a foot in the frame of its sole; nan in the air. Shape (M, 2), m."""
         turn, load = self.sole_rotation[foot], self.loads[foot]
         moment, force = (np.einsum("kji,kj->ki", turn, part) for part in (load[:, :3], load[:, 3:]))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -91,7 +92,7 @@ class StepsMotion:
         return np.asarray(np.einsum("kji,kj->ki", self.sole_rotation[foot], self.loads[foot][:, 3:]))
 
     def friction(self, foot: str) -> Array:
-        """Return the required friction coefficient, tangential over normal force; nan in the air. Shape (M,)."""
+        """Return the friction coefficient a foot needs, tangential over normal force; nan in the air. Shape (M,)."""
         force = self._force(foot)
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
@@ -112,12 +113,12 @@ class StepsMotion:
 
 
 def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> StepsMotion:
-    """Sample a plan of `steps_problem`.
+    """Sample a plan of `steps_problem` at evenly spaced times of each phase.
 
     Args:
         steps: Steps of the plan.
         solution: Plan.
-        samples: Samples of each phase, both ends included.
+        samples: Number of samples of each phase, both ends included.
 
     Raises:
         ProblemError: The plan has other phases.
@@ -143,7 +144,7 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
 
 
 def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion:
-    """Join the values that `sample_stance` returns for each phase to one motion."""
+    """Join the values that `sample_stance` returns for each phase into one motion."""
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def by_foot(quantity: str) -> dict[str, Array]:
@@ -159,8 +160,8 @@ def sample_stance(
     """Return the quantities of `StepsMotion` by name along a motion in one stance. Shape (M, ...) each.
 
     Args:
-        motion: q, q', q'' in the stance's order. Shape (M, n) each.
-        foot_loads: Loads of the feet besides the first, in their held rows. Shape (M, k) each.
+        motion: Joint positions, velocities and accelerations in the stance's joint order. Shape (M, n) each.
+        foot_loads: Components `Stance.load_rows` of the loads of the feet besides the first. Shape (M, k) each.
     """
     q, qd, qdd = motion
     function, names = _function(steps, stance)
@@ -185,7 +186,10 @@ def sample_stance(
 
 
 def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
-    """Return a casadi function (q, q', q'', loads) -> quantities of `StepsMotion`, and their names."""
+    """Return a casadi Function that computes the quantities of `StepsMotion` in a stance, and their names.
+
+    Its inputs are joint positions, velocities and accelerations, and the loads of the feet besides the first.
+    """
     n = stance.joint_size
     q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
     rows = {name: ca.SX.sym("load", len(stance.load_rows[name])) for name in stance.other_feet}
@@ -209,7 +213,7 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
 
 
 def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsMotion:
-    """Compute steps with the least joint rates at every time by local resolution, as `resolve` does.
+    """Compute steps with the least joint rates at every time by local redundancy resolution, as `resolve` does.
 
     A lifted foot moves to its next foothold from rest to rest. Seen from above its path is straight; at the share s of
     the path it is raised by 64 s^3 (1 - s)^3 times the steps' clearance. A foot without a next foothold follows the
@@ -217,8 +221,8 @@ def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsM
 
     Args:
         steps: Robot and its stances; a free duration takes its guess.
-        start: Joints in the robot's order, with the feet on their footholds. Shape (n,), rad or m.
-        samples: Samples of each phase, both ends included.
+        start: Joint positions in the robot's order, with the feet on their footholds. Shape (n,), rad or m.
+        samples: Number of samples of each phase, both ends included.
 
     Raises:
         ProblemError: Sizes or values do not fit, or a foot is off its foothold at the start.
@@ -240,7 +244,7 @@ def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsM
 
 
 def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> tuple[Array, Array, Array]:
-    """Return joints, rates and accelerations of phase k in the order of its stance. Shape (M, n) each."""
+    """Return joint positions, rates and accelerations of phase k in the order of its stance. Shape (M, n) each."""
     stance = steps.stances[k]
     swings = [swing for swing in steps.swings(k) if swing.lifted is not None and swing.landing is not None]
     if not swings:
@@ -283,7 +287,10 @@ def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) 
 
 
 def _least_loads(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str, Array]:
-    """Return the loads of feet besides the first with the least sum of squares, as free rows. Shape (M, k) each."""
+    """Return the loads of the feet besides the first that make the sum of squared loads of all feet least.
+
+    They are in the components `Stance.load_rows`, shape (M, k) each.
+    """
     sizes = {name: len(stance.load_rows[name]) for name in stance.other_feet}
     if not sizes:
         return {}

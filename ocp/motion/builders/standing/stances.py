@@ -1,8 +1,8 @@
-"""Stances of a legged machine, configurations that stand in them, and a first guess of steps.
+"""Stances (sets of feet held on footholds) of a legged machine, configurations in them, and a first guess of steps.
 
-A stance is a set of feet held on footholds. `Steps` is a sequence of stances, each for some time.
-`standing_configuration` finds joints with the feet on their footholds and the center of mass over a point, near given
-joints. The first guess of steps interpolates between such configurations, at rest in each.
+`Steps` is a sequence of stances, each for some time. `standing_configuration` finds a configuration with the feet on
+their footholds and the center of mass over a point, near a given configuration. The first guess of steps interpolates
+between such configurations, at rest in each.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class StancePhase:
 
     Attributes:
         footholds: Footholds by the names of the feet; the machine is rooted at the first.
-        duration: s, or FreeTime(...).
+        duration: Duration, s, or FreeTime(...).
 
     Raises:
         ProblemError: There are no footholds, or the duration is invalid.
@@ -88,13 +88,13 @@ class Swing:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Robot, its feet, and the sequence of its stances.
+    """Robot with its feet and its sequence of stances, in each of which some feet are held on footholds.
 
     Attributes:
         robot: Robot, rooted anywhere; joint vectors are in its order.
         feet: Feet by name.
         phases: Consecutive stances. The foothold of a foot that is held in two consecutive phases must not change.
-        gravity: m/s^2, downwards.
+        gravity: Acceleration of free fall, m/s^2, downwards.
         balance: "static" requires the centre of mass over the support at all times, except in stances with a grip.
         margin: Distance by which centers of pressure, and a constrained center of mass, stay inside the edges, m. It
             must cover how far the machine leans out on compliant ground and joints, which are rigid here. It needs the
@@ -158,11 +158,11 @@ class Steps:
         return tuple(Stance.on(self.robot, self.feet, phase.footholds, self.gravity) for phase in self.phases)
 
     def order(self, stance: Stance) -> NDArray[np.intp]:
-        """Return the indices `order` of a stance's joints in the robot, such that q_stance = q[order]. Shape (n,)."""
+        """Return the permutation from the robot's joint order to that of a stance: q_stance = q[order]. Shape (n,)."""
         return np.array([self.robot.joint_names.index(name) for name in stance.robot.joint_names], dtype=np.intp)
 
     def swings(self, k: int) -> tuple[Swing, ...]:
-        """Return the swings of phase k: feet in the air that stood before, or that land at its end."""
+        """Return the swings of phase k: motions of feet in the air that stood before or land at its end."""
         swings = []
         for name in self.feet:
             if name in self.phases[k].footholds:
@@ -209,7 +209,7 @@ def walk(
     shift: float | FreeTime,
     swing: float | FreeTime,
 ) -> tuple[StancePhase, ...]:
-    """Return the phases of consecutive steps, in which all feet stand and one foot moves in turn.
+    """Return the phases of a walk, which alternate between all feet on the ground and one foot in the air.
 
     Args:
         footholds: Footholds at the start, by foot.
@@ -242,10 +242,11 @@ class ConfigurationSettings:
     """Settings of the search for a standing configuration.
 
     Attributes:
-        near: Weight of a joint's squared distance from its initial value, 1/rad^2.
-        over: Weight of the squared distance of the center of mass, 1/m^2: 1 cm costs less than a tenth of a radian.
+        near: Weight of a joint's squared distance from its initial position, 1/rad^2.
+        over: Weight of the squared distance of the center of mass from its goal, 1/m^2: 1 cm costs less than a tenth of
+            a radian.
         gap: Largest gap between a foot and its foothold, m or rad.
-        steps: Steps in the guess of a phase.
+        steps: Number of time steps in the guess of a phase.
     """
 
     near: float = 1.0
@@ -258,13 +259,13 @@ CONFIGURATIONS = ConfigurationSettings()
 
 
 def foothold_equations(stance: Stance, footholds: dict[str, Foothold]) -> TaskEquations:
-    """Return equations that keep feet other than the first on their footholds, in directions that joints can move."""
+    """Return task equations that keep feet other than the first on footholds, in the components joints can move."""
     tasks = [foot_task(stance, name, foothold.position, foothold.rotation) for name, foothold in footholds.items()]
     return bind(stance, tasks)
 
 
 def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **options: Any) -> TipTask:
-    """Return the task of a foot other than the first: the pose of its sole's frame, constant or a function of time."""
+    """Return the tip task of a foot other than the first: the pose of its sole, constant or a function of time."""
     foot = stance.feet[name]
     back = np.asarray(foot.rotation).T
     turn = (lambda t: ca.mtimes(rotation(t), back)) if callable(rotation) else np.asarray(rotation) @ back
@@ -279,15 +280,15 @@ def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **options
 
 
 def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array:
-    """Return the nearest configuration with all feet on footholds and the center of mass over a given point.
+    """Return the configuration nearest to a given one with all feet on footholds and the center of mass over a point.
 
     Args:
         stance: Feet and their footholds.
-        near: Joints from which the distance is measured, in the stance's order. Shape (n,), rad or m.
+        near: Configuration from which the distance is measured, in the stance's order. Shape (n,), rad or m.
         over: Wanted (x, y) of the center of mass, approached as far as the joints allow; None for anywhere. m.
 
     Returns:
-        Joints within their limits. Shape (n,).
+        Joint positions within their limits. Shape (n,).
 
     Raises:
         ProblemError: No configuration within the limits puts the feet there.
@@ -318,7 +319,7 @@ def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array
 
 
 def check_placed(stance: Stance, joints: Array) -> None:
-    """Raise ProblemError if a foot is off its foothold at the start joints, given in the stance's order."""
+    """Raise ProblemError if a foot is off its foothold in a start configuration, given in the stance's joint order."""
     if not stance.other_feet:
         return
     equations = foothold_equations(stance, {name: stance.footholds[name] for name in stance.other_feet})
@@ -333,10 +334,10 @@ def check_placed(stance: Stance, joints: Array) -> None:
 
 
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:
-    """Return guesses of joints, velocities and accelerations of each phase, in the joint order of its stance.
+    """Return guesses of joint positions, velocities and accelerations of each phase, in the joint order of its stance.
 
     Args:
-        start: Joints at the start, in the robot's order.
+        start: Start configuration, in the robot's joint order.
         lift: Height of a foot above the line between its footholds, halfway, m.
     """
     ends, guesses = [start], []
@@ -354,13 +355,13 @@ def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]
 
 
 def _configuration(steps: Steps, stance: Stance, near: Array, over: Array) -> Array:
-    """Return a balanced configuration of a stance near a given one, in the joint order of the robot."""
+    """Return a balanced configuration in a stance, near a given configuration; both in the robot's joint order."""
     joints = standing_configuration(stance, near[steps.order(stance)], over)
     return np.asarray(steps.in_order(stance, joints[None])[0])
 
 
 def _raised_poses(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
-    """Return the raised poses of swinging feet midway between their footholds."""
+    """Return the poses of swinging feet raised midway between their footholds, by the name of the foot."""
     raised = {}
     for swing in swings:
         if swing.lifted is None or swing.landing is None:
@@ -372,7 +373,7 @@ def _raised_poses(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]
 
 
 def _interpolate(configurations: Array, seconds: float) -> dict[str, Any]:
-    """Return a quintic rest-to-rest motion through 2 or 3 configurations."""
+    """Return a smooth rest-to-rest motion through 2 or 3 configurations as a guess of the states and controls."""
     share = np.linspace(0.0, 1.0, CONFIGURATIONS.steps + 1)
     first, last = configurations[0], configurations[-1]
     values = first + (last - first) * rest_to_rest(share)[:, None]

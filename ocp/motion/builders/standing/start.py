@@ -1,4 +1,4 @@
-"""Check whether a standing machine can start a motion, and guess the motion.
+"""Checks whether a standing machine can start a motion, and the first guess of the motion.
 
 The checks are of joint limits and of what the ground and the joints can bear at the start. The guess is the local
 motion along the task, with the null-space velocities damped.
@@ -38,7 +38,7 @@ class StartSettings:
         violation: Relative violation of a limit that is tolerated.
         largest_acceleration: Bound of unlimited accelerations, rad/s^2 or m/s^2.
         damping: Damping of null-space velocities in the guess, 1/s.
-        steps: Steps of the guess.
+        steps: Number of time steps of the guess.
         largest_speed: Speed of a local motion near a singularity at which the guess stops, rad/s or m/s.
     """
 
@@ -53,7 +53,7 @@ STARTS = StartSettings()
 
 
 def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
-    """Return the start joints after moving those onto limits that exceed them by rounding. Shape (n,).
+    """Return the start configuration, with joints that exceed a limit by rounding moved onto it. Shape (n,).
 
     Raises:
         ProblemError: A joint starts outside its limits, or has no range between them.
@@ -72,7 +72,7 @@ def check_freedom(
     """Raise ProblemError if tasks, zero moment point and final rest require more joints than the machine has.
 
     Args:
-        size: Rows of all tasks.
+        size: Number of rows of all tasks.
     """
     pinned = len(machine.moving_directions) if isinstance(zmp, Pinned | Following) else 0
     left = machine.joint_size - (size + pinned - along_parameter)
@@ -109,15 +109,15 @@ def check_loads(
     bounds: JointBounds,
     demand: tuple[Array, Array] | None,
 ) -> None:
-    """Raise ProblemError if no joint accelerations satisfy the limits at a start from rest.
+    """Raise ProblemError if no joint accelerations satisfy the limits of torque and ground reaction at rest.
 
     Torques, vertical force and zero moment point are linear in the accelerations. A linear program finds the least
     violation.
 
     Args:
-        machine, joints, wrenches: Machine, joints and external wrenches at the start.
+        machine, joints, wrenches: Machine, configuration and external wrenches at the start.
         zmp, least_force, bounds: Limits, see standing_problem.
-        demand: Rows T and values a of the tasks' accelerations, T q'' = a; None without.
+        demand: Matrix T and vector a of the tasks' equations T q'' = a of the accelerations q''; None without tasks.
     """
     n, rest = machine.joint_size, np.zeros(machine.joint_size)
     qdd = ca.SX.sym("qdd", n)
@@ -158,9 +158,9 @@ def check_loads(
 
 
 def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) -> tuple[Array, Array]:
-    """Return rows and values of the accelerations that the tasks require when they start from rest.
+    """Return matrix and right side of the equations that tasks impose on the joint accelerations at a start from rest.
 
-    Along a parameter the acceleration in the path's direction is free, and only the rows across it remain.
+    Along a parameter the acceleration in the path's direction is free, and only the equations across it remain.
     """
     n = len(joints)
 
@@ -199,7 +199,7 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 def _least_violations(
     at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """Return violations of the rows with the least sum; None if no accelerations satisfy the tasks."""
+    """Return the violations of torque and ground limits with the least sum; None if no accelerations do the tasks."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):
@@ -231,7 +231,10 @@ def local_guess(
     by_parameter: bool,
     external: External | None,
 ) -> dict[str, Any]:
-    """Return guesses by name from a local motion; after it fails or gets too fast, its last joints are kept."""
+    """Return guesses of states and controls, by name, from a resolved-acceleration motion along the tasks.
+
+    After the motion fails or gets too fast, its last configuration is kept.
+    """
     tasks = [part.task for part in equations.bound]
     if by_parameter:
         tasks = [retime_task(task, lambda time: rest_to_rest(time / horizon)) for task in tasks]

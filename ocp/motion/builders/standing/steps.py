@@ -45,12 +45,12 @@ GUESSED_LIFT = 1.5  # height of a foot halfway in the guess, over the clearance
 
 @dataclass(frozen=True)
 class StepWeights:
-    """Weights of the cost, which is an integral over the motion plus `time` times the free durations.
+    """Weights of the cost of `steps_problem`: an integral over the motion, plus `time` times the free durations.
 
     Attributes:
         acceleration, velocity: Weights of the sums of squares over the joints.
         torque: Weight of the sum of squared joint torques, 1/(N m)^2/s.
-        joint_limits: Weight of the joint-limit index p1 (23).
+        joint_limits: Weight of the joint-limit index p1, equation (23) of Yoo et al. 2004.
         load: Weight of the squared loads of the feet, in units of the machine's weight (and 1 m). It distributes the
             load.
         time: Weight of the free durations, 1/s.
@@ -70,7 +70,7 @@ class StepWeights:
 
 @dataclass(frozen=True)
 class _Options:
-    """Options that all phases share."""
+    """Options of `steps_problem` that all its phases share."""
 
     balance: str
     margin: float
@@ -82,7 +82,7 @@ class _Options:
 @remembers_request("steps")
 @interruptible
 def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, limits: Limits | None = None) -> Phases:
-    """Declare a motion through consecutive stances, from rest to rest, with the lowest cost.
+    """Declare the optimal control problem of a rest-to-rest motion through consecutive stances at the lowest cost.
 
     The phases have the names `Steps.names`; joint vectors of a phase are in its stance's order. The states are "joints"
     and "velocities". The controls are "accelerations", and "FOOT load" of each held foot but the first, in the rows
@@ -98,7 +98,7 @@ def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, 
 
     Args:
         steps: Robot and its stances.
-        start: Joints in the robot's order, with the feet on their footholds, see `standing_configuration`. Shape (n,).
+        start: Configuration in the robot's order, with the feet on footholds, see `standing_configuration`. Shape (n,).
         cost: Weights of the cost.
         limits: Limits of joints and ground. `vertical_force` is the least normal force of a held sole, N; 0 if None.
 
@@ -138,7 +138,7 @@ def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, 
 
 
 def _check_start(stance: Stance, joints: Array, options: _Options) -> None:
-    """Raise ProblemError if a foot is off its foothold, or the center of mass is not over the support."""
+    """Raise ProblemError if, at the start, a foot is off its foothold or the center of mass not over the support."""
     check_placed(stance, joints)
     if stance.support is not None:
         left = float(stance.support.margin(stance.center_of_mass(joints)[:2])) - options.margin
@@ -151,7 +151,7 @@ def _check_start(stance: Stance, joints: Array, options: _Options) -> None:
 
 
 def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], options: _Options) -> Problem:
-    """Declare the problem of a phase."""
+    """Declare the problem of phase k of `steps_problem`, in which some feet are held and others swing."""
     phase, stance, last = steps.phases[k], steps.stances[k], k + 1 == len(steps.phases)
     robot, n, weights = stance.robot, stance.joint_size, options.weights
     bounds = _bounds(steps, stance, options.limits)
@@ -215,7 +215,7 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], opt
 
 
 def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
-    """Return the joint limits in the order of a stance; explicit limits are in the robot's order."""
+    """Return the limits of a phase by name in its stance's joint order; `limits` are in the robot's joint order."""
     order = steps.order(stance)
     bounds = limits.bounds(stance, ("velocity", "torque"))._asdict()
     for name in bounds:
@@ -226,7 +226,7 @@ def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
 
 
 def _load(problem: Problem, stance: Stance, name: str) -> Any:
-    """Return the load on a foot other than the first, with its free rows declared as a control. Shape (6, 1)."""
+    """Return the load on a foot other than the first; declare its free components as a control. Shape (6, 1)."""
     rows = stance.load_rows[name]
     share = stance.weight / len(stance.footholds)
     guess = [share * (row == 5) for row in rows]
@@ -251,7 +251,7 @@ def _limit_load(problem: Problem, stance: Stance, name: str, load: Any, options:
 def _swing(
     problem: Problem, stance: Stance, swing: Swing, motion: tuple[Any, Any], share: Any, clearance: float
 ) -> None:
-    """Keep the sole of a swinging foot above the ground and land it on its foothold at rest."""
+    """Constrain the sole of a swinging foot to stay above the ground and to land at rest on its foothold."""
     joints, rates = motion
     none = ca.DM(0, 1)
     foot = stance.feet[swing.name]
@@ -276,7 +276,7 @@ def _swing(
 
 
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the indices of distinct rows; for planar machines, corners of soles coincide."""
+    """Return the indices of the distinct rows of a constraint; for planar machines, corners of soles coincide."""
     rng = np.random.default_rng(0)
     others = [
         symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in ca.vertsplit(joints))
@@ -289,7 +289,7 @@ def _distinct_rows(rows: Any, joints: Any) -> list[int]:
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return the distances of the center of mass from the support edges that joints affect. Shape (k, 1), m."""
+    """Return the distances of the center of mass from support edges that the joints can change. Shape (k, 1), m."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))
