@@ -46,7 +46,7 @@ ACTUATOR_LIMITS = ("acceleration", "jerk", "torque", "power")
 
 
 def limits_actuators(limits: Limits) -> bool:
-    """Return whether limits include other limits than those of positions and rates."""
+    """Return whether the acceleration, jerk, torque or power of joints is limited."""
     return any(getattr(limits, quantity) is not None for quantity in ACTUATOR_LIMITS)
 
 
@@ -56,12 +56,12 @@ def weights_actuators(cost: Cost) -> bool:
 
 
 def without_actuators(limits: Limits) -> Limits:
-    """Return the limits of positions and rates only."""
+    """Return limits of positions and rates alone, without those of acceleration, jerk, torque and power."""
     return replace(limits, acceleration=None, jerk=None, torque=None, power=None)
 
 
 def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
-    """Return the cost of a plan's motion by the trapezoidal rule; joints that the plan holds do not count."""
+    """Return the cost of a plan's motion by the trapezoidal rule, not counting joints that it keeps at rest."""
     machine = hold_joints(plan.machine, plan.held) if plan.held else plan.machine
     sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
     free = [name not in plan.held for name in plan.names]
@@ -82,7 +82,7 @@ def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
 
 @dataclass(frozen=True)
 class ActuatorDemand:
-    """Largest actuator demand of a motion, relative to its limit.
+    """Actuator demand of a motion that is largest relative to its limit: quantity, joint, time and values.
 
     Attributes:
         quantity: "torque", "power" or "acceleration".
@@ -106,9 +106,9 @@ class ActuatorDemand:
 
     @classmethod
     def of(cls, plan: SolvedPlan, limits: Limits) -> ActuatorDemand | None:
-        """Return the largest actuator demand of a plan, relative to its limit; None if no actuator is limited.
+        """Return the actuator demand of a plan that is largest relative to its limit; None if no actuator is limited.
 
-        The limits are those of the joints that the plan does not hold.
+        The limits are those of the joints that the plan does not keep at rest.
         """
         machine = checked_motors("limits", plan.machine)
         robot, unlimited = machine.robot, dict.fromkeys(plan.held, np.inf)
@@ -142,17 +142,17 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     """Solve a request again within its actuator limits; the guess is a motion that ignores these limits.
 
     Args:
-        request: The request. If many starts are equally good, the motion has its own start.
+        request: The request. If many starts are equally good, that of the first solution is fixed.
         start, reference: As in `tool_motion_problem`.
         unlimited: Motion without actuator limits.
 
     Raises:
-        SolveError: None was found. Names the joint, the time, the demand without the limit, and the limit.
+        SolveError: No motion was found. Names the joint, the time, the demand without the limit, and the limit.
     """
     limits = request.actuator_limits or request.limits
     first = request.stretches[0]
     if request.start is None:
-        # a joint that started elsewhere separates bodies and is not ignorable
+        # a joint that started elsewhere moves separated bodies: its start stays free
         initial = unlimited.solution[f"joints{first.suffix}"][0]
         start = np.where(np.isclose(initial, start, rtol=0.0), start, np.nan)
 
@@ -185,7 +185,7 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
 
 
 def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError:
-    """Return the error with the actuator demand of the motion that ignores the limits added to its text."""
+    """Return an error whose text also states the actuator demand of the motion that ignores the limits."""
     details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
     words = "no motion within the actuator limits was found"
     if demand is not None:

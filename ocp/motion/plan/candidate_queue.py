@@ -1,4 +1,4 @@
-"""Best-first search over candidates: the one of least cost is advanced by one stage at a time.
+"""Best-first search over candidate motions: the one of least cost is advanced by one solution stage at a time.
 
 The cost on the coarse mesh is an estimate, and separation constraints or actuator limits can only increase it. Apart
 from the error of the coarse mesh, the cost of a candidate is therefore a lower bound of its final cost, and candidates
@@ -29,11 +29,11 @@ __all__ = ["CandidateQueue", "Solver"]
 
 
 class Solver:
-    """Interface of the solvers that advance the candidates of one request.
+    """Base class of the solvers that advance the candidate motions of one request from stage to stage.
 
     Attributes:
         last: Stage that a plan must reach.
-        turning: Joints whose full turns move no body, as indices.
+        turning: Indices of the joints whose full turns move no body.
         error: Last error of a solve.
     """
 
@@ -42,7 +42,7 @@ class Solver:
     error: SolveError | None = None
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """Advance a candidate by one stage or reject it; also return candidates derived from it."""
+        """Advance a candidate by one solution stage or reject it; return it and any candidates derived from it."""
         raise NotImplementedError
 
     def collision(self, candidate: Candidate) -> Reason | None:
@@ -58,7 +58,7 @@ class Solver:
         return True
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error that no candidate passes its audit, with the reasons, the most frequent first."""
+        """Return the error raised if no candidate passes its audit; it lists the reasons, the most frequent first."""
         reasons = Counter(str(candidate.reason) for candidate in candidates).most_common()
         listed = "\n".join(f"  {count} of {len(candidates)} candidates: {reason}" for reason, count in reasons)
         last = next((candidate.solution for candidate in candidates if candidate.solution is not None), None)
@@ -78,14 +78,14 @@ class Solver:
 
 @dataclass
 class _Motion:
-    """Motion to which candidates converge: the first of them, and duplicates that wait for its result."""
+    """Motion to which several candidates converge: the first one, and duplicates that wait for its result."""
 
     first: Candidate
     waiting: list[Candidate] = field(default_factory=list)
 
 
 class CandidateQueue:
-    """Priority queue of the candidates of one request.
+    """Priority queue of the candidate motions of one request, the lowest cost first.
 
     Attributes:
         candidates: Finished candidates, which passed or were rejected.
@@ -98,7 +98,7 @@ class CandidateQueue:
             solver: Solver of the candidates.
             settings: Settings of the planner.
             include_costlier: Whether all batches include costlier motions, see `run`, and motions of the same cost,
-                since another cost will rank them.
+                since they will be ranked by another cost.
         """
         self.solver, self.settings, self._began = solver, settings, time.thread_time()
         self._always_costlier = include_costlier
@@ -128,11 +128,11 @@ class CandidateQueue:
     def run(self, seeds: Iterable[Candidate], include_costlier: bool = False) -> None:
         """Advance the candidates of a batch until none of them can cost less than the best one that passed.
 
-        Seeds that differ by full turns of joints lead to motions that differ by the same turns, unless joint limits
-        intervene: only the first of them is solved then.
+        Initial guesses that differ by full turns of joints lead to motions that differ by the same turns, unless joint
+        limits intervene: only the first of them is solved then.
 
         Args:
-            seeds: Seeds in the order of their first solve.
+            seeds: Candidates in the order in which they are solved from their initial guesses.
             include_costlier: Whether costlier motions are completed as well, as far as their number and cost are
                 limited.
         """
@@ -231,7 +231,7 @@ class CandidateQueue:
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, candidate: Candidate) -> bool:
-        """Return whether a candidate of equal cost has passed; if costlier motions are needed, also of equal path."""
+        """Return whether a candidate of equal cost (if costlier ones are needed, also of equal path) has passed."""
         passed = [c for c in self.candidates if c.passed]
         same = [c for c in passed if abs(candidate.cost - c.cost) <= self.settings.same_cost * c.cost]
         if not self._always_costlier or candidate.solution is None:
@@ -239,7 +239,7 @@ class CandidateQueue:
         return any(c.solution is not None and self.solver.same_path(candidate.solution, c.solution) for c in same)
 
     def _take(self, previous: Candidate, advanced: Candidate) -> None:
-        """Store a candidate that is finished after an advance, or push it to the queue again."""
+        """Store an advanced candidate if it is finished or rejected; otherwise push it to the queue again."""
         if not advanced.passed:
             self.candidates.append(advanced)
             self._failures += previous.stage is not Stage.SEED
@@ -267,7 +267,7 @@ class CandidateQueue:
                 self._push(candidate)
 
     def _push_turned(self, candidate: Candidate) -> None:
-        """Push the seeds that differ from the seed of a candidate by full turns of joints."""
+        """Push the candidates whose initial guesses differ from that of a candidate by full turns of joints."""
         for turned in self._turned.pop(id(candidate.seed), []):
             self._push(turned)
 

@@ -1,4 +1,4 @@
-"""Stages of a candidate: coarse mesh, separation of bodies, fine mesh, refinement, audit, actuator limits.
+"""Solution stages of a candidate: coarse mesh, separation of bodies, fine mesh, refinement, audit, actuator limits.
 
 All candidates of a request share one problem, except for separated pairs and fixed starts. Each variant is declared and
 prepared once.
@@ -49,12 +49,12 @@ __all__ = ["CandidateSolver"]
 
 
 class CandidateSolver(Solver):
-    """Solver of the candidates of a machine with a fixed or floating base.
+    """Solver of the candidate motions of a machine on a fixed or floating base.
 
     Attributes:
         request: The request.
         settings: Settings of the planner.
-        start: Joints at the start, nan where they are free.
+        start: Joint positions at the start, nan where they are free.
         motion: Problem without separation constraints.
     """
 
@@ -75,7 +75,7 @@ class CandidateSolver(Solver):
         self._collisions: tuple[Solution | None, list[Collision]] = None, []
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """Advance a candidate by one stage or reject it; also return candidates derived from it."""
+        """Advance a candidate by one solution stage or reject it; return it and any candidates derived from it."""
         steps = {
             Stage.SEED: self._solve_seed,
             Stage.COARSE: self._separate,
@@ -97,13 +97,13 @@ class CandidateSolver(Solver):
         if self._may_relax(advanced):
             return [Candidate(candidate.start, candidate.seed.cost, seed=replace(candidate.seed, relaxed=True))]
         if not advanced.passed and candidate.seed.relaxed and np.isnan(self._start(candidate)).any():
-            # IPOPT may stall at a free start whose conditions depend on each other: fix it, at a higher cost
+            # IPOPT may stall at a free start whose conditions are dependent: fix it, at a higher cost
             seed = replace(candidate.seed, fixed=True)
             return [advanced, Candidate(candidate.start, seed.cost, seed=seed)]
         return [advanced, *self._free_start(advanced)]
 
     def with_own_cost(self) -> CandidateSolver:
-        """Return the solver with an additional last stage, which minimises the cost of the request."""
+        """Return the solver with an additional last stage, which minimises the cost that the request defines."""
         solver = copy(self)
         solver.last = Stage.ACTUATED
         return solver
@@ -114,7 +114,7 @@ class CandidateSolver(Solver):
         return cost_of_motion(self.plan([candidate]), self.request.cost)
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
-        """Return whether the tasks are nearly dependent along a local motion, so that its candidate relaxes them."""
+        """Return whether the task Jacobian is nearly singular along a local motion, so that the tasks are relaxed."""
         return self._can_relax and is_nearly_singular(self.motion.stretches, local)
 
     @property
@@ -122,14 +122,14 @@ class CandidateSolver(Solver):
         return self.request.time_cost is None
 
     def _may_relax(self, candidate: Candidate) -> bool:
-        """Return whether to solve a rejected candidate again with relaxed tasks, which does not help in collisions."""
+        """Return whether to solve a rejected candidate again with relaxed tasks; in collisions that would not help."""
         seed, reason = candidate.seed, candidate.reason
         if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or _is_separated(candidate):
             return False
         return self._can_relax and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
-        """Return why the solver found no motion: the violation of its last iterate or, without one, of the seed."""
+        """Return why no motion was found: what the initial guess or, for relaxed tasks, the last iterate violates."""
         samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
         if not samples:
             return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
@@ -171,7 +171,7 @@ class CandidateSolver(Solver):
         return self._solve(candidate, Stage.SEPARATED if separated else Stage.COARSE, seed.guess)
 
     def _separate(self, candidate: Candidate) -> Candidate:
-        """Separate the bodies that collide on the coarse mesh; if none do, continue on the fine mesh."""
+        """Solve a candidate again with its colliding bodies separated; without collisions, solve on the fine mesh."""
         collisions = self.collisions(candidate)
         if not collisions:
             return self._solve(candidate, Stage.FINE, candidate.solution)
@@ -181,7 +181,7 @@ class CandidateSolver(Solver):
         return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
-        """Separate the bodies that collide on the fine mesh; if none do, refine the mesh for tips and joint limits."""
+        """Solve again with colliding bodies separated; without collisions, refine the mesh for tips and limits."""
         if collisions := self.collisions(candidate):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
@@ -244,7 +244,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return a new candidate with a free start from a candidate that passed with a fixed start."""
+        """Return a new candidate with a free start configuration for a candidate that passed with a fixed one."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints
@@ -279,7 +279,7 @@ class CandidateSolver(Solver):
     def prepared(
         self, candidate: Candidate, fine: bool, cost: float = np.inf
     ) -> tuple[ToolMotion, Collocation, Prepared]:
-        """Return the problem of a candidate, its first mesh, and both prepared for guesses of similar cost."""
+        """Return the problem of a candidate, its first mesh, and its solver, prepared for guesses of similar cost."""
         settings, separated = self.settings, _is_separated(candidate)
         margins: tuple[Any, ...] = ()
         if candidate.constraints is not None and separated:
@@ -304,7 +304,7 @@ class CandidateSolver(Solver):
         return declared_motion(self.request, **options, relaxed=candidate.seed.relaxed)
 
     def _start(self, candidate: Candidate) -> Array:
-        """Return the joints at the start, nan where free; joints that move separated bodies stay free."""
+        """Return the start configuration, nan for free joints; joints that move separated bodies stay free."""
         if candidate.seed.fixed:
             return candidate.start
         constraints = candidate.constraints
@@ -315,7 +315,7 @@ class CandidateSolver(Solver):
     def _options(
         self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return solver options for a problem with separated bodies, with a barrier parameter limited by the cost.
+        """Return solver options; for separated bodies, the cost of the guess limits the initial barrier parameter.
 
         An interior-point method with barrier parameter mu leads to a point whose cost exceeds the least one by mu for
         each limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier
@@ -378,7 +378,7 @@ class CandidateSolver(Solver):
         return solution
 
     def _deviations(self, motion: ToolMotion, solution: Solution) -> Array:
-        """Return the largest error of tips, or of joints beyond limits, in each mesh interval (N,), m and rad."""
+        """Return the largest pose error or excess over a joint limit in each mesh interval (N,), m and rad."""
         fractions, samples = self._samples(solution), self.settings.samples_per_interval
         sample, worst = solution.at_fraction(fractions), np.zeros(len(fractions))
         robot = self.request.machine.robot
@@ -398,7 +398,7 @@ class CandidateSolver(Solver):
         return np.asarray(np.maximum(worst[:-1], worst[1:]).reshape(-1, samples).max(axis=1))
 
     def _samples(self, solution: Solution) -> Array:
-        """Return fractions of the horizon: several samples in each mesh interval, and the end."""
+        """Return sample times as fractions of the horizon: several in each mesh interval, and the end."""
         nodes, count = solution.state_interpolant.breaks, self.settings.samples_per_interval
         return np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * np.arange(count) / count).ravel(), 1.0)
 
@@ -414,7 +414,7 @@ class CandidateSolver(Solver):
         return bool(np.minimum(joints - bounds.lower, bounds.upper - joints).min() <= self.settings.same_path)
 
     def _joints_along(self, solution: Solution) -> Array:
-        """Return joints at samples of all S stretches of time. Shape (S, M, n)."""
+        """Return joint positions at M equally spaced times of each of S stretches of time. Shape (S, M, n)."""
         values = solution.at_fraction(np.linspace(0.0, 1.0, self.settings.compared_samples))
         return np.array([values[f"joints{stretch.suffix}"] for stretch in self.motion.stretches])
 
@@ -441,7 +441,7 @@ class CandidateSolver(Solver):
         return self._collision_reason(collisions[0]) if collisions else None
 
     def local_collisions(self, seed: Seed) -> list[Collision]:
-        """Return the collisions in the local motion of a seed, in order of severity."""
+        """Return the collisions along the local motion of an initial guess, in order of severity."""
         constraints, collisions = self.request.clearance_constraints, list[Collision]()
         for motion in seed.local if constraints is not None else ():
             assert constraints is not None
@@ -454,7 +454,7 @@ class CandidateSolver(Solver):
         return any(isinstance(value, Unreachable) for value in self._clear_counts.values())
 
     def _count_clear_at(self, time: float) -> int | Unreachable | None:
-        """Return the result of `count_clear_configurations` at a time, from the cache if possible."""
+        """Return the number of collision-free configurations at a time or why there are none, from a cache if known."""
         if time not in self._clear_counts:
             self._clear_counts[time] = count_clear_configurations(self.request, time)
         return self._clear_counts[time]
@@ -466,7 +466,7 @@ class CandidateSolver(Solver):
     # ---- results -----------------------------------------------------------------------------------------------------
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error that no candidate passes; if bodies collide, it describes the lowest-cost candidate."""
+        """Return the error raised if no candidate passes; it describes the lowest-cost candidate that collides."""
         error = super().failure(candidates)
         colliding = [c for c in candidates if c.reason is not None and c.reason.kind is Rejection.COLLISION]
         if not colliding:
@@ -496,5 +496,5 @@ def _is_separated(candidate: Candidate) -> bool:
 
 
 def _refinable_failures(audit: Audit) -> list[Finding]:
-    """Return the failures that a finer mesh may correct: all but violated clearances."""
+    """Return the failures of an audit that a finer mesh may correct: all but violated clearances."""
     return [finding for finding in audit.failures if finding.name not in audit.clearances]

@@ -1,4 +1,4 @@
-"""Plans that solve one declared problem: goals one after the other, tasks of a standing machine, steps, captures."""
+"""Plans from one optimal control problem: goals in sequence, tasks of a standing machine, steps, captures."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ __all__ = [
 ]  # fmt: skip
 
 PHASE_INTERVALS = 40
-"""Intervals of the first mesh of all phases together; one phase begins with no more than a motion of its own."""
+"""Number of intervals of the first mesh, over all phases; one phase gets no more than a motion of its own."""
 REGION_SAMPLES = 8
-"""Random places of the tip in the region of a goal, besides its centre."""
+"""Number of random tip positions in the region of a goal, besides its centre."""
 
 
 def plan_sequence(
@@ -115,7 +115,7 @@ def plan_sequence(
 def plan_goal(
     machine: Machine, goal: Goal, horizon: Any, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> SolvedPlan:
-    """Plan the motion to one goal: around obstacles, or as one phase of a problem with its own tasks and machine.
+    """Plan the motion to one goal: around obstacles or, if it has its own tasks or machine, as a one-phase problem.
 
     Args:
         machine: Arm on a fixed or floating base.
@@ -133,7 +133,7 @@ def plan_goal(
 
 
 def _has_only_target(goal: Goal) -> bool:
-    """Return whether a goal is only a target: without tasks on the way, and without change of machine or base."""
+    """Return whether a goal states only a target: no tasks on the way, and no change of machine or base."""
     has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
     return not has_tasks and goal.machine is None and goal.base is None
 
@@ -141,7 +141,7 @@ def _has_only_target(goal: Goal) -> bool:
 def _goal_request(
     machine: FixedBase, goal: Goal, horizon: Any, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> GoalRequest:
-    """Return the request for a motion to one goal.
+    """Check the arguments of a motion to one goal, and return them as a request.
 
     Raises:
         ProblemError: The start is missing, or as in `goal_configurations`.
@@ -177,7 +177,7 @@ def plan_steps(
 
     Args:
         machine: Machine of the first stance, `steps.stances[0]`.
-        start: Joints at the start in the order of this machine.
+        start: Joint positions at the start, in the order of this machine.
 
     Raises:
         ProblemError: As `steps_problem`; or the machine is not that of the first stance.
@@ -216,19 +216,19 @@ def plan_capture(
 
 
 def with_joints(goal: Goal, joints: Array) -> Goal:
-    """Return a goal with joints in place of its pose."""
+    """Return a goal with a joint configuration in place of its pose."""
     no_pose: dict[str, Any] = dict.fromkeys(("tip", "position", "orientation", "direction", "within", "region"))
     return replace(goal, joints=joints, **no_pose)
 
 
 def _plan_of_phases(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
-    """Return the plan whose motion is a solution with phases."""
+    """Return the plan whose motion is the solution of a problem with phases."""
     candidate = Candidate(start, solution.cost, None, Stage.AUDITED, solution)
     return PhasedPlan(machine, solution, parts_of_phases(solution), (candidate,))
 
 
 def nearest_configuration(machine: Machine, goal: Goal, near: Array, *, limits: Limits, seed: int) -> Array:
-    """Return the joints at the pose of a goal that are nearest to the given ones. Shape (n,).
+    """Return the configuration at the pose of a goal that is nearest to the configuration `near`. Shape (n,).
 
     Raises:
         Unreachable, ProblemError: As `inverse_kinematics`.
@@ -242,13 +242,15 @@ def nearest_configuration(machine: Machine, goal: Goal, near: Array, *, limits: 
 def goal_configurations(
     machine: Machine, goal: Goal, near: Array, *, limits: Limits, constraints: ClearanceConstraints | None, seed: int
 ) -> Array:
-    """Return configurations at a goal within limits and clearance, sorted by distance from `near`. Shape (K, n).
+    """Return configurations that satisfy a goal, sorted by distance from `near`. Shape (K, n).
+
+    They are within the joint limits and, at a pose, collision-free.
 
     The tip of a goal with a region is at the centre of the region, and at random places in it. Joints that do not move
     the tip stay where they are.
 
     Args:
-        near: Joints to which the goals are compared. Shape (n,).
+        near: Configuration from which distances are measured. Shape (n,).
 
     Raises:
         Unreachable, ProblemError: As `inverse_kinematics`; or the joints of the goal do not fit, see `clip_to_limits`.
@@ -280,7 +282,7 @@ def goal_configurations(
 
 
 def _points_inside(region: Box | Sphere | None, seed: int) -> Array:
-    """Return random points in a region, in world; none without a region. Shape (K, 3), m."""
+    """Return random points in the region of a goal, in world; none without a region. Shape (K, 3), m."""
     if region is None:
         return np.zeros((0, 3))
     center: Array = np.array(region.position, dtype=float)
@@ -354,7 +356,7 @@ def plan_to_stand(
 
 @dataclass
 class _StandingSolver(Solver):
-    """Solver of the candidates of a standing machine, with one stage, in which `solve_standing` does everything."""
+    """Solver of the candidate motions of a standing machine, in one stage: `solve_standing` solves and audits them."""
 
     machine: Standing
     tasks: list[TipTask]
@@ -363,10 +365,10 @@ class _StandingSolver(Solver):
     start_is_fixed: bool
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """Return the candidate after its solve: audited, or rejected.
+        """Solve a candidate; return it as audited or rejected.
 
         Raises:
-            ProblemError, SolveError: Errors of a given start.
+            ProblemError, SolveError: The only start is given, and no motion was found from it.
         """
         try:
             solution = solve_standing(self.machine, self.tasks, self.duration, start=candidate.start, **self.options)
@@ -385,7 +387,7 @@ class _StandingSolver(Solver):
 
 
 def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
-    """Return "rest" if the tips are at rest at a time, else "free"."""
+    """Return the condition on the joint velocities at a time: "rest" if the tips are at rest, else "free"."""
     try:
         check_rest(equations, time)
     except ProblemError:
@@ -394,7 +396,7 @@ def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
 
 
 def _takes_scalars(equations: TaskEquations) -> bool:
-    """Return whether the functions of time in the tasks accept SX symbols."""
+    """Return whether the functions of time in the tasks accept CasADi SX symbols."""
     try:
         equations.targets(ca.SX.sym("time"))
     except (RuntimeError, NotImplementedError):
@@ -405,7 +407,7 @@ def _takes_scalars(equations: TaskEquations) -> bool:
 def _start_configurations(
     machine: Standing, tasks: list[TipTask], start: Any, limits: Limits | None, seed: int
 ) -> list[Array]:
-    """Return joint vectors at the start, in order of their conditioning."""
+    """Return start configurations, in order of their conditioning; only the given one if there is one."""
     if start is not None:
         return [start]
     poses = [task for task in tasks if task.is_pose]

@@ -63,14 +63,14 @@ def plan(
     Args:
         machine: A machine on a fixed or floating base, or standing, see `plan_to_stand`.
         tasks: Tasks of its tips, each from its `begin` for its `duration`; goals, which are reached one after the
-            other; or waypoints, which an arm on a fixed base whose joints exceed the rows of a pose by at most two
-            passes by the shortest joint path. Goals and tasks in one sequence are done one after the other, tasks at
-            once in an inner sequence, and a motion of its own leads to each task (see `plan.sequence`).
+            other; or waypoints, which an arm on a fixed base with at most two redundant joints passes by the shortest
+            joint path. Goals and tasks in one sequence are done one after the other, tasks at once in an inner
+            sequence, and a motion of its own leads to each task (see `plan.sequence`).
         horizon: s; None: until the last task ends. "free": the tasks may be done more slowly than they say, never
             faster; their pace is planned together with the self-motion, for the least sum of duration and joint rates.
-        start: Joints at the start, rad or m, shape (n,), or a `Start` with the configuration of a floating base; None:
-            any joints that do the first tasks, which are searched. Joints that move no task frame, such as a gripper's,
-            are held there, or at the nearest free position, see `Plan.held`.
+        start: Joint positions at the start, rad or m, shape (n,), or a `Start` with the configuration of a floating
+            base; None: any that satisfy the first tasks, which are searched. Joints that move no task frame, such as a
+            gripper's, stay at rest there, or at the nearest free position, see `Plan.held`.
         cyclic: Whether the joints end where they start.
         cost: Weights of the cost. For tip tasks all its terms, the `time` only if the horizon is free (1 if `cost` is
             None), in (rad/s)^2: the larger, the closer to the least time. For waypoints,
@@ -85,11 +85,11 @@ def plan(
         search: "start": from the given start, or from the best conditioned solution of inverse kinematics.
             "configurations": from all solutions of inverse kinematics; each may slide along its self-motion.
             "global": among all motions in the tasks' own time. On a fixed base, the plan has a lower `bound`; the tasks
-            must be poses that leave at most two directions free. If more are free, joints that also carry another limb,
-            such as a torso, are held (see `search.search`). On a floating base, the motions come from a search over
-            exact states without a bound (see `search.cells`), which also passes singularities. "segments": as "global";
-            if no single motion does the tasks, in the fewest segments, between which an arm on a fixed base moves to
-            another configuration while the tasks wait.
+            must be poses that leave at most two degrees of freedom undetermined. If more are, joints that also carry
+            another limb, such as a torso, are held at rest (see `search.search`). On a floating base, the motions come
+            from a search over exact states without a bound (see `search.cells`), which also passes singularities.
+            "segments": as "global"; if no single motion does the tasks, in the fewest segments, between which an arm on
+            a fixed base moves to another configuration while the tasks wait.
         seed: Seed of all random numbers.
         time_limit: Seconds after which planning ends with a SolveError; None for no limit.
         progress: Function that is called with the name of each stage; True: a line shows it; False: nothing is shown;
@@ -217,11 +217,11 @@ def plan_problem(
     limits: Limits | None = None,
     scene: Scene | Literal[False] | None = None,
 ) -> Problem:
-    """Declare the problem that `plan` solves, without a search over start configurations.
+    """Declare the optimal control problem that `plan` would solve; start configurations are not searched here.
 
     The clearance of the scene is proven by the audit of a solution, but no pair of bodies is separated yet, see
-    `ClearanceConstraints.with_pairs`. Poses of goals need joints here. Limits of actuators beside tip tasks, and a free
-    horizon for them, belong to `plan`.
+    `ClearanceConstraints.with_pairs`. A goal needs joint positions here, not a pose. Limits of actuators beside tip
+    tasks, and a free horizon for them, belong to `plan`.
 
     Args:
         machine, tasks, horizon, start, cyclic, cost, limits, scene: As in `ocp.plan`.
@@ -270,7 +270,11 @@ def _goal_problem(
     limits: Limits | None,
     clearance_constraints: ClearanceConstraints | None,
 ) -> Problem:
-    """Declare the motion to goals: at constant speed if only velocities are weighted and limited, else smooth."""
+    """Declare the optimal control problem of a motion to one goal or several goals.
+
+    On a fixed base, a motion to one goal has constant speed if only velocities are weighted and limited. Every other
+    motion has continuous velocities.
+    """
     state, joints, base = Start.of(start, machine)
     is_smooth = limits is not None and limits_actuators(limits)
     is_smooth = is_smooth or (cost is not None and cost.terms != ("velocity",))

@@ -3,7 +3,7 @@
 Without actuator limits, a path at constant speed is a candidate whose clearance is proven. In least time, the fastest
 motion without obstacles is a candidate if it is clear, and a sequence of linear programs finds a locally fastest motion
 near each path (`ocp.motion.sampling.fastest_motion`). With another cost, each path is the guess of an optimal control
-problem, which stays in its class. A motion that stops at the corners of the path is the last resort.
+problem, which stays in its homotopy class. A motion that stops at the corners of the path is the last resort.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class GoalSettings:
-    """Settings of the motions to a goal.
+    """Settings for planning motions to a goal.
 
     Attributes:
         search: Settings of the search for paths.
@@ -62,14 +62,14 @@ class GoalSettings:
         unlimited_rate: Rate of joints without a rate limit, rad/s or m/s, where the planner chooses the horizon.
         spare: Horizon of a motion within actuator limits, where the planner chooses it, relative to the least time of a
             motion that stops at corners.
-        longest: Largest and inverse of the least horizon in free time, relative to the same.
-        guess_times: Samples of a guess.
+        longest: Largest horizon in free time, and inverse of the least one, relative to the same.
+        guess_times: Number of time samples of a guess.
         near_bound: Relative excess of the cost over its lower bound below which a motion counts as optimal.
-        phase_samples: Samples of each phase of a motion at which its clearance is checked before the audit.
+        phase_samples: Number of samples of each phase of a motion at which its clearance is checked before the audit.
         margins: Largest number of margins, each twice the one before, that are tried for the clearance between samples.
         fastest: Settings of the fastest motions near a path.
         near: Pairs of bodies closer than the clearance plus this along a path are separated from the first solve on, m.
-        turns: Numbers of full turns by which goals of unlimited joints are shifted, beside the nearest one.
+        turns: Largest number of further full turns by which goals of unlimited joints are shifted.
     """
 
     search: PathSearchSettings = field(default_factory=PathSearchSettings)
@@ -93,8 +93,8 @@ class GoalRequest:
 
     Attributes:
         machine: Machine on a fixed base.
-        start: Joints at the start, rad or m. Shape (n,).
-        goals: Joints that all satisfy the goal. Shape (K, n), or (n,) for one.
+        start: Joint positions at the start, rad or m. Shape (n,).
+        goals: Configurations that each satisfy the goal. Shape (K, n), or (n,) for one.
         horizon: Final time, s; None: as short as the limits of the rates allow for the path, or free if the cost
             weights time.
         limits: Limits of joints and actuators; the robot's own positions and rates if None.
@@ -125,7 +125,7 @@ class GoalRequest:
 
 @dataclass(frozen=True, eq=False)
 class GoalTask:
-    """Checked request for a motion to goals: bounds, start, goals in all turns, metric, and collision checks."""
+    """Checked request for a motion to goals: bounds, start, goals in all full turns, metric, collision checks."""
 
     request: GoalRequest
     bounds: JointBounds
@@ -142,12 +142,12 @@ class GoalTask:
 
     @property
     def is_dynamic(self) -> bool:
-        """Whether the motion is smooth, because actuators are limited or more than velocity or length is weighted."""
+        """Whether joint velocities must be continuous, due to actuator limits, the cost, or velocities at the ends."""
         return limits_actuators(self.limits) or not set(self.request.cost.terms) <= {"velocity", "length"} or self.moves
 
     @property
     def moves(self) -> bool:
-        """Whether the machine has a velocity at the start or at the end."""
+        """Whether the joints need not be at rest at the start or at the end of the motion."""
         return not all(isinstance(velocity, str) and velocity == "rest" for velocity in self.end_velocities)
 
     @property
@@ -163,7 +163,7 @@ class GoalTask:
 
     @property
     def length(self) -> bool:
-        """Whether the length in joint space is the cost."""
+        """Whether the cost is the length of the path in joint space."""
         return bool(self.request.cost.length)
 
     def report(self, text: str) -> None:
@@ -172,7 +172,7 @@ class GoalTask:
 
 
 def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return motions at constant speed along paths, with their audits."""
+    """Return the audited candidate motions that follow paths at constant speed."""
     request = task.request
     fastest = np.where(np.isfinite(task.bounds.velocity), task.bounds.velocity, request.settings.unlimited_rate)
     candidates = []
@@ -193,14 +193,14 @@ def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate
 
 
 def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return motions along paths, as the limits and the cost require, with their audits."""
+    """Return audited candidate motions along paths: fastest, within actuator limits, or at constant speed."""
     if task.is_fastest:
         return [_fastest(task, path) for path in paths]
     return _within_actuator_limits(task, paths) if task.is_dynamic else _at_constant_speed(task, paths)
 
 
 def synchronised_candidates(task: GoalTask) -> list[Candidate]:
-    """Return the fastest motion that ignores obstacles, with its audit, if it is collision-free; else no motion.
+    """Return the fastest motion that ignores obstacles, audited, if it is collision-free; else an empty list.
 
     No motion is faster unless torques slow it down.
     """
@@ -221,7 +221,7 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
 
 
 def _fastest(task: GoalTask, path: JointPath) -> Candidate:
-    """Return a locally fastest motion near a path with its audit or, if none is found, one that stops at corners."""
+    """Return an audited, locally fastest motion near a path or, if none is found, one that stops at its corners."""
     settings = task.request.settings.fastest
     ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
     limits = MotionLimits(task.motions, task.bounds, task.torques, *ends)
@@ -243,7 +243,7 @@ def _fastest(task: GoalTask, path: JointPath) -> Candidate:
 
 
 def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return audited motions within actuator limits: first with stops at corners, then, if time is left, without."""
+    """Return audited motions along paths within actuator limits: with stops at corners or, if better, without."""
     request, settings, bounds = task.request, task.request.settings, task.bounds
     candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
     for path in paths:
@@ -278,7 +278,7 @@ def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _PathProblem:
-    """Problem of a motion near one path, within actuator limits.
+    """Optimal control problem of a motion near one path, within actuator limits.
 
     Attributes:
         task: Checked request.
@@ -298,7 +298,7 @@ class _PathProblem:
         return self.motion.duration if self.fixed is None else self.fixed
 
     def declare(self, clearance: ClearanceConstraints | None) -> Problem:
-        """Declare the problem, with or without clearance constraints."""
+        """Declare the optimal control problem, with or without clearance constraints."""
         task, ends = self.task, {"start": self.path.joints[0], "end": self.path.joints[-1]}
         guess = self.horizon_guess
         least = 0.0 if task.moves else least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()
@@ -315,7 +315,7 @@ class _PathProblem:
         return dynamics_problem(task.request.machine, (), horizon, **ends, limits=limits, cost=cost, setup=setup)
 
     def stopping_motion(self) -> Candidate:
-        """Return the motion that stops at corners, slowed down to the horizon if that is fixed, with its audit."""
+        """Return the audited motion that stops at the path's corners, slowed down to the horizon if that is fixed."""
         task, factor = self.task, self.horizon_guess / self.motion.duration
         if task.request.cost.energy or np.isfinite(task.bounds.power).any() or task.moves:
             words = "motions with stops are not offered where power counts, or the machine moves at an end"
@@ -354,7 +354,7 @@ class _PathProblem:
 
 
 def _audit_candidate(task: GoalTask, solution: Solution, path: JointPath) -> Candidate:
-    """Return a solution as a candidate, rejected if it is not feasible or could not be audited in time."""
+    """Audit a solution; return it as a candidate, rejected if it is infeasible or could not be audited in time."""
     candidate = Candidate(path.joints[0], solution.cost, None, Stage.FINE, solution)
     task.report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
     try:

@@ -40,7 +40,7 @@ __all__ = ["plan_to_goal"]
 
 @interruptible
 def plan_to_goal(request: GoalRequest) -> SolvedPlan:
-    """Return the lowest-cost motion from the start to a goal that was found; with actuator limits, from rest to rest.
+    """Return the lowest-cost collision-free motion that was found from the start to one of the goals.
 
     Raises:
         ProblemError: Sizes do not match; the start, or every goal, is outside the limits or collides: names the pair of
@@ -64,7 +64,7 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
 
 
 def _check_request(request: GoalRequest) -> GoalTask:
-    """Return the checked request, with goals of unlimited joints shifted by full turns to be near the start.
+    """Check a request; return it with goals of unlimited joints shifted by full turns towards the start.
 
     Raises:
         ProblemError: As `plan_to_goal`.
@@ -129,7 +129,7 @@ def _collision(scene: Any, name: str, collision: Any) -> ProblemError:
 
 
 def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal: Array, turns: int) -> list[Array]:
-    """Return a goal in all full turns of its unlimited joints within limits, the one nearest to the start first."""
+    """Return a goal with its unlimited joints shifted by full turns within limits, the nearest to the start first."""
     nearest = start + space.difference(goal, start)
     shifts = []
     for joint in range(len(goal)):
@@ -147,7 +147,7 @@ def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
     """Search for collision-free paths of several homotopy classes, and sort them by length.
 
     Raises:
-        SolveError: None was found.
+        SolveError: No path was found.
     """
     request, bounds, joints = task.request, task.bounds, np.vstack([task.start, task.goals])
     lower = np.where(np.isfinite(bounds.lower) & ~task.space.periodic, bounds.lower, joints.min(axis=0) - np.pi)
@@ -180,7 +180,7 @@ def _best(task: GoalTask, candidates: list[Candidate]) -> SolvedPlan:
     """Return the lowest-cost candidate as the plan, with a lower bound of the cost of all motions.
 
     Raises:
-        SolveError: None passed its audit.
+        SolveError: No candidate passed its audit.
     """
     passed = sorted((c for c in candidates if c.passed), key=lambda candidate: candidate.cost)
     if not passed:

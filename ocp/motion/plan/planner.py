@@ -1,9 +1,9 @@
 """Planner of tip tasks: from start configurations to the lowest-cost motion that passes its audit.
 
 If the start is not given, inverse kinematics finds start configurations on every branch and spread over the
-self-motion. Resolved-rate control tracks the tasks from each of them. These local motions are the seeds of candidates,
-whose start is free along its self-motion. The queue advances the candidates by rising cost
-(`ocp.motion.plan.candidate_queue`), until none is left that may be cheaper than the best one found.
+self-motion. Resolved-rate control tracks the tasks from each of them. These local motions are the initial guesses
+(seeds) of candidates, whose start is free along its self-motion. The queue advances the candidates by rising cost
+(`ocp.motion.plan.candidate_queue`), until none is left that may cost less than the best one found.
 
 Seeds come from one configuration, from all that inverse kinematics finds, or from a global search. A more expensive
 kind of seeds is used only if the kinds before it led to no plan, or to none that is good enough.
@@ -70,11 +70,11 @@ __all__ = [
 def plan_from_configurations(
     request: PlanRequest, configurations: Array, solver: CandidateSolver
 ) -> tuple[SolvedPlan, float | None]:
-    """Return the plan that starts from one of some configurations, and a lower bound of its cost or None.
+    """Return the lowest-cost plan from any of the start configurations, and a lower bound of its cost or None.
 
     Args:
         request: The request.
-        configurations: Joints at the start, the best conditioned first. Shape (K, n).
+        configurations: Joint configurations at the start, the best conditioned first. Shape (K, n).
         solver: Solver of the candidates.
 
     Raises:
@@ -112,10 +112,10 @@ def plan_from_configurations(
 
 
 def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
-    """Return the plan of the lowest-cost candidate, as measured by the cost of the request.
+    """Return the plan of the candidate whose cost, as the request defines it, is lowest.
 
-    If the request has another cost than the squared rates, all motions that passed are solved again at that cost, in
-    the order of the cost that they have without a change.
+    If the request has another cost than the squared rates, all motions that passed are solved again for this cost,
+    in the order of the value that it has for them before.
 
     Raises:
         SolveError: No motion passed.
@@ -130,7 +130,7 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates from local motions, sorted by whether they satisfy their tasks, then by cost.
+    """Return candidates whose initial guesses are local motions: those that satisfy their tasks first, then by cost.
 
     Args:
         motions: K local motions through each stretch.
@@ -156,7 +156,7 @@ def _repair(
     configurations: Array,
     seeds: list[Candidate],
 ) -> None:
-    """Solve seeds in collision again; without collisions, try other guesses and diagnose conflicting constraints."""
+    """Retry after all candidates failed: with separated bodies if some collided, otherwise from other guesses."""
     if queue.collided and not solver.no_clear_configuration:
         _try_alternatives(queue, solver, seeds)
     if queue.passed or queue.collided or queue.exhausted:
@@ -169,7 +169,7 @@ def _repair(
 
 
 def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configurations: Array, thorough: bool) -> None:
-    """Try configurations one after the other, in order of their conditioning, until one leads to a plan.
+    """Try start configurations one after the other, in order of their conditioning, until one leads to a plan.
 
     Args:
         thorough: Whether failures are diagnosed, since nothing else is tried.
@@ -185,13 +185,13 @@ def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configuratio
 
 
 def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch) -> None:
-    """Solve the classes of motions that may contain the optimum; if all fail, solve one motion of every class.
+    """Solve candidates from the motions of a global search that may lead to the optimum; if these fail, from all.
 
     A free start and a coarse mesh may lead away from a nearly optimal motion. Motions of the search that promise a
     lower cost than the plan are therefore also solved with their start fixed, until the plan is close to its bound.
 
     Raises:
-        DeadEnd: Motions end somewhere.
+        DeadEnd: No motion of the search reaches the end.
     """
     settings = solver.settings
     _check_dead_end(search)
@@ -219,7 +219,7 @@ def _check_dead_end(search: TaskSearch) -> None:
 def _search_cells(
     queue: CandidateQueue, solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array
 ) -> None:
-    """Solve candidates from a cell search over the states of a floating machine, and those from local motions.
+    """Solve candidates of a floating machine from motions of a `CellSearch` and from local (resolved-rate) motions.
 
     Raises:
         Unreachable, DeadEnd: As in `CellSearch`, if no local motion leads to a plan either.
@@ -255,7 +255,7 @@ def _search_cells(
 
 
 def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Solve candidates in collision again, from their own local motions, then from fixed, collision-free starts.
+    """Solve candidates in collision again with separated bodies, and from fixed, collision-free starts.
 
     Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
     motions belong to different homotopy classes; those without collision, or with the least, come first. A free start
@@ -282,14 +282,14 @@ def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: lis
         alternatives += [(distances[id(c)], replace(c, seed=seed)) for c, seed in fixed]
     for _, seed in sorted(alternatives, key=lambda entry: -entry[0]):
         start = seed.start
-        queue.candidates = [c for c in queue.candidates if c.start is not start]  # it finishes again
+        queue.candidates = [c for c in queue.candidates if c.start is not start]  # this candidate finishes again
         queue.run([seed])
         if queue.passed:
             return
 
 
 def plan_request(request: PlanRequest) -> SolvedPlan:
-    """Plan a checked request.
+    """Plan a checked request; after a failure, move or release joints that were held at rest, and try again.
 
     Raises:
         ProblemError, SolveError: As in `plan`.
@@ -308,7 +308,7 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
 
 
 def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
-    """Plan a request with some joints held; `whole` is the request before any joints were held.
+    """Plan a request with some joints held at rest; `whole` is the request before any joints were held.
 
     Raises:
         ProblemError, SolveError: As in `plan`.
@@ -412,7 +412,7 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
-    """Return the cost of tip tasks after a check of its weights.
+    """Check the weights of the cost of tip tasks, and return the cost.
 
     Args:
         free: Whether the horizon is free.

@@ -45,7 +45,7 @@ from ocp.motion.tasks.tip_task import TipTask, retime_task
 __all__ = ["SequenceRequest", "plan_consecutive", "plan_in_segments"]
 
 AT_START = 1e-6
-"""Largest pose error with which a configuration is the start of a task or at a goal, m and rad."""
+"""Largest pose error of a configuration that counts as the start of a task or as being at a goal, m and rad."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class SequenceRequest:
 
     Attributes:
         machine: Machine on a fixed or floating base.
-        start: Start of the first motion, as in `plan`; None if that is along a task.
+        start: Start of the first motion, as in `plan`; may be None if this motion is along a task.
         free: Whether the planner chooses the durations.
         cost, limits, scene, search, seed: As in `plan`.
     """
@@ -110,7 +110,7 @@ def plan_consecutive(request: SequenceRequest, parts: Sequence[Goal | TipTask | 
 
 @dataclass(eq=False)
 class _Sequence:
-    """The motions of a sequence that are already planned, and the state at their end."""
+    """Planner of a sequence of motions: the motions planned so far, and the state at their end."""
 
     request: SequenceRequest
     parts: tuple[Any, ...]
@@ -128,8 +128,8 @@ class _Sequence:
             raise ProblemError(words, name="start")
 
     def plan(self) -> SequencePlan:
-        """Plan all parts of the sequence."""
-        led: SolvedPlan | None = None  # the next part, if the goal before it has been chosen for it
+        """Plan the motions to all goals and along all tasks of the sequence, one after the other."""
+        led: SolvedPlan | None = None  # plan of the next tasks, if the goal before them leads to their start
         for number, (part, following) in enumerate(zip_longest(self.parts, self.parts[1:]), 1):
             if isinstance(part, Goal):
                 name = part.name or f"goal {number}"
@@ -154,7 +154,7 @@ class _Sequence:
         self.state = _State.end_of(plan, self.request.smooth)
 
     def _joints_near(self, goal: Goal) -> Array | None:
-        """Return the joints of a goal; joints that the goal leaves open have their current values."""
+        """Return the joint positions of a goal, with current positions for the joints that the goal leaves open."""
         if goal.joints is None or self.state.joints is None:
             return self.state.joints
         joints = floats(goal.joints).ravel()
@@ -178,7 +178,7 @@ class _Sequence:
         return plan_goal(own, replace(goal, machine=None), horizon, options, constraints=self._constraints())
 
     def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
-        """Return the motion along tasks, from the joints `near` if the tasks start there, else from any joints."""
+        """Return the motion along tasks from the configuration `near` or, if they do not start there, from any."""
         request, machine = self.request, self.machine
         options: dict[str, Any] = {"cost": request.cost, "limits": request.limits, "seed": request.seed}
         options |= {"search": request.search, "start": None}
@@ -195,7 +195,7 @@ class _Sequence:
         return plan_request(checked)
 
     def _approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
-        """Add the motion to the start of a task, and return the motion along the task."""
+        """Append the motion to the start of a task, if one is needed, and return the motion along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
@@ -229,20 +229,20 @@ class _Sequence:
 
 
 def _is_at_start(machine: Machine, tasks: Any, joints: Array) -> bool:
-    """Return whether joints satisfy the tasks at the start of their motion; velocity tasks begin anywhere."""
+    """Return whether a configuration satisfies the tasks at their start; velocity tasks may start anywhere."""
     first = [task for task in ((tasks,) if isinstance(tasks, TipTask) else tasks) if not task.begin]
     return _misses(bind(machine, first), joints) <= AT_START if first else True
 
 
 def _misses(equations: TaskEquations, joints: Array) -> float:
-    """Return the largest pose error of joints at time 0, m or rad; tool axes may lie anywhere in their cones."""
+    """Return the largest pose error of joint positions at time 0, m or rad; tool axes may be anywhere in a cone."""
     at: tuple[Any, ...] = np.zeros(1), None, joints[None]
     errors = equations.errors(*at), equations.cone_violations(*at)
     return max(float(np.abs(each).max(initial=0.0)) for each in errors)
 
 
 def _led_to(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return a goal with the joints and velocity at the start of a task if that start satisfies the goal."""
+    """Return a goal with the configuration and velocity at the start of a task, if that start satisfies the goal."""
     first = plan.at(0.0)
     if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
         return goal
@@ -269,7 +269,7 @@ def _rests(request: PlanRequest) -> tuple[bool, bool]:
 
 
 def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:
-    """Return a velocity as numbers, which are zero for "rest"."""
+    """Return a joint velocity as an array, which is zero for "rest"."""
     return np.zeros_like(like["rates"]) if isinstance(velocity, str) else floats(velocity)
 
 
@@ -303,7 +303,8 @@ def plan_in_segments(
     Args:
         machine: An arm on a fixed base.
         tasks, horizon, start, cost, limits, seed: As in `plan`; the tasks are poses that leave at most two
-            directions free. Actuator limits do not influence the division, but the segments are planned within them.
+            degrees of freedom undetermined. Actuator limits do not influence the division, but the segments are planned
+            within them.
         scene: As in `plan`, with static obstacles, since a reconfiguration takes time.
 
     Returns:
@@ -369,7 +370,7 @@ def _plan_segment(request: PlanRequest, begin: float, end: float) -> SolvedPlan:
 
 
 def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
-    """Return the part of a task between two times, with its start at time 0; None if it is empty."""
+    """Return the part of a task between two times, with `begin` as the new time 0; None if it is empty."""
     first, last = max(task.begin, begin), min(task.end, end)
     if last <= first:
         return None
@@ -382,7 +383,7 @@ def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
 
 
 def _plan_reconfiguration(request: PlanRequest, time: float, before: Array, after: Array) -> Reconfiguration:
-    """Return a motion between two configurations of all joints, straight or around obstacles."""
+    """Plan a collision-free motion between two configurations of all joints; the result says why if none is found."""
     machine, whole = require.instance("machine", request.machine, FixedBase), request.whole or request.machine
     free = [name not in request.held for name in whole.robot.joint_names]
     goal = GoalRequest(

@@ -38,7 +38,7 @@ SINGULAR = SingularSettings()
 
 
 def is_nearly_singular(stretches: Sequence[Stretch], motions: Sequence[LocalMotion]) -> bool:
-    """Return whether the rows of the tasks become nearly dependent somewhere along a local motion."""
+    """Return whether the task Jacobian becomes nearly singular somewhere along a local (resolved-rate) motion."""
     for stretch, motion in zip(stretches, motions, strict=True):
         if stretch.equations is None or not stretch.equations.size:
             continue
@@ -53,7 +53,7 @@ def is_nearly_singular(stretches: Sequence[Stretch], motions: Sequence[LocalMoti
 
 @dataclass(frozen=True)
 class MotionSample:
-    """Samples of a motion in one stretch of time.
+    """Samples of a motion in one interval of time (stretch) with the same active tasks.
 
     Attributes:
         stretch: The stretch.
@@ -69,11 +69,11 @@ class MotionSample:
 
     @classmethod
     def of_local(cls, stretch: Stretch, motion: LocalMotion) -> MotionSample:
-        """Sample the first of several local motions."""
+        """Return the samples of the first of several local (resolved-rate) motions."""
         return cls(stretch, motion.t, motion.base[0], motion.joints[0], motion.rates[0])
 
     def misses(self) -> tuple[Array, Array]:
-        """Return the position errors, m, and orientation errors, rad, of the worst task. Shapes (M,).
+        """Return the largest position and orientation errors of any task at each sample, m and rad. Shapes (M,).
 
         The error of a velocity task is the integral of its velocity error.
         """
@@ -99,7 +99,7 @@ class MotionSample:
 
 
 def limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason | None:
-    """Return the reason that a joint, the one with the largest excess, exceeds its rate limit; None if none does."""
+    """Return a rejection reason about the joint that exceeds its rate limit most; None if no joint exceeds it."""
     reasons = []
     for sample in samples:
         shares = _rate_shares(request, sample.rates)
@@ -116,7 +116,7 @@ def limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reaso
 
 
 def describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
-    """Return the reason that a motion misses its tasks: time, amount, and a joint at its limit there."""
+    """Return a rejection reason for a motion that misses its tasks: time, pose error, and a joint at its limit."""
     sample, k, misses = samples[0], 0, (0.0, 0.0)
     for each in samples:
         distances, angles = each.misses()
@@ -146,7 +146,7 @@ def describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) ->
 
 
 def _rate_shares(request: PlanRequest, rates: Array) -> Array:
-    """Return joint rates relative to their limits; the share of a joint at rest is zero."""
+    """Return absolute joint rates relative to their limits; the ratio is zero for a joint at rest."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.nan_to_num(np.abs(rates) / request.bounds.velocity, nan=0.0)
 

@@ -4,7 +4,7 @@ The cost is the weighted sum of all joint displacements, or the largest of them,
 no joint moves more than a given step. A global search covers some of the waypoints (see `search.search`). A path
 through all waypoints costs no less than one through some of them, so that the bound holds for all. The best paths found
 are then extended to all waypoints and shortened there by dynamic programming over neighbouring configurations.
-Violations are penalised, so that a path may leave them. If no path goes through all waypoints, one in the fewest
+Violations are penalised, so that a path can move out of them. If no path goes through all waypoints, one in the fewest
 segments may be requested (see `ocp.motion.search.reconfigurations`).
 """
 
@@ -45,23 +45,23 @@ Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 
 WAYPOINT = "waypoint {:g}"
 TOO_MANY_CHARTS = "configurations"
-"""Name in the error of a search that needs too many charts."""
+"""Field `name` of the error of a search that needs too many charts of the self-motion manifold."""
 NO_PATH = "no path through the waypoints keeps all limits"
 
 
 @dataclass(frozen=True)
 class WaypointSettings:
-    """Settings of the search through waypoints.
+    """Settings of the search for a path through waypoints.
 
     Attributes:
-        stride: With at most one free direction, every so many-th waypoint is searched, and half the stride is tried
+        stride: With at most one redundant joint, every so many-th waypoint is searched, and half the stride is tried
             next if no path found goes through all.
-        first_steps: With two free directions, number of steps of a first search, which finds short paths.
+        first_steps: With two redundant joints, number of steps of a first search, which finds short paths.
         steps, strides: Approximate number of steps of the next two searches, and their least strides.
-        max_paths: Paths of a search that are shortened, the lowest cost first.
+        max_paths: Largest number of paths of a search that are shortened, the lowest cost first.
         widths: Initial and final spacing of the configurations of `shorten_path`, rad or m.
         pose_tolerance: Largest pose error, m and rad, which the last width leaves.
-        search, sections: Settings of the searches with at most one free direction, and with two.
+        search, sections: Settings of the searches with at most one redundant joint, and with two.
     """
 
     stride: int = 5
@@ -79,10 +79,10 @@ class _Path(NamedTuple):
     """Joint path through all waypoints, in one or several segments.
 
     Attributes:
-        cost: Its cost.
-        why: Why it is not valid; "" if it is.
-        wrong: Waypoints where it is not valid.
-        joints: Shape (N, n).
+        cost: Cost of the path.
+        failure: Why the path is not valid; "" if it is.
+        invalid: Waypoints where it is not valid.
+        joints: Configurations at the waypoints. Shape (N, n).
         breaks: Waypoints after which the arm reconfigures.
     """
 
@@ -102,10 +102,10 @@ def plan_path(
     scene: Scene | Literal[False] | None = None,
     seed: int = 0,
 ) -> PathPlan:
-    """Plan the lowest-cost path through poses of the tip, within limits and collision-free at every waypoint.
+    """Plan the lowest-cost joint path through tool poses, within limits and collision-free at every waypoint.
 
     Args:
-        machine: An arm on a fixed base whose number of joints exceeds the rows of a pose by at most two. If by two,
+        machine: An arm on a fixed base with at most two redundant joints for the poses of its tip. If it has two,
             paths are searched on sections in which the joint nearest to the base has one of several values (see
             `ocp.motion.search.reconfigurations`), and no bound is known.
         waypoints: Poses of the tip.
@@ -199,7 +199,7 @@ class _WaypointPlanner:
             words = f"{machine.robot.name}: {int((~pose.idle).sum())} joints for the {pose.size} rows of a pose"
             words += f"; lock joints until at most {MAX_FREE_DIRECTIONS} degrees of freedom are left"
             raise ProblemError(words, name="machine", value=self.manifolds.size, limit=MAX_FREE_DIRECTIONS)
-        # with two free directions, sections fix the joint nearest to the base, which moves all others
+        # with two redundant joints, sections fix the joint nearest to the base, which moves all others
         robot = machine.robot
         names = [joint.name for joint in robot.path_to(robot.tip_link) if joint.name in robot.joint_names]
         self._section_joint = robot.joint_names.index(names[0]) if self.manifolds.size > 1 else None
@@ -242,7 +242,7 @@ class _WaypointPlanner:
         return self._best_plan(paths, bound)
 
     def _segmented_paths(self, search: AtlasSearch, segmented: bool) -> tuple[list[list[Segment]], float]:
-        """Return segmented paths through the searched waypoints, and a lower bound of their cost."""
+        """Return paths through the searched waypoints as lists of segments, and a lower bound of their cost."""
         if segmented:
             result = fewest_segments(search)
             return ([], np.inf) if result is None else ([result[0]], result[1])
@@ -281,7 +281,7 @@ class _WaypointPlanner:
     # ---- searched waypoints ------------------------------------------------------------------------------------------
 
     def _strides(self) -> tuple[list[int], int]:
-        """Return the strides of the searches in order, and the number of searches that are always made."""
+        """Return the strides between waypoints of the successive searches, and the number of searches always made."""
         settings, count = self.settings, len(self.positions)
         if self._section_joint is None:
             halves = int(np.log2(settings.stride)) + 1
@@ -292,9 +292,9 @@ class _WaypointPlanner:
         return [-(-count // settings.first_steps), *strides], 2
 
     def _search_with_stride(self, stride: int, known: AtlasSearch | None = None) -> AtlasSearch | None:
-        """Search every n-th waypoint; the stride n doubles as long as the atlas requires too many charts.
+        """Return a search over every `stride`-th waypoint; the stride doubles while too many charts are needed.
 
-        None if it has no more waypoints than a known search.
+        Return None if it has no more waypoints than a known search.
         """
         last, known_count = len(self.positions) - 1, 1 if known is None else len(known.times)
         while True:
@@ -311,7 +311,7 @@ class _WaypointPlanner:
             stride *= 2
 
     def _search_at_failures(self, search: AtlasSearch, path: _Path | None) -> AtlasSearch | None:
-        """Search again, including waypoints where a path is invalid; None if there are none, or too many."""
+        """Return a search that also includes the waypoints where a path is invalid, or None if that is impossible."""
         chosen = search.times.astype(int)
         if path is None or self._section_joint is not None or np.isin(path.invalid, chosen).all():
             return None
@@ -323,7 +323,7 @@ class _WaypointPlanner:
             return None
 
     def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
-        """Return the search over some waypoints: of all configurations or, with two free directions, on sections."""
+        """Return the search over some waypoints: of all configurations or, with two redundant joints, on sections."""
         manifolds = SelfMotionManifolds(self.space, self.manifolds.equations, self.manifolds.targets[chosen])
         distances = np.diff(chosen)[:, None]
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
@@ -341,7 +341,7 @@ class _WaypointPlanner:
         return SectionSearch(*arguments, **options, **sections, joint=joint)
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
-        """Return the error that all paths end, located among the waypoints that the search skipped."""
+        """Return the error that says where all paths end, located among the waypoints that the search skipped."""
         error, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
         if error is None:
             return SolveError("no path goes through the waypoints", name="waypoints")
@@ -350,10 +350,10 @@ class _WaypointPlanner:
         return (None if len(refined) == len(chosen) else dead_end(self._search(refined), WAYPOINT)) or error
 
     def _negligibly_relaxed_paths(self, search: AtlasSearch) -> list[_Path]:
-        """Return paths that require only a negligible relaxation of poses, as a diagnosis finds them; else none.
+        """Return paths that a relaxation of the poses by no more than the pose tolerance makes possible.
 
         Raises:
-            SolveError: There is none.
+            SolveError: There is no such path.
         """
         uncovered = [float(time) for time, charts in zip(search.times, search.atlas, strict=True) if not len(charts)]
         if uncovered and self._section_joint is not None:
@@ -409,7 +409,7 @@ class _WaypointPlanner:
         return self._seed_cache[number]
 
     def _interpolate(self, chosen: NDArray[np.intp], chain: list[Segment]) -> Array:
-        """Interpolate segments through some waypoints at all waypoints, with full turns into limits. Shape (N, n)."""
+        """Interpolate path segments at all waypoints, and shift them by full turns into the limits. Shape (N, n)."""
         numbers = np.arange(len(self.positions))
         path = np.concatenate([segment.joints for segment in chain])
         joints = np.column_stack([np.interp(numbers, chosen, column) for column in path.T])
@@ -421,7 +421,7 @@ class _WaypointPlanner:
         return joints
 
     def _check_path(self, joints: Array, breaks: tuple[int, ...]) -> tuple[str, NDArray[np.intp]]:
-        """Return the name of a limit that a path violates ("" if none), and the waypoints where it does."""
+        """Describe a requirement that a path violates ("" if none); also return the waypoints where it is invalid."""
         names, indices = self.machine.robot.joint_names, np.arange(len(joints))
         errors = np.abs(self.manifolds.linearize(indices, joints)[0]).max(axis=1)
         excess = np.maximum(joints - self.upper, self.lower - joints)
@@ -463,7 +463,7 @@ def _path_weights(weights: Any, size: int) -> Array:
 
 
 def _step(step: Any, size: int) -> Array:
-    """Return the largest displacement of each joint between waypoints, after checks. Shape (n,)."""
+    """Check the largest displacement between waypoints, and return it for each joint. Shape (n,)."""
     try:
         steps = floats(step)
         if steps.shape in ((), (1,), (size,)) and (steps > 0).all():
@@ -475,7 +475,7 @@ def _step(step: Any, size: int) -> Array:
 
 
 def _poses(positions: ArrayLike, quaternions: ArrayLike) -> tuple[Array, Array]:
-    """Return checked positions (N, 3) and rotations (N, 3, 3)."""
+    """Check the poses of waypoints, and return positions (N, 3) and rotation matrices (N, 3, 3)."""
     arrays = []
     for name, values, size in (("positions", positions, 3), ("quaternions", quaternions, 4)):
         words = f"{name} must be finite numbers of shape (N, {size}) with N > 1"

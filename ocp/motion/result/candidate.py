@@ -75,7 +75,7 @@ class Reason:
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Reason:
-        """Return the reason from data of a file; values are checked because files are not trusted.
+        """Return the rejection reason from data of a file; they are checked because files are not trusted.
 
         Raises:
             KeyError, TypeError, ValueError: The record is damaged.
@@ -94,19 +94,19 @@ class Reason:
 
 
 def collision_reason(pair: Collision | ClosestPair, limit: float, remedy: str = "") -> Reason:
-    """Return the rejection reason that two bodies are closer than a limit, m."""
+    """Return the rejection reason for two bodies that are closer to each other than the clearance `limit`, m."""
     return Reason(Rejection.COLLISION, str(pair), " and ".join(pair.bodies), pair.distance, limit, pair.time, remedy)
 
 
 @dataclass(frozen=True, eq=False)
 class Seed:
-    """Guess from which a candidate is solved.
+    """Initial guess from which a candidate motion is solved, and how it is solved.
 
     Attributes:
         guess: Guess of the first solve.
         cost: Cost of the local motion; inf if there is none.
         local: Local motion in each stretch of time; () if there is none.
-        tracked: Whether the local motion does the tasks.
+        tracked: Whether the local motion satisfies the tasks.
         direct: Whether the first solve is on the fine mesh.
         fixed: Whether the start is fixed, though it could move along its self-motion.
         thorough: Whether a motion that fails is solved again with relaxed tasks.
@@ -123,7 +123,7 @@ class Seed:
     relaxed: bool = False
 
     def is_turned(self, other: Seed, turning: Sequence[int] | NDArray[np.intp]) -> bool:
-        """Return whether the local motions of two seeds are equal apart from full turns of the joints `turning`."""
+        """Return whether another initial guess is the same motion apart from full turns of the joints `turning`."""
         pairs = list(zip(self.local, other.local, strict=False))
         if not pairs or (self.direct, self.fixed, self.relaxed) != (other.direct, other.fixed, other.relaxed):
             return False
@@ -141,7 +141,7 @@ class Candidate:
     """Motion that may become the plan, with the state of its solution process.
 
     Attributes:
-        start: Initial joints of the search, rad or m. Shape (n,).
+        start: Start configuration of the search, rad or m. Shape (n,).
         cost: Cost of the motion, nan if none was found. Until it is solved on the fine mesh, it is an estimate, which
             further constraints can only increase.
         reason: Why it is not the plan; None for the plan.
@@ -186,7 +186,7 @@ class Candidate:
         return cls(np.array(start, dtype=float), float(cost), rejection, Stage(stage), motion)
 
     def record(self) -> list[Any]:
-        """Return start, cost, stage and reason as plain data for a file."""
+        """Return the start, cost, stage and reason of the candidate as plain data for a file."""
         return [self.start.tolist(), self.cost, int(self.stage), self.reason and self.reason.record()]
 
     @property
@@ -195,7 +195,7 @@ class Candidate:
         return self.reason is None
 
     def with_rejection(self, reason: Reason) -> Candidate:
-        """Return the candidate as rejected, for this reason or for an earlier collision that it led to."""
+        """Return the candidate as rejected, for `reason` or for the collision after which bodies were separated."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)

@@ -1,4 +1,4 @@
-"""Joint path of straight motions, through tool poses or to a goal, as a plan."""
+"""Plan that is a joint path of straight motions, through tool poses or to a goal."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ __all__ = ["PathPlan", "PathPoses"]
 POSE_TOLERANCE = 1e-6
 """Largest pose error at a waypoint, m and rad."""
 STEP_TOLERANCE = 1e-6
-"""Largest excess over a joint limit or a step, rad or m."""
+"""Largest excess over a joint limit or over the largest step between waypoints, rad or m."""
 UNLIMITED_RATE = 1.0
-"""Rate of joints without velocity limits by which a path is timed, rad/s or m/s."""
+"""Rate at which joints without velocity limits pass a path, rad/s or m/s."""
 UNDECIDED = "a path through waypoints is compared with its lower bound, not with its neighbours"
 
 
@@ -60,7 +60,7 @@ class PathPlan(Plan):
 
     Attributes:
         machine: The arm.
-        joints: Joints at the waypoints. Shape (N, n), rad or m.
+        joints: Joint positions at the waypoints. Shape (N, n), rad or m.
         limits: Limits of the joints.
         path_cost: Cost of the path, without reconfigurations.
         constraints: Collision scene; None without a collision check.
@@ -90,7 +90,7 @@ class PathPlan(Plan):
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
-        """None, because a path through waypoints solves no optimal control problem.
+        """Solution of an optimal control problem, which a path through waypoints does not have.
 
         Raises:
             ProblemError: Always.
@@ -100,7 +100,7 @@ class PathPlan(Plan):
 
     @property
     def targets(self) -> tuple[Target, ...]:  # type: ignore[override]
-        """Poses of the waypoints."""
+        """Tool poses that the path must reach at the waypoints, in world."""
         return () if self.poses is None else (Target(self.t, self.poses.positions, self.poses.rotations),)
 
     @property
@@ -180,7 +180,7 @@ class PathPlan(Plan):
         return f"the best of {len(self.candidates)} paths"
 
     def _pose_findings(self, poses: PathPoses) -> list[Finding]:
-        """Return the findings about the largest pose errors and about the largest excess of a joint step."""
+        """Return the audit findings about the largest pose errors and the largest excess of a joint step."""
         t, tips = self.t, tip_poses(self.machine, np.zeros((len(self.joints), 0)), self.joints)
         misses = np.abs(tips[:, :3] - poses.positions)
         turns = scipy.spatial.transform.Rotation.from_quat(
@@ -280,7 +280,7 @@ def _check_constraints(constraints: Any) -> None:
 def _largest(
     name: str, values: Array, limit: float, times: Array, names: tuple[str, ...] = (), unit: str = ""
 ) -> Finding:
-    """Return the finding about the largest positive entry of values, with one row per time."""
+    """Return the audit finding about the largest positive entry of `values`, which has one row per time."""
     if not values.size:
         return Finding(name, 0.0, limit, unit=unit)
     row, column = np.unravel_index(int(np.argmax(values)), values.shape)

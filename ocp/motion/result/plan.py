@@ -32,7 +32,7 @@ from ocp.tolerances import LIMIT_SHARE
 __all__ = ["CHECKED_TIMES", "Plan", "PlanSample"]
 
 CHECKED_TIMES = 2001
-"""Samples at which joint limits are checked, besides the times of the plan."""
+"""Number of samples at which joint limits are checked, besides the times of the plan."""
 TIME_TOLERANCE = 1e-9
 """Share of the horizon by which a time may lie outside it."""
 
@@ -112,20 +112,20 @@ class Plan(ABC):
 
     @abstractmethod
     def _values(self, name: str) -> Array:
-        """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
+        """Return the values of "joints", "rates" or "base" at the times `t` of the plan. Shape (M, n)."""
 
     @abstractmethod
     def _values_at(self, name: str, times: Array) -> Array:
-        """Return "joints", "rates", "accelerations" or "base" at times (M,) that have been checked. Shape (M, n)."""
+        """Return values of "joints", "rates", "accelerations" or "base" at checked times (M,). Shape (M, n)."""
 
     def __getitem__(self, name: str) -> Array:
-        """Return "joints", "rates" or "base" at the times `t`. Shape (M, n)."""
+        """Return the values of "joints", "rates" or "base" at the times `t` of the plan. Shape (M, n)."""
         if name not in self._names():
             raise require.unknown("name in a plan", name, self._names())
         return self._values(name)
 
     def at(self, time: Any) -> dict[str, Array]:
-        """Return "joints", "rates" and "base" at a time, each (n,), or at times (M,), each (M, n).
+        """Return the values of "joints", "rates" and "base" at a time, (n,) each, or at times (M,), (M, n) each.
 
         Raises:
             ProblemError: A time is not finite or outside 0 to the horizon.
@@ -192,7 +192,7 @@ class Plan(ABC):
         return tuple(self._audits.values())
 
     def limit_findings(self) -> list[Finding]:
-        """Return the findings about joints and rates that exceed the limits of the machine most."""
+        """Return the audit findings about the joint position and the joint rate that exceed their limits most."""
         robot, t = self.machine.robot, np.union1d(self.t, np.linspace(0.0, self.horizon, CHECKED_TIMES))
         at, findings = self.at(t), list[Finding]()
         for name, values, lower, upper in (
@@ -213,7 +213,7 @@ class Plan(ABC):
         return f"<Plan of {self.horizon:.6g} s: {len(self.names)} joints, {self._costs}, {self._counts}>"
 
     def __str__(self) -> str:
-        """Return cost, held joints, and rejected motions with their reasons, in at most 15 lines."""
+        """Return a text of at most 15 lines: cost, joints held at rest, and rejected motions with their reasons."""
         moving = [name for name in self.names if name not in self.held]
         lines = [f"plan of {self.horizon:.6g} s for {', '.join(moving)}: {self._costs}; {self._counts}"]
         if self.held:
@@ -297,7 +297,7 @@ class Plan(ABC):
         return JointTrajectory(self.names, sample.t, sample.joints, sample.rates, sample.accelerations)
 
     def table(self, period: float = 0.01) -> dict[str, Array]:
-        """Return columns by name, with a row every `period` s, for pandas, polars or pyarrow.
+        """Return the motion as a table of named columns, with a row every `period` s, for pandas, polars or pyarrow.
 
         They are `time` (s), the joints (rad or m), and `NAME.velocity` and `NAME.acceleration` of each. Shape (M,)
         each.
@@ -339,7 +339,7 @@ class Plan(ABC):
         return np.asarray(np.clip(times, 0.0, self.horizon))
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
-        """Return the poses of the tip at times (M,) that have been checked. Shape (M, 7)."""
+        """Return the poses of the machine's tip at checked times (M,). Shape (M, 7)."""
         return tip_poses(self.machine, bases, joints)
 
 

@@ -1,4 +1,4 @@
-"""Origin of a plan's problem as data, from which the reader of a plan file declares the problem again.
+"""Requests from which the reader of a plan file declares the optimal control problem of a plan again.
 
 A request names a builder and holds its arguments: machine, tasks, limits, weights and clearance constraints. They are
 written by the fields of their dataclasses, and read by the constructors, which check them. Functions of time (of a task
@@ -74,7 +74,7 @@ MACHINES = (FixedBase, FreeFloating, Standing, Stance)
 KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
 TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingObstacle: ("position", "rotation")}
-"""Fields that may be functions of time."""
+"""Fields of tasks and moving obstacles that may be functions of time."""
 
 
 def _machine_of(arguments: Mapping[str, Any]) -> Machine:
@@ -93,7 +93,7 @@ class MotionRequest:
     Attributes:
         builder: Name of the builder in BUILDERS.
         arguments: Arguments of the builder, by name. All but the tasks are for the machine with the joints in "held"
-            locked at the positions there.
+            locked at these positions.
     """
 
     builder: str
@@ -101,18 +101,18 @@ class MotionRequest:
 
     @property
     def machine(self) -> Machine:
-        """Machine of the problem."""
+        """Machine whose motion the problem describes."""
         return _machine_of(self.arguments)
 
     @property
     def held(self) -> Mapping[str, float]:
-        """Positions of the joints that the problem holds, by name."""
+        """Positions of the joints that stay at rest and are no variables of the problem, rad or m, by name."""
         held: Mapping[str, float] = self.arguments.get("held", {})
         return held
 
     @property
     def tasks(self) -> tuple[TipTask, ...]:
-        """Tasks of the problem."""
+        """Tip tasks that the problem contains as constraints."""
         tasks = self.arguments.get("tasks", ())
         return (tasks,) if isinstance(tasks, TipTask) else tuple(tasks)
 
@@ -120,7 +120,7 @@ class MotionRequest:
         return f"<MotionRequest of {self.builder!r}: {', '.join(self.arguments)}>"
 
     def problem(self) -> Problem:
-        """Declare the problem.
+        """Call the builder with its arguments to declare the optimal control problem again.
 
         Raises:
             ProblemError: As the builder.
@@ -139,7 +139,7 @@ def declared_motion(
     actuation: Actuation | None = None,
     relaxed: bool = False,
 ) -> ToolMotion:
-    """Declare the optimal control problem of a request; the result can be declared again from a file.
+    """Declare the optimal control problem of a request, and note in it how a plan file can declare it again.
 
     Args:
         request: The request.
@@ -185,7 +185,7 @@ BUILDERS: dict[str, Callable[..., Problem]] = {
     "joint motion": joint_motion_problem,
 }
 MACHINE_NAMES = ("machine", "chaser")
-"""Arguments that are the machine of a motion."""
+"""Names of the builder arguments that hold the machine."""
 
 
 def machines_of_phases(request: MotionRequest | None) -> tuple[Machine, ...]:
@@ -213,7 +213,7 @@ def request_of(problem: Problem | None) -> MotionRequest | None:
 
 
 def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a request as a record of names, numbers and arrays.
+    """Return a request as a record of names, numbers and arrays for a file.
 
     Raises:
         ProblemError: An argument is not data, such as a machine of another kind or a Python callback.
@@ -267,7 +267,7 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _scene_fields(scene: CollisionScene) -> dict[str, Any]:
-    """Return the arguments of a collision scene, with the bodies that cover meshes instead of mesh files."""
+    """Return the arguments of a collision scene, with the bodies that enclose meshes instead of mesh files."""
     return {
         "obstacles": scene.obstacles,
         "clearance": scene.clearance,
@@ -365,7 +365,7 @@ def _of_time(function: Any) -> Any:
 
 
 def _mesh_covers(written: Mapping[str, Any]) -> dict[tuple[str, int], tuple[Body, ...]]:
-    """Return the bodies that cover each mesh, by the link and the index of the mesh among its collision shapes."""
+    """Return the bodies that enclose each mesh, by link and index of the mesh among the link's collision shapes."""
     bodies = {}
     for place, (points, shapes) in written.items():
         link, _, number = place.rpartition("/")

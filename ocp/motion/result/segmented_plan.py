@@ -39,7 +39,7 @@ class Reconfiguration:
 
     Attributes:
         time: Time of the tasks, which wait, s.
-        before, after: Joints, rad or m. Shape (n,).
+        before, after: Configurations, rad or m. Shape (n,).
         motion: Collision-free motion within the rate limits; unlike in a plan, its joints do not start at rest. None if
             none was found, which does not prove that there is none.
         failure: Why there is no motion; "" otherwise.
@@ -96,12 +96,12 @@ class ConsecutivePlans(Plan):
 
     @property
     def cost(self) -> float:
-        """Sum of the costs."""
+        """Sum of the costs of the consecutive plans; reconfigurations do not count."""
         return float(sum(plan.cost for plan in self._plans))
 
     @property
     def bound(self) -> float | None:  # type: ignore[override]
-        """Sum of the lower bounds of all plans, for fixed ends; None if one of them is unknown."""
+        """Sum of the lower bounds of the consecutive plans, each between fixed ends; None if one is unknown."""
         bounds = [plan.bound for plan in self._plans]
         return None if None in bounds else float(sum(bounds))  # type: ignore[arg-type]
 
@@ -112,17 +112,17 @@ class ConsecutivePlans(Plan):
 
     @property
     def targets(self) -> tuple[Target, ...]:  # type: ignore[override]
-        """Targets of all plans."""
+        """Target poses of the tasks of all consecutive plans, in world."""
         return tuple(
             target._replace(t=target.t + piece.begin) for piece in self.pieces for target in piece.plan.targets
         )
 
     @property
     def solution(self) -> Solution:  # type: ignore[override]
-        """The solution, if the whole plan consists of a single one; else None.
+        """Solution of the optimal control problem of the plan, if it consists of a single motion.
 
         Raises:
-            ProblemError: There are several.
+            ProblemError: There are several motions.
         """
         if len(self.pieces) == 1:
             return self.pieces[0].plan.solution
@@ -131,13 +131,13 @@ class ConsecutivePlans(Plan):
 
     @property
     def horizon(self) -> float:
-        """Duration of all plans, s."""
+        """Total duration of the consecutive plans, s."""
         last = self.pieces[-1]
         return last.begin + last.plan.horizon
 
     @property
     def t(self) -> Array:
-        """Times of the grids of all segments, s; a time between two segments occurs twice. Shape (M,)."""
+        """Times of the grids of the consecutive plans, s; a time between two plans occurs twice. Shape (M,)."""
         return np.concatenate([piece.begin + piece.plan.t for piece in self.pieces])
 
     def _values(self, name: str) -> Array:
@@ -154,7 +154,7 @@ class ConsecutivePlans(Plan):
         return values
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solved parts of all plans; see `Plan.solved_parts`."""
+        """Return the solutions of all consecutive plans; see `Plan.solved_parts`."""
         pieces = self.pieces
         which = np.searchsorted([piece.begin for piece in pieces], times, side="right") - 1
         parts: list[tuple[Solution, str, Array]] = []
@@ -189,12 +189,12 @@ class ConsecutivePlans(Plan):
         return Audit(self.kind, tuple(findings), undecided, clearances=clearances)
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the findings about jumps of joints and base at the junctions."""
+        """Return the audit findings about jumps of joint and base positions between consecutive motions."""
         names = ("joints", *(("base",) if self.machine.base_size else ()))
         return [self._jump_finding(name) for name in names] if len(self.pieces) > 1 else []
 
     def _jump_finding(self, name: str) -> Finding:
-        """Return the finding about the largest jump of "joints", "rates" or "base" between consecutive motions."""
+        """Return the audit finding about the largest jump of "joints", "rates" or "base" between two motions."""
         jumps = [
             np.abs(after.plan.at(0.0)[name] - before.plan.at(before.plan.horizon)[name])
             for before, after in pairwise(self.pieces)
@@ -237,7 +237,7 @@ class SequencePlan(ConsecutivePlans):
         return poses
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the findings about jumps of joints and base at junctions, and of rates that must be continuous."""
+        """Return the audit findings about jumps of joints, base, and rates that must be continuous, between motions."""
         rates = [self._jump_finding("rates")] if self.smooth and len(self.parts) > 1 else []
         return super()._junction_findings() + rates
 
@@ -308,7 +308,7 @@ class SegmentedPlan(ConsecutivePlans):
 
     @property
     def held(self) -> Mapping[str, float]:  # type: ignore[override]
-        """Joints that stand still in all segments."""
+        """Positions of the joints that stay at rest in all segments, rad or m, by name."""
         return self.segments[0].held
 
     @property
@@ -336,7 +336,7 @@ class SegmentedPlan(ConsecutivePlans):
         return np.asarray(np.minimum(task_times / self.task_horizon, 1.0))
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the findings about reconfigurations without a motion, and about jumps of joints."""
+        """Return the audit findings about reconfigurations without a motion, and about jumps of joints."""
         if not self.reconfigurations:
             return []
         missing = [each for each in self.reconfigurations if each.motion is None]

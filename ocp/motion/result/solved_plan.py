@@ -32,11 +32,11 @@ __all__ = ["PHASED", "Part", "PhasedPlan", "SolvedPlan", "parts_of", "parts_of_p
 
 RATES = ("rates", SLOPES, "velocities")
 PHASED = "plan.phased"
-"""Name of an array in the files of these plans."""
+"""Name of the array that marks the file of a plan of several phases."""
 PHASED_RATES = "velocities"
 """Name of the joint rates in the solution of a problem of several phases."""
 TARGET_TIMES = 401
-"""Samples at which a plan keeps the targets of its tasks."""
+"""Number of times at which a plan stores the target poses of its tasks."""
 
 
 class Part(NamedTuple):
@@ -53,7 +53,7 @@ class SolvedPlan(Plan):
 
     Attributes:
         solution: The solution.
-        parts: Intervals of time with the same tasks; in the solution they run side by side.
+        parts: Intervals of time with the same tasks, which share one normalised time in the solution.
         machine, candidates, bound, targets, held: As in `Plan`.
     """
 
@@ -93,7 +93,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, np.concatenate([self.solution[own + part.suffix] for part in self.parts]))
 
     def _of_all_joints(self, name: str, values: Array) -> Array:
-        """Return joint values of the solution, (M, m), extended by the joints that are held."""
+        """Return joint values of the solution (M, m), extended by the joints that stay at rest."""
         return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
 
     def _values_at(self, name: str, times: Array) -> Array:
@@ -108,7 +108,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, self._over(times, values))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solution, once for each part; see `Plan.solved_parts`."""
+        """Return the solution once for each time interval (part) of the plan; see `Plan.solved_parts`."""
         begins = [part.begin for part in self.parts]
         which = np.clip(np.searchsorted(begins, times, "right") - 1, 0, len(begins) - 1)
         return [
@@ -218,7 +218,7 @@ class SolvedPlan(Plan):
     # ---- time of the motion and time of the solution -----------------------------------------------------------------
 
     def _check_parts(self) -> None:
-        """Raise ValueError unless the parts match the solution, and its joints match the machine."""
+        """Raise ValueError unless the time intervals of the plan and its machine match the solution."""
         ends = [0.0, *(part.end for part in self.parts)]
         contiguous = all(part.begin == end < part.end for part, end in zip(self.parts, ends, strict=False))
         clock = self.solution.states.get(CLOCK)
@@ -237,12 +237,12 @@ class SolvedPlan(Plan):
 
     @property
     def rate_name(self) -> str:
-        """Name of the joint rates in the solution; SLOPES are derivatives by task time, to be divided by the pace."""
+        """Name of the joint rates in the solution. SLOPES, with respect to task time, are divided by the pace."""
         names = {**self.solution.states, **self.solution.controls}
         return next(name for name in RATES if name + self.parts[0].suffix in names)
 
     def accelerations(self, part: Part, fraction: Array) -> Array:
-        """Return the accelerations of the joints of the solution at fractions (M,) of a part. Shape (M, m)."""
+        """Return the joint accelerations at fractions (M,) of a time interval (part) of the plan. Shape (M, m)."""
         sample, duration = self.solution.at_fraction(fraction), part.end - part.begin
         name = self.rate_name + part.suffix
         if "accelerations" + part.suffix in sample:
@@ -254,7 +254,7 @@ class SolvedPlan(Plan):
         return np.asarray((slope * pace - sample[name] * change) / pace**3 / self.solution.horizon)
 
     def _slope(self, name: str, fraction: Array) -> Array:
-        """Return the derivative of a state or control by the horizon fraction. Shape (M, n)."""
+        """Return the derivative of a state or control with respect to the horizon fraction. Shape (M, n)."""
         is_state = name in self.solution.states
         pool = self.solution.states if is_state else self.solution.controls
         interpolant = self.solution.state_interpolant if is_state else self.solution.control_interpolant
@@ -262,7 +262,7 @@ class SolvedPlan(Plan):
         return np.asarray(interpolant.derivative()(fraction)[:, offset : offset + pool[name].shape[1]])
 
     def _fractions(self, part: Part, times: Array) -> Array:
-        """Return the fractions of the solution's horizon at times (M,) of a part."""
+        """Return the fractions of the solution's horizon that belong to times (M,) in a time interval of the plan."""
         if CLOCK not in self.solution.states:
             return np.asarray(np.clip((times - part.begin) / (part.end - part.begin), 0.0, 1.0))
         low, high = np.zeros(len(times)), np.ones(len(times))
@@ -273,7 +273,10 @@ class SolvedPlan(Plan):
         return np.asarray((low + high) / 2)
 
     def _over(self, times: Array, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate each part at those of the times (M,) that it covers; a junction belongs to the later part."""
+        """Evaluate a quantity at times (M,), each in the time interval (part) of the plan that contains it.
+
+        `evaluate` takes a part and fractions of the solution's horizon. A junction belongs to the later part.
+        """
         begins = [part.begin for part in self.parts]
         which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(self.parts) - 1)
         result: Array | None = None
@@ -286,7 +289,7 @@ class SolvedPlan(Plan):
 
 
 def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
-    """Return the parts of a plan: the time interval and the name suffix of each stretch."""
+    """Return the time interval and the name suffix of each part of a plan, one for each stretch of time."""
     return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)
 
 
@@ -342,7 +345,7 @@ class PhasedPlan(SolvedPlan):
         )
 
     def _in_order(self, part: Part, name: str, values: Array) -> Array:
-        """Return joint values of a phase in the joint order of the first machine."""
+        """Return joint values of a phase in the joint order of the first phase's machine."""
         return values if name == "base" else values[:, self._joint_indices[part.suffix]]
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
@@ -379,5 +382,5 @@ class PhasedPlan(SolvedPlan):
 
 
 def parts_of_phases(solution: Solution) -> tuple[Part, ...]:
-    """Return the parts of a plan: the time interval and the name of each phase."""
+    """Return the time interval and the name of each part of a plan, one for each phase."""
     return tuple(Part(begin, end, name) for name, (begin, end) in solution.phases.items())

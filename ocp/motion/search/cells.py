@@ -1,14 +1,14 @@
-"""Low-cost motions of machines with a moving base: forward search over exact states, pruned by cells.
+"""Forward search for low-cost motions of machines with a moving base, pruned by a grid over joints and base attitude.
 
-What such a machine can reach is no manifold of configurations at each time, since the attitude of the base depends on
-the path. The search therefore keeps states that were reached by exact integration of the tasks. Of the states that fall
-into one cell of joints and attitude, it keeps the one reached at least cost. From each state, a fan of self-motions
-leads on. The cells are as large as the number of states requires. The tried rates are in proportion to the cost that a
-motion may have: searches with few states estimate this cost, and the last one, with many states, covers all motions
-within a multiple of it.
+The configurations that such a machine can reach at a time do not form a manifold, since the attitude of the base
+depends on the path. The search therefore keeps states that were reached by exact integration of the tasks. Of the
+states in one cell of a grid over joint positions and attitude, it keeps the one reached at least cost. Each state is
+continued with several self-motions. The cells are as large as the number of states requires. The largest rate of a
+self-motion follows from the largest cost that a motion may have: runs with few states estimate this cost, and the last
+run, with many states, covers all motions within a multiple of it.
 
-Each final state has a path. Paths that cost less than all neighbouring ones represent the classes of motions, and are
-guesses for the optimal control problem. The search proves nothing: it may miss a motion through a passage narrower
+Each final state has a path. Paths that cost less than all neighbouring ones are initial guesses for the optimal control
+problem. The search proves nothing: it may miss a motion through a passage narrower
 than a cell, and gives no bound.
 """
 
@@ -37,27 +37,27 @@ __all__ = ["CellSearch", "tracks_tasks"]
 Indices = NDArray[np.intp]
 
 MAX_VELOCITY_ERROR = 0.1
-"""Largest share of the prescribed tip displacement that a local motion may miss under velocity tasks."""
+"""Accepted integral of the tip's velocity error under velocity tasks, relative to that of the prescribed speed."""
 
 
 @dataclass(frozen=True)
 class CellSettings:
-    """Resolution of the search.
+    """Settings of the cell search, such as the numbers of states and of time steps.
 
     Attributes:
-        states: States kept at each time, of 1 kB each.
-        few: Share of these that the searches keep which estimate the cost.
-        searches: Largest number of searches, including those that end early, whose cost limit is then raised.
+        states: Largest number of states kept at each time, of 1 kB each.
+        few: Share of this number that is kept in the runs which estimate the cost.
+        searches: Largest number of runs, including those that end early and are repeated with a higher cost limit.
         max_cost_ratio: Motions that cost more than so many times the best one are not searched.
         steps: Least number of time steps.
-        halvings: Largest number of halvings of a step that leaves no state.
-        levels: Rates of a one-dimensional self-motion; for more directions, that many more are drawn at random.
+        halvings: Largest number of halvings of a time step after which no state is left.
+        levels: Number of rates tried for a one-dimensional self-motion; for dimension r, r times as many random ones.
         longest: Largest joint displacement in one step, rad or m.
-        growth, narrowest: Factor by which cells are resized to fit the number of states, and least size, rad or m.
-        corrections: Newton steps from a state to the poses of tasks that begin.
-        neighbours: Paths with which a path is compared, for each free direction.
-        seats: Times at which they are compared.
-        classes: Largest number of paths returned, the cheapest first.
+        growth, narrowest: Factor by which cells are resized to fit the number of states; least size, rad or m.
+        corrections: Largest number of Newton steps that move a state to the poses of tasks that begin.
+        neighbours: Number of paths with which a path is compared, per dimension of the self-motion.
+        seats: Number of times at which paths are compared.
+        classes: Largest number of paths that are returned, the lowest cost first.
     """
 
     states: int = 2000
@@ -77,7 +77,7 @@ class CellSettings:
 
 
 def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArray[np.bool_]:
-    """Return which of K local motions reach their poses and track most of the prescribed velocities."""
+    """Return which of K local (resolved-rate) motions reach their poses and track their prescribed velocities."""
     count = len(motions[0].cost)
     missing, prescribed = np.zeros(count), np.zeros(count)
     for stretch, motion in zip(request.stretches, motions, strict=True):
@@ -92,12 +92,12 @@ def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArra
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """States that the search reaches at one time.
+    """States (base and joint positions) that the search reaches at one time.
 
     Attributes:
         time: s.
-        base, joints: Shapes (K, b), (K, n).
-        cost: Cost until then. Shape (K,).
+        base, joints: Positions of base and joints. Shapes (K, b), (K, n).
+        cost: Cost of the motion up to this time. Shape (K,).
         parent: Index of the preceding state in the layer before. Shape (K,).
     """
 
@@ -112,15 +112,15 @@ class _Layer:
 
 
 class CellSearch:
-    """Cell search for motions of a floating machine, from start configurations through all stretches of a request."""
+    """Forward search, pruned by grid cells, for motions of a floating machine that perform all tasks of a request."""
 
     def __init__(self, request: PlanRequest, configurations: Array, settings: CellSettings = CellSettings()) -> None:
-        """Run the search passes, from few states to many.
+        """Run the search several times, first with few states and at last with many.
 
         Args:
             request: The request.
-            configurations: Joints at the start. Shape (K, n).
-            settings: Resolution of the search.
+            configurations: Joint configurations at the start. Shape (K, n).
+            settings: Settings of the search.
 
         Raises:
             Unreachable: From some time on, a task is out of reach for any attitude of the base.
@@ -164,7 +164,7 @@ class CellSearch:
             raise locate_error(request, unreachable, unreachable.time) from error
 
     def _cost_estimate(self, configurations: Array) -> float:
-        """Estimate the cost of the tasks from the rates that the best start configuration requires for them."""
+        """Estimate the cost of the tasks from the joint rates that they require at the best start configuration."""
         request, total, count = self.request, 0.0, self._settings.seats
         base = np.tile(request.base, (len(configurations), 1))
         for stretch, kinematics in zip(request.stretches, self._kinematics, strict=True):
@@ -174,18 +174,18 @@ class CellSearch:
         return total
 
     def local_motions(self) -> list[list[LocalMotion]]:
-        """Return the lowest-cost motion of each class for each search pass, the largest pass first."""
+        """Return the locally lowest-cost motions that each run of the search found, the last run first."""
         return [search.local_motions() for search in reversed(self._searches)]
 
 
 class _CellPass:
-    """One pass of the cell search, with a limited cost and a limited number of states.
+    """One run of the cell search, over motions of limited cost and with a limited number of states at each time.
 
     Attributes:
         cost: Cost of the best path.
         layers: States at each time.
         max_cost: Largest cost of a motion.
-        states: Largest number of states.
+        states: Largest number of states at each time.
     """
 
     def __init__(
@@ -197,7 +197,7 @@ class _CellPass:
         seed: int,
         settings: CellSettings,
     ) -> None:
-        """Set up a pass over motions of limited cost; with `full`, it keeps the full number of states."""
+        """Prepare a run over motions of limited cost; with `full`, it keeps the full number of states at each time."""
         self.request, self.kinematics, self.max_cost, self._settings = request, kinematics, max_cost, settings
         self.states = settings.states if full else int(settings.few * settings.states)
         self.root, self._rng = np.sqrt(request.weights), np.random.default_rng(seed)
@@ -207,10 +207,10 @@ class _CellPass:
         self.cost = np.inf
 
     def search(self, configurations: Array) -> None:
-        """Search from start configurations (K, n) to the end of the request.
+        """Search from start configurations (K, n) to the end of the requested tasks.
 
         Raises:
-            DeadEnd: No state reaches it.
+            DeadEnd: No state reaches the end.
         """
         request, layers = self.request, self.layers
         count = len(configurations)
@@ -239,10 +239,10 @@ class _CellPass:
     def _expand(
         self, kinematics: ReducedKinematics, layer: _Layer, task: TaskKinematics, time: float, limited: bool
     ) -> tuple[_Layer | None, Counter[tuple[int, int]]]:
-        """Propagate the states of a layer to a time; return the best state of each cell, or None if none remains.
+        """Propagate the states of one time to a later time, and keep the lowest-cost state in each grid cell.
 
-        Also count, if the joints are `limited`, the states that each limit of each joint stops, by (joint,
-        `LimitSide`).
+        Return None if no state remains. If the joints are `limited`, also count the states that each joint limit
+        stops, by (joint, `LimitSide`).
         """
         request, step, root = self.request, time - layer.time, self.root
         self_motions = self._sample_self_motions(len(layer.cost), task.null.shape[2])
@@ -283,7 +283,7 @@ class _CellPass:
         return expanded.select(best), limit_counts
 
     def _sample_self_motions(self, count: int, r: int) -> Array:
-        """Return random self-motions of each state as coordinates in its null space. Shape (count, C, r)."""
+        """Return self-motion rates to try from each state, as null-space coordinates. Shape (count, C, r)."""
         levels = self._settings.levels
         share = np.linspace(-1.0, 1.0, levels)
         rates = self._max_rate * np.sign(share) * share**2  # finer near zero, where most motions are
@@ -296,12 +296,15 @@ class _CellPass:
         return np.asarray(samples)
 
     def _best_of_cells(self, base: Array, joints: Array, cost: Array, resize: bool) -> Indices:
-        """Return the lowest-cost state of each cell; with `resize`, the cells adapt to the number of states."""
+        """Return the indices of the lowest-cost states in the grid cells, whose size adapts to the number of states.
+
+        The cells grow if there are more states than may be kept. Only with `resize`, they also shrink if there are few.
+        """
         attitude = base[:, 2:] if base.shape[1] == 3 else 2 * base[:, 3:]
         points = np.hstack([joints * self.root, attitude * np.sqrt(np.mean(self.root**2))])
         hash_weights = np.random.default_rng(0).uniform(1.0, 2.0, size=points.shape[1])
         order = np.argsort(cost, kind="stable")
-        # without the offset, coordinates of either sign would form cells of their own
+        # without the offset, coordinates of opposite sign would never share a cell
         points = points[order] - points.min(axis=0)
 
         def winners(width: float) -> Indices:
@@ -320,7 +323,7 @@ class _CellPass:
         return best
 
     def _valid_states(self, kinematics: ReducedKinematics, layer: _Layer) -> NDArray[np.bool_]:
-        """Return which states satisfy tilt limits and clearance. Shape (K,)."""
+        """Return which states satisfy the tilt limits of the tool and the required clearance. Shape (K,)."""
         valid, times = np.isfinite(layer.cost), np.full(len(layer.cost), layer.time)
         if kinematics.equations is not None and len(times):
             cone_violations = kinematics.equations.cone_violations(times, layer.base, layer.joints)
@@ -334,7 +337,7 @@ class _CellPass:
         return np.asarray(valid)
 
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
-        """Correct states to the poses of tasks that begin at their time, and return the corrected states."""
+        """Return the states of one time, corrected to the poses of the tasks that begin then."""
         states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
         corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
         base, joints, pose_error = corrected
@@ -345,7 +348,7 @@ class _CellPass:
         return _Layer(layer.time, base, joints, cost, np.arange(len(cost))).select(reached)
 
     def _dead_end_error(self, layer: _Layer, limit_counts: Counter[tuple[int, int]]) -> DeadEnd:
-        """Return the error that no state can be continued, with the limit that stops most states."""
+        """Return the error that says that no state can be continued, and which joint limit stops most of them."""
         bounds, names = self.request.bounds, self.request.machine.robot.joint_names
         details: dict[str, Any] = {"time": layer.time, "name": "task"}
         words = "the joint rates would diverge: the tasks lead beyond the workspace or through a singularity"
@@ -363,7 +366,7 @@ class _CellPass:
     # ---- results -----------------------------------------------------------------------------------------------------
 
     def local_motions(self) -> list[LocalMotion]:
-        """Return the lowest-cost motion of each class through all stretches."""
+        """Return the locally lowest-cost motions, one result for each time interval (stretch) with the same tasks."""
         layers, request = self.layers, self.request
         final, states = layers[-1], np.arange(len(layers[-1].cost))
         paths = np.empty((len(layers), len(states)), dtype=np.intp)
@@ -389,7 +392,7 @@ class _CellPass:
         return motions
 
     def _local_motion(self, layers: Sequence[_Layer], paths: Indices) -> LocalMotion:
-        """Return motions along paths through layers; rows of `paths` (L, K) are the indices of the states."""
+        """Return the motions through given states; row `paths[k]` (K,) holds their indices at the k-th of L times."""
         times = np.array([layer.time for layer in layers])
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)

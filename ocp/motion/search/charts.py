@@ -1,11 +1,11 @@
 """Atlas of the self-motion manifold: charts that cover all configurations that perform a task at some time samples.
 
-If a task leaves r of n joint directions free, the configurations that do it at one time form curves (r = 1), surfaces
-(r = 2) or isolated points (r = 0). A chart consists of a configuration, an orthonormal basis of the tangent space
-there (the self-motions), and a box in the tangent space near the manifold.
+If a task leaves r of n degrees of freedom undetermined, the configurations that satisfy it at one time form curves
+(r = 1), surfaces (r = 2) or isolated points (r = 0). A chart consists of a configuration (its centre), an orthonormal
+basis of the tangent space there (the self-motions), and a box in this tangent space, which is near the manifold.
 
 The atlas grows from the solutions of inverse kinematics at all time samples. Wherever the edge of a chart lies in no
-other chart, the next chart is put there, until the charts have no edge except at the joint limits (Henderson 2002, Int.
+other chart, a further chart is added, until the charts have no edge except at the joint limits (Henderson 2002, Int.
 J. Bifurcation and Chaos 12). Components are covered completely, also at folds and bifurcations.
 """
 
@@ -36,17 +36,17 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class ChartSettings:
-    """Settings of the atlas.
+    """Settings of the atlas of charts that covers a self-motion manifold.
 
     Attributes:
-        corrections: Largest number of Newton steps of a projection.
-        spacing: Share of its radius by which a chart is put beyond the edge that it covers; the rest is overlap.
-        flatness: Largest distance of the manifold from a chart, relative to the radius, by the number of free
-            directions. With two, half the value takes two to three times as long, and twice the value loses bounds.
-        halvings: Largest number of halvings of the radius; the atlas ends closer to singular configurations.
-        listed: Samples of the free parameters at which configurations on all branches are listed.
-        starts: Random starts of inverse kinematics at a time sample.
-        neighbours: Charts in which a point of an edge is searched.
+        corrections: Largest number of Newton steps of a projection onto the manifold.
+        spacing: Distance of a chart's centre from the edge that it covers, relative to its radius; the rest is overlap.
+        flatness: Largest distance of the manifold from a chart, relative to its radius, by its dimension. For surfaces,
+            half the value takes two to three times as long, and twice the value loses some cost bounds.
+        halvings: Largest number of halvings of the radius; the more, the closer the atlas gets to singularities.
+        listed: Number of samples of the free parameters at which a solver lists the configurations on all branches.
+        starts: Number of random starts of inverse kinematics at a time sample.
+        neighbours: Number of nearest charts that are tested for whether they cover a configuration.
     """
 
     corrections: int = 12
@@ -60,7 +60,7 @@ class ChartSettings:
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """Charts of the self-motion manifolds at some time samples: boxes in tangent spaces.
+    """Charts of the self-motion manifolds at some time samples, each a box in a tangent space.
 
     Attributes:
         layer: Index of the time sample. Shape (N,).
@@ -68,7 +68,7 @@ class Charts:
         tangents: Basis of the tangent space, orthonormal in the metric. Shape (N, n, r).
         radii: Half widths of the boxes, in the metric. Shape (N,).
         low, high: Ends of the boxes, cut where the joint limits are nearer. Shape (N, r).
-        deviations: Vectors from the c points of `_rim` on the box to the manifold. Shape (N, c, n).
+        deviations: Vectors to the manifold from the c points of `_rim` on each box. Shape (N, c, n).
     """
 
     layer: Indices
@@ -83,29 +83,29 @@ class Charts:
         return len(self.layer)
 
     def select(self, chosen: Any) -> Charts:
-        """Return the charts with the given indices."""
+        """Return those charts of the self-motion manifolds that have the given indices."""
         return Charts(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
     @property
     def spans(self) -> Array:
-        """Largest distance of the charts from their centres in each joint. Shape (N, n)."""
+        """Largest displacement of each joint from the centre of a chart to a point in the chart. Shape (N, n)."""
         reach = np.maximum(np.abs(self.low), np.abs(self.high))
         return np.asarray((np.abs(self.tangents) * reach[:, None]).sum(axis=2) + self.max_deviation)
 
     @property
     def max_deviation(self) -> Array:
-        """Largest distance, in each joint, of the manifold from the tangent boxes. Shape (N, n)."""
+        """Largest deviation of the manifold from each tangent box, for each joint. Shape (N, n)."""
         return np.asarray(np.abs(self.deviations).max(axis=1, initial=0.0))
 
     def points(self, places: Array) -> Array:
-        """Return the points (N, n) of the tangent spaces at chart coordinates (N, r)."""
+        """Return the points of the tangent spaces, (N, n), that have given chart coordinates, (N, r)."""
         return np.asarray(self.centers + np.einsum("knr,kr->kn", self.tangents, places))
 
     def curvature(self) -> tuple[Array, Array]:
-        """Fit quadratic forms to the distances of the manifold from the tangent boxes by least squares.
+        """Fit quadratic forms in the chart coordinates to the manifold's deviations from its charts (least squares).
 
         Returns:
-            The form, (N, n, r, r), and the residuals at the rim, (N, c, n).
+            The forms, (N, n, r, r), and their residuals at the points of `_rim`, (N, c, n).
         """
         r = self.tangents.shape[2]
         rim, count = _rim(r), self.deviations.shape[1]
@@ -120,23 +120,23 @@ class Charts:
 
 
 def point_chart(joints: Array) -> Charts:
-    """Return the chart of a single configuration (n,)."""
+    """Return a chart of dimension 0, which contains a single configuration (n,)."""
     n, empty = len(joints), np.zeros((1, 0))
     deviations = np.zeros((1, 0, n))
     return Charts(np.zeros(1, dtype=np.intp), joints[None], np.zeros((1, n, 0)), np.zeros(1), empty, empty, deviations)
 
 
 def concatenate(parts: list[Charts]) -> Charts:
-    """Return several sets of charts as one."""
+    """Concatenate several sets of charts of the self-motion manifolds."""
     return Charts(*(np.concatenate([getattr(part, name) for part in parts]) for name in Charts.__dataclass_fields__))
 
 
 class SplitCharts(NamedTuple):
-    """Charts of half the radius that replace others.
+    """Manifold charts of half the radius that replace larger charts.
 
     Attributes:
-        charts, owners: N charts, and the rows of the charts that they replace, (N,).
-        low, high: Ends of the replaced part in the box of the owner. Shape (N, r).
+        charts, owners: N charts, and the indices of the charts that they replace, (N,).
+        low, high: Ends of the part that each of them replaces in the box of the larger chart. Shape (N, r).
     """
 
     charts: Charts
@@ -146,13 +146,13 @@ class SplitCharts(NamedTuple):
 
 
 class _Edges(NamedTuple):
-    """Points of the manifold at the edges of charts, from which the search continues to cover it.
+    """Manifold points at the edges of charts, from which the atlas is extended.
 
     Attributes:
-        layer, owners: Indices of the time samples and rows of the charts. Shape (E,).
+        layer, owners: Indices of the time samples and of the charts. Shape (E,).
         points: Configurations. Shape (E, n).
         directions: Unit vectors that lead away from the chart. Shape (E, n).
-        radii: Radii of the charts to be put there. Shape (E,).
+        radii: Radii of the charts that are to cover these points. Shape (E,).
     """
 
     layer: Indices
@@ -200,9 +200,9 @@ class SelfMotionManifolds:
         return ik_branches(self.equations, self.space.lower, self.space.upper)
 
     def seeds(self, index: int, limits: Any, seed: int) -> Array:
-        """Return configurations (K, n) of a time sample within limits, on as many manifold components as possible.
+        """Return configurations that satisfy the task at a time sample, on as many manifold components as possible.
 
-        A solver lists some of every branch. Iterations from random starts add others, unless all are listed.
+        Shape (K, n), within limits. A solver lists some of every branch. Random starts add others unless all are known.
 
         Raises:
             Unreachable: No configuration was found.
@@ -224,7 +224,7 @@ class SelfMotionManifolds:
         return np.vstack([listed, *(solution.joints for solution in random)])
 
     def linearize(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
-        """Return the task errors (M, m) and their Jacobians by the scaled joints (M, m, n)."""
+        """Return the task errors (M, m) and their Jacobians with respect to the scaled joint positions (M, m, n)."""
         error, jacobian = self._sampler(joints, self.targets[layer])
         m, n = error.shape[1], joints.shape[1]
         return error, jacobian.reshape(-1, n, m).transpose(0, 2, 1) / self.space.scale
@@ -248,10 +248,10 @@ class SelfMotionManifolds:
         return projected, converged
 
     def tangents_at(self, layer: Indices, joints: Array, like: Array | None = None) -> Array:
-        """Return tangent bases at configurations (M, n), orthonormal in the metric. Shape (M, n, r).
+        """Return bases (M, n, r) of the manifolds' tangent spaces at configurations (M, n), orthonormal in the metric.
 
         Args:
-            like: Bases with which they are aligned as closely as possible. Shape (M, n, r).
+            like: Bases to which the returned ones are aligned as closely as possible. Shape (M, n, r).
         """
         _, jacobian = self.linearize(layer, joints)
         r = self.size if like is None else like.shape[2]
@@ -265,7 +265,7 @@ class SelfMotionManifolds:
     # ---- charts ------------------------------------------------------------------------------------------------------
 
     def charts_at(self, layer: Indices, joints: Array, radii: Array, like: Array | None = None) -> tuple[Charts, Array]:
-        """Return charts at configurations, with radii that are halved until the manifold is flat enough.
+        """Return charts centred at configurations; their radii are halved until the manifold is nearly flat in them.
 
         Returns:
             The charts, and the points of the manifold at their rims, nan where none was found. Shape (N, c, n).
@@ -288,7 +288,7 @@ class SelfMotionManifolds:
         return self._clip_boxes(layer, joints, tangents, radii, deviations), points
 
     def _clip_boxes(self, layer: Indices, joints: Array, tangents: Array, radii: Array, deviations: Array) -> Charts:
-        """Shrink the boxes of charts such that they end at the joint limits."""
+        """Return charts with given centres and radii, whose tangent boxes are shrunk to end at the joint limits."""
         deviations = np.nan_to_num(deviations)
         max_deviation = np.abs(deviations).max(axis=1, initial=0.0)
         reach = np.abs(tangents) * radii[:, None, None]
@@ -305,7 +305,7 @@ class SelfMotionManifolds:
         return Charts(layer, joints, tangents, radii, -low, high, deviations)
 
     def _deviations(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
-        """Return the manifold points at the rims of boxes, nan where none was found, and their offsets from boxes."""
+        """Return manifold points near the rims of tangent boxes (nan if not found), and their offsets from the rims."""
         rim = _rim(tangents.shape[2])
         tangent_points = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
         projected, converged = self.project(np.repeat(layer, len(rim)), tangent_points.reshape(-1, joints.shape[1]))
@@ -313,20 +313,20 @@ class SelfMotionManifolds:
         return projected, projected - tangent_points
 
     def within_limits(self, charts: Charts) -> NDArray[np.bool_]:
-        """Return which charts lie at least partly within the joint limits. Shape (N,)."""
+        """Return which manifold charts lie at least partly within the joint limits. Shape (N,)."""
         low, high = charts.centers - charts.spans, charts.centers + charts.spans
         reached = ((high >= self.space.lower) & (low <= self.space.upper)).all(axis=1)
         return np.asarray(reached & (charts.low <= charts.high).all(axis=1))
 
     def cover(self, layer: Indices, joints: Array, radius: float, max_charts: int) -> Charts:
-        """Cover all components of the manifold that contain given configurations, within and across time samples.
+        """Return charts that cover the manifold components of given configurations, also at neighbouring time samples.
 
         Args:
             layer, joints: Indices of time samples and configurations on their manifolds. Shapes (M,), (M, n).
             radius, max_charts: Largest radius and largest number of charts.
 
         Raises:
-            ProblemError: The atlas needs more charts.
+            ProblemError: More than `max_charts` charts are needed.
         """
         charts, pending = None, np.arange(len(layer))
         while charts is None or pending.size:
@@ -349,7 +349,7 @@ class SelfMotionManifolds:
         return charts
 
     def _grow(self, atlas: Charts | None, layer: Indices, joints: Array, radius: float, max_charts: int) -> Charts:
-        """Extend the atlas by the manifold components that contain given configurations."""
+        """Extend an atlas of charts by the manifold components that contain given configurations."""
         first = 0 if atlas is None else len(atlas)
         charts, edges = self._new_charts(layer, joints, np.full(len(layer), radius), None, first)
         charts = charts if atlas is None else concatenate([atlas, charts])
@@ -379,7 +379,7 @@ class SelfMotionManifolds:
         return charts
 
     def split(self, charts: Charts) -> SplitCharts:
-        """Replace charts by charts of half the radius; a chart is kept if its halves cannot be projected."""
+        """Replace manifold charts by charts of half the radius; keep a chart whose halves cannot be projected."""
         r = charts.tangents.shape[2]
         signs = np.array(list(product((-0.5, 0.5), repeat=r))).reshape(2**r, r)
         offsets = charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)
@@ -406,11 +406,11 @@ class SelfMotionManifolds:
         return SplitCharts(concatenate([halves.select(within_limits), charts.select(unsplit)]), owners, low, high)
 
     def _split_radii(self, charts: Charts, signs: Array) -> Array:
-        """Return the radii of half-size charts, centred at `signs` (c, r) in the boxes of charts. Shape (N c,).
+        """Return the radii that half-size charts need to cover the same part of the manifold as those they replace.
 
-        At the centre of a half, let the manifold leave the chart with slope Ds. A shift u in the chart is then a shift
-        (1 + Ds' Ds)^1/2 u in the half, whose axes are aligned as closely as possible. Added are Ds' times the quadratic
-        deviation within the half, and the residual of the quadratic form.
+        Shape (N c,). Their centres are `signs` (c, r) times the radii. At the centre of a half, let the manifold leave
+        the chart with slope Ds. A shift u in the chart is then a shift (1 + Ds' Ds)^1/2 u in the half, whose axes are
+        aligned as closely as possible. Added are Ds' times the quadratic deviation within the half, and the residual.
         """
         r = charts.tangents.shape[2]
         form, residuals = charts.curvature()
@@ -424,7 +424,7 @@ class SelfMotionManifolds:
     def is_covered(
         self, charts: Charts, layer: Indices, joints: Array, excluded: Indices | None = None
     ) -> NDArray[np.bool_]:
-        """Return which configurations lie in any chart, or in any except that in `excluded`. Shape (M,)."""
+        """Return which configurations lie in a manifold chart, not counting the chart in `excluded`. Shape (M,)."""
         if not len(layer) or not len(charts):
             return np.zeros(len(layer), dtype=bool)
         r = charts.tangents.shape[2]
@@ -448,7 +448,7 @@ class SelfMotionManifolds:
         return covered
 
     def _thin_out(self, layer: Indices, joints: Array, radii: Array) -> Indices:
-        """Return the indices of configurations that lie outside the radius of all earlier ones in the result."""
+        """Return the indices of configurations that remain after removing those within the radius of an earlier one."""
         if not len(layer):
             return np.zeros(0, dtype=np.intp)
         pairs = self.space.tree(joints, layer).query_pairs(float(radii.max()), output_type="ndarray")
@@ -464,7 +464,7 @@ class SelfMotionManifolds:
     def _new_charts(
         self, layer: Indices, joints: Array, radii: Array, like: Array | None, first: int = 0
     ) -> tuple[Charts, _Edges]:
-        """Return charts at configurations, and their edge points within limits; charts are numbered from `first`."""
+        """Return new manifold charts, numbered from `first`, at configurations, and their edge points within limits."""
         if like is None:
             chosen = self._thin_out(layer, joints, radii)
             layer, joints, radii = layer[chosen], joints[chosen], radii[chosen]
@@ -477,21 +477,21 @@ class SelfMotionManifolds:
 
 
 class TimeSample(NamedTuple):
-    """Self-motion manifold of a time sample: its task, and its index among the samples of this task."""
+    """Self-motion manifold at one time sample: the manifolds of its task, and its index among their time samples."""
 
     manifolds: SelfMotionManifolds
     row: int
 
 
 def _rim(r: int) -> Array:
-    """Return the midpoints of sides and the corners of a box of half width 1. Shape (c, r)."""
+    """Return the points (c, r) of a box of half width 1 at which charts are checked: side midpoints and corners."""
     middles = [side * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0)] if r > 1 else []
     corners = [np.array(signs) for signs in product((-1.0, 1.0), repeat=r)] if r else []
     return np.array([*middles, *corners]).reshape(-1 if r else 0, r)
 
 
 def _solve_normal_equations(square: Array, right: Array) -> Array:
-    """Solve the linear systems (K, m, m) for right sides (K, m), regularised where they are singular."""
+    """Solve K systems of normal equations (K, m, m) for right-hand sides (K, m), regularised against singularity."""
     m = square.shape[1]
     if not m:
         return right

@@ -1,4 +1,4 @@
-"""Requests of plans, their start configurations, local motions by resolved-rate control, and the end of the reach."""
+"""Plan requests, their start configurations, local motions by resolved-rate control, and limits of the workspace."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ __all__ = [
 
 SearchKind: TypeAlias = Literal["start", "configurations", "global"]
 REACH_TOLERANCE = 1e-4
-"""m or rad: a pose with a larger error may be out of reach."""
+"""Largest error with which a pose counts as reached, m or rad."""
 
 
 @dataclass(frozen=True)
@@ -47,29 +47,29 @@ class PlannerSettings:
     """Settings of `ocp.motion.plan.plan`, derived from theory or from the problem families in tests/sweep.
 
     Attributes:
-        ik_starts: Random starts of inverse kinematics.
-        local_steps: Steps of a local motion, besides the breaks of its tasks.
-        dampings: Dampings of local motions, relative to the singular values; the next one is tried if none tracks.
+        ik_starts: Number of random starts of inverse kinematics.
+        local_steps: Number of time steps of a local motion, besides the breaks of its tasks.
+        dampings: Dampings of local motions, relative to the singular values; the next is tried if no motion tracks.
         min_intervals: Least number of mesh intervals.
         coarse_degree, fine_degree: Degrees of collocation; the fine one represents a smooth segment to rounding.
-        separated_intervals: Intervals of a coarse mesh with separation constraints.
-        coarse_options, fine_options: Options of IPOPT. A coarse solve starts from a guess that does its tasks.
+        separated_intervals: Number of intervals of a coarse mesh with separation constraints.
+        coarse_options, fine_options: Options of IPOPT. A coarse solve starts from a guess that satisfies its tasks.
         barriers: Default mu_init of IPOPT, and the tolerance at which the barrier parameter ends.
-        samples_per_interval: Samples of an interval at which collisions and deviations are checked.
-        compared_samples: Samples at which two motions are compared.
+        samples_per_interval: Number of samples in a mesh interval at which collisions and deviations are checked.
+        compared_samples: Number of time samples at which two motions are compared.
         same_cost, same_path: Two candidates count as one motion if either difference is smaller: relative; rad or m.
-        negligible_rate: (rad/s)^2 or (m/s)^2: smaller mean squared rates are rounding errors of a motion at rest.
-        tip_tolerance: m and rad: largest deviation of a tip from its task at any time, over all rows.
-        max_deviation: m and rad: a motion with a larger deviation on its last mesh is rejected without an audit.
-        max_refinements, max_splits, max_intervals: Meshes refined for the deviation of the tips; parts into which one
-            refinement splits an interval; intervals of the last mesh.
+        negligible_rate: Mean squared rate that counts as rounding error of a motion at rest, (rad/s)^2 or (m/s)^2.
+        tip_tolerance: Largest deviation of a tip from its task at any time, m and rad.
+        max_deviation: Deviation on its last mesh beyond which a motion is rejected without an audit, m and rad.
+        max_refinements, max_splits, max_intervals: Largest numbers of mesh refinements for the deviation of the tips,
+            of parts into which one refinement splits an interval, and of intervals of the last mesh.
         least_progress: Largest share of the deviation that a refinement may leave if the task may be out of reach.
-        max_failures: Failed candidates of a batch after which no further one is repaired; also the number of sorted
-            seeds that are tried, and of motions that are audited if all are requested.
+        max_failures: Number of failed candidates of a batch after which no further one is repaired; also of sorted
+            initial guesses that are tried, and of motions that are audited if all are requested.
         refusal_time: Processor time after which no further candidate is tried if those before failed for other reasons
             than collisions, s.
-        batch: Seeds that are solved before the best of them is audited, if each takes seconds.
-        max_separations: Solves of one candidate with more, or wider, separation constraints.
+        batch: Number of initial guesses that are solved before the best is audited, if each takes seconds.
+        max_separations: Largest number of solves of one candidate with more, or wider, separation constraints.
         max_cost_ratio: A local motion whose cost exceeds that of the best solve by this factor is not solved.
         gain: Relative cost reduction that a motion must promise to be solved with its start fixed.
         near_bound: A plan whose cost is within this factor of its lower bound is accepted.
@@ -112,8 +112,8 @@ class PlanRequest:
     Attributes:
         machine, tasks, horizon: As in `plan`.
         stretches: Intervals of time in which the same tasks are active.
-        start: Joints at the start, rad or m, or None if they are searched. Shape (n,).
-        base: Base at the start. Shape (base_size,).
+        start: Joint positions at the start, rad or m, or None if they are searched. Shape (n,).
+        base: Base configuration at the start. Shape (base_size,).
         weights: Weights of the squared joint rates. Shape (n,).
         limits: Limits of joint positions and rates.
         time_cost: Cost of a second if the horizon is free; else None.
@@ -123,7 +123,7 @@ class PlanRequest:
         actuator_limits: Limits that include those of the actuators; None if these are not limited.
         clearance_constraints: Clearance constraints of the motion, or None.
         settings: Settings of the planner.
-        held: Positions of the joints of `whole` that are held still and that `machine` does not have, by name.
+        held: Positions of the joints of `whole` that stay at rest and that `machine` does not have, by name.
         whole: Machine with all its joints; None if no joint is held.
     """
 
@@ -148,7 +148,7 @@ class PlanRequest:
     whole: Machine | None = None
 
     def with_held(self, positions: Mapping[str, float]) -> PlanRequest:
-        """Return the request for the machine with further joints held at given positions, rad or m."""
+        """Return the request for the machine with further joints held at rest at given positions, rad or m."""
         if not positions:
             return self
         free = np.array([name not in positions for name in self.machine.robot.joint_names])
@@ -172,25 +172,25 @@ class PlanRequest:
 
     @property
     def ik_arguments(self) -> dict[str, Any]:
-        """Arguments for inverse kinematics at the start."""
+        """Keyword arguments of `inverse_kinematics` for configurations at the start of the motion."""
         own = IkOptions(base=self.base, limits=self.limits.joints)
         return {"seed": self.seed, "starts": self.settings.ik_starts, "options": own}
 
     @cached_property
     def bounds(self) -> JointBounds:
-        """Bounds of the joints."""
+        """Position and rate limits of the machine's joints as arrays."""
         return self.limits.bounds(self.machine)
 
     @cached_property
     def turning_joints(self) -> NDArray[np.intp]:
-        """Indices of the joints that may start in different full turns; none if the start is given."""
+        """Indices of the joints whose start angles may differ by full turns; none if the start is given."""
         if self.start is not None:
             return np.zeros(0, dtype=np.intp)
         return turning_joints(self.machine.robot, self.bounds.lower, self.bounds.upper)
 
 
 def start_configurations(request: PlanRequest) -> Array:
-    """Return joint vectors at the start, collision-free ones first, then in order of conditioning. Shape (K, n)."""
+    """Return start configurations, sorted by their conditioning, but collision-free ones first. Shape (K, n)."""
     if request.start is not None:
         return request.start[None]
     first = [request.tasks[i] for i in request.stretches[0].tasks if request.tasks[i].is_pose]
@@ -209,9 +209,9 @@ def start_configurations(request: PlanRequest) -> Array:
 def start_collisions(
     request: PlanRequest, configurations: Array, pairs: list[int] | None = None
 ) -> list[Collision | None]:
-    """Return the closest pair of bodies in each configuration (K, n), or None if it has the required clearance.
+    """Return the closest pair of bodies in each start configuration (K, n), or None if the clearance is kept.
 
-    With `pairs`, the indices of the only pairs that count.
+    If given, `pairs` are the indices of the only pairs that are checked.
     """
     if request.clearance_constraints is None or pairs == []:
         return [None] * len(configurations)
@@ -223,7 +223,7 @@ def start_collisions(
 
 
 def check_clear_start(request: PlanRequest, configurations: Array) -> None:
-    """Raise ProblemError if the given start is in collision."""
+    """Raise ProblemError if the given start configuration is in collision."""
     if (collision := start_collisions(request, configurations)[0]) is not None:
         assert request.clearance_constraints is not None
         scene, name = request.clearance_constraints.scene, " and ".join(collision.bodies)
@@ -250,7 +250,7 @@ def count_clear_configurations(request: PlanRequest, time: float) -> int | Unrea
 
 
 def describe_alternatives(count: int | Unreachable | None) -> list[str]:
-    """Return a sentence about the result of `count_clear_configurations` for an error; an empty list if it is None."""
+    """Describe for an error message how many other configurations are collision-free; an empty list if unknown."""
     if count is None:
         return []
     if isinstance(count, Unreachable):
@@ -260,14 +260,14 @@ def describe_alternatives(count: int | Unreachable | None) -> list[str]:
 
 
 def local_motions_from(request: PlanRequest, configurations: Array) -> list[LocalMotion]:
-    """Track the tasks from K configurations (K, n) by resolved-rate control; return one result per stretch.
+    """Track the tasks from K start configurations (K, n) by resolved-rate control; return a result per stretch of time.
 
-    A motion is the same from all whole turns of its start. Joints that can make a turn within their limits are
-    therefore tracked without limits, and the motion is shifted to the middle of them. If it does the tasks, but fits
-    nowhere, it is tracked within the limits from all turns: there may be more than K motions.
+    Starts that differ by full turns lead to the same motion. Joints that can make a full turn within their limits are
+    therefore tracked without limits, and the motion is shifted to mid-range. If it satisfies the tasks, but exceeds the
+    limits in every turn, it is tracked within the limits from all turns: there may be more than K motions.
 
     Raises:
-        Unreachable: A pose that no joints within their limits reach.
+        Unreachable: No joint positions within the limits reach a pose.
     """
     turning, lower, upper = request.turning_joints, request.bounds.lower.copy(), request.bounds.upper.copy()
     lower[turning], upper[turning] = -np.inf, np.inf
@@ -279,7 +279,7 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
 
 
 def _track_within(request: PlanRequest, configurations: Array, lower: Array, upper: Array) -> list[LocalMotion]:
-    """Return local motions within limits, with the smallest damping at which one of them reaches its poses."""
+    """Return resolved-rate motions within limits, with the least damping at which one of them reaches its poses."""
     settings, least_damped = request.settings, list[LocalMotion]()
     for damping in settings.dampings:
         motions: list[LocalMotion] = []
@@ -305,7 +305,7 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
 
 
 def _within_limits(request: PlanRequest, configurations: Array, motions: Sequence[LocalMotion]) -> list[LocalMotion]:
-    """Shift motions by full turns into the limits, or track them again if that fails; see `local_motions_from`."""
+    """Shift motions by full turns into the joint limits; track those again that no shift brings within them."""
     turning, bounds = request.turning_joints, request.bounds
     limits = bounds.lower[turning], bounds.upper[turning]
     joints = np.concatenate([motion.joints for motion in motions], axis=1)[:, :, turning]
@@ -329,7 +329,7 @@ def _within_limits(request: PlanRequest, configurations: Array, motions: Sequenc
 def _joints_at_new_poses(
     request: PlanRequest, stretch: Stretch, base: Array, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the nearest joints (K, n) that satisfy earlier tasks and the poses that begin in a stretch."""
+    """Return the nearest configurations (K, n) that satisfy the tasks so far and the poses that begin now."""
     before = request.stretches[request.stretches.index(stretch) - 1]
     if not any(request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)):
         return joints
@@ -349,7 +349,7 @@ def _joints_at_new_poses(
 
 
 def largest_pose_errors(motions: Sequence[LocalMotion]) -> list[float]:
-    """Return the largest pose error over all stretches of each of K motions."""
+    """Return the largest pose error of each of K motions over the whole horizon, m or rad."""
     return np.max([motion.pose_error for motion in motions], axis=0).tolist()  # type: ignore[no-any-return]
 
 
@@ -369,7 +369,7 @@ def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
 
 
 def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unreachable:
-    """Add the time of an error, and the task positions at that time, to its message."""
+    """Return an error with its time, and the task positions at that time, added to its message."""
     places = []
     for number, task in enumerate(request.tasks):
         if task.position is not None and task.begin <= time <= task.end:
@@ -384,10 +384,10 @@ class ReachSettings:
     """Settings of the search for the time at which tasks leave the reachable workspace.
 
     Attributes:
-        intervals: Intervals of the stretch of time, at whose ends the reach is evaluated before the bisection.
+        intervals: Number of intervals at whose ends the reach is evaluated before the bisection.
         bisections: Number of bisections of one interval.
         tolerance: Pose error up to which a pose is within reach, m or rad: below the repeatability of arms.
-        continued: Number of solutions from which the next time is tried before random starts.
+        continued: Number of solutions that are starts of inverse kinematics at the next time, before random starts.
     """
 
     intervals: int = 32
@@ -401,7 +401,7 @@ REACH = ReachSettings()
 
 @dataclass
 class _Reach:
-    """Inverse kinematics of tasks over time; each time starts from the solutions at the previous one."""
+    """Inverse kinematics of tasks at successive times, each started from the solutions at the previous time."""
 
     equations: TaskEquations
     options: dict[str, Any]
@@ -411,7 +411,7 @@ class _Reach:
         self._targets = self.equations.target_function()
 
     def unreachable_at(self, time: float, limits: bool) -> Unreachable | None:
-        """Update the solutions to a time; return the error if there are none, else None."""
+        """Solve inverse kinematics at a time and keep the solutions; return None, or the error if there are none."""
         targets = np.array(self._targets(time)).ravel()
         options = {**self.options, "options": IkOptions(limits=limits, tolerance=REACH.tolerance)}
         for starts in (0, self.options["starts"]):
@@ -440,7 +440,7 @@ def end_of_reach(
 ) -> Unreachable | None:
     """Return an error that says when tasks leave the workspace of a machine on a fixed base, and why.
 
-    The end is the first time at which no joint positions within the limits do the tasks. A joint ends the reach if it
+    The end is the first time at which the tasks have no solution within the joint limits. A joint ends the reach if it
     is at its limit there and the pose would be within reach without limits. Otherwise the tasks' Jacobian is singular.
 
     Args:
@@ -490,7 +490,7 @@ def end_of_reach(
 
 
 def _joint_at_limit(machine: Machine, joints: Array) -> tuple[str, dict[str, Any]]:
-    """Describe the joint nearest to its limit where limits end the reach; return text and error fields."""
+    """Return text and error fields about the joint nearest to its limit, where joint limits end the reach."""
     moving = machine.robot.moving_joints
     limits = [min(joint.lower, joint.upper, key=lambda x: abs(x - q)) for joint, q in zip(moving, joints, strict=True)]
     nearest = int(np.abs(joints - limits).argmin())

@@ -1,9 +1,9 @@
 """Diagnosis of a task without a motion: where motions end, what obstructs them, and by how much to relax the task.
 
 From the first time sample on, configurations are propagated from chart to chart by all steps within the limits. Each
-chart keeps the configuration whose path has the largest clearance. The task ends at the last sample that is reached,
-and the obstructions are found by going on regardless. From there, a motion is sought that violates only one
-requirement, by as little as possible. The amount found is no bound; another motion may need less.
+chart keeps the configuration whose path has the largest clearance. Motions end at the last sample that is reached. The
+obstructions are the constraints that steps from there to the next sample would violate. A motion is then sought that
+violates only one requirement, by as little as possible. This amount is no bound; another motion may need less.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ __all__ = ["DeadEnd", "Obstruction", "Relaxation", "dead_end"]
 Indices = NDArray[np.intp]
 
 MAX_TRIALS = 3
-"""Configurations from which each chart is tried, and obstructions that the message names."""
+"""Largest number of configurations from which a step into a chart is tried, and of obstructions in a message."""
 NEGLIGIBLE = 1e-9
-"""m or rad: smaller relaxations count as none."""
+"""Least amount by which relaxations of the tasks are scaled, to avoid division by zero, m or rad."""
 
 
 class ObstructionKind(StrEnum):
-    """Kinds of obstructions: position limit, step limit, collision, pose out of reach, narrow passage."""
+    """Kinds of constraints that stop a motion: position or step limit, collision, unreachable pose, narrow passage."""
 
     LIMIT = "limit"
     STEP = "step"
@@ -54,14 +54,14 @@ class RelaxationKind(StrEnum):
 
 
 class Obstruction(NamedTuple):
-    """Constraint that prevents all motions from continuing beyond a sample.
+    """Constraint that prevents all motions from continuing beyond a time sample or waypoint.
 
     Attributes:
         kind: Position limit of a joint; largest step of a joint until the next sample; collision of two bodies; a pose
-            out of reach; or a narrow passage, through which configurations go on but no propagated one did.
+            out of reach; or a narrow passage, beyond which there are configurations that no propagated path reached.
         name: The joint; two bodies, "one and other"; or "tip".
-        value: Value that it would take: position, step, distance or pose error, rad or m.
-        limit: Its limit.
+        value: Value that would be required: position, step, distance or pose error, rad or m.
+        limit: Limit of this value.
         before, after: Configurations: the last one reached, and the one that would have to follow. Shape (n,).
     """
 
@@ -92,7 +92,7 @@ class Relaxation(NamedTuple):
 
     Attributes:
         kind: Deviation of the tip's position, m; rotation of its axes, rad; or the clearance that remains, m.
-        amount: Its amount.
+        amount: Amount of this deviation, rotation or clearance.
         times: Times of the samples, s, or waypoint numbers. Shape (K,).
         joints: Configurations at the samples. Shape (K, n).
     """
@@ -115,10 +115,10 @@ class DeadEnd(SolveError):
 
     Attributes:
         time: Time, s, or waypoint number, from which no motion can be continued.
-        until: First sample that is not reached; nan if unknown.
+        until: First time, s, or waypoint number that is not reached; nan if unknown.
         name, value, limit: Of the smallest obstruction. With a moving base, whose attitude is not known there: the
             joint whose limit obstructs most states, its position and limit; or "task".
-        obstructions: What obstructs motions there, one of each kind and name with the least excess, the least first.
+        obstructions: Constraints that stop motions there, each kind and name with its least excess, the least first.
         relaxations: Motions that would do the task with a relaxed requirement, the smallest one found of each kind.
         segments: Number of segments in which the task may be done, see `plan`, search="segments"; None if unknown.
     """
@@ -142,17 +142,17 @@ class DeadEnd(SolveError):
         self.until, self.obstructions, self.relaxations, self.segments = until, obstructions, relaxations, segments
 
     def __reduce__(self) -> Any:
-        """Pickle the error with its arguments and fields."""
+        """Return what `pickle` needs to rebuild the error: its class, arguments and fields."""
         return type(self), (*self.args, self.until, self.obstructions, self.relaxations), self.__dict__
 
 
 def dead_end(
     search: AtlasSearch, unit: str = "{:.4g} s", proven: bool = True, segments: int | None = None
 ) -> DeadEnd | None:
-    """Diagnose why all motions of a search end before the last sample; None if one reaches it.
+    """Return an error that says why all motions of a search end before the last time sample; None if one reaches it.
 
     Args:
-        unit: Format of its times.
+        unit: Format of the sample times in the message.
         proven: Whether the search proves, under its assumptions, that no motion exists.
         segments: As in `DeadEnd`.
     """
@@ -189,7 +189,7 @@ def dead_end(
 
 
 class _Propagation:
-    """Configurations that are propagated from sample to sample, one for each chart that can be reached.
+    """Configurations propagated from one time sample to the next, one for each manifold chart that can be reached.
 
     Attributes:
         layers: Charts of each sample, no wider than steps, including those in collision.
@@ -217,11 +217,11 @@ class _Propagation:
 
     @property
     def last(self) -> int:
-        """Index of the last sample that is reached with the required clearance; -1 if none is."""
+        """Index of the last time sample that is reached with the required clearance; -1 if none is."""
         return max((k for k, clearance in enumerate(self.clearance) if (clearance >= self.required).any()), default=-1)
 
     def path(self, k: int, chart: int) -> Array:
-        """Return the configurations from the first sample to a chart of sample k. Shape (K', n)."""
+        """Return the configurations from the first time sample to a manifold chart of sample k. Shape (k + 1, n)."""
         path = []
         for sample in range(k, -1, -1):
             path.append(self.joints[sample][chart])
@@ -229,7 +229,7 @@ class _Propagation:
         return np.array(path[::-1])
 
     def _propagate(self, graph: ChartGraph, k: int) -> None:
-        """Step from a sample to the charts of the next one, from configurations with large clearance first."""
+        """Propagate configurations from a time sample to the manifold charts of the next, largest clearance first."""
         space, limit, successor = self.search.space, self.search.limits[k], k + 1
         reached = np.isfinite(self.joints[k][:, 0])
         parts = [(i[reached[i]], j[reached[i]]) for i, j in graph.edges(k, successor)]
@@ -250,7 +250,7 @@ class _Propagation:
             self._record(successor, j[chosen], self.joints[k][i[chosen]] + displacement[chosen], i[chosen])
 
     def _record(self, k: int, charts: Indices, joints: Array, parents: Indices) -> None:
-        """Record configurations that satisfy task and limits, if their clearance exceeds that of recorded ones."""
+        """Project configurations to the manifold; keep for each chart the one within limits with most clearance."""
         search = self.search
         sample, required = search.samples[k], self.required
         if k == 0 and search.start is not None:
@@ -277,7 +277,7 @@ class _Propagation:
 
 
 def _fine_charts(search: AtlasSearch) -> list[Charts]:
-    """Return charts of all configurations, split until steps can pass through them or there are too many."""
+    """Return manifold charts of all configurations, split until none is wider than a step or there are too many."""
     layers = search.atlas
     reach = search.limits.max(axis=1) / 2
     max_radius = np.minimum(np.append(reach, np.inf), np.append(np.inf, reach))
@@ -290,7 +290,7 @@ def _fine_charts(search: AtlasSearch) -> list[Charts]:
 
 
 def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruction]:
-    """Return the smallest obstruction of each kind and name at the last sample that is reached, sorted by size."""
+    """Return the constraints that stop motions at the last reached time sample, each once, the least violated first."""
     space, scene, last = search.space, search.scene, front.last
     names, n, next_sample = search.samples[0].manifolds.equations.machine.robot.joint_names, len(space.scale), last + 1
     before, targets, converged = _continuations(search, front)
@@ -310,7 +310,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
     largest = excess[np.arange(len(worst)), worst]
 
     def obstruction_of(row: int) -> Obstruction:
-        """Return the obstruction that a row of excesses describes, by its largest entry."""
+        """Return the obstruction of one attempted step: its most violated constraint."""
         kind, joint = divmod(int(worst[row]) - 1, n)
         current, target = before[row], targets[row]
         if worst[row] == 0:
@@ -331,7 +331,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
         if largest[row] > TOLERANCE:
             entry = obstruction_of(row)
             smallest.setdefault((entry.kind, entry.name), entry)
-    if not smallest:  # configurations go on, but no propagated one does
+    if not smallest:  # there are configurations at the next sample, but no propagated path reaches them
         charts = front.layers[next_sample].centers
         after = charts[0] if len(charts) else before[0]
         return [Obstruction(ObstructionKind.NARROW, "tip", 0.0, 0.0, before[0], after)]
@@ -339,10 +339,10 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
 
 
 def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return configurations (M, n) reached last, targets (M, n) at the next sample, and which satisfy the task (M,).
+    """Return attempted steps from configurations reached last (M, n) to targets at the next time sample (M, n).
 
     Targets are the projection of each configuration to the next sample, and the configurations there which keep all
-    limits but are too far away.
+    limits but are too far away. Also return which targets satisfy the task (M,).
     """
     space, last = search.space, front.last
     sample, layer = search.samples[last + 1], max(last, 0)
@@ -365,7 +365,10 @@ def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Arr
 
 
 def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Array:
-    """Return a path (K, n) to the last reached sample, continued straight to the nearest chart of the final one."""
+    """Return a path (K, n) beyond a dead end, as a guess: a path to the last reached sample, then a straight line.
+
+    The line leads to the nearest chart centre of the last time sample.
+    """
     space, last, count = search.space, max(front.last, 0), len(search.times)
     distances = np.nan_to_num(space.length(front.joints[last] - blocked), nan=np.inf)
     path = front.path(last, int(distances.argmin())) if np.isfinite(distances).any() else blocked[None]
@@ -376,13 +379,13 @@ def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Ar
 
 
 def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
-    """Return the motion near a path (K, n) that deviates or rotates the tips least; None if none is found."""
+    """Return the motion near a path (K, n) whose tips deviate or rotate least from the tasks; None if none is found."""
     if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
     scene, pairs = search.scene, list[int]()
     for _ in range(LOOKS):
         problem = _RelaxedProblem(search, turning, pairs)
-        rough = problem.solve(path, None)  # the largest row is smooth at zero, unlike a norm
+        rough = problem.solve(path, None)  # a bound of the largest error component is smooth at zero, unlike a norm
         if rough is None:
             return None
         refined = problem.solve(rough, max(problem.amount(rough), NEGLIGIBLE))
@@ -398,7 +401,7 @@ def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: Rela
 
 
 class _RelaxedProblem:
-    """Nonlinear program that minimises the deviation or rotation of the tips, with some bodies kept apart."""
+    """Nonlinear program for the least deviation or rotation of the tips, with some bodies separated by constraints."""
 
     def __init__(self, search: AtlasSearch, turning: bool, pairs: list[int]) -> None:
         self.search, self.turning = search, turning
@@ -442,7 +445,7 @@ class _RelaxedProblem:
         return float(np.arcsin(min(largest, 1.0))) if self.turning else largest
 
     def solve(self, path: Array, scale: float | None) -> Array | None:
-        """Return the optimal joints (K, n) near a guess; None if the solver fails."""
+        """Return the optimal joint path (K, n) near a guess; None if the solver fails."""
         search, slack = self.search, ca.MX.sym("slack")
         if scale is None:
             relaxed_constraints, slack_guess = ca.vertcat(self._relaxed_rows - slack, -self._relaxed_rows - slack), 0.1

@@ -1,13 +1,13 @@
-"""Joints that a plan holds still: those that move no task frame, and those shared with other limbs.
+"""Joints that a plan keeps at rest: those that move no task frame, and those shared with other limbs.
 
 A gripper, a head or another arm adds joints that no task determines. They are locked at the present position, or at a
 free one near the middle of their limits, and the motion is planned for the machine that remains. Bodies that then
 cannot move relative to each other are checked once. A joint is released only if a body that it moves obstructs the
 motion.
 
-A torso that carries the arm of a task carries other limbs as well. A global search of an arm that has more free
-directions than it can cover holds such joints, so that its lower bound holds for motions with the torso where it is.
-The last joint of an arm whose roll is free may change nothing but itself. It is fixed at the start only.
+A torso that carries the arm of a task carries other limbs as well. If an arm has more redundant degrees of freedom than
+a global search can cover, such joints are held at rest. The lower bound is then one for motions with the torso at rest.
+The last joint of an arm whose roll is free may affect nothing but itself. It is fixed at the start only.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ __all__ = [
 ]
 
 STIFFNESS = 1e6
-"""Weight of the rates of shared joints, relative to their own, with which a local motion leaves them nearly still."""
+"""Factor on the rate weights of joints that also move other limbs, with which a local motion hardly moves them."""
 Error = TypeVar("Error", bound=Exception)
 
 
 def all_joints(robot: Robot, held: Mapping[str, float], values: Array, *, rates: bool = False) -> Array:
-    """Return values of all joints of a robot, (..., n), from the values of those that are not held, (..., m).
+    """Return positions or rates of all joints (..., n) from those of the joints that are not held at rest (..., m).
 
     Args:
         robot: Robot with all its joints.
@@ -72,7 +72,7 @@ def all_joints(robot: Robot, held: Mapping[str, float], values: Array, *, rates:
 
 
 def hold_idle_joints(request: PlanRequest) -> PlanRequest:
-    """Return the request with all joints held that move no task frame, at their start or mid-range positions."""
+    """Return a request that holds joints which move no task frame at rest, at their start or mid-range positions."""
     idle = bind(request.machine, request.tasks).idle
     if idle.all():
         return request
@@ -82,7 +82,7 @@ def hold_idle_joints(request: PlanRequest) -> PlanRequest:
 
 
 def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanRequest, Array]:
-    """Move held joints to collision-free positions; return the request and its start configurations (K, m).
+    """Move joints held at rest to collision-free positions; return the request and its start configurations (K, m).
 
     Held joints stay where they are if any configuration is collision-free there. Otherwise they take the nearest
     sampled positions with a collision-free configuration. A global search may hold further joints, see
@@ -105,10 +105,10 @@ def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanReq
 
 
 def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations: Array) -> PlanRequest:
-    """Hold idle joints at the nearest positions that make a configuration of (K, m) collision-free.
+    """Hold joints that move no task frame at the nearest positions at which some start configuration is collision-free.
 
-    If held bodies of the machine collide with each other wherever they are, that is ignored. So are configurations that
-    collide wherever the held joints are, unless all do.
+    If held bodies of the machine collide with each other at all sampled positions, that is ignored. So are start
+    configurations (K, m) whose collisions do not depend on the held joints, unless all have such collisions.
     """
     robot, own = whole.machine.robot, _own_held(whole, request)
     if whole.clearance_constraints is None or whole.start is not None or not own:
@@ -132,12 +132,12 @@ def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations:
 
 
 def _own_held(whole: PlanRequest, request: PlanRequest) -> dict[str, float]:
-    """Return the positions, by name, of the joints that a request holds and the whole request does not."""
+    """Return the positions, by name, of the joints that `request` holds at rest and `whole` does not."""
     return {name: position for name, position in request.held.items() if name not in whole.held}
 
 
 def _still_pairs(whole: PlanRequest, request: PlanRequest) -> list[int]:
-    """Return the pairs of bodies that the joints of a request cannot move relative to each other."""
+    """Return the indices of the body pairs that the moving joints of a request cannot move relative to each other."""
     assert whole.clearance_constraints is not None
     moving = [name not in request.held for name in whole.machine.robot.joint_names]
     levers = whole.clearance_constraints.scene.levers.joints[:, moving]
@@ -145,7 +145,7 @@ def _still_pairs(whole: PlanRequest, request: PlanRequest) -> list[int]:
 
 
 def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: Array) -> None:
-    """Raise an error if bodies collide at the start that the joints of the request cannot move apart.
+    """Check for collisions at the start between bodies that the moving joints of the request cannot separate.
 
     Raises:
         ProblemError: A body collides with an obstacle.
@@ -176,12 +176,12 @@ def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: 
 
 
 def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[Array, Array]:
-    """Return the start joints (nan where free), and the configurations with ignorable joints fixed.
+    """Fix joints that have no effect on the tasks; return their start positions (n,), nan for the other joints.
 
-    An ignorable coordinate changes nothing but the joint itself: the last joint of an arm whose roll is free turns
-    about the tool's axis. If it were free, each motion would belong to a family of equal cost. It is therefore fixed in
-    the middle of its range. If that puts every configuration in collision, it takes the values of a configuration, or
-    random ones, for which most configurations are collision-free.
+    Also return the configurations with these joints fixed. An example of such an ignorable (cyclic) coordinate is the
+    last joint of an arm whose roll about the tool's axis is free. If it were free, each motion would belong to a family
+    of equal cost. It is therefore fixed in the middle of its range. If that puts every configuration in collision, it
+    takes the values of a configuration, or random ones, for which most configurations are collision-free.
     """
     bounds = request.bounds
     start = np.full(request.machine.joint_size, np.nan)
@@ -204,7 +204,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
 
 
 def move_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return the request with held joints moved so that they no longer cause a reported collision.
+    """Return a request whose held joints are at other positions, so that they no longer cause a reported collision.
 
     Args:
         whole: Request before joints were held.
@@ -236,7 +236,7 @@ def move_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> P
 
 
 def release_obstructing(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return the request without holding the joints that move a colliding body; None if none of them is held.
+    """Return a request that no longer holds the joints which move a colliding body; None if none of them is held.
 
     Args: As in `move_aside`.
     """
@@ -247,7 +247,7 @@ def release_obstructing(whole: PlanRequest, request: PlanRequest, error: SolveEr
 
 
 def _obstructing_joints(whole: PlanRequest, request: PlanRequest, error: SolveError) -> list[str]:
-    """Return the held joints that move a body of the collision that an error reports."""
+    """Return the names of the held joints that move one of the two bodies whose collision an error reports."""
     if whole.clearance_constraints is None:
         return []
     scene, own = whole.clearance_constraints.scene, _own_held(whole, request)
@@ -257,7 +257,7 @@ def _obstructing_joints(whole: PlanRequest, request: PlanRequest, error: SolveEr
 
 
 def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[dict[str, float]]:
-    """Return random positions of held joints within limits, sorted by distance from the current ones."""
+    """Return random positions within limits for joints held at rest, sorted by distance from the present ones."""
     names, bounds = whole.machine.robot.joint_names, whole.bounds
     samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, seed=whole.seed)
     columns = [names.index(name) for name in held]
@@ -266,7 +266,7 @@ def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[di
 
 
 def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequest:
-    """Hold as many shared joints as necessary to make a global search over the other free directions possible.
+    """Hold as many joints at rest that also move other limbs as a global search with the remaining joints requires.
 
     Only joints that carry a limb without a task are held, those nearest to the root first. They are held at the start
     of the motion if it is given, otherwise where the lowest-cost local motion begins that leaves them nearly still.
@@ -292,7 +292,7 @@ def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequ
 
 
 def _shared_joints(request: PlanRequest) -> list[int]:
-    """Return the joints that move several limbs with task frames, sorted from the root outwards.
+    """Return the indices of the joints that move a task frame and also another limb, sorted from the root outwards.
 
     A gripper at the end of an arm is no such limb: it is fixed to the part that carries the frame.
     """
@@ -308,7 +308,7 @@ def _shared_joints(request: PlanRequest) -> list[int]:
 
 
 def restore_error(error: Error, request: PlanRequest) -> Error:
-    """Add the held joints of the request to the configurations in an error, and return the error."""
+    """Return an error after adding the joints that the request holds at rest to the configurations in it."""
     if request.whole is None:
         return error
     robot = request.whole.robot

@@ -29,19 +29,22 @@ __all__ = [
 Indices = NDArray[np.intp]
 
 TOLERANCE = 1e-9
-"""m and rad: largest task error of a configuration, and largest excess over a limit."""
+"""Largest task error and largest excess over a joint limit of a valid configuration, m and rad."""
 FULL_TURN = 2 * np.pi
 MAX_STEP = 1e6
-"""rad or m: upper bound of any step. The nearest-neighbour tree also keeps the layers of two samples this far apart."""
+"""Upper bound of the length of a step between two time samples, rad or m.
+
+The nearest-neighbour tree also keeps configurations of different time samples this far apart.
+"""
 
 
 class JointSpace:
-    """Joint space with a metric of weighted squared rates, in which joints without limits are periodic.
+    """Joint space with a weighted Euclidean metric, in which revolute joints without limits are periodic.
 
     Attributes:
-        scale: Square roots of the weights; the metric is |scale * dq|. Shape (n,).
-        periodic: Mask of the joints that turn without end. A revolute joint whose range holds two full turns counts as
-            one, since some turn always lies within its limits. Shape (n,).
+        scale: Square roots of the weights of the squared joint rates; the metric is |scale * dq|. Shape (n,).
+        periodic: Mask of the periodic joints. A revolute joint whose range spans two full turns counts as one, since
+            some turn always lies within its limits; a joint that others mimic does not. Shape (n,).
         lower, upper: Limits of the other joints, rad or m. Shape (n,).
     """
 
@@ -55,14 +58,14 @@ class JointSpace:
         self.upper = np.where(self.periodic, np.inf, upper)
 
     def difference(self, to: Array, start: Array) -> Array:
-        """Return the displacement `to` minus start, (..., n); periodic joints take the shorter way."""
+        """Return the joint displacements from `start` to `to`, (..., n); periodic joints take the shorter way round."""
         delta = to - start
         turns = delta[..., self.periodic]
         delta[..., self.periodic] = turns - FULL_TURN * np.round(turns / FULL_TURN)
         return np.asarray(delta)
 
     def length(self, displacement: Array) -> Array:
-        """Return the lengths of joint displacements (..., n) in the metric of the space."""
+        """Return the lengths of joint displacements (..., n) in the metric of the joint space."""
         return np.asarray(np.linalg.norm(displacement * self.scale, axis=-1))
 
     def within(self, joints: Array) -> NDArray[np.bool_]:
@@ -71,7 +74,7 @@ class JointSpace:
             return np.asarray(((joints >= self.lower - TOLERANCE) & (joints <= self.upper + TOLERANCE)).all(axis=-1))
 
     def shift_turns(self, path: Array, lower: Array, upper: Array) -> Array:
-        """Shift a path (K, n) by full turns towards the middle of the limits (n,)."""
+        """Return a joint path (K, n) with periodic joints shifted by full turns towards the middle of their limits."""
         limited = np.flatnonzero(self.periodic & np.isfinite(lower) & np.isfinite(upper))
         middle = (lower[limited] + upper[limited] - path[:, limited].min(axis=0) - path[:, limited].max(axis=0)) / 2
         shifted = path.copy()
@@ -79,7 +82,7 @@ class JointSpace:
         return shifted
 
     def tree(self, joints: Array, layer: Indices | None = None) -> Any:
-        """Return a nearest-neighbour tree of configurations (M, n), to be queried with `tree_points`."""
+        """Return a k-d tree for nearest-neighbour queries among configurations (M, n); query it with `tree_points`."""
         box = np.append(0.0, np.where(self.periodic, FULL_TURN * self.scale, 0.0))
         periods = box if self.periodic.any() else None  # None is faster
         return scipy.spatial.cKDTree(self.tree_points(joints, layer), boxsize=periods)
@@ -87,7 +90,7 @@ class JointSpace:
     def tree_points(self, joints: Array, layer: Indices | None = None) -> Array:
         """Return the coordinates of configurations (M, n) in the nearest-neighbour tree. Shape (M, 1 + n).
 
-        The first coordinate separates configurations of different layers by MAX_STEP.
+        The first coordinate separates configurations of different time samples (layers) by MAX_STEP.
         """
         wrapped = joints.copy()
         wrapped[:, self.periodic] = np.remainder(wrapped[:, self.periodic], FULL_TURN)
@@ -96,7 +99,7 @@ class JointSpace:
 
 @dataclass(frozen=True, eq=False)
 class TasksWithFixedJoints(TaskEquations):
-    """Task equations with additional rows that fix some joints, whose values are the last targets.
+    """Task equations, and equations that fix some joints at positions which are appended to the targets.
 
     Attributes:
         fixed: Indices of the fixed joints.
@@ -131,9 +134,9 @@ class TasksWithFixedJoints(TaskEquations):
 
 
 def turning_joints(robot: Robot, lower: Array, upper: Array) -> NDArray[np.intp]:
-    """Return the indices of joints with limits that can still make full turns.
+    """Return the indices of the revolute joints whose limits are at least a full turn apart.
 
-    They are revolute, have no followers, and their limits are at least a whole turn apart.
+    They have at least one finite limit, and no other joint mimics them.
 
     Args:
         robot: The robot.
@@ -146,13 +149,13 @@ def turning_joints(robot: Robot, lower: Array, upper: Array) -> NDArray[np.intp]
 
 
 def whole_turns_between(start: Array, end: Array, lower: Any = -np.inf, upper: Any = np.inf) -> Array:
-    """Return the full turns within limits that bring angles as close as possible to given ones, rad."""
+    """Return the multiples of 2 pi that bring the angles `start` closest to `end` without leaving the limits, rad."""
     least, greatest = np.ceil((lower - start) / FULL_TURN), np.floor((upper - start) / FULL_TURN)
     return np.asarray(FULL_TURN * np.clip(np.round((end - start) / FULL_TURN), least, greatest))
 
 
 def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the full turns that shift motions towards mid-range, and which joints then stay within limits.
+    """Return the multiples of 2 pi that shift joint motions towards mid-range, and which joints then keep their limits.
 
     Args:
         joints: Motions of k joints. Shape (K, M, k), rad.
@@ -162,7 +165,7 @@ def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, 
         Shapes (K, k): turns, rad; whether all samples are within the limits. No other turns fit where these do not.
     """
     least, greatest = joints.min(axis=1), joints.max(axis=1)
-    # away from a limit without a counterpart, a motion has room as between limits that are far apart
+    # replace a missing limit by one that is too far away to restrict the motion
     low = np.where(np.isfinite(lower), lower, upper - (greatest - least) - 2 * FULL_TURN)
     high = np.where(np.isfinite(upper), upper, lower + (greatest - least) + 2 * FULL_TURN)
     with np.errstate(invalid="ignore"):  # a motion that diverges fits nowhere
@@ -171,11 +174,11 @@ def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, 
 
 
 def all_turns(joints: Array, known: Array, lower: Array, upper: Array) -> Array:
-    """Return a configuration with its joints shifted by full turns in all combinations within the limits.
+    """Return all variants of a configuration that differ by full turns of its joints and keep the limits.
 
     Args:
         joints: Angles. Shape (k,), rad.
-        known: Angles of joints that keep their turn; nan for the others. Shape (k,).
+        known: Final angles of joints that are not shifted; nan for the others. Shape (k,).
         lower, upper: Limits, at least one of each joint finite. Shape (k,).
 
     Returns:

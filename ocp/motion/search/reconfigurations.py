@@ -1,16 +1,16 @@
-"""Paths in the fewest segments, between which the arm reconfigures, and paths found on sections of the manifold.
+"""Paths in the fewest segments with reconfigurations between them, and paths found on sections of the manifold.
 
 Where a motion cannot be continued, the arm has to leave the task and come back to it in any configuration that does the
 task: at the next time sample, if the samples are all there is, or at the same one if they stand for a continuous time.
-A segment can always start later and end earlier. Greedily extended segments are therefore the fewest, and greedy
+Any part of a segment is feasible as well. Greedily extended segments are therefore the fewest, and greedy
 segments from the end give the earliest start of each. Among all divisions, the one of least cost is found best first:
 the bounds of the cost-to-go bound the cost of a segment, and segments are searched one by one until no other division
-can cost less. Fewest first, then cheapest, as in IKLink (Wang et al. 2024).
+can cost less. Their number is minimised first, then the cost, as in IKLink (Wang et al. 2024).
 
-If a task leaves two directions free, the manifold at a time sample is a surface, which takes too many charts for an arm
-of eight joints. With one joint fixed it is a curve. The curves for several values of the joint are close enough for
-steps between them, so that paths on which the joint moves are found as well; shortened on the surfaces, they leave the
-curves. This proves nothing and gives no bound.
+If a task leaves two degrees of freedom undetermined, the manifold at a time sample is a surface, which takes too many
+charts for an arm of eight joints. With one joint fixed it is a curve (a section). The curves for several values of the
+joint are close enough for steps between them, so that paths on which the joint moves are found as well; shortened on
+the surfaces, they leave the curves. This proves nothing and gives no bound.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ocp.motion.search.search import AtlasSearch
 __all__ = ["SectionSearch", "SectionSettings", "Segment", "Span", "fewest_segments", "section_values", "segment_ends"]
 
 Span = tuple[int, int]
-"""First and last sample of a segment."""
+"""Indices of the first and the last time sample of a segment."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class SegmentSettings:
 
     Attributes:
         max_iterations: Largest number of divisions that are evaluated; then the best known one is taken.
-        gap: Relative cost reduction that must be possible to go on.
+        gap: Relative cost reduction that must still be possible for the search to continue.
     """
 
     max_iterations: int = 40
@@ -66,13 +66,13 @@ class Segment(NamedTuple):
 def fewest_segments(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
 ) -> tuple[list[Segment], float] | None:
-    """Return a lowest-cost division into the fewest segments, and a lower bound of its cost.
+    """Divide a path into the fewest segments at the least cost; return them, and a lower bound of this cost.
 
     Args:
         gap: Samples from the end of a segment to the start of the next one: 1, or 0 if the samples stand for a
             continuous time.
-        barred: Spans that are known not to be done in one segment, nor any span that contains them.
-        settings: Effort.
+        barred: Spans of samples that are known to be infeasible in one segment, as is any span that contains them.
+        settings: Limits of the effort.
 
     Returns:
         None if the motion cannot be continued somewhere. With gap 1, a sample without a configuration is a segment of
@@ -86,7 +86,7 @@ def fewest_segments(
     segments = dict[Span, Segment | None]()
 
     def best_chain(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
-        """Return the lowest-cost chain of solved segments, measured by their costs or by their lower bounds.
+        """Return the lowest-cost chain of adjoining segments; with `bounds`, solved ones count by lower bounds.
 
         Segments not solved yet count with their lower bounds if `bounded`, and are left out otherwise.
         """
@@ -106,7 +106,7 @@ def fewest_segments(
 
 
 def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
-    """Return where each of the fewest segments may begin and end; None if a sample cannot be passed.
+    """Return at which time samples each of the fewest segments may begin and end; None if no segments pass all samples.
 
     Segments extended greedily forwards give the latest ends, those extended backwards the earliest starts.
     """
@@ -130,7 +130,7 @@ def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> 
 def segment_ends(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), ruled_out: bool = False
 ) -> list[int]:
-    """Return the last samples of the segments, each of which extends as far as possible.
+    """Return the last time sample of each segment if every segment is extended as far as possible.
 
     The list ends with the last sample of all, or with the one from which the motion cannot be continued.
 
@@ -151,12 +151,12 @@ def segment_ends(
 
 
 def _is_barred(span: Span, gap: int, barred: Collection[Span]) -> bool:
-    """Return whether a span is empty or contains an infeasible span, so that no segment covers it."""
+    """Return whether a span of samples is empty or contains an infeasible one, so that no segment can cover it."""
     return (span[0] == span[1] and not gap) or any(span[0] <= bar[0] and bar[1] <= span[1] for bar in barred)
 
 
 def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None:
-    """Return the lowest-cost segment between two samples; None if none was found."""
+    """Return the lowest-cost segment between two time samples; None if none was found."""
     part = search.restrict(first, last)
     joints, bound = part.solve(np.inf)
     return None if joints is None else Segment(first, last, joints, part.path_cost(joints), bound)
@@ -165,7 +165,7 @@ def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None
 def _last_reachable(
     search: AtlasSearch, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
 ) -> int | None:
-    """Return the last sample (with `back`: the first) that a segment from a sample reaches; None if there is none."""
+    """Return the farthest time sample that one segment from `start` reaches (backwards with `back`), or None."""
 
     def reaches(sample: int) -> bool:
         span = min(start, sample), max(start, sample)
@@ -190,7 +190,7 @@ def _last_reachable(
 
 
 def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: list[range]) -> dict[Span, float]:
-    """Return lower bounds of the cost of segments by span; spans without a path may be absent."""
+    """Return lower bounds of the cost of segments, by first and last sample; those without a path may be absent."""
     bounds = dict[Span, float]()
     for starts, ends in zip(start_ranges, end_ranges, strict=True):
         if len(ends) == 1:  # one backward sweep serves all starts
@@ -208,7 +208,7 @@ def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: 
 def _best_chain(
     start_ranges: list[range], end_ranges: list[range], gap: int, costs: dict[Span, float]
 ) -> tuple[list[Span], float]:
-    """Return the chain of segments of least total cost, and this cost; an empty chain and inf if there is none."""
+    """Return the chain of adjoining segments of least total cost, and this cost; [] and inf if there is none."""
     best: dict[int, tuple[float, list[Span]]] = {start_ranges[0][0]: (0.0, [])}
     for starts, ends in zip(start_ranges, end_ranges, strict=True):
         after: dict[int, tuple[float, list[Span]]] = {}
@@ -225,12 +225,12 @@ def _best_chain(
 
 @dataclass(frozen=True)
 class SectionSettings:
-    """Settings of the sections of self-motion manifolds, on which one joint is fixed.
+    """Settings of the sections of self-motion manifolds: curves on which one joint has a fixed position.
 
     Attributes:
         radii: Radii of the charts for few and for many samples, rad or m.
         spacing: Largest difference between values of the joint: prismatic, m, and revolute, rad.
-        values: Largest number of values.
+        values: Largest number of values of the joint.
         charts: Largest number of charts, over all samples and values.
     """
 
@@ -243,7 +243,7 @@ class SectionSettings:
 def section_values(
     prismatic: bool, lower: float, upper: float, max_step: float, *, settings: SectionSettings = SectionSettings()
 ) -> Array:
-    """Return the values at which a joint is fixed: evenly spaced over its range. Shape (V,), rad or m.
+    """Return the positions at which sections fix a joint, evenly spaced over its range. Shape (V,), rad or m.
 
     Args:
         prismatic: Whether the joint is prismatic.
@@ -261,7 +261,7 @@ class SectionSearch(AtlasSearch):
     """Search for paths on sections of self-motion manifolds, on each of which one joint has a constant value."""
 
     def __init__(self, *args: Any, joint: int, values: Array, radius: float, charts: int, **options: Any) -> None:
-        """Build the charts of all sections at all time samples.
+        """Build the charts of all sections of the self-motion manifolds at all time samples.
 
         Args:
             args, options: As in `AtlasSearch`; all samples must belong to one `SelfMotionManifolds` of dimension two.
@@ -274,7 +274,7 @@ class SectionSearch(AtlasSearch):
         super().__init__(*args, **options)
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return charts of the section curves at each sample."""
+        """Return charts of the curves on which the joint is fixed, for each time sample."""
         manifolds, count = self.samples[0].manifolds, len(self.samples)
         indices, value_count = [sample.row for sample in self.samples], len(self._values)
         targets = np.tile(manifolds.targets[indices], (value_count, 1))
@@ -294,7 +294,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return the best path, then the best path for each constant joint value, sorted by cost; the bound is 0."""
+        """Return the best path and the best for each value of the fixed joint, by rising cost; the cost bound is 0."""
         count = len(self.samples)
         paths = [path for path in (self.find_path(np.inf)[1],) if path is not None]
         for value in range(len(self._values)):

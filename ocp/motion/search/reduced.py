@@ -1,4 +1,4 @@
-"""Vectorised kinematics of many states of a machine with a moving base, in scaled joint rates; and its reach.
+"""Vectorised kinematics of a machine with a moving base at many states, and a test of which poses it can reach.
 
 With the scaled rates p = sqrt(W) dq/dt, the running cost is |p|^2 / 2. The rates that do a task, A p = v, are the
 least-norm solution plus any rates in the null space of A, the self-motions. The base follows, since its momentum is
@@ -36,9 +36,9 @@ __all__ = ["LimitSide", "ReducedKinematics", "TaskKinematics", "check_floating_r
 
 
 START_GAP = 1e-4
-"""Largest gap at the start of a pose task, m or rad, with which the task still holds its pose."""
+"""Largest pose error at the start of a pose task with which the tip counts as being at the pose, m or rad."""
 SIMPSON_STEPS = 400
-"""Steps of the integration of a velocity to a position."""
+"""Number of steps of Simpson's rule that integrates a tip velocity to a position."""
 
 
 class LimitSide(IntEnum):
@@ -51,11 +51,13 @@ class LimitSide(IntEnum):
 
 
 class TaskKinematics(NamedTuple):
-    """Linearised tasks at K states of n joints, with m task rows and b base coordinates.
+    """Tasks linearised at several states of a machine: linear equations in the scaled joint rates.
+
+    At each of K states, the m equations are A p = v for the rates p of n joints.
 
     Attributes:
         right, error: Required task rates, and pose errors. Shape (K, m).
-        base, drift: The rate of the base is base @ p + drift. Shapes (K, b, n), (K, b).
+        base, drift: The rate of the b base coordinates is base @ p + drift. Shapes (K, b, n), (K, b).
         row_space, lower: A = lower @ row_space', with orthonormal columns of row_space and lower triangular.
             Shapes (K, n, m), (K, m, m).
         null: Orthonormal basis of the null space of A. Shape (K, n, r).
@@ -74,32 +76,32 @@ class TaskKinematics(NamedTuple):
         return TaskKinematics(*(part[rows] for part in self))
 
     def task_rates(self, rates: Array) -> Array:
-        """Return the task rates (K, m) that scaled joint rates (K, n) cause."""
+        """Return the tip velocities in the task equations (K, m) that scaled joint rates (K, n) cause."""
         rates_of_tasks: Array = self.lower @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None])
         return rates_of_tasks[:, :, 0]
 
     def least_rates(self, required: Array) -> Array:
-        """Return the least-norm scaled rates (K, n) with the required task rates (K, m)."""
+        """Return the least-norm scaled joint rates (K, n) that cause required tip velocities (K, m)."""
         if not required.shape[1]:
             return np.zeros(self.null.shape[:2])
         solutions: Array = self.row_space @ np.linalg.solve(self.lower, required[:, :, None])
         return solutions[:, :, 0]
 
     def null_rates(self, rates: Array) -> Array:
-        """Project scaled rates (K, n) onto the null space of the tasks."""
+        """Project scaled joint rates (K, n) onto the null space of the tasks."""
         projected: Array = self.row_space @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None])
         return np.asarray(rates - projected[:, :, 0])
 
     def base_rates(self, rates: Array) -> Array:
-        """Return the rates of the base (K, b) that scaled joint rates (K, n) cause, without the drift."""
+        """Return the rates of the base (K, b) that scaled joint rates (K, n) cause; the drift is not added."""
         return np.asarray((self.base @ rates[:, :, None])[:, :, 0])
 
 
 class ReducedKinematics:
-    """Kinematics of a machine under the equations of its tasks, if it has tasks.
+    """Kinematics of a machine and of its tasks, if it has any, in scaled joint rates at many states.
 
     Attributes:
-        rows: Number of task rows.
+        rows: Number of task equations.
         equations: Task equations, or None.
         root: Square roots of the weights. Shape (n,).
     """
@@ -118,7 +120,7 @@ class ReducedKinematics:
         self._sampler = Sampler(symbols, parts)
 
     def at(self, base: Array, joints: Array, time: float) -> TaskKinematics:
-        """Linearise the tasks at states: bases (K, b) and joints (K, n)."""
+        """Linearise the tasks at states, which consist of base (K, b) and joint (K, n) coordinates."""
         count, n = joints.shape
         arguments = [base, joints]
         if self._targets is not None:
@@ -128,7 +130,7 @@ class ReducedKinematics:
         base_jacobian = base_jacobian.reshape(count, n, -1).transpose(0, 2, 1) / self.root
         basis, triangular = np.linalg.qr(matrix.reshape(count, n, self.rows) / self.root[:, None], mode="complete")
         lower = triangular[:, : self.rows].transpose(0, 2, 1).copy()
-        for i in range(self.rows):  # regularise dependent rows
+        for i in range(self.rows):  # regularise dependent task equations
             threshold = ROUNDING_SHARE * np.abs(lower).max(axis=(1, 2)) + np.finfo(float).tiny
             lower[:, i, i] = np.where(np.abs(lower[:, i, i]) < threshold, threshold, lower[:, i, i])
         if self.equations is not None:
@@ -137,7 +139,7 @@ class ReducedKinematics:
         return TaskKinematics(right, error, base_jacobian, drift, row_space, lower, null)
 
     def speed(self, base: Array, joints: Array, time: float) -> Array:
-        """Estimate the squared scaled rates (K,) that the tasks require at a time, far from singularities."""
+        """Estimate the squared norm (K,) of the scaled rates that tasks require at a time, far from singularities."""
         if self.equations is None:
             return np.zeros(len(joints))
         tasks = [part.task for part in self.equations.bound]
@@ -147,7 +149,7 @@ class ReducedKinematics:
         return np.asarray(self.rows * rates_squared / (task.lower**2).sum(axis=(1, 2)))
 
     def velocity_errors(self, base: Array, joints: Array, rates: Array, time: float) -> tuple[Array, Array]:
-        """Return the errors of joint rates (K, n) in velocity tasks, and the required speeds. Shapes (K,)."""
+        """Return the tip speed errors of joint rates (K, n) in velocity tasks, and the required speeds. Shapes (K,)."""
         zeros = np.zeros(len(joints))
         if self.equations is None or self.equations.pose_rows.all():
             return zeros, zeros
@@ -165,7 +167,7 @@ class ReducedKinematics:
         interval: tuple[float, float],
         tolerance: float,
     ) -> tuple[Array, Array, Array]:
-        """Advance states over a time step by the midpoint rule, with self-motions as in scaled rates (K, n).
+        """Advance states over a time step by the midpoint rule; keep the self-motion of given scaled rates (K, n).
 
         Returns:
             Base (K, b), joints (K, n) and remaining pose errors (K,), which are corrected down to the tolerance.
@@ -198,12 +200,13 @@ class ReducedKinematics:
         max_steps: int = 3,
         remaining: Callable[[TaskKinematics, Array], Array] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Correct the pose errors of states by Newton steps; the results are those of `step`.
+        """Correct the pose errors of states by Newton steps; return the same quantities as `step`.
 
         Args:
             tolerance: Pose error, m and rad, below which the iteration ends.
             max_steps: Largest number of Newton steps.
-            remaining: Returns the missing displacements in all rows, (K, m), for linearised tasks and joints.
+            remaining: Function of linearised tasks and joints that returns the missing displacement in each equation,
+                (K, m).
         """
         pose_error = np.zeros(len(joints))
         if self.equations is None or (remaining is None and not self.equations.pose_rows.any()):
@@ -233,12 +236,12 @@ def _normalize(base: Array) -> Array:
 def limit_rates(
     rates: Array, null: Array, lower: Array, upper: Array, *, max_rates: Array
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Change scaled rates (K, n) by self-motions such that each joint keeps its limits.
+    """Return scaled joint rates (K, n), changed by self-motions so that each joint keeps its limits.
 
     Args:
         null: Bases of the self-motions. Shape (K, n, r).
-        lower, upper: Limits. Shape (K, n).
-        max_rates: Rate limits alone. Shape (n,).
+        lower, upper: Limits of the scaled rates. Shape (K, n).
+        max_rates: Those that are due to rate limits alone. Shape (n,).
 
     Returns:
         The rates, and for each state the joint that cannot keep a limit and its `LimitSide`, or -1. Shape (K, 2).
@@ -269,11 +272,11 @@ def limit_rates(
 
 
 STARTS = 64
-"""Random joints and attitudes from which inverse kinematics starts at each time."""
+"""Number of random joint positions and attitudes from which inverse kinematics starts at each time."""
 PLACE_TOLERANCE = 1e-4
-"""m or rad: largest error of a pose that is reached."""
+"""Largest error of a pose that counts as reached, m or rad."""
 CHECKED_TIMES = 17
-"""Times at which the reach is evaluated before the bisection."""
+"""Number of times at which poses are tested for reach before the bisection."""
 
 
 def check_floating_reach(
@@ -286,16 +289,16 @@ def check_floating_reach(
     bounds: JointBounds,
     seed: int = 0,
 ) -> None:
-    """Raise Unreachable if a floating machine cannot reach a pose with any attitude, tried from many starts.
+    """Raise Unreachable if inverse kinematics from many starts finds a pose out of reach for any attitude of the base.
 
     Velocities in world axes are integrated to positions; orientations from velocities are ignored.
 
     Args:
         machine: Free-floating machine with conserved momentum.
         tasks: All tasks, each in its own time.
-        base, start: Base and joints at 0 s. Shapes (base_size,), (n,).
+        base, start: Base and joint positions at 0 s. Shapes (base_size,), (n,).
         interval: Begin and end of the time that is checked, s, at CHECKED_TIMES samples. The interval before an
-            unreachable pose is bisected to a 2**10th.
+            unreachable pose is bisected ten times.
         bounds: Limits of the joints.
         seed: Seed of the random starts.
 
@@ -312,7 +315,7 @@ def check_floating_reach(
     solutions = np.zeros((0, n + attitude_size))  # solutions at the preceding time
 
     def unreachable_at(time: float) -> Unreachable | None:
-        """Return the error that a pose is out of reach at a time; None if it can be reached."""
+        """Return the error that a pose is out of reach at a time; None if all poses can be reached."""
         nonlocal solutions
         poses = []
         for task in tasks:
@@ -381,7 +384,10 @@ def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float,
 
 
 def _base_about_center_of_mass(machine: FreeFloating, base: Array, start: Array, z: Any, time: float) -> Any:
-    """Return the base at which the centre of mass follows its straight line, for joints and attitude z at a time."""
+    """Return the base configuration that places the centre of mass on its straight line at a time.
+
+    z holds the joint positions and the attitude of the base.
+    """
     robot, frame, n = machine.robot, machine.world_from_base(ca.DM(base)), machine.joint_size
     joints, attitude = z[:n], z[n:]
     momentum = np.zeros(6)

@@ -1,9 +1,9 @@
-"""Global search over the self-motion manifolds: the lowest-cost motion, and a lower bound of the cost of all.
+"""Global search over the self-motion manifolds: the lowest-cost motion, and a lower bound of any motion's cost.
 
-An atlas of charts covers all configurations that do the tasks at some time samples. Dynamic programming over the
-charts yields lower bounds of the cost-to-go and the cost-to-come, and the classes of motions of least cost, each of
-which is a guess for the optimal control problem. Then branch and bound: charts through which no motion can cost less
-than a share of the best known cost are discarded, and the others are split, until none is left. No motion then costs
+An atlas of charts covers all configurations that satisfy the tasks at some time samples. Dynamic programming over the
+charts yields lower bounds of the cost-to-go and the cost-to-come, and paths of locally least cost, each of which is a
+guess for the optimal control problem. Then branch and bound: charts through which no motion can cost less than a share
+of the best known cost are discarded, and the others are split, until none is left. No motion then costs
 less than that share, since straight steps from sample to sample cost no more than the motion itself.
 
 The bound holds under these assumptions alone. Closed forms at samples of the free parameter, or inverse kinematics from
@@ -45,16 +45,16 @@ class SearchSettings:
     """Settings of the global search.
 
     Attributes:
-        radii: Initial radii of the charts, rad or m, by the number of free directions.
+        radii: Initial radii of the charts, rad or m, by the dimension of the manifold.
         charts: Largest number of charts over all time samples; each takes about 1 kB with its steps.
         charts_without_path: The same while no path is known. In a narrow passage, neither a path nor a proof that there
             is none may then be found.
         finest: Charts of a smaller radius are not split, rad or m.
-        gaps: Relative gap between cost and bound at which the search stops, by the number of free directions.
-        max_classes: Largest number of classes of motions that are returned.
-        max_cost_ratio: Classes of motions that cost more than so many times the best one are not returned.
+        gaps: Relative gap between cost and bound at which the search stops, by the dimension of the manifold.
+        max_classes: Largest number of paths of locally least cost that are returned.
+        max_cost_ratio: Paths that cost more than so many times the best one are not returned.
         same_path: Motions that differ by less everywhere count as one, rad or m.
-        seats: Time samples at which the lowest-cost motions through each chart are compared.
+        seats: Number of time samples at which the lowest-cost motions through each chart are compared.
     """
 
     radii: tuple[float, float, float] = (0.07, 0.07, 0.2)
@@ -69,7 +69,7 @@ class SearchSettings:
 
 
 def checked_bound(bound: float, cost: float) -> float | None:
-    """Return the lower bound of the cost of all motions, or None if the cost of a motion lies below it.
+    """Return a lower bound of the cost of all motions, or None if it is wrong, since a known motion costs less.
 
     Warns:
         BoundWarning: The cost of a motion lies below the bound.
@@ -100,19 +100,20 @@ class AtlasSearch:
         scene: CollisionScene | None = None,
         settings: SearchSettings = SearchSettings(),
     ) -> None:
-        """Build the atlas at all time samples.
+        """Build the atlas of the self-motion manifolds at all time samples.
 
         Args:
             space: Joint space.
             samples: Manifolds of the time samples, by rising time.
             steps: Steps between the samples.
-            seeds: Returns configurations (M, n) at a sample, on as many components as possible; raises Unreachable.
+            seeds: Function that returns configurations (M, n) at a sample, on as many manifold components as possible,
+                or raises Unreachable.
             start: Configuration at the first sample, if given. Shape (n,).
             scene: Collision scene, or None.
             settings: Settings of the search.
 
         Raises:
-            Unreachable: At some sample no configuration does the tasks within limits.
+            Unreachable: At some sample no configuration within limits satisfies the tasks.
             ProblemError: The atlas needs too many charts.
         """
         self.space, self.samples = space, samples
@@ -123,7 +124,7 @@ class AtlasSearch:
         self.layers = [self.without_collisions(charts, k) for k, charts in enumerate(self.atlas)]
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return charts of all configurations of each time sample.
+        """Return charts of the self-motion manifolds that cover all configurations for the tasks at each time sample.
 
         Raises:
             Unreachable, ProblemError: As in the constructor.
@@ -152,7 +153,7 @@ class AtlasSearch:
         return atlas
 
     def without_collisions(self, charts: Charts, k: int) -> Charts:
-        """Return the charts of a time sample except those whose configurations are all in collision."""
+        """Return the manifold charts of a time sample except those on which all configurations are in collision."""
         return charts.select(self._collision_free(charts, k))
 
     def _collision_free(self, charts: Charts, k: int) -> NDArray[np.bool_]:
@@ -164,7 +165,10 @@ class AtlasSearch:
         return np.asarray((distances + charts.spans @ scene.levers.joints.T >= scene.clearance).all(axis=1))
 
     def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
-        """Return the graph of steps between charts that cost at most `max_costs`: one value, or shape (K - 1,)."""
+        """Return the graph of charts of the self-motion manifolds and of the steps of limited cost between them.
+
+        Each step costs at most `max_costs`: one value for all steps, or shape (K - 1,).
+        """
         max_costs = np.broadcast_to(max_costs, len(self.times) - 1)
         return ChartGraph(self.space, layers, self._steps, max_costs)
 
@@ -173,11 +177,11 @@ class AtlasSearch:
         return Steps(self.times, self.cost, self.limits)
 
     def full_graph(self) -> ChartGraph:
-        """Return the graph of all steps between the initial charts."""
+        """Return the graph of all possible steps between the initial charts of the self-motion manifolds."""
         return self.graph(self.layers)
 
     def restrict(self, first: int, last: int) -> AtlasSearch:
-        """Return the search restricted to the samples from `first` to `last`, both included."""
+        """Return the search restricted to the time samples from `first` to `last`, both included."""
         part, rows = copy(self), slice(first, last + 1)
         part.samples, part.times, part.limits = self.samples[rows], self.times[rows], self.limits[first:last]
         part.atlas, part.layers, part._cost_bounds = self.atlas[rows], self.layers[rows], None
@@ -193,17 +197,17 @@ class AtlasSearch:
         """Return the cost of the straight steps along a path (K, n)."""
         return float(self.cost.evaluate(np.diff(path, axis=0), np.diff(self.times)[:, None]).sum())
 
-    # ---- classes of motions ------------------------------------------------------------------------------------------
+    # ---- paths of locally least cost ---------------------------------------------------------------------------------
 
     def class_representatives(self, max_cost: float, include_costlier: bool = False) -> list[Array]:
-        """Return the lowest-cost path (K, n) of each class of motions, sorted by cost.
+        """Return the paths (K, n) of locally least cost, sorted by cost.
 
-        A class is represented by a chart through which a motion costs less than through its neighbours. After `solve`,
-        only classes are returned that its bound does not exclude.
+        Such a path leads through a chart through which motions cost less than through the neighbouring charts. After
+        `solve`, only paths are returned that its bound does not exclude.
 
         Args:
             max_cost: Largest cost of one step, such as the cost of a known motion; or inf.
-            include_costlier: Whether excluded classes are returned as well.
+            include_costlier: Whether excluded paths are returned as well.
         """
         if self._cost_bounds is None or include_costlier:
             graph = self.graph(self.layers, max_cost)
@@ -239,7 +243,7 @@ class AtlasSearch:
         cost_to_come: list[QuadraticBounds],
         cost_to_go: list[QuadraticBounds],
     ) -> Array | None:
-        """Return the lowest-cost path through a chart; None if it cannot be continued."""
+        """Return the lowest-cost path through one manifold chart; None if it cannot be continued to both ends."""
         slope = cost_to_go[k].slope[chart] + (cost_to_come[k].slope[chart] if k else 0.0)
         start_chart = graph.layers[k].select([chart])
         place = np.where(slope > 0, start_chart.low[0], np.where(slope < 0, start_chart.high[0], 0.0))
@@ -267,9 +271,10 @@ class AtlasSearch:
         return np.array([path[number] for number in range(last + 1)])
 
     def project_in_box(self, k: int, box: Charts, place: Array) -> Array | None:
-        """Return a valid configuration at box coordinates (r,) or, if there is none, nearer to the middle; else None.
+        """Return a valid configuration at coordinates (r,) of a manifold chart or nearer to its middle, else None.
 
-        A box reaches beyond the joint limits by the deviation of the manifold.
+        Points nearer to the middle are tried if the first is not valid: a box reaches beyond the joint limits by the
+        deviation of the manifold.
         """
         middle = (box.low[0] + box.high[0]) / 2
         shares = (0.0, 0.25, 0.5, 1.0)
@@ -278,7 +283,7 @@ class AtlasSearch:
         return next((configuration for configuration in projected if configuration is not None), None)
 
     def _project(self, k: int, joints: Array) -> Array | None:
-        """Project joints onto the manifold of a sample; return None if that violates limits or clearance."""
+        """Project a configuration to the manifold of a time sample; return None if it violates limits or clearance."""
         if k == 0 and self.start is not None:
             return self.start
         projected, converged = self.samples[k].manifolds.project(np.array([self.samples[k].row]), joints[None])
@@ -314,7 +319,7 @@ class AtlasSearch:
         return 1 - self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
 
     def _solve(self, max_cost: float) -> tuple[Array | None, float]:
-        """Return the best path and a lower bound as `solve` does, with steps that each cost at most `max_cost`."""
+        """Return what `solve` does (best path, lower bound) for paths whose steps each cost at most `max_cost`."""
         target = self._target_share
         layers, best_path = self.find_path(max_cost)
         if not layers:
@@ -327,7 +332,7 @@ class AtlasSearch:
         known_bounds: list[QuadraticBounds] | None = None  # lower bounds of the cost-to-come
         while True:
             graph = self.graph(layers, min(max_cost, best_cost) - remaining)
-            # bounds beyond the cutoff are not needed; at first it leaves a margin for other classes
+            # bounds beyond the cutoff are not needed; at first it leaves a margin for other local minima
             cutoff = best_cost / target if coarse else target * best_cost
             cost_to_go = graph.cost_to_go(known_bounds, cutoff)
             if coarse:
@@ -356,7 +361,7 @@ class AtlasSearch:
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
-        """Return the charts that paths with steps of at most `max_cost` may pass through, and one such path.
+        """Find a path whose steps each cost at most `max_cost`; return the charts open to such paths, and the path.
 
         The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """
@@ -379,17 +384,17 @@ class AtlasSearch:
             layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
     def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
-        """Return the path of least cost-to-go, shortened; None if it cannot be continued or is too fast."""
+        """Follow the least cost-to-go; return the shortened path, or None if the path breaks off or is too fast."""
         chart = int(graph.minima(cost_to_go[0], 0).argmin())
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 
     def _can_split(self, layers: list[Charts], max_charts: int) -> bool:
-        """Return whether the charts may be halved without exceeding `max_charts` or becoming too small."""
+        """Return whether the manifold charts may be halved without exceeding `max_charts` or becoming too small."""
         count = sum(2 ** charts.tangents.shape[2] * len(charts) for charts in layers)
         return count <= max_charts and max(float(charts.radii.max()) for charts in layers) >= self.settings.finest
 
     def _path_through_centers(self, graph: ChartGraph) -> Array | None:
-        """Return the lowest-cost path through chart centres, with a penalty on steps that are too long."""
+        """Return the lowest-cost path through the centres of manifold charts; steps that are too long are penalised."""
         layers = graph.layers
         cost, back_pointers = np.where(self._is_clear(layers[-1].centers, len(layers) - 1), 0.0, np.inf), list[Array]()
         for k in range(len(layers) - 2, -1, -1):
@@ -415,7 +420,7 @@ class AtlasSearch:
         return np.array(path)
 
     def _is_clear(self, joints: Array, k: int) -> NDArray[np.bool_]:
-        """Return which configurations (N, n) of a sample satisfy limits and clearance. Shape (N,)."""
+        """Return which configurations (N, n) of a time sample satisfy joint limits and clearance. Shape (N,)."""
         valid, scene = self.space.within(joints), self.scene
         if scene is not None:
             rows = np.flatnonzero(valid)
@@ -425,7 +430,7 @@ class AtlasSearch:
         return valid
 
     def _shorten(self, path: Array | None, layers: list[Charts]) -> Array | None:
-        """Shorten a path within its charts unless that causes a collision; return None if it is too fast."""
+        """Shorten a path on the manifolds if the result is valid; return None if the path is then too fast."""
         bounds = self.space.lower, self.space.upper
         if path is None:
             return None
@@ -438,7 +443,7 @@ class AtlasSearch:
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
 
     def split_charts(self, charts: Charts, k: int) -> Charts:
-        """Return charts of half the radius in place of those of a sample."""
+        """Return charts of the self-motion manifold with half the radius, in place of those of a time sample."""
         return self._split(charts, k).charts
 
     def _split(self, charts: Charts, k: int) -> SplitCharts:
@@ -448,7 +453,7 @@ class AtlasSearch:
         return self.samples[k].manifolds.split(numbered)
 
     def _refine(self, charts: Charts, k: int, values: QuadraticBounds) -> tuple[Charts, QuadraticBounds]:
-        """Halve charts; return the halves that are not in collision, with bounds on them."""
+        """Halve manifold charts; return the halves that are not in collision, and lower bounds of the cost on them."""
         halves = self._split(charts, k)
         free = self._collision_free(halves.charts, k)
         values, low, high = values.select(halves.owners[free]), halves.low[free], halves.high[free]

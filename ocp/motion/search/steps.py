@@ -1,4 +1,4 @@
-"""Lower bounds of the cost of straight steps between charts, as functions of the place where a step begins.
+"""Lower bounds of the cost of straight steps between charts of the self-motion manifold, as functions of their start.
 
 The integral of half the squared rates is no less than |dq|^2 / (2 dt), the length no less than |dq|_1. Charts are
 tangent to the manifold; its measured deviation is taken into account, and assumed to be no larger within a box than at
@@ -23,18 +23,20 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_CUTS = 8
-"""Cuts with tangents by which the minimum of a homogeneous cost is bracketed; it has one linear piece per joint."""
+"""Number of tangents that bracket the minimum of a homogeneous cost, which has one linear piece per joint."""
 MAX_CONCAVITY = 0.5
-"""Largest concavity of bounds that is kept, as a share of the step's own curvature; the rest becomes a constant."""
+"""Largest concavity of a cost bound relative to the curvature of a step's cost; the excess becomes a constant."""
 
 
 class QuadraticBounds(NamedTuple):
-    """Lower bounds of a value function on charts, as quadratic functions least + slope . t + t . curve . t / 2.
+    """Quadratic lower bounds of a value function on N charts of the self-motion manifold, in chart coordinates.
+
+    At chart coordinates t, the bound is least + slope . t + t . curve . t / 2.
 
     Attributes:
         least: Constant terms, infinite where no motion passes. Shape (N,).
-        slope: Shape (N, r).
-        curve: Symmetric. Shape (N, r, r).
+        slope: Coefficients of the linear terms. Shape (N, r).
+        curve: Symmetric matrices of the quadratic terms. Shape (N, r, r).
     """
 
     least: Array
@@ -42,21 +44,21 @@ class QuadraticBounds(NamedTuple):
     curve: Array
 
     def select(self, rows: Any) -> QuadraticBounds:
-        """Return the bounds of the given rows."""
+        """Return the bounds on the charts with the given indices."""
         return QuadraticBounds(*(part[rows] for part in self))
 
     @classmethod
     def constant(cls, least: Array, free: int) -> QuadraticBounds:
-        """Return constant bounds on charts that have `free` dimensions."""
+        """Return constant lower bounds on manifold charts of dimension `free`."""
         return cls(least, np.zeros((len(least), free)), np.zeros((len(least), free, free)))
 
     def minimum(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """Return the minima over the boxes (N, r), and where they are attained."""
+        """Return the minima of the bounds over the boxes of the charts (N, r), and the coordinates of the minima."""
         least, place = least_in_box(self.slope, self.curve, low, high)
         return self.least + least, place
 
     def at(self, places: Array) -> Array:
-        """Return the values (N,) at chart coordinates (N, r)."""
+        """Return the values of the bounds (N,) at chart coordinates (N, r)."""
         products = np.einsum("nab,nb->na", self.curve, places)
         return np.asarray(self.least + (places * (self.slope + products / 2)).sum(axis=1))
 
@@ -68,7 +70,7 @@ class Steps:
     Attributes:
         times: Times of the samples, s. Shape (K,).
         cost: Cost of a step.
-        limits: Largest step of each joint. Shape (K - 1, n).
+        limits: Largest displacement of each joint in a step. Shape (K - 1, n).
     """
 
     times: Array
@@ -77,12 +79,12 @@ class Steps:
 
 
 class CurvedCharts(NamedTuple):
-    """Charts with the manifold's deviation as a quadratic form, t . bends . t / 2, and its residual.
+    """Manifold charts, and the deviation of the manifold from them as a quadratic form with a residual.
 
     Attributes:
         charts: N charts.
-        bends: Quadratic forms. Shape (N, n, r, r).
-        rest: Residuals at the rim. Shape (N, c, n).
+        bends: Matrices of the forms t . bends . t / 2 in the chart coordinates t. Shape (N, n, r, r).
+        rest: Residuals at the rims of the charts. Shape (N, c, n).
     """
 
     charts: Charts
@@ -90,28 +92,34 @@ class CurvedCharts(NamedTuple):
     rest: Array
 
     def select(self, rows: Any) -> CurvedCharts:
-        """Return the charts of the given rows."""
+        """Return the charts with the given indices."""
         return CurvedCharts(self.charts.select(rows), self.bends[rows], self.rest[rows])
 
 
 class StepCost(ABC):
-    """Cost of a straight step between configurations, with lower bounds over charts (base class)."""
+    """Cost of a straight step between configurations, and its lower bounds over manifold charts (base class)."""
 
     @abstractmethod
     def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
     ) -> tuple[Array, Array]:
-        """Return cost (P,) and chart coordinates (P, r) of the lowest-cost steps into charts at distances (P, n)."""
+        """Return the costs (P,) and end coordinates (P, r) of the lowest-cost steps into manifold charts.
+
+        The centres of the charts are `delta` (P, n) away. The costs include the remaining costs `after`.
+        """
 
     @abstractmethod
     def lower_bounds(
         self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
     ) -> StepBounds:
-        """Return lower bounds of P steps between charts whose centres are `delta` (P, n) apart."""
+        """Return lower bounds of the costs of P steps between manifold charts, plus the costs `after` them.
+
+        The centres of the charts are `delta` (P, n) apart.
+        """
 
     @abstractmethod
     def evaluate(self, delta: Array, seconds: Any) -> Array:
-        """Return the cost of steps (..., n)."""
+        """Return the costs of steps with given joint displacements (..., n) and durations."""
 
     @abstractmethod
     def reach(self, cost: float, seconds: float) -> float:
@@ -120,11 +128,11 @@ class StepCost(ABC):
 
 @dataclass(frozen=True, eq=False)
 class SquaredRates(StepCost):
-    """Cost of steps as the integral of half the weighted squared rates.
+    """Cost of a step: the integral of half the weighted squared joint rates.
 
     A step d has a component along the chart that it enters and one across it. Along the chart, the cost is convex in
-    both places, and its minimum over the place in the box is quadratic in the starting place, by the multipliers of the
-    box. Across, |d|^2 / (2 dt) is at least p . d - dt |p|^2 / 2, with the multiplier p taken at the nearest places. The
+    its start and end, and its minimum over the end in its box is quadratic in the start, by the multipliers of the
+    box. Across, |d|^2 / (2 dt) is at least p . d - dt |p|^2 / 2, with the multiplier p taken at the nearest points. The
     quadratic deviation of the manifold enters the curvature of the bounds, where it cancels from step to step. Only its
     residual, of third order, is lost.
     """
@@ -171,7 +179,7 @@ class SquaredRates(StepCost):
             share = np.where(normal_cost > 0, np.clip(1 - loss / normal_cost, 0.0, 1.0), 0.0)
         multiplier *= share
         curve, excess = _raise_eigenvalues(curve + _dot(end_bends, multiplier[:, None, None]), -MAX_CONCAVITY / seconds)
-        # the deviation also shifts the places along the chart
+        # the deviation also shifts the ends along the chart
         slack = _symmetric_support(_rows_last(start.deviations), weighted_tangents)
         slack += _symmetric_support(_rows_last(end.deviations), weighted_tangents)
         widened_box = np.stack([end_box[0] - slack, end_box[1] + slack])
@@ -186,22 +194,22 @@ class SquaredRates(StepCost):
 
 
 def _rows_last(rows: Array) -> Array:
-    """Move the axis of the steps to the end, so that sums over few joints are vectorised over all steps."""
+    """Move the first axis, that of the steps, to the end, so that sums over joints are vectorised over all steps."""
     return np.ascontiguousarray(np.moveaxis(rows, 0, -1))
 
 
 def _apply(matrix: Array, vector: Array) -> Array:
-    """Multiply matrices (..., b, P) by vectors (b, P)."""
+    """Multiply P matrices (..., b, P) by P vectors (b, P)."""
     return np.asarray((matrix * vector).sum(axis=-2))
 
 
 def _apply_transposed(matrix: Array, vector: Array) -> Array:
-    """Multiply transposed matrices (a, b, P) by vectors (a, P)."""
+    """Multiply P transposed matrices (a, b, P) by P vectors (a, P)."""
     return np.asarray((matrix * vector[:, None]).sum(axis=0))
 
 
 def _multiply_transposed(left: Array, right: Array) -> Array:
-    """Multiply transposed matrices (a, b, P) by matrices (a, c, P)."""
+    """Multiply P transposed matrices (a, b, P) by P matrices (a, c, P)."""
     return np.asarray((left[:, :, None] * right[:, None]).sum(axis=0))
 
 
@@ -210,7 +218,7 @@ def _dot(left: Array, right: Array) -> Array:
 
 
 def _support(points: Array, direction: Array) -> Array:
-    """Return the support function of points (c, n, P) and the origin, in directions (n, P). Shape (P,)."""
+    """Return the support function of each point set (c, n, P) and the origin in directions (n, P). Shape (P,)."""
     support = np.zeros(direction.shape[1])
     for point in points:
         np.maximum(support, _dot(point, direction), out=support)
@@ -218,7 +226,7 @@ def _support(points: Array, direction: Array) -> Array:
 
 
 def _symmetric_support(points: Array, directions: Array) -> Array:
-    """Return the largest absolute component of points (c, n, P) in directions (n, r, P). Shape (r, P)."""
+    """Return the largest absolute component of each point set (c, n, P) along directions (n, r, P). Shape (r, P)."""
     support = np.zeros(directions.shape[1:])
     for point in points:
         np.maximum(support, np.abs(_apply_transposed(directions, point)), out=support)
@@ -228,7 +236,7 @@ def _symmetric_support(points: Array, directions: Array) -> Array:
 def _nearest_places(
     projection: Array, rotation: Array, start_box: Array, end_box: Array, slope: Array, curve: Array, seconds: float
 ) -> tuple[Array, Array]:
-    """Return coordinates (2, r, P) in the boxes at both ends of each step between which the step has a low cost."""
+    """Return the start and end coordinates (r, P) of a low-cost step between the boxes of each of P pairs of charts."""
     square, middle = curve + np.eye(len(projection))[:, :, None] / seconds, (start_box[0] + start_box[1]) / 2
     end_place = _least_in_box((projection - _apply(rotation, middle)) / seconds + slope, square, *end_box)[1]
     slope, square = -_apply_transposed(rotation, projection + end_place), _multiply_transposed(rotation, rotation)
@@ -237,11 +245,11 @@ def _nearest_places(
 
 @dataclass(frozen=True, eq=False)
 class SquaredRateBounds:
-    """Lower bounds of a step's cost plus the remaining cost, as functions of the start t in its box.
+    """Lower bounds of the cost of steps plus the remaining cost, as functions of the start coordinates t of a step.
 
     The bound is least + slope . t + t . level . t / 2, plus the minimum over t' in the box `end_box` of
     v . v / (2 dt) + after . t' + t' . after_curve . t' / 2. Here v = projection - rotation . t + t' is the step along
-    the chart. The axis of the steps comes last. Each place p yields a global lower bound: value + slope . (t - p) plus
+    the chart. The axis of the steps comes last. Each point p yields a global lower bound: value + slope . (t - p) plus
     (t - p) . curve . (t - p) / 2.
     """
 
@@ -271,12 +279,12 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + _rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Return the step to the end t' = 0, the least cost that the choice of t' in its box adds, and that t'."""
+        """Minimise the bounds over the end of a step; return the step to end 0, the least cost added, the best end."""
         start = self.projection - _apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        """Return values (P,) and slopes (P, r) of the bounds at chart coordinates (P, r)."""
+        """Return values (P,) and slopes (P, r) of the bounds at start coordinates (P, r)."""
         places = _rows_last(places)
         start, after, end_place = self._minimize_after(places)
         products = _apply(self.level, places)
@@ -285,7 +293,10 @@ class SquaredRateBounds:
         return value + _dot(places, products / 2 + self.slope), _rows_first(slope)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Return coordinates (P, r) that lower the bounds minus slope . t + t . curve . t / 2, starting at `places`."""
+        """Improve start coordinates (P, r) towards a minimum of the bounds minus a quadratic function of them.
+
+        With start coordinates t, this function is slope . t + t . curve . t / 2.
+        """
         end_place = self._minimize_after(_rows_last(places))[2]
         gradient = -_apply_transposed(self.rotation, self.projection + end_place) / self.seconds
         square = _multiply_transposed(self.rotation, self.rotation) / self.seconds + self.level - _rows_last(curve)
@@ -293,13 +304,13 @@ class SquaredRateBounds:
 
 
 def _rows_first(columns: Array) -> Array:
-    """Move the axis of the steps to the front."""
+    """Move the last axis, that of the steps, to the front: the inverse of `_rows_last`."""
     return np.ascontiguousarray(np.moveaxis(columns, -1, 0))
 
 
 @dataclass(frozen=True, eq=False)
 class Homogeneous(StepCost):
-    """Cost proportional to the length of a step, with affine lower bounds; at most one free direction.
+    """Cost proportional to the length of a step, with affine lower bounds on charts of dimension 0 or 1.
 
     Attributes:
         weights: Weights of the joint displacements, 0 to ignore a joint. Shape (n,).
@@ -309,10 +320,10 @@ class Homogeneous(StepCost):
 
     @abstractmethod
     def gradient(self, displacement: Array) -> Array:
-        """Return the gradients of the cost at displacements (P, n)."""
+        """Return the gradients of the cost at joint displacements (P, n)."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return lower bounds (P,) of the cost of steps into charts, their gradients (P, n), and minimisers (P, 1)."""
+        """Return lower bounds (P,) of the costs of steps plus later costs, gradients (P, n), and end points (P, 1)."""
         count = len(delta)
         if not target.tangents.shape[2]:
             return self.evaluate(delta, 1.0) + after.least, self.gradient(delta), np.zeros((count, 0))
@@ -320,12 +331,12 @@ class Homogeneous(StepCost):
         box = target.low[:, 0], target.high[:, 0]
 
         def linearize(place: Array) -> list[Array]:
-            """Return a place, the gradient there, the tangent's value at the origin, and the total slope."""
+            """Return chart coordinates, the gradient there, the tangent's value at the origin, and the total slope."""
             gradient = self.gradient(delta + along * place[:, None])
             return [place, gradient, (gradient * delta).sum(axis=1), (gradient * along).sum(axis=1) + slope]
 
         def intersect() -> Array:
-            """Return the intersection of the tangents at the bracket's ends; an end with rising cost is the minimum."""
+            """Return where the tangents at the ends of the bracket intersect, or the end at which the cost is least."""
             with np.errstate(divide="ignore", invalid="ignore"):
                 crossing = np.clip(np.nan_to_num((first[2] - last[2]) / (last[3] - first[3])), first[0], last[0])
             return np.where(first[3] >= 0, first[0], np.where(last[3] <= 0, last[0], crossing))
@@ -360,7 +371,7 @@ class Homogeneous(StepCost):
 
 
 class PathLength(Homogeneous):
-    """Cost of steps as the weighted sum of the absolute joint displacements."""
+    """Cost of a step: the weighted sum of the absolute joint displacements."""
 
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).sum(axis=-1))
@@ -373,7 +384,7 @@ class PathLength(Homogeneous):
 
 
 class LargestMotion(Homogeneous):
-    """Cost of steps as the largest weighted displacement; with weights 1 / velocity limit it is a duration."""
+    """Cost of a step: the largest weighted joint displacement, a duration if weights are inverse velocity limits."""
 
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).max(axis=-1))
@@ -390,7 +401,7 @@ class LargestMotion(Homogeneous):
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBounds:
-    """Lower bounds of steps with a homogeneous cost; arguments are those of `Homogeneous.lower_bounds`."""
+    """Lower bounds of a homogeneous cost of steps plus later costs, as built by `Homogeneous.lower_bounds`."""
 
     cost: Homogeneous
     delta: Array
@@ -420,20 +431,21 @@ class HomogeneousBounds:
 
 
 StepBounds: TypeAlias = SquaredRateBounds | HomogeneousBounds
-"""Lower bounds of P steps and of the cost after them, as functions of the place in the starting box."""
+"""Lower bounds of the costs of P steps plus the costs after them, as functions of the start coordinates."""
 
 
 def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return minima (P,) of slope . t + t . square . t / 2 in boxes of up to two dimensions, and minimisers (P, r).
+    """Return the minima (P,) and minimisers (P, r) of P quadratic functions over boxes of at most two dimensions.
 
-    Compared are the corners, the stationary points on the sides, and the stationary point inside.
+    The functions are slope . t + t . square . t / 2. Compared are the corners, the stationary points on the sides, and
+    the stationary point inside.
     """
     least, place = _least_in_box(_rows_last(slope), _rows_last(square), _rows_last(low), _rows_last(high))
     return least, _rows_first(place)
 
 
 def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the minima as `least_in_box` does, with the functions along the last axis."""
+    """Minimise P quadratic functions over boxes as `least_in_box` does, but with the functions along the last axis."""
     r, count = slope.shape
     if not r:
         return np.zeros(count), np.zeros(slope.shape)
@@ -473,7 +485,7 @@ def _lowest_eigenvalue(square: Array) -> Array:
 
 
 def _raise_eigenvalues(square: Array, floor: float) -> tuple[Array, Array]:
-    """Raise the eigenvalues of symmetric matrices (r, r, P) to a minimum; also return the largest increases (P,)."""
+    """Raise the eigenvalues of symmetric matrices (r, r, P) to at least `floor`; also return the increases (P,)."""
     excess = np.maximum(floor - _lowest_eigenvalue(np.moveaxis(square, -1, 0)), 0.0)
     rows = np.flatnonzero(excess > 0)
     if rows.size:

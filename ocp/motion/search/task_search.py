@@ -1,4 +1,4 @@
-"""Global search over all motions that perform the tasks at their times: choice of the time samples, and bounds."""
+"""Global search over all motions that perform the tasks at their times: choice of time samples, and bounds."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ __all__ = ["TaskSearch"]
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """Settings of the choice of time samples.
+    """Settings for the choice of the time samples of a global search.
 
     Attributes:
-        lost: Share of the cost that straight steps between the samples may lose, by the number of free directions. With
-            two, each sample is expensive: a third of the loss took half as long again.
+        lost: Share of the cost that straight steps between the samples may lose, by the dimension of the manifold. On
+            surfaces, each sample is expensive: a third of the loss took half as long again.
         steps: Least number of steps over the motion.
         closest: Least distance between samples, as a share of the horizon.
         near_speed_limit: Share of its velocity limit from which on a joint is nearly at it, so that samples are added.
         near_position_limit: The same for position limits: distance to the limit, rad or m.
         subdivisions: Parts into which a step is divided where a segment ends and one segment fewer might do.
-        motion_steps: Samples of the returned motions, besides the breaks of the tasks.
+        motion_steps: Number of time steps of the returned motions, besides the breaks of the tasks.
     """
 
     lost: tuple[float, float, float] = (0.0033, 0.0033, 0.045)
@@ -65,14 +65,14 @@ class TaskSearch:
         times: Times of the samples, s.
 
     Raises:
-        ProblemError: A moving base, a task that is no pose, or too many free directions.
+        ProblemError: A moving base, a task that is no pose, or too many redundant degrees of freedom.
         Unreachable: At some sample no configuration does the tasks.
     """
 
     def __init__(
         self, request: PlanRequest, motions: list[LocalMotion], settings: SampleSettings = SampleSettings()
     ) -> None:
-        """Choose the time samples and search at them.
+        """Choose the time samples and search over the configurations at these times.
 
         Args:
             request: The request.
@@ -126,7 +126,7 @@ class TaskSearch:
         self._search_at(times)
 
     def _search_at(self, times: list[Array]) -> None:
-        """Search over the configurations at given times of each stretch that has tasks."""
+        """Search over the configurations at time samples, given for each interval (stretch) that has tasks."""
         self._build_search(times)
         self._path, bound = self._search.solve(self._known_cost)
         self.bound = max(self.bound, bound)  # the bound of fewer samples stays valid
@@ -134,7 +134,7 @@ class TaskSearch:
             self._known_cost = max(self._known_cost, self._search.path_cost(self._path))
 
     def _build_search(self, times: list[Array]) -> None:
-        """Build the atlas at the given times of each stretch that has tasks."""
+        """Build the atlas of the manifolds at time samples, given for each interval (stretch) that has tasks."""
         request, samples = self.request, list[TimeSample]()
         for equations, stretch_times in zip(self._equations, times, strict=True):
             manifolds = self._manifolds(equations, stretch_times)
@@ -156,7 +156,7 @@ class TaskSearch:
         return [stretch.equations for stretch in self.request.stretches if stretch.equations is not None]
 
     def dead_end(self) -> DeadEnd | None:
-        """Diagnose where motions end, and why; None if a motion reaches the end."""
+        """Return an error that says where all motions end, and why; None if a motion reaches the end."""
         if self._path is not None:
             return None
         ends = segment_ends(self._search, 0)
@@ -164,10 +164,10 @@ class TaskSearch:
         return dead_end(self._search, proven=not np.isfinite(self.bound), segments=len(ends) if through else None)
 
     def segments(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
-        """Return the start and end of the fewest, lowest-cost segments, and a lower bound of their number.
+        """Divide the tasks into the fewest segments of lowest cost; return their times and a bound of their number.
 
         Args:
-            barred: Begin and end, s, of intervals that are known not to be done in one segment.
+            barred: Begin and end, s, of intervals that are known to be infeasible in one segment.
 
         Returns:
             None if the motion cannot be continued somewhere, however the tasks are divided.
@@ -193,15 +193,15 @@ class TaskSearch:
 
     @property
     def _can_subdivide(self) -> NDArray[np.bool_]:
-        """Mask of the steps between samples that are long enough to be subdivided."""
+        """Mask of the steps between time samples that are long enough to be subdivided."""
         return np.asarray(np.diff(self.times) > self._settings.closest * self.request.horizon)
 
     def _with_samples(self, times: Array) -> list[Array]:
-        """Return the sample times of each stretch, including additional ones."""
+        """Return the sample times of each interval (stretch) that has tasks, including additional times."""
         return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._times_by_stretch]
 
     def refine_samples(self) -> bool:
-        """Add samples where the best path is near a limit, and search again; return whether samples were added."""
+        """Add time samples where the best path is near a limit, and search again; return whether any were added."""
         if self._path is None:
             return False
         settings, bounds, path = self._settings, self.request.bounds, self._path
@@ -215,7 +215,7 @@ class TaskSearch:
         return True
 
     def _seeds(self, k: int) -> Array:
-        """Return configurations at a sample, from closed forms and from inverse kinematics with random starts."""
+        """Return configurations for the tasks at a time sample, from closed-form and iterative inverse kinematics."""
         manifolds, index = self._samples[k]
         try:
             return manifolds.seeds(index, self.request.limits.joints, self.request.seed + k)
@@ -223,9 +223,9 @@ class TaskSearch:
             raise locate_error(self.request, error, float(self.times[k])) from error
 
     def local_motions(self, include_costlier: bool = False) -> list[LocalMotion]:
-        """Return the lowest-cost motion of each class through all stretches, as guesses for the planner.
+        """Return motions of locally least cost as guesses, one result for each time interval with the same tasks.
 
-        By default only classes that may hold the optimum; with `include_costlier` one motion of every class.
+        By default only motions near which the optimum may lie; with `include_costlier` all of them.
         """
         request, settings, motions = self.request, self._settings, list[LocalMotion]()
         paths = self._search.class_representatives(self._known_cost, include_costlier)
@@ -253,7 +253,7 @@ class TaskSearch:
 def choose_samples(
     t: Array, joints: Array, weights: Array, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Choose the fewest times of a motion (M,) with which straight steps keep its cost to a given accuracy.
+    """Choose a few times of a motion (M,) such that straight steps between them keep its cost to a given accuracy.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.

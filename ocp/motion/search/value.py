@@ -1,19 +1,19 @@
-"""Dynamic programming over charts: lower bounds of the cost-to-go, and paths shortened within the manifolds.
+"""Dynamic programming over charts of the self-motion manifold: lower bounds of the cost-to-go, and shortening of paths.
 
 Between two time samples a motion costs at least what the straight step costs: the integral of half the squared rates is
 no less than |dq|^2 / (2 dt), the length no less than |dq|_1. The least cost over all sequences of configurations, one
 per sample, is therefore a lower bound for every motion that does the task. Backward dynamic programming finds it:
 w_k(q) = min over q' of d(q, q') + w_{k+1}(q').
 
-On each chart, the value function is bounded from below by a quadratic function of the place in the box. Every step
-gives one such function for each corner by its multipliers, all with nearly the same curvature. Less the curvature of
-the cheapest step they are affine, and their least is concave. An affine function below a concave one at the corners of
+On each chart, the value function is bounded from below by a quadratic function of the chart coordinates. Every step
+gives one such function for each corner by its multipliers, all with nearly the same curvature. Minus that of the
+lowest-cost step they are affine, and their minimum is concave. An affine function below a concave one at the corners of
 a box lies below it everywhere. The loss is of third order in the size of the charts for squared rates, and of second
 order for lengths, whose bounds are affine.
 
 Paths are shortened by dynamic programming as well. At every sample, some configurations on either side of the path are
 taken, and the lowest-cost path through them replaces it. Their spacing is reduced once the path no longer runs along
-their edge. Violations are penalised, so that a path leaves them where it can. A path that no longer changes is optimal
+their edge. Violations are penalised, so that a path can move out of them. A path that no longer changes is optimal
 among its neighbours, whatever kinks its cost has.
 """
 
@@ -43,14 +43,14 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class GraphSettings:
-    """Settings of the graph of charts.
+    """Settings of the graph of charts of the self-motion manifold.
 
     Attributes:
-        successors: Charts that are tried as the next one of a configuration.
+        successors: Number of charts that are tried as the next one after a configuration.
         pairs: Approximate number of neighbouring charts that are processed together, limited by memory.
-        sample: Charts from which the number of neighbours is estimated.
-        tangents, refinements: Tangent planes by which the least of a step in a box is bounded more tightly, and places
-            on the way to each. Fewer give looser bounds, and split charts that could be discarded.
+        sample: Number of charts from which the number of neighbours is estimated.
+        tangents, refinements: Numbers of tangent planes that tighten the bound of a step over a box, and of iterations
+            towards each. Fewer give looser bounds, so that charts are split that could be discarded.
     """
 
     successors: int = 8
@@ -61,7 +61,7 @@ class GraphSettings:
 
 
 class ChartGraph:
-    """Layered graph of the charts at all time samples, with the possible steps between them."""
+    """Layered graph whose nodes are the manifold charts at all time samples, and whose edges are possible steps."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class ChartGraph:
         *,
         settings: GraphSettings = GraphSettings(),
     ) -> None:
-        """Build the graph of charts and possible steps.
+        """Create the graph of charts of the self-motion manifold and possible steps between them.
 
         Args:
             space: Joint space.
@@ -87,13 +87,13 @@ class ChartGraph:
 
     @cached_property
     def curved(self) -> list[CurvedCharts]:
-        """Charts of each time sample with the curvature of the manifold."""
+        """Manifold charts of each time sample, with the curvature of the manifold."""
         return [CurvedCharts(charts, *charts.curvature()) for charts in self.layers]
 
     def cost_to_go(
         self, cost_to_come: list[QuadraticBounds] | None = None, max_cost: float = np.inf
     ) -> list[QuadraticBounds]:
-        """Return lower bounds of the remaining cost (cost-to-go) on the charts of each sample.
+        """Return lower bounds of the remaining cost (cost-to-go) on the manifold charts of each time sample.
 
         Motions that cost at least `max_cost` in all, by bounds of the `cost_to_come`, are left out.
         """
@@ -102,11 +102,11 @@ class ChartGraph:
     def cost_to_come(
         self, cost_to_go: list[QuadraticBounds] | None = None, max_cost: float = np.inf
     ) -> list[QuadraticBounds]:
-        """Return lower bounds of the previous cost (cost-to-come) on the charts of each sample."""
+        """Return lower bounds of the cost so far (cost-to-come) on the manifold charts of each time sample."""
         return self._sweep(range(len(self.layers)), 1, cost_to_go, max_cost)
 
     def reachable(self) -> list[NDArray[np.bool_]]:
-        """Return which charts lie on a path from the first to the last sample. Shape (N,) for each sample."""
+        """Return which manifold charts lie on a path from the first to the last time sample. Shape (N,) for each."""
         masks = [np.ones(len(charts), dtype=bool) for charts in self.layers]
         end = len(masks) - 1
         for order in (range(end), range(end, 0, -1)):
@@ -119,7 +119,7 @@ class ChartGraph:
         return masks
 
     def edges(self, k: int, neighbour: int) -> Iterator[tuple[Indices, Indices]]:
-        """Yield batches of pairs of charts of two consecutive samples between which a step is possible."""
+        """Yield batches of pairs of manifold charts of consecutive time samples between which a step is possible."""
         source, target = self.layers[k], self.layers[neighbour]
         if not len(source) or not len(target):
             return
@@ -151,10 +151,11 @@ class ChartGraph:
     def successors(
         self, joints: Array, k: int, neighbour: int, after: QuadraticBounds
     ) -> Iterator[tuple[Charts, Array]]:
-        """Yield the charts of a neighbouring sample that a configuration (n,) can reach, sorted by cost.
+        """Yield the manifold charts of a neighbouring time sample that a configuration (n,) can reach, by rising cost.
 
         Yields:
-            A single chart, shifted by full turns to the configuration, and the place in its box, (r,).
+            A single chart, shifted by full turns to the configuration, and the end of the step in chart coordinates
+            (r,).
         """
         charts = self.layers[neighbour]
         between = min(k, neighbour)
@@ -172,7 +173,7 @@ class ChartGraph:
     def _sweep(
         self, order: range, direction: int, known_bounds: list[QuadraticBounds] | None, max_cost: float
     ) -> list[QuadraticBounds]:
-        """Propagate bounds from sample to sample in the given order."""
+        """Propagate lower bounds of the cost from time sample to time sample in the given order."""
         layers = self.layers
         bounds: list[Any] = [None] * len(layers)
         first = order[0]
@@ -189,15 +190,15 @@ class ChartGraph:
     def _propagate(
         self, k: int, neighbour: int, after: QuadraticBounds, known_bounds: QuadraticBounds | None, max_cost: float
     ) -> QuadraticBounds:
-        """Return bounds on the charts of sample k from the bounds on the charts of its neighbour, `after`.
+        """Return cost bounds on the manifold charts of sample k, from the bounds `after` on a neighbouring sample.
 
-        With `known_bounds` of the rest of the motions, those that cost `max_cost` or more are left out.
+        With `known_bounds` of the other part of the motions, those that cost `max_cost` or more are left out.
         """
         source, target = self.layers[k], self.layers[neighbour]
         seconds = float(self.seconds[min(k, neighbour)])
         bounds = QuadraticBounds.constant(np.full(len(source), np.inf), source.low.shape[1])
         known_costs = np.zeros(len(source)) if known_bounds is None else self.minima(known_bounds, k)
-        # leave out steps that are nowhere the cheapest of their chart: first by distances, then by tangent planes
+        # leave out steps that nowhere cost least of their chart: first by distances, then by tangent planes
         start_spans, end_spans = source.spans, target.spans
         places = np.clip(0.0, target.low, target.high)
         lowest, middle = self.minima(after, neighbour), after.at(places)
@@ -232,7 +233,7 @@ class ChartGraph:
 
     @staticmethod
     def _raise_to_floor(values: QuadraticBounds, charts: Charts, floor: Array) -> QuadraticBounds:
-        """Replace a bound by a constant `floor` where that exceeds the mean of its middle value and its minimum."""
+        """Replace a cost bound by the constant `floor` where this exceeds the mean of its middle value and minimum."""
         least = values.minimum(charts.low, charts.high)[0]
         higher = values.at((charts.low + charts.high) / 2) + least < 2 * floor
         return QuadraticBounds(
@@ -242,17 +243,17 @@ class ChartGraph:
         )
 
     def minima(self, values: QuadraticBounds, k: int) -> Array:
-        """Return the minima of bounds over the boxes of a sample's charts. Shape (N,)."""
+        """Return the minimum of the cost bound on each chart of a time sample's self-motion manifold. Shape (N,)."""
         return values.minimum(self.layers[k].low, self.layers[k].high)[0]
 
     def cost_through(self, cost_to_come: list[QuadraticBounds], cost_to_go: list[QuadraticBounds], k: int) -> Array:
-        """Return lower bounds of the cost of motions through each chart of a sample. Shape (N,)."""
+        """Return lower bounds of the cost of motions through each manifold chart of a time sample. Shape (N,)."""
         total = QuadraticBounds(*(first + second for first, second in zip(cost_to_come[k], cost_to_go[k], strict=True)))
         return np.where(np.isfinite(total.least), self.minima(total, k), np.inf)
 
 
 def _bound_with_rest(steps: StepBounds, charts: Charts, known_bounds: QuadraticBounds) -> Array:
-    """Return lower bounds of steps from charts plus the remaining motion. Shape (P,)."""
+    """Return lower bounds of the total cost of motions that contain given steps. Shape (P,)."""
     middle, curve = (charts.low + charts.high) / 2, steps.curve
     total = _tangent_bounds(middle, steps.at(middle), curve, -known_bounds.curve, -known_bounds.slope)
     return known_bounds.least + total.minimum(charts.low, charts.high)[0]
@@ -267,16 +268,16 @@ def _least_of_groups(values: Array, groups: Indices) -> Array:
 def _bound_charts(
     steps: StepBounds, charts: Charts, starts: Indices, max_costs: Array, settings: GraphSettings
 ) -> QuadraticBounds:
-    """Combine the bounds of the steps from each chart, which begin at `starts`, into one lower bound per chart.
+    """Combine the cost bounds of all steps from a chart of the self-motion manifold into one bound for each chart.
 
-    Values above `max_costs`, shape (M,), need not be resolved.
+    The steps of a chart are consecutive and begin at `starts`. Values above `max_costs` (M,) need not be resolved.
     """
     r = charts.tangents.shape[2]
     count = np.diff(np.append(starts, len(charts)))
     group = np.repeat(np.arange(len(starts)), count)
     middle, half = (charts.low + charts.high) / 2, (charts.high - charts.low) / 2
     places = [middle, *(middle + side * half * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0))]
-    # less the curvature of the cheapest step and the concavity of the least of all, they are nearly affine
+    # minus the curvature of the lowest-cost step and the concavity of their minimum, bounds are nearly affine
     tangents, curves = [steps.at(place) for place in places], steps.curve
     curve = curves[np.lexsort((tangents[0][0], group))[starts]].copy()
     heights = np.minimum.reduceat(np.stack([value for value, _ in tangents]), starts, axis=1)
@@ -285,7 +286,7 @@ def _bound_charts(
     common = curve[group]
     values = np.stack([tangent[0] - _quadratic(common, place) for tangent, place in zip(tangents, places, strict=True)])
     slope = _secant_slopes([*(heights - _quadratic_at_places(curve, places, starts))], half[starts])
-    # how far the steps lie above the linear functions: by tangent planes at places where they are low
+    # bound how far the steps lie above the linear functions by tangent planes at points where they are low
     tilt, rows = slope[group], np.arange(len(charts))
     excess = values - np.stack([(place * tilt).sum(axis=1) for place in places])
     upper, best_place = np.minimum.reduceat(excess.min(axis=0), starts)[group], excess.argmin(axis=0)
@@ -293,7 +294,7 @@ def _bound_charts(
     lowest, value, slope_at = stacked
     best = _tangent_bounds(lowest, (value, slope_at), curves, common, tilt)
     least = best.minimum(charts.low, charts.high)[0]
-    for _ in range(settings.tangents):  # the steps that may be the least of their chart
+    for _ in range(settings.tangents):  # only steps that may determine the minimum of their chart
         undecided = np.flatnonzero(least[rows] < upper[rows])
         rows, best = rows[undecided], best.select(undecided)
         remaining, boxes, curvature = steps.select(rows), charts.select(rows), common[rows]
@@ -309,9 +310,9 @@ def _bound_charts(
 def _best_combination(
     best: QuadraticBounds, best_least: Array, tangent: QuadraticBounds, charts: Charts
 ) -> tuple[QuadraticBounds, Array]:
-    """Return the convex combinations of two bounds whose minimum is highest, and this minimum.
+    """Return the convex combination of two cost bounds whose minimum is highest, and this minimum, for P steps.
 
-    Of both, which have the same curvature, those combinations are tried that are level along an axis. `best_least` is
+    Both have the same curvature. Combinations are tried that are level along an axis. `best_least` is
     the minimum of the first. Shape (P,).
     """
     first = best
@@ -329,7 +330,7 @@ def _best_combination(
 
 
 def _quadratic(curve: Array, place: Array) -> Array:
-    """Return t . curve . t / 2. Shape (P,)."""
+    """Return the quadratic form t . curve . t / 2 at P points t. Shape (P,)."""
     return np.asarray((place * np.einsum("pab,pb->pa", curve, place)).sum(axis=1) / 2)
 
 
@@ -340,16 +341,19 @@ def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> 
 def _tangent_bounds(
     places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
 ) -> QuadraticBounds:
-    """Return affine lower bounds of functions at given places, minus tilt . t + t . common . t / 2."""
+    """Return lower bounds of functions by their tangents at given points, minus a common quadratic function.
+
+    This function is tilt . t + t . common . t / 2.
+    """
     value, slope = values
     at_origin = value - (places * slope).sum(axis=1) + _quadratic(curve, places)
     return QuadraticBounds(at_origin, slope - np.einsum("pab,pb->pa", curve, places) - tilt, curve - common)
 
 
 def _concavity(values: Array, half: Array, curve: Array) -> Array:
-    """Estimate the concavity of functions in boxes from values in the middle and on each axis. Shape (M, r, r).
+    """Estimate the concavity of functions on charts from values in the middle and on each axis. Shape (M, r, r).
 
-    The total curvature does not become negative by it.
+    It does not make the total curvature negative.
     """
     second_differences = (values[1::2] + values[2::2] - 2 * values[0]).T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -359,7 +363,7 @@ def _concavity(values: Array, half: Array, curve: Array) -> Array:
 
 
 def _secant_slopes(values: list[Array], half: Array) -> Array:
-    """Return slopes of functions in boxes, from values in the middle and at both ends of each axis. Shape (M, r).
+    """Return slopes of functions on charts, from values in the middle and at both ends of each axis. Shape (M, r).
 
     A concave function gets the slope from end to end, a convex one the flattest slope.
     """
@@ -374,7 +378,7 @@ def _secant_slopes(values: list[Array], half: Array) -> Array:
 
 
 PENALTY = 1e6
-"""Cost per rad or m of a violated limit, beyond the cost of any path."""
+"""Penalty per rad or m by which a limit is violated, larger than the cost of any path."""
 
 
 @dataclass(frozen=True)
@@ -382,9 +386,9 @@ class ShorteningSettings:
     """Settings of `shorten_path`.
 
     Attributes:
-        neighbours: Configurations on either side of the path, by the number of free directions.
+        neighbours: Number of configurations on either side of the path, by the dimension of the manifold.
         margin: Distance by which the clearance is exceeded, m.
-        max_moves: Iterations with one spacing.
+        max_moves: Largest number of iterations with one spacing.
         least_gain: Relative cost reduction below which the spacing is reduced though the path runs along the edge.
     """
 
@@ -460,7 +464,7 @@ def shorten_path(
 def _violation(
     candidates: Array, times: Array, bounds: tuple[Array, Array], scene: CollisionScene | None, margin: float
 ) -> Array:
-    """Return the amount by which candidates (K, s, n) violate limits and clearance, rad and m. Shape (K, s)."""
+    """Return by how much configurations (K, s, n) violate joint limits and clearance, rad and m. Shape (K, s)."""
     excess = np.maximum(np.maximum(candidates - bounds[1], bounds[0] - candidates), 0.0).sum(axis=2)
     if scene is None:
         return np.asarray(excess)
