@@ -33,81 +33,81 @@ endif
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
-reproduce: $(VENV)/run.stamp ## run every paper script: figures, tables and summary.json into results/
+reproduce: $(VENV)/run.stamp ## recompute the figures and tables of the papers into results/
 	$(BIN)/python scripts/reproduce.py --out "$(OUT)"
 
-gallery: $(VENV)/gallery.stamp ## real robots: plan, audit and draw each example into results/gallery
+gallery: $(VENV)/gallery.stamp ## plan, audit and draw the examples with real robots into results/gallery
 	$(BIN)/python scripts/gallery.py --out "$(OUT)"
 
-benchmark: $(VENV)/peers.stamp $(VENV)/test.stamp ## time model functions, builds, solves and plans, beside other packages
+benchmark: $(VENV)/peers.stamp $(VENV)/test.stamp ## time model functions, builds, solves and plans, also with other packages
 	$(BIN)/python scripts/benchmark.py --out "$(OUT)"
 
-site: $(VENV)/site.stamp ## build the documentation into build/site, its tutorials run, and look at every link
+site: $(VENV)/site.stamp ## build the documentation into build/site, run the code of its pages, check every link
 	rm -rf build/site
 	$(BIN)/python -m sphinx -q -E -a -j $(WORKERS) --fail-on-warning --keep-going -d build/doctrees docs build/site
 	$(BIN)/python -m docs.links build/site
 
-test: $(VENV)/test.stamp ## run the tests (ARGS="-k momentum -x" passes options on)
+test: $(VENV)/test.stamp ## run the fast tests (ARGS="-k momentum -x" passes options on to pytest)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(ARGS)
 
-long: $(VENV)/test.stamp ## run the tests that take minutes: the gallery, random paths and robots, standing plans
+long: $(VENV)/test.stamp ## run the slow tests: the gallery, random paths and robots, standing plans
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m long $(ARGS)
 
-sweep: $(VENV)/test.stamp ## audit a thousand random problems whose truth is known (ARGS="--only pendulum --seed 3")
+sweep: $(VENV)/test.stamp ## audit a thousand random problems of known solution (ARGS="--only pendulum --seed 3")
 	$(BIN)/python -m tests.sweep --workers $(WORKERS) --out "$(OUT)" $(ARGS)
 
-crowded: $(VENV)/test.stamp ## plan 300 random tasks among boxes and look for collisions with coal (ARGS="--only ur5 --count 20")
+crowded: $(VENV)/test.stamp ## plan 300 random tasks among boxes, check for collisions with coal (ARGS="--only ur5 --count 20")
 	$(BIN)/python -W ignore -m tests.sweep.crowded --out "$(OUT)/sweeps/crowded.jsonl" $(ARGS)
 
-brute: $(VENV)/test.stamp ## 1000 coarse tasks searched, beside all sequences of postures of a fine grid (ARGS="--again": those that older code did)
+brute: $(VENV)/test.stamp ## compare 1000 global searches with all sequences of configurations on a fine grid (ARGS="--again": repeat old results)
 	$(BIN)/python -W ignore -m tests.sweep.brute_force --out "$(OUT)/sweeps/brute_force.jsonl" $(ARGS)
 
-global: $(VENV)/test.stamp ## plan seeded tasks by search over all motions, beside 200 random starts each (ARGS="--only panda")
+global: $(VENV)/test.stamp ## compare plans of search="global" with plans from 200 random starts each (ARGS="--only panda")
 	$(BIN)/python -W ignore -m tests.sweep.global_plans --out "$(OUT)/sweeps/global_plans.jsonl" $(ARGS)
 
-redundancy: $(VENV)/test.stamp ## plan the problems of a public benchmark of redundant arms, and check them (ARGS="--only panda__1cube")
+redundancy: $(VENV)/test.stamp ## plan and check six problems of a published benchmark of redundant arms (ARGS="--only panda__1cube")
 	$(BIN)/python -W ignore -m tests.sweep.redundancy --out "$(OUT)/sweeps/redundancy.jsonl" $(ARGS)
 
-mbm: $(VENV)/test.stamp ## plan 700 problems of MotionBenchMaker, and 70 in least time (DATA=FOLDER of robot and problems; ARGS="--only cage")
+mbm: $(VENV)/test.stamp ## plan 700 problems of MotionBenchMaker, 70 also in least time (DATA=FOLDER of robot and problems; ARGS="--only cage")
 	$(BIN)/python -W ignore -m tests.sweep.motion_bench_maker --data "$(DATA)" --out "$(OUT)/sweeps/motion_bench_maker.jsonl" $(ARGS)
 
-passages: $(VENV)/test.stamp ## plan 40 paths of floating arms past singularities that can be done (ARGS="--only beyond": that cannot)
+passages: $(VENV)/test.stamp ## plan 40 feasible paths of floating arms past singularities (ARGS="--only beyond": infeasible ones)
 	$(BIN)/python -W ignore -m tests.sweep.passages --out "$(OUT)/sweeps/passages.jsonl" $(ARGS)
 
-singular: $(VENV)/test.stamp ## plan motions from singular configurations, moved by 1e-12, beside damped least squares (ARGS="--only ur5")
+singular: $(VENV)/test.stamp ## compare plans from nearly singular configurations with damped least squares (ARGS="--only ur5")
 	$(BIN)/python -W ignore -m tests.sweep.singular --out "$(OUT)/sweeps/singular.jsonl" $(ARGS)
 
-frauds: $(VENV)/test.stamp ## edit eight plans 264 times and audit them: what passes is looked at without the audit (ARGS="--only arm")
+frauds: $(VENV)/test.stamp ## falsify eight plans in 264 ways and audit them; check plans that pass by other means (ARGS="--only arm")
 	$(BIN)/python -W ignore -m tests.sweep.frauds --out "$(OUT)/sweeps/frauds.jsonl" $(ARGS)
 
-moving: $(VENV)/test.stamp ## prove 200 random obstacles that jump, spike and spin clear of an arm, beside coal (ARGS="--only ur5 --count 20")
+moving: $(VENV)/test.stamp ## prove clearance from 200 random obstacles that jump and spin, and compare with coal (ARGS="--only ur5 --count 20")
 	$(BIN)/python -W ignore -m tests.sweep.moving_obstacles --out "$(OUT)/sweeps/moving_obstacles.jsonl" $(ARGS)
 
-faults: $(VENV)/test.stamp ## kill workers, drivers and a cluster through batches of 500 plans, and fill a disk
+faults: $(VENV)/test.stamp ## kill workers, drivers and a cluster during batches of 500 plans, and fill a disk
 	$(BIN)/python -W ignore -m tests.sweep.faults
 
-fuzz: $(VENV)/test.stamp ## read 2000 mutated files of each kind: none crashes, hangs, runs code or writes elsewhere (ARGS="--only csv,urdf")
+fuzz: $(VENV)/test.stamp ## read 2000 damaged files of each kind: none crashes, hangs, runs code or writes elsewhere (ARGS="--only csv,urdf")
 	$(BIN)/python -W ignore -m tests.sweep.fuzz $(ARGS)
 
-fresh: $(VENV)/test.stamp ## audit plans of the gallery and of the papers before they are files and again in another process (ARGS="--only blend")
+fresh: $(VENV)/test.stamp ## audit plans before they are saved and again after loading in another process (ARGS="--only blend")
 	$(BIN)/python -W ignore -m tests.sweep.fresh $(ARGS)
 
-browser: $(VENV)/test.stamp ## open pages of the viewer, and of the site, in a real browser (ARGS=--if-there: where there is one)
+browser: $(VENV)/test.stamp ## open pages of the viewer and of the site in a real browser (ARGS=--if-there: only if one is installed)
 	$(BIN)/python -W ignore -m tests.browser $(ARGS)
 
-installed: $(VENV)/run.stamp ## install the wheel with its extras elsewhere and use it as a new user would
+installed: $(VENV)/run.stamp ## install the wheel with its extras in a new environment and use it as a new user would
 	$(BIN)/python -m tests.installed $(ARGS)
 
-check: $(VENV)/check.stamp ## lint, formatting and types, changing nothing
+check: $(VENV)/check.stamp ## check style, formatting and types without changing a file
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(VENV)/check.stamp ## reformat the code and apply the safe lint fixes
+format: $(VENV)/check.stamp ## reformat the code and apply safe corrections of its style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-dev: $(VENV)/dev.stamp ## install everything a developer needs and the pre-commit hooks
+dev: $(VENV)/dev.stamp ## install everything that a developer needs, and the pre-commit hooks
 	$(BIN)/pre-commit install
 
 build: $(VENV)/run.stamp ## build the wheel into dist/

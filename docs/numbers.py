@@ -18,7 +18,7 @@ def listed(tables: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
     """Markdown of the tables of all papers: the number of reproduced values, the values, and reasons of differences."""
     compared = [row for rows in tables.values() for row in rows if row["ours"]]
     count = sum(row["reproduced"] == "yes" for row in compared)
-    parts = [f"**{count} of {len(compared)} numbers are reproduced.** Durations are not listed.\n"]
+    parts = [f"**{count} of {len(compared)} numbers are reproduced.** Computing times are left blank.\n"]
     for paper, rows in tables.items():
         reasons = list(dict.fromkeys(row["why"] for row in rows if row["why"]))
         parts.append(f"### {paper}\n\n| | | printed | ours | reproduced |\n|---|---|---:|---:|---|")

@@ -28,7 +28,7 @@ def command(plan: Path, file: Path) -> list[str]:
     beside = plan.with_name(f"{plan.stem}.local.csv")
     names = ["--name", "plan"]
     if beside.exists():
-        names += ["--name", "instant by instant"]
+        names += ["--name", "local resolution"]
     motions = [str(plan), *([str(beside)] if beside.exists() else [])]
     return [sys.executable, "-m", "ocp.app.command", "view", *motions, "--page", str(file), "--quiet", *names]
 

@@ -1,4 +1,4 @@
-"""The guide to goals claims what the committed results of MotionBenchMaker say."""
+"""Pages claim what the committed results say."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scripts.papers.reproduced import read_tables
 from tests.sweep.results import rows_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -19,13 +20,27 @@ def test_the_guide_to_goals_has_the_numbers_of_the_rows() -> None:
     assert not [row for row in rows if row["wrong"]]
     page = " ".join((ROOT / "docs" / "tutorials" / "goals.md").read_text(encoding="utf-8").split())
     claims = re.search(
-        r"has (\d+) problems .* length is ([\d.]+) rad, the median planning time ([\d.]+) s of one core, the longest "
-        r"(\d+) s\. .* all (\d+) are .*; (\d+) motions last at most 0\.3 %",
+        r"has (\d+) problems .* path length is ([\d.]+) rad\. The median processor time of a plan is ([\d.]+) s, the "
+        r"longest (\d+) s .* For all (\d+) problems a motion was found; (\d+) motions last at most 0\.3 %",
         page,
     )
     assert claims is not None
     near = sum(row["cost"] <= 1.003 * row["bound"] for row in fastest)
     numbers = [len(shortest), round(float(np.mean([row["length"] for row in shortest])), 2)]
     numbers += [round(float(np.median([row["cpu"] for row in shortest])), 1)]
-    numbers += [round(max(row["seconds"] for row in shortest)), len(fastest), near]
+    numbers += [round(max(row["cpu"] for row in shortest)), len(fastest), near]
     assert [float(claim) for claim in claims.groups()] == numbers
+
+
+def test_pages_have_the_number_of_reproduced_results() -> None:
+    tables = read_tables(ROOT / "results").values()
+    verdicts = [row["reproduced"] for rows in tables for row in rows]
+    counts = [len(verdicts), verdicts.count("yes")]
+    for name in ("README.md", "CHANGELOG.md", "docs/papers.md"):
+        page = " ".join((ROOT / name).read_text(encoding="utf-8").split())
+        claims = re.search(r"Of the (\d+) results that the papers print as numbers, (\d+) are reproduced", page)
+        assert claims is not None, name
+        assert [int(claim) for claim in claims.groups()] == counts, name
+    claims = re.search(r"are reproduced\. (\d+) differ", page)
+    assert claims is not None
+    assert int(claims[1]) == verdicts.count("no")
