@@ -28,9 +28,9 @@ Sign: TypeAlias = Literal["any", "positive", "nonnegative"]
 NOT_NUMBERS = (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError)
 """Exceptions that NumPy and CasADi raise for values that are not numeric."""
 ROUNDING = 1e-9
-"""Relative tolerance (or absolute, in m or rad) below which a difference is attributed to rounding."""
+"""Tolerance, relative or in m or rad, below which a difference is attributed to rounding errors."""
 MAX_LISTED = 12
-"""Largest number of vector entries, or of names, that a message lists."""
+"""Largest number of vector entries, or of names, that an error message lists."""
 
 _Choice = TypeVar("_Choice")
 _Kind = TypeVar("_Kind")
@@ -94,13 +94,13 @@ def freeze(array: Array) -> Array:
 
 
 def argument_of(label: str) -> str:
-    """Return the name of an argument from a label: `scheme` from `Collocation: scheme`."""
+    """Return the name of the argument with which a label ends, such as `scheme` for `Collocation: scheme`."""
     return label.rpartition(" ")[2].strip("'")
 
 
 @dataclass(frozen=True)
 class Checks:
-    """Checks of arguments that raise the exception class of one package.
+    """Checks of arguments, which raise the exception class of the package that uses them.
 
     The first argument of each check, `label`, is the name of the argument, behind its owner if that helps: "count" or
     "box: size". Messages state the label, the requirement and the value; the fields of the exception are `name`, the
@@ -119,7 +119,7 @@ class Checks:
         return self.error(words, name=argument_of(label), value=value, limit=limit)
 
     def unknown(self, kind: str, name: object, known: Iterable[str]) -> DetailedError:
-        """Return the exception for an unknown name; its message lists similar known names, or else all."""
+        """Return the exception for an unknown name; its message lists similar known names, or else known names."""
         names = [str(item) for item in known]
         by_case = {item.casefold(): item for item in reversed(names)}
         similar = [by_case[item] for item in get_close_matches(str(name).casefold(), by_case, n=3, cutoff=0.5)]
@@ -130,7 +130,7 @@ class Checks:
         return self.error(words, name=str(name) or kind, value=name, limit=tuple(names))
 
     def number(self, label: str, value: Any, *, finite: bool = True, unit: str = "") -> float:
-        """Return a value as a float after checking that it is a number; with `finite`, infinity is rejected."""
+        """Return a value as a float after checking that it is a number and, if `finite`, that it is finite."""
         number = real(value)
         if isnan(number) or (finite and isinf(number)):
             raise self.invalid(label, ("a finite number" if finite else "a number") + _in(unit), value)
@@ -158,7 +158,7 @@ class Checks:
         return int(value)
 
     def choice(self, label: str, value: _Choice, choices: Iterable[Any]) -> _Choice:
-        """Return the value after checking that it is one of the choices and has the same type."""
+        """Return the value after checking that it equals one of the choices and has the type of that choice."""
         allowed = tuple(choices)
         if not any(isinstance(value, type(item)) and value == item for item in allowed):
             raise self.invalid(label, " or ".join(map(repr, allowed)), value, allowed)
@@ -201,7 +201,7 @@ class Checks:
         return tuple(self.instance(label, item, kind) for item in items)
 
     def mapping(self, label: str, values: Any, keys: type = str) -> dict[Any, Any]:
-        """Return a copy of a dictionary after checking the class of its keys; an empty one for None."""
+        """Return a copy of a dictionary after checking the class of its keys; return an empty dictionary for None."""
         if not isinstance(values, Mapping | None) or not all(isinstance(key, keys) for key in values or ()):
             raise self.invalid(label, "a dictionary by name", values)
         return dict(values or {})
@@ -257,7 +257,7 @@ class Checks:
         sign: Sign = "any",
         unit: str = "",
     ) -> Array:
-        """Return an array of one number per item, given such an array or one number for all items. Shape (count,).
+        """Return an array with one number for each item; a single given number holds for all items. Shape (count,).
 
         Args:
             items: Plural noun for messages.
@@ -281,7 +281,7 @@ class Checks:
         return indices.astype(np.intp)
 
     def rotation(self, label: str, value: ArrayInput) -> Array:
-        """Return a read-only rotation matrix; a matrix with rounded digits is projected onto the nearest rotation."""
+        """Return a matrix after checking that it is a rotation; rounding errors of its entries are corrected."""
         matrix = self.array(label, value, (3, 3))
         error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost
@@ -297,7 +297,7 @@ class Checks:
         return self.error(f"{label} {words}", name=argument_of(label), value=value, limit=limit)
 
     def _check_shape(self, label: str, array: Array, shape: tuple[int | str, ...], least: int, meaning: str) -> Array:
-        """Return the array after checking its shape against `shape`, in which strings stand for free dimensions."""
+        """Return the array after checking its shape; a string in `shape` stands for a dimension of any size."""
         if len(shape) == 1 and ((array.ndim == 0 and isinstance(shape[0], str)) or array.shape[1:] == (1,)):
             array = array.reshape(-1)
         fits = array.ndim == len(shape) and all(
@@ -320,7 +320,7 @@ def _in(unit: str) -> str:
 
 
 def _description(array: Array, wrong: Any) -> str:
-    """Return the text that shows an invalid array in an error message: all of it, or its first invalid entry or row."""
+    """Return the text by which a message shows an invalid array: the whole array, or its first invalid entry or row."""
     if array.ndim < 2 and array.size <= MAX_LISTED:
         return f"{array.tolist()}"
     if array.ndim == 1:
@@ -331,7 +331,7 @@ def _description(array: Array, wrong: Any) -> str:
 
 
 def warn_of_degrees(label: str, angles: ArrayInput, name: str | None = None) -> None:
-    """Warn if an angle (rad) exceeds two turns and so looks like degrees. Values above 1e4 count as "no limit".
+    """Warn if an angle (rad) exceeds two turns, since it may be in degrees. Values above 1e4 count as "no limit".
 
     Python shows the same message only once.
 
@@ -347,12 +347,12 @@ def warn_of_degrees(label: str, angles: ArrayInput, name: str | None = None) -> 
 
 
 def warn_of_millimetres(label: str, lengths: ArrayInput, name: str | None = None) -> None:
-    """Warn if a length (m) exceeds 50 m and so looks like millimetres, as `warn_of_degrees` does for angles."""
+    """Warn if a length (m) exceeds 50 m, since it may be in millimetres; arguments as for `warn_of_degrees`."""
     _warn_of_unit(label, lengths, name, (50.0, inf), "m is long for a robot; lengths are in m, is it in millimetres?")
 
 
 def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tuple[float, float], words: str) -> None:
-    """Warn about the first value whose magnitude suggests another unit, such as degrees or millimetres."""
+    """Warn about the first value whose magnitude suggests that it is in another unit, such as degrees."""
     low, high = range_
     for value in np.ravel(values).tolist():  # faster than array operations on few entries
         if low < abs(value) < high:

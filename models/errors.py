@@ -32,7 +32,7 @@ class ModelError(DetailedError, ValueError):
 
 
 class ModelWarning(DetailedError, UserWarning):
-    """Warning about a suspicious but usable description of a machine; the message names the part."""
+    """Warning about a suspicious but usable description of a machine; the message names the suspicious part."""
 
 
 def _picklable(value: Any) -> Any:

@@ -33,7 +33,7 @@ def paper_example() -> FreeFloating:
 
 
 STANDING_STARTS = {1: np.deg2rad([45.0, 160.0, 240.0, 200.0, 50.0]), 2: np.deg2rad([60.0, 80.0, 295.0, 230.0, 100.0])}
-"""Start joint angles of `standing_example` in Tables 1 and 2 of Yoo et al. 2004, by the number of the table, rad."""
+"""Start joint angles of `standing_example`, rad, keyed by the number of the table (1 or 2) in Yoo et al. 2004."""
 
 
 def standing_example() -> Standing:
@@ -60,7 +60,10 @@ def standing_example() -> Standing:
 
 
 def reference_rig(**limits: Any) -> Rig:
-    """Return the captive trajectory rig of the reproduced results; assumed lengths: 20, 20, 4, 30, 20, 10 in."""
+    """Return the captive trajectory rig of the reproduced results, with assumed link lengths.
+
+    Assumed: 20, 20, 4, 30, 20, 10 in, in the order of the fields of Rig. Keywords are the joint limits of Rig.
+    """
     return Rig(*(INCH * length for length in (20.0, 20.0, 4.0, 30.0, 20.0, 10.0)), **limits)
 
 
@@ -74,7 +77,7 @@ def reference_tunnel() -> Tunnel:
 
 X, Y, Z = np.eye(3)
 ALONG = {id(X): ((0, 0, 1), (0, 1, 0), (-1, 0, 0)), id(Y): ((1, 0, 0), (0, 0, 1), (0, -1, 0)), id(Z): np.eye(3)}
-"""Rotations that turn the z axis of a cylinder to the axis X, Y or Z, by the `id` of that axis."""
+"""Rotation matrices that turn the z axis of a cylinder to the axis X, Y or Z, keyed by the `id` of the axis."""
 ROWS: dict[str, list[tuple[Any, ...]]] = {
     "six_axis": [
         ("shoulder", (0, 0, 0.09), Z, 3.14, 3.14, 150, Z, -0.05, 0.06, 0.06, 3.5),
@@ -94,8 +97,10 @@ ROWS: dict[str, list[tuple[Any, ...]]] = {
         ("link_7", (0, 0, 0.08), Z, 3.05, 3.1, 40, Z, 0.0, 0.045, 0.04, 0.3),
     ],
 }
-"""Links of each example robot: name, position in the previous link (m), joint axis, limits of position, velocity and
-effort (rad, rad/s, N m), and a homogeneous cylinder: its axis, start and end along it, radius (m), mass (kg).
+"""Data of each link of the example robots.
+
+A row has: name, position in the previous link (m), joint axis, limits of position, velocity and effort (rad, rad/s, N
+m), and a homogeneous cylinder: its axis, start and end along it, radius (m), mass (kg).
 """
 
 

@@ -39,7 +39,7 @@ __all__ = ["INPUT_LIMITS", "InputLimits", "UnfitFile", "open_regular", "parse_xm
 
 @dataclass(frozen=True)
 class InputLimits:
-    """Upper limits on the size of input: several times the largest known files, but small enough for the memory.
+    """Upper limits on the size of input: several times the largest known files, but small enough to fit into memory.
 
     Attributes:
         count: Any number that a user chooses, such as a number of nodes; larger values would run too long.
@@ -86,7 +86,7 @@ INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
-    """Error about a file that is not read: it is not a regular file, is too large, or is not owned by the user.
+    """Error about a file that is refused: it is no regular file, is too large, or does not belong to the user.
 
     Attributes:
         value: Size of a file that is too large, bytes; else None.
@@ -178,11 +178,11 @@ MAX_LIBRARY_BYTES = 2**28
 """Total size of the cached shared libraries, bytes, beyond which the least recently used are removed."""
 KINDS = (".json", ".so", ".lock", ".part")
 UNREADABLE = (OSError, ValueError, RuntimeError, RecursionError)
-"""Exceptions that reading a missing or damaged cache file can raise; RuntimeError if there is no home folder."""
+"""Exceptions that reading a missing or damaged cache file can raise; RuntimeError stands for a missing home folder."""
 
 
 def cache_key(version: str, *contents: Any) -> str:
-    """Return the cache key of a result: the SHA-256 digest, in hexadecimal digits, of the data that determine it.
+    """Return the cache key of a result: the hexadecimal SHA-256 digest of the data that determine the result.
 
     Args:
         version: Version of the code that computes the result, see `source_version`.
@@ -198,7 +198,7 @@ def cache_key(version: str, *contents: Any) -> str:
 
 @functools.cache
 def source_version(module: str) -> str:
-    """Return a digest of the source of a module and of all modules of its package that it imports, directly or not.
+    """Return a digest of the source of a module and of all modules of its package that it imports, also indirectly.
 
     So any change of the code invalidates its cached values. Imports must be written `from PACKAGE... import`.
     """
@@ -215,7 +215,7 @@ def source_version(module: str) -> str:
 
 
 def cache_folder() -> Path:
-    """Return the path of the cache folder; it need not exist."""
+    """Return the path of the cache folder, which need not exist."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()) / "selfmotion"
 
@@ -263,7 +263,7 @@ def _log_once(message: str) -> None:
 
 
 def cache_files() -> list[Path]:
-    """Return all cache files, including partial ones of interrupted writes."""
+    """Return all cache files, including incomplete files that interrupted writes have left."""
     try:
         return sorted(file for file in private_folder().iterdir() if file.is_file() and file.suffix in KINDS)
     except UNREADABLE:
@@ -271,7 +271,7 @@ def cache_files() -> list[Path]:
 
 
 def load_value(key: str) -> Any:
-    """Return the JSON value stored under a key, or None if there is none or it is damaged."""
+    """Return the JSON value stored under a key, or None if the value is missing or damaged."""
     try:
         digest, _, content = read_regular(private_folder() / f"{key}.json", MAX_VALUE_BYTES, own=True).partition(b"\n")
         return json.loads(content) if digest == _digest(key, content) else None
@@ -291,7 +291,7 @@ def _digest(key: str, content: bytes) -> bytes:
 
 
 def load_library(key: str) -> Path | None:
-    """Return the path of the shared library stored under a key and mark it as used; return None if there is none.
+    """Return the path of the shared library stored under a key and mark it as used; return None if none is stored.
 
     Damaged libraries are removed; those that another user owns or may write are ignored.
     """
@@ -311,7 +311,7 @@ def load_library(key: str) -> Path | None:
 
 
 def store_library(key: str, library: bytes) -> Path | None:
-    """Store a shared library under a key and return its path, or None if it cannot be written."""
+    """Store a shared library under a key and return its path; return None if the library cannot be written."""
     with suppress(*UNREADABLE):
         file = _write(_library_name(key, library), library)
         _evict(file)
@@ -321,7 +321,7 @@ def store_library(key: str, library: bytes) -> Path | None:
 
 @contextmanager
 def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]:
-    """Lock a cache key for a `with` block, so that only one process or thread at a time computes its value.
+    """Lock a cache key for a `with` block, so that only one process or thread at a time computes the value of the key.
 
     If the lock file cannot be created, the block runs without a lock.
 
@@ -341,7 +341,7 @@ def exclusive(key: str, ask: Callable[[], Any] = lambda: None) -> Iterator[None]
 
 
 def _open_locked(file: Path, ask: Callable[[], Any]) -> IO[bytes]:
-    """Open a lock file, creating it if necessary, and wait until this process holds its lock."""
+    """Open a lock file, creating it if necessary, and wait until this process holds the lock."""
     while True:
         stream = open(file, "ab")  # noqa: SIM115
         try:
@@ -363,7 +363,7 @@ def _library_name(key: str, library: bytes) -> str:
 
 
 def _evict(newest: Path) -> None:
-    """Remove locks of ended processes, and the least recently used libraries until all fit MAX_LIBRARY_BYTES."""
+    """Remove locks of ended processes, and the least recently used libraries until the rest fits MAX_LIBRARY_BYTES."""
     for lock in newest.parent.glob("*.lock"):
         with suppress(OSError), open(lock, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while the lock is in use

@@ -51,7 +51,7 @@ class Frame(NamedTuple):
 
 
 def expression(value: Expression) -> Expression:
-    """Return a value as a CasADi matrix.
+    """Convert a value to a CasADi matrix.
 
     A CasADi matrix is returned unchanged; numbers become a DM without its exact zeros, vectors become columns. Lists,
     tuples and arrays with CasADi entries are stacked vertically, inner lists horizontally.
@@ -85,7 +85,7 @@ def _is_sequence(value: Any) -> bool:
 
 
 def on_scalars(function: _Callable) -> _Callable:
-    """Decorate a function so that it is evaluated with SX symbols even for MX arguments.
+    """Decorate a function so that it is evaluated with SX symbols even if its arguments are MX.
 
     Element-wise MX graphs are slow to build and to run. If an argument is MX, the decorated function is evaluated once
     with SX symbols of the same sparsity, and the resulting Function is called. Other arguments pass through unchanged.
@@ -142,7 +142,7 @@ def rotation(axis: Expression, angle: Expression) -> Expression:
 
 
 def rotation_from_rpy(roll: Expression, pitch: Expression, yaw: Expression) -> Expression:
-    """Return Rz(yaw) Ry(pitch) Rx(roll): rotations about the fixed x, y, z axes (URDF). Angles in rad. Shape (3, 3)."""
+    """Return the rotation matrix of roll, pitch, yaw (rad) as in URDF: Rz(yaw) Ry(pitch) Rx(roll). Shape (3, 3)."""
     return ca.mtimes([rotation((0, 0, 1), yaw), rotation((0, 1, 0), pitch), rotation((1, 0, 0), roll)])
 
 
@@ -278,10 +278,10 @@ def spatial_inertia(mass: Expression, center_of_mass: Expression, inertia: Expre
 
 @on_scalars
 def solve_spd(matrix: Expression, right: Expression) -> Expression:
-    """Solve matrix x = right for x, with a small symmetric positive definite matrix. Shape (n, m), that of `right`.
+    """Solve a linear system whose matrix is small, symmetric and positive definite. Shape (n, m), that of `right`.
 
-    L D L' elimination without pivoting or square roots, meant for n <= 7; only the lower triangle is read.
-    An indefinite matrix is not detected, and a singular one gives inf or nan.
+    L D L' elimination without pivoting or square roots, meant for n <= 7; only the lower triangle is read. An
+    indefinite matrix is not detected, and a singular one gives inf or nan.
 
     Instructions of the SX function of a dense matrix with one right-hand side, against ca.solve: n = 2: 16 (20), 3: 38
     (77), 4: 72 (200), 6: 184 (588), 7: 266 (896); with seven right-hand sides n = 6 takes 652 (1272).
@@ -340,7 +340,7 @@ def expand_tables(values: Any) -> Any:
     """Return an SX matrix in which look-up tables of one argument are replaced by piecewise polynomials.
 
     Raises:
-        ModelError: It calls a function that is not a table of one argument.
+        ModelError: An entry calls a function that is not a table of one argument.
     """
     instructions = ca.Function("values", ca.symvar(values), [values])
     if ca.OP_CALL not in {instructions.instruction_id(k) for k in range(instructions.n_instructions())}:

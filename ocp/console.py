@@ -35,8 +35,7 @@ T = TypeVar("T")
 
 
 GRACE_PERIOD_S = 0.8
-"""Time after Ctrl-C, s, for a call to end by itself with its last iterate; then it is stopped, within a second in all.
-"""
+"""Time after Ctrl-C, s, in which a call may end by itself with its last iterate before the call is stopped."""
 
 
 # ---- Ctrl-C ------------------------------------------------------------------------------------------------------
@@ -77,7 +76,7 @@ class _Call(threading.Thread):
         return self._work()
 
     def end(self) -> None:
-        """Stop the call: set the flag ``stop``; if that does not end it, raise KeyboardInterrupt in its thread."""
+        """Stop the call: set the flag ``stop`` and, if the call does not end, raise KeyboardInterrupt in its thread."""
         self.stop = True
         began = time.monotonic()
         try:
@@ -99,7 +98,7 @@ _DEADLINE: contextvars.ContextVar[float] = contextvars.ContextVar("deadline", de
 
 
 def interruptible(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a public function so that Ctrl-C ends it within a second.
+    """Decorate a public function so that Ctrl-C ends a call of the function within a second.
 
     KeyboardInterrupt is raised, or whatever another signal handler raises. It carries as ``solution`` the last iterate
     of the call, if any (see :class:`ocp.errors.Interrupted`). Outside the main thread, which alone receives signals,
@@ -169,7 +168,7 @@ def time_limited(seconds: float | None) -> Iterator[None]:
 
 
 def time_left() -> float:
-    """Return the time that remains until the time limit, s; infinite without a limit, negative once it has passed."""
+    """Return the time that remains until the time limit, s; infinite without a limit, negative after the limit."""
     return _DEADLINE.get() - time.monotonic()
 
 
@@ -389,7 +388,7 @@ class _Monitor(ca.Callback):  # type: ignore[misc]
 
 
 class IterationMonitor(_Monitor):
-    """Iteration callback of a solver, with a progress line on a terminal unless the call has its own display."""
+    """Iteration callback of a solver that shows a progress line on a terminal, unless the call has its own display."""
 
     def __init__(self, n: int, m: int, np_: int, *, title: str, show: bool) -> None:
         self.sizes = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": np_}
@@ -425,7 +424,7 @@ class IterationMonitor(_Monitor):
 
 
 class FatropMonitor(_Monitor):
-    """Function that is evaluated at each iterate of fatrop, which has no callback: 1 to continue, 0 to stop."""
+    """Function that serves as callback of fatrop: evaluated at each iterate, it is 1 to continue and 0 to stop."""
 
     def __init__(self, n: int, title: str) -> None:
         self.size = n

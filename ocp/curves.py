@@ -1,4 +1,4 @@
-"""Piecewise polynomials given by values at nodes, as the interpolants of a solution, and integrators of ODEs."""
+"""Piecewise polynomials given by values at nodes, such as the interpolants of a solution, and integrators of ODEs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class PiecewisePolynomial:
         return f"<PiecewisePolynomial of {intervals} intervals of {nodes} nodes, {columns} columns>"
 
     def __call__(self, at: np.ndarray) -> np.ndarray:
-        """Return the values at positions ``at`` (M,), right-continuous and constant beyond the ends. Shape (M, n)."""
+        """Return the values at M positions; they are right-continuous, and constant beyond the ends. Shape (M, n)."""
         interval = np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, len(self.breaks) - 2)
         start, end = self.breaks[interval], self.breaks[interval + 1]
         return self.within(interval, np.clip((at - start) / (end - start), 0.0, 1.0))
@@ -72,7 +72,7 @@ def barycentric_weights(nodes: np.ndarray) -> np.ndarray:
 
 
 def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Evaluate the Lagrange basis polynomials of ``nodes`` (d,) at ``at`` (M,), in barycentric form. Shape (M, d)."""
+    """Evaluate the d Lagrange basis polynomials of ``nodes`` at M positions in barycentric form. Shape (M, d)."""
     at = np.asarray(at, dtype=float)
     if len(nodes) == 1:
         return np.ones((len(at), 1))
@@ -96,7 +96,7 @@ def differentiation_matrix(nodes: np.ndarray) -> np.ndarray:
 
 
 def quadrature_weights(points: np.ndarray) -> np.ndarray:
-    """Return the interpolatory quadrature weights of ``points`` (d,) for integrals over 0..1. Shape (d,)."""
+    """Return the interpolatory quadrature weights of d ``points`` for integrals over 0..1. Shape (d,)."""
     gauss, weight = np.polynomial.legendre.leggauss(len(points))
     return np.asarray(0.5 * weight @ lagrange(points, 0.5 * (gauss + 1.0)))
 

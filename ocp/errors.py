@@ -67,7 +67,7 @@ class AuditError(DetailedError, RuntimeError):
 
 
 class RefinementWarning(DetailedError, UserWarning):
-    """Warning that mesh refinement stopped before the audit passed; ``value`` is the largest error over its limit."""
+    """Warning that mesh refinement stopped before the audit passed; ``value`` is the largest error-to-limit ratio."""
 
 
 class StorageWarning(DetailedError, UserWarning):

@@ -200,7 +200,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
 def _displaced_guess(
     form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
 ) -> dict[str, Any]:
-    """Return an initial guess: the plan, displaced to one side (``sign``) along the variation that lowers its cost.
+    """Return an initial guess: the plan displaced, to the side ``sign``, along a variation that lowers the cost.
 
     If the variation is unknown, all controls are displaced by seeded random amounts.
     """
@@ -267,7 +267,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Comparison of the solutions of one problem by several methods, with the audit of each.
+    """Comparison of the solutions of one problem by several methods, including the audit of each solution.
 
     Attributes:
         problem: Name of the problem.
@@ -406,7 +406,7 @@ def checked_solutions(solutions: Any) -> dict[str, Solution]:
 
 
 def name_by_method(solutions: Sequence[Solution]) -> dict[str, Solution]:
-    """Return solutions by names of their methods, such as ``Collocation legendre-3, 50``, numbered if they repeat."""
+    """Return solutions by the name of their method, such as ``Collocation legendre-3, 50``; repeats are numbered."""
     named: dict[str, Solution] = {}
     for solution in solutions:
         method = solution.method

@@ -1,4 +1,4 @@
-"""Mesh refinement driven by the audit: intervals are split until every error that it reports is within its limit."""
+"""Mesh refinement driven by the audit: intervals are split until every error in the audit is within its limit."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def _refine_mesh(
     arguments: dict[str, Any],
     settings: RefinementSettings,
 ) -> tuple[Solution, Audit]:
-    """Refine the mesh until a plan is accurate enough, or warn that it is not; return the last plan and its audit."""
+    """Refine the mesh until a plan is accurate enough, or warn if none is; return the last plan and its audit."""
     solution, audit = first
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
@@ -244,7 +244,7 @@ def _next(
 
 
 class _Row(NamedTuple):
-    """An error that the audit reports: its value and the contributions of the intervals, relative to its limit.
+    """An error that the audit reports: its value and the contributions of mesh intervals, relative to its limit.
 
     ``errors`` (N,) are the contributions, None if it cannot be attributed to intervals; ``order`` is the power of the
     interval width with which it falls.
@@ -258,7 +258,7 @@ class _Row(NamedTuple):
 
 
 class _Parts(NamedTuple):
-    """Contributions of the mesh intervals to an error that the audit reports, which is their sum or their maximum.
+    """Contributions of the mesh intervals to an error that the audit reports; the error is their sum or maximum.
 
     ``values`` (N,) are in any unit.
     """
@@ -269,7 +269,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Return the contributions, scaled so that their maximum (of a sum, their mean) is ``total``. Shape (N,)."""
+        """Return the contributions, scaled so that their maximum or, for a sum, their mean is ``total``. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))
@@ -280,7 +280,7 @@ class _Parts(NamedTuple):
 def _rows(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit, tolerance: float, method: DirectMethod
 ) -> list[_Row]:
-    """Return the errors that the audit of a plan reports, each with the contributions of the mesh intervals to it."""
+    """Return the errors that the audit of a plan reports, each split into contributions of the mesh intervals."""
     # over the whole horizon an unstable motion diverges; the sum is what feedback would have to correct
     deviation = min(audit.integration_error, float(audit.local_errors.sum()))
     requested = Finding(f"integration error, {tolerance:.0e} requested", deviation, tolerance)
@@ -312,7 +312,7 @@ def _rows(
 def _violations(
     form: Formulation, p: np.ndarray, solution: Solution, audit: Audit
 ) -> dict[str, tuple[bool, np.ndarray]]:
-    """Return for each bound and path constraint whether it is an equality, and its violation in each interval (N,)."""
+    """Return whether each bound and path constraint is an equality, and its violation in each interval. Shape (N,)."""
     n = len(audit.local_errors)
     x, u = stack(audit.states), stack(audit.controls, len(audit.t))
     g = form.sampled([form.path.expression], x, u, audit.t, solution.horizon, p)[0]
@@ -334,7 +334,10 @@ def _violations(
 def _parts_per_interval(
     beyond: list[_Row], rows: list[_Row], mesh: np.ndarray, settings: RefinementSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of parts into which to split each interval, and its largest relative error. Shape (N,) each."""
+    """Return the number of parts into which to split each interval, and the interval's largest relative error.
+
+    Shape (N,) each.
+    """
     n = len(mesh) - 1
     parts, error = np.ones(n, int), np.zeros(n)
     for row in beyond:

@@ -144,7 +144,7 @@ class Solution:
         )
 
     def __str__(self) -> str:
-        """Return method, solver, cost, and the ranges of states and controls, in 15 lines at most."""
+        """Return a text of at most 15 lines with method, solver, cost, and the ranges of states and controls."""
         lines = [
             f"Solution of {self.name!r} by {self.method.get('type')} and {self.solver}: {self._verdict} after "
             f"{self.iterations} iterations; cost {self.cost:.10g}, {self.horizon:.6g} s, {len(self.t)} times"
@@ -260,7 +260,7 @@ class Solution:
         return {name: (float(b), float(b + n)) for name, b, n in zip(declared, begins, lengths, strict=True)}
 
     def phase(self, name: str) -> Solution:
-        """Return one phase as a solution over its own time, 0 to its duration, with the variable names of the phase.
+        """Return one phase as a solution over the time from 0 to its duration, with the variable names of the phase.
 
         Its cost is the cost of the phase alone. It has no problem, as only the whole plan can be audited.
 
@@ -302,7 +302,7 @@ class Solution:
         )
 
     def _sample(self, expressions: list[Any], fractions: np.ndarray) -> list[np.ndarray]:
-        """Evaluate expressions of declared symbols along the plan at horizon fractions (M,). Shape (M, n) each."""
+        """Evaluate expressions of declared symbols along the plan at M fractions of the horizon. Shape (M, n) each."""
         form = Formulation.of(self.problem)
         plan = match_order(form, self)
         x, u = plan.state_interpolant(fractions), plan.control_interpolant(fractions)
@@ -330,7 +330,7 @@ class Solution:
         return replace(self, problem=problem, problem_lost="")
 
     def tied_to(self, problem: Problem) -> Solution:
-        """Return the plan with a problem from a file; raise ProblemError if this is damaged or has other variables."""
+        """Return the plan with a problem from a file; raise ProblemError if the problem is damaged or does not fit."""
         try:
             check_variables_match(Formulation.of(problem), self)
         except ProblemError:
@@ -407,7 +407,7 @@ class Solution:
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> Solution:
-        """Return the solution from the arrays of its file, which are removed from ``arrays``; raises as `load`."""
+        """Return the solution from the arrays of its file, which are removed from ``arrays``; errors as of `load`."""
         try:
             head = read_head(path, arrays.pop("head"))
             version = head.pop("version")

@@ -46,7 +46,7 @@ INTERPOLANTS = ("state_interpolant", "control_interpolant", "costate_interpolant
 
 
 class Sample(dict[str, np.ndarray]):
-    """States and controls at one time (each (n,)) or at several (each (M, n)), by name."""
+    """States and controls by name, at one time or at several times. Shape (n,) or (M, n) each."""
 
     def __missing__(self, name: str) -> np.ndarray:
         raise require.unknown("state or control", name, self)
@@ -54,7 +54,7 @@ class Sample(dict[str, np.ndarray]):
 
 @dataclass(frozen=True)
 class Refinement:
-    """Record of a mesh refinement.
+    """Record of a mesh refinement: number of intervals and errors in each round.
 
     Attributes:
         intervals: Number of intervals in each round.
@@ -131,7 +131,7 @@ def read_status(path: Any, word: Any) -> SolverStatus:
 
 
 def entry_named(kind: str, name: Any, pool: Mapping[str, T]) -> T:
-    """Return the entry of a dictionary with a given name; if there is none, raise ProblemError with similar names."""
+    """Return the entry of a dictionary with a given name, or raise ProblemError, which suggests similar names."""
     if not isinstance(name, str) or name not in pool:
         raise require.unknown(kind, name, pool)
     return pool[name]
@@ -145,7 +145,7 @@ def plain(value: Any) -> Any:
 
 
 def stack(pool: Mapping[str, np.ndarray], like: int = 0) -> np.ndarray:
-    """Stack the arrays (M, n) of a dictionary side by side; without any, return an empty array of ``like`` rows."""
+    """Stack the arrays (M, n) of a dictionary side by side; for an empty dictionary, return ``like`` empty rows."""
     return np.hstack(list(pool.values())) if pool else np.zeros((like, 0))
 
 
@@ -201,7 +201,7 @@ def match_order(form: VariableSlices, solution: Any) -> Any:
 
 
 def tightening_at(bound_tightening: np.ndarray, mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the amounts by which the bounds of a plan were tightened at fractions ``at`` (M,). Shape (2, M, m).
+    """Return the amounts by which the bounds of a plan were tightened at M horizon fractions. Shape (2, M, m).
 
     ``bound_tightening`` (2, N, m) holds them for each interval; at a node between two intervals the larger one counts.
     """
@@ -323,7 +323,7 @@ _FUNCTIONS: dict[str, str] = {}
 
 
 def register(operation: str, module: str) -> None:
-    """Make a function available to `call_registered` under its name; its module is imported on the first call."""
+    """Make a function available to `call_registered` by name; the function's module is imported on the first call."""
     _FUNCTIONS[operation] = module
 
 

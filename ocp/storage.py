@@ -96,7 +96,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any],
 
 
 def open_part(target: Path) -> IO[bytes]:
-    """Return a new, locked temporary file in the folder of the target, to replace the target when it is complete."""
+    """Create a locked temporary file in the folder of a target file, to replace the target when complete."""
     while True:
         stream = open(target.with_name(f"{target.name}.{secrets.token_hex(4)}.part"), "xb")  # noqa: SIM115
         with suppress(OSError):  # some file systems have no locks
@@ -108,7 +108,7 @@ def open_part(target: Path) -> IO[bytes]:
 
 
 def remove_abandoned(target: Path) -> None:
-    """Remove partial files of a target that interrupted writers have left behind."""
+    """Remove partial versions of a target file that interrupted writers have left behind."""
     prefix = f"{target.name}."
     with suppress(OSError):
         for name in os.listdir(target.parent):
@@ -157,7 +157,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def open_unlinked(path: str | os.PathLike[str]) -> io.BufferedReader:
-    """Open a regular file of at most ``MAX_FILE_BYTES`` for reading, but no link, which another user may have made.
+    """Open a regular file of at most ``MAX_FILE_BYTES`` for reading; refuse links, which another user may have made.
 
     Raises:
         OSError: It cannot be opened.
@@ -224,10 +224,10 @@ def array_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
 
 SUFFIXES = ("", ".velocity", ".acceleration")
 ESCAPED = re.compile(r"[^\w./: -]|^[^\w]| $")
-"""Characters of names that tables contain as %XX: all but letters, digits and harmless punctuation. A leading `-` would
-start a formula, a leading `/` a command, and spaces at the ends would be lost."""
+"""Characters of joint names that tables contain as %XX: all but letters, digits and harmless punctuation. A leading `-`
+would start a formula, a leading `/` a command, and spaces at the ends would be lost."""
 FORMULA = re.compile(r"^[=+\-@\t\r%]")
-"""First characters of a formula in a spreadsheet, and the escape character itself."""
+"""Characters with which a spreadsheet formula can begin, and the escape character itself."""
 
 
 def column_name(name: str) -> str:

@@ -35,7 +35,7 @@ __all__ = ["WARM_START_OPTIONS", "largest_excess", "solve_at_switches", "switche
 
 @dataclass(frozen=True)
 class TighteningSettings:
-    """Settings of the tightening of limits.
+    """Settings of :func:`tighten`, which tightens the limits of a plan.
 
     Attributes:
         places: Evaluation points per interval and polynomial degree of the plan.
@@ -146,7 +146,7 @@ def tighten(
 
 
 def largest_excess(problem: Problem, solution: Solution) -> float:
-    """Return the largest violation of a bound or inequality by a plan, also between grid points, in its own unit."""
+    """Return a plan's largest violation of a bound or inequality, also between grid points, in the bound's unit."""
     form = Formulation.of(problem)
     p = form.parameter_vector(solution.parameters)
     index = np.concatenate([form.bounds.places[kind] for kind in ("state", "control", "path")])
@@ -155,7 +155,7 @@ def largest_excess(problem: Problem, solution: Solution) -> float:
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """Return a text that describes the largest excess over a bound, and the fields of an error; see :func:`_excess`."""
+    """Return a text about the largest excess over a bound (see :func:`_excess`), and the fields for an error."""
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
@@ -167,7 +167,7 @@ def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[st
 def _places(
     form: Formulation, transcription: Transcription, shared: bool
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return the bounded quantity and the intervals to which each variable ("x") and row ("g") of a program belongs.
+    """Return which bounded quantity each variable ("x") and row ("g") of a program is, and in which mesh intervals.
 
     The quantity is an index among the stacked states, controls and path constraints, or -1. The indices of two
     intervals, left and right, differ at a node between intervals.
@@ -205,7 +205,7 @@ def _slack(
     high: np.ndarray,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Return the smallest distance of grid values to their lower and upper bounds in each interval. Shape (2, N, m).
+    """Return the smallest distance of grid values from their lower and upper bounds in each interval. Shape (2, N, m).
 
     It is infinite for a bound without grid values in the interval.
     """
@@ -222,7 +222,7 @@ def _slack(
 def _excess(
     form: Formulation, solution: Solution, p: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest excess over lower and upper bounds in each interval, and the ends of the intervals, s.
+    """Return the largest excess of each quantity over its lower and upper bound in each interval, and interval ends, s.
 
     Shapes (2, N, m) and (N + 1,).
     """
@@ -247,7 +247,7 @@ def _excess(
 
 
 def _peaks(values: np.ndarray) -> np.ndarray:
-    """Return the maxima of sampled curves (N, K, m), by parabolas through neighbouring samples. Shape (N, m)."""
+    """Return the maxima of sampled curves (N, K, m) from parabolas through neighbouring samples. Shape (N, m)."""
     left, middle, right = values[:, :-2], values[:, 1:-1], values[:, 2:]
     with np.errstate(invalid="ignore", divide="ignore"):
         rise = (right - left) ** 2 / (8 * (2 * middle - left - right))
@@ -261,7 +261,7 @@ def _peaks(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SwitchingSettings:
-    """Settings for the location of the switches of a plan, the times at which it reaches or leaves a limit.
+    """Settings for locating the switches of a plan: times at which a control or constraint reaches or leaves a limit.
 
     Attributes:
         at_limit: Distance from a limit, relative to the range of both limits, below which a value is at the limit: the
@@ -287,7 +287,7 @@ class SwitchingSettings:
 
 SWITCHING = SwitchingSettings()
 WARM_START_OPTIONS = {"mu_init": 1e-4}
-"""Options of IPOPT for a nearly optimal guess, which keep the iterates close to it."""
+"""IPOPT options that keep the iterates close to an initial guess that is nearly optimal."""
 
 
 def switches(problem: Problem, solution: Solution) -> np.ndarray:
@@ -353,7 +353,7 @@ def _limited_values(
 def solve_at_switches(
     problem: Problem, method: Collocation, plan: Solution, *, parameters: ByName = None, options: ByName = None
 ) -> Solution:
-    """Solve a problem again with mesh nodes at the switches of its plan, located more accurately in each round.
+    """Solve a problem again with mesh nodes at the switches of its plan; each round locates them more accurately.
 
     Args:
         problem, parameters, options: As for :func:`ocp.methods.solve`.
@@ -381,13 +381,13 @@ def solve_at_switches(
 
 
 def _distinct(fractions: np.ndarray) -> np.ndarray:
-    """Return the fractions of those switches that are inside the horizon; of several close ones, only the first."""
+    """Return the horizon fractions of switches inside the horizon; of several close switches, only the first."""
     inside = fractions[(fractions > SWITCHING.same) & (fractions < 1 - SWITCHING.same)]
     return np.asarray(inside[np.diff(inside, prepend=-1.0) > SWITCHING.same])
 
 
 def _mesh(mesh: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return a mesh with nodes at the fractions of switches, without those old nodes that are close to them."""
+    """Return a mesh with nodes at the fractions of switches, and without old nodes that are close to a switch."""
     inner, width = mesh[1:-1], np.diff(mesh)
     interval = np.clip(np.searchsorted(mesh, at, side="right") - 1, 0, len(width) - 1)
     close = (np.abs(inner[:, None] - at) < SWITCHING.too_near * width[interval]).any(axis=1)

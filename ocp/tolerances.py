@@ -9,16 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 LIMIT_SHARE = 1e-3
-"""Allowed relative error of states, bounds, constraints, joint limits and cost, and difference of agreeing solutions.
-Solvers and integrators err by less than a thousandth of it, and the masses and actuators of an arm are not known more
-accurately.
-"""
+"""Allowed relative error of states, bounds, constraints, joint limits and cost, and allowed difference of solutions
+that agree. Solvers and integrators err by less than a thousandth of this, and the masses and actuators of an arm are
+not known more accurately."""
 COSTATE_SHARE = 1e-2
 """Allowed relative error of costates. Its effect on the cost is quadratic: 1e-4, a tenth of `LIMIT_SHARE`."""
 UNFIT_COSTATE_SHARE = 0.1
-"""Allowed distance of costates from their best fit, relative to the cost, if controls enter linearly and many costates
-fit. The quadratic effect on the cost is at most 1e-2.
-"""
+"""Allowed distance of costates from their best fit, relative to the cost, if controls enter linearly and the best fit
+is not unique. The quadratic effect on the cost is at most 1e-2."""
 POSITION_TOLERANCE_M = 1e-4
 """Default tolerance of the position of a tip, m: the repeatability of a common robot arm."""
 ORIENTATION_TOLERANCE_RAD = 1e-3
@@ -28,30 +26,26 @@ CLEARANCE_TOLERANCE_M = 1e-6
 collisions.
 """
 MOMENTUM_SHARE = 1e-2
-"""Allowed change of the total momentum, relative to that of the joint motion, if a file states the motion of the base.
-The velocity of the base then comes from finite differences.
-"""
+"""Allowed change of the total momentum, relative to the momentum of the joint motion, if a file states the motion of
+the base. The velocity of the base then comes from finite differences."""
 HELD_SHARE = 1e-2
-"""Smallest path length by which the audit divides the error of a path, relative to the size of the terms of the error.
-For a tip that stands still, and has no path length, `LIMIT_SHARE` of it is `RESOLVED_SHARE`.
-"""
+"""Smallest path length, relative to the terms of a path's error, by which the audit divides this error. For a tip that
+stands still, whose path has no length, `LIMIT_SHARE` times this value is `RESOLVED_SHARE`."""
 
 NEAR_LIMIT_SHARE = 1e-2
-"""Distance from a limit, relative to the limited quantity, below which the limit may be active. The audit counts the
-multiplier times the distance as lost cost, so a larger share changes no result and takes longer.
-"""
+"""Distance of a quantity from a limit, relative to the size of the quantity, below which the limit may be active. The
+audit counts the multiplier times the distance as lost cost, so a larger share changes no result and takes longer."""
 TIGHTENED_SHARE = 0.1
-"""Largest tightening of a limit, relative to the limited quantity, at which the limit may be active. Beyond it, the
-multiplier says little about the cost of the tightening.
-"""
+"""Largest tightening of a limit, relative to the limited quantity, at which the limit may be active. Beyond that, the
+multiplier says little about the cost of the tightening."""
 IMPLIED_SHARE = 1e-4
-"""Singular value of unit constraint gradients below which they may be dependent within the error of a plan."""
+"""Singular value of stacked unit gradients of constraints below which the gradients may be linearly dependent within
+the error of a plan."""
 SOLVER_SHARE = 1e-6
 """Residuals to expect from a solver (1e-8 in its scaled variables), relative to the largest value of their kind."""
 RESOLVED_SHARE = 10 * SOLVER_SHARE
-"""Smallest relative size that a plan resolves reliably. What moves less stands still, and a value whose distance from
-its limit is a smaller share of its range is at the limit.
-"""
+"""Smallest relative change that a plan resolves reliably. What moves less stands still, and a value whose distance from
+its limit is a smaller share of its range is at the limit."""
 FLAT_SHARE = 1e-7
 """Relative curvature below which the cost counts as flat. Second derivatives along a plan known to `SOLVER_SHARE` keep
 about half of the sixteen digits of a number.
@@ -65,7 +59,7 @@ STANDSTILL = 1e-12
 
 
 def path_tolerance(positions: np.ndarray) -> float:
-    """Return the position tolerance of a path: 0.1 mm, or a thousandth of its extent if that is smaller, m.
+    """Return the position tolerance of a path, m: 0.1 mm, or a thousandth of the path's extent if that is smaller.
 
     Args:
         positions: Points of the path, m. Shape (M, 3). For a single point the tolerance is 0.1 mm.

@@ -1,1 +1,1 @@
-"""Kinematics of the captive trajectory rig of a wind tunnel, and the choice of the roll that its task leaves free."""
+"""Kinematics of a wind tunnel's captive trajectory rig, and the choice of the roll angle that the task leaves free."""

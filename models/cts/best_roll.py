@@ -1,8 +1,8 @@
-"""Inverse kinematics of the rig with the globally optimal roll, in a bounded number of operations.
+"""Inverse kinematics of the captive trajectory rig at the optimal roll angle, in a bounded number of operations.
 
 The optimal roll on a set of arcs is a stationary point of the index inside an arc, or an end of an arc. Stationary
 points come first: in closed form for I1 (`trigonometric.least_point`), and by Newton's method on intervals of convexity
-for I2, which adds the squared change of roll. If the best of them is within reach and limits, it is optimal.
+for I2, which adds the squared change of roll. If the best of them is within reach and limits, it is globally optimal.
 
 Otherwise the ends of the arcs matter, and `Search` evaluates them in order until no other can improve. Ends at limits
 of joints 4 to 6 and at the reach of the pitch link have a closed form and are all compared. The others are first
@@ -52,7 +52,7 @@ _Record = TypeVar("_Record")
 
 
 class Incumbent(NamedTuple):
-    """The best feasible roll that the search has found so far.
+    """The best feasible roll angle that the search has found so far.
 
     Attributes:
         cost: Value of the index at the roll; inf if there is none yet.
@@ -70,7 +70,7 @@ class Incumbent(NamedTuple):
 
 
 class RoughRoll(NamedTuple):
-    """An approximate roll that may be optimal, given by its cosine and sine.
+    """Approximation of a roll angle that may be optimal, stored as cosine and sine.
 
     Attributes:
         bound: Lower bound of the cost near the point; inf if the roll is infeasible.
@@ -89,14 +89,17 @@ class RoughRoll(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Cost of a roll, inf if the reach of the pitch link or joints 4 to 6 exclude it, and cos q2 at the roll."""
+    """Cost and cos q2 at a roll angle; the cost is inf if joints 4 to 6 or the pitch link's reach exclude the angle."""
 
     cost: Expression
     cos2: Expression
 
 
 class LevelBound(NamedTuple):
-    """A value of cos q2 at which a limit is reached, and a lower bound of the cost there; `side` as in RoughRoll."""
+    """A value of cos q2 at which a constraint becomes active, with a lower bound of the cost index near it.
+
+    `side` is as in RoughRoll.
+    """
 
     bound: Expression
     cosine: Expression
@@ -111,7 +114,7 @@ NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
 
 
 class RigSolution(NamedTuple):
-    """Solution for one target: joint positions (6, 1), cost, code of the active constraint, code of the status."""
+    """Solution for one target: joint positions (6, 1), cost, and codes of the active constraint and of the status."""
 
     joints: Expression
     cost: Expression
@@ -125,7 +128,7 @@ def stack(kind: Any, records: Sequence[Any]) -> Expression:
 
 
 def unstack(kind: Callable[..., _Record], matrix: Expression) -> list[_Record]:
-    """Return the columns of a matrix as named tuples of one class, the inverse of `stack`."""
+    """Return the columns of a matrix as named tuples of one class; this is the inverse of `stack`."""
     return [kind(*ca.vertsplit(column)) for column in ca.horzsplit(matrix)]
 
 
@@ -140,7 +143,7 @@ def _inputs(symbols: Any) -> tuple[Any, Any]:
 def optimal_inverse(
     rig: Rig, tunnel: Tunnel, branch: Branch = HOME, *, rate_weight: float = 0.0, limits: bool = True
 ) -> Any:
-    """Return the casadi Function that computes the joint positions of the rig for a target, at the optimal roll.
+    """Return the casadi Function that computes the rig's joint positions for a target at the optimal roll angle.
 
     Args:
         rig: Dimensions and joint limits.
@@ -185,7 +188,7 @@ def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits
 
 @dataclass(frozen=True)
 class Search:
-    """Search for the best roll; each step is a casadi Function, which a method returns.
+    """Search for the best roll angle, whose steps are casadi Functions that the methods return.
 
     The argument `best` of these Functions is an Incumbent, `evaluations` columns of Evaluation, `rough` columns of
     RoughRoll. Their result `answer` is a RigSolution.
@@ -200,7 +203,7 @@ class Search:
     gain: float
 
     def direct(self) -> Any:
-        """Return the Function that finds the best stationary point of the index as a function of the roll.
+        """Return the Function that finds the best roll angle among the stationary points of the cost index.
 
         (target, previous) -> (answer, done, best, evaluations). `done` says that the answer is final: it is within
         reach and limits, or the input is not finite.
@@ -238,7 +241,7 @@ class Search:
         return ca.Function("direct", [x, before], list(settled))
 
     def search_ends(self, count: int) -> Any:
-        """Return the Function that searches all ends of feasible roll intervals for a roll better than the incumbent.
+        """Return the Function that searches the ends of feasible roll intervals for a roll better than the incumbent.
 
         (target, previous, best, `count` evaluations) -> answer.
         """
@@ -266,7 +269,7 @@ class Search:
     # ---- candidates ------------------------------------------------------------------------------------------
 
     def _cheap_ends(self) -> Any:
-        """Return the Function that compares those ends of feasible roll intervals that have a closed form.
+        """Return the Function that compares the incumbent with the interval ends that can be computed in closed form.
 
         (target, previous, best) -> (best, evaluations).
         """
@@ -279,7 +282,7 @@ class Search:
         )
 
     def _rough_stationary(self) -> Any:
-        """Return the Function that approximates the rolls at which the index I1 is stationary, if it may have 2 minima.
+        """Return the Function that approximates the roll angles at which the cost index I1 is stationary.
 
         (target) -> rough; NO_ROLL if there is only one minimum. In the axes of trigonometric.least_point there are only
         two stationary points outside the astroid |p|^(2/3) + |q|^(2/3) = (4 r)^(2/3), which the circle hypot(p, q) = 4
@@ -296,7 +299,7 @@ class Search:
         return ca.Function("rough_stationary", [x], [answer])
 
     def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the Function that tries the ends of feasible roll intervals due to the yaw joints 2 and 3.
+        """Return the Function that searches the ends of feasible roll intervals that the yaw joints 2 and 3 cause.
 
         (target, previous, evaluations, best) -> best. A level, the value of cos q2 at such an end, is searched if an
         evaluated roll better than the incumbent is on its infeasible side. All levels are searched if one violates a
@@ -341,7 +344,7 @@ class Search:
         return ca.Function("levels", [x, before, evaluations, first], [best])
 
     def _slide_ends(self, chart: Any, upper: bool) -> Any:
-        """Return the Function that tries the rolls at which joint 1 (the slide) is at its lower or upper limit.
+        """Return the Function that compares the incumbent with roll angles that put prismatic joint 1 at a limit.
 
         (target, previous, best) -> best.
         """
@@ -360,14 +363,14 @@ class Search:
         return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
-        """Return bounds of the changes of sin q4 and cos q2 for a change of the roll by ROOTS.root_tolerance."""
+        """Return bounds of the changes of sin q4 and cos q2 when the roll angle changes by ROOTS.root_tolerance."""
         rig = self.rig
         sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4
         return sin4, (ROOTS.root_tolerance * rig.goose_neck + rig.pitch_link * cos4) / rig.yaw_link_1
 
     def _approximation(self, target: Expression) -> Callable[..., RoughRoll]:
-        """Return a function that gives an approximate roll a lower bound of the index, to compare with the incumbent.
+        """Return a function that computes a lower bound of the cost index near an approximate roll angle.
 
         `about` = (middle, half width) is the range of cos q2 outside of which the bound is inf.
         """
@@ -387,7 +390,7 @@ class Search:
         return rough
 
     def _improve(self, polished: Callable[[Expression, RoughRoll], Point], count: int) -> Any:
-        """Return the Function that polishes `count` approximate rolls and compares them with the incumbent.
+        """Return the Function that refines `count` approximate roll angles and compares them with the incumbent.
 
         (target, previous, rough, best) -> best. Rolls whose bound is not below the cost of the incumbent are skipped.
         """
@@ -407,7 +410,7 @@ class Search:
         return ca.Function("gates", [target, previous, rough, first], [column])
 
     def _stationary(self, target: Expression, rough: RoughRoll) -> Point:
-        """Return the stationary point of the index I1 near an approximate roll, by Newton's method."""
+        """Return the stationary point of the cost index I1 near an approximate roll angle, by Newton's method."""
         slope = self._index(target).derivative()
         bend = slope.derivative()
         return polish((rough.c, rough.s), lambda c, s: (slope.value(c, s), bend.value(c, s)))
@@ -415,7 +418,11 @@ class Search:
     def _compare(
         self, target: Expression, previous: Expression, points: Sequence[Candidate], best: Incumbent
     ) -> tuple[Incumbent, list[Evaluation], Expression]:
-        """Return the best of the incumbent and given rolls, the Evaluation of each roll, and the rolls' least cost."""
+        """Compare given rolls with the incumbent; return the best roll, and evaluations and least cost of the given
+        rolls.
+
+        The result is (Incumbent, list of Evaluation, cost).
+        """
         f = self._index(target)
         cost, c, s, code, below, above = best
         least, evaluations = ca.SX(ca.inf), []
@@ -446,20 +453,20 @@ class Search:
     # ---- answers ---------------------------------------------------------------------------------------------
 
     def _finish(self) -> Any:
-        """Return the Function (target, previous, best) -> answer that computes the joint positions of the incumbent."""
+        """Return the Function of (target, previous, best) that computes the joint positions at the incumbent's roll."""
         target, previous = _inputs(ca.SX)
         best = ca.SX.sym("best", INCUMBENT_SIZE)
         answer = self._solution(target, previous, _record(Incumbent, best), 0)
         return ca.Function("finish", [target, previous, best], ca.cse([answer]))
 
     def _infeasible(self) -> Any:
-        """Return the Function (target) -> answer for an infeasible target: joint positions nan, and a status."""
+        """Return the Function that reports an infeasible target by joint positions nan and the reason as status."""
         target = ca.SX.sym("target", 5)
         result = RigSolution(ca.DM.ones(6) * np.nan, np.nan, 0, infeasibility_code(self.rig, target, self.branch))
         return ca.Function("infeasible", [target], ca.cse([ca.vertcat(*result)]))
 
     def _solution(self, target: Expression, previous: Expression, best: Incumbent, status: Expression) -> Expression:
-        """Return the RigSolution of an incumbent as a column. Shape (9, 1)."""
+        """Return the RigSolution at the roll angle of an incumbent, stacked in a column. Shape (9, 1)."""
         roll = unwrap_roll(self.rig, best.c, best.s, previous)
         joints = joints_of(self.rig, target, roll, self._configuration(target, best.c, best.s))
         spoilt = ca.if_else(ca.SX(status) == 0, 0, np.nan)
@@ -467,15 +474,16 @@ class Search:
 
 
 def _is_finite(target: Expression, previous: Expression) -> Expression:
-    """Return whether target and previous roll are finite."""
+    """Return whether all entries of the target and the previous roll angle are finite."""
     total = ca.sum1(target) + previous
     return ca.fabs(total) < ca.inf
 
 
 def evaluate_unless(alternative: Any, shape: tuple[int, int] = (INCUMBENT_SIZE, 1)) -> Any:
-    """Return a Function (settled, known, *arguments) -> `known` if `settled` is true, else alternative(*arguments).
+    """Return a Function that returns a known value if a condition holds, and otherwise evaluates another Function.
 
-    The alternative is only evaluated if needed. casadi.if_else would also evaluate what its arguments depend on.
+    (settled, known, *arguments) -> `known` if `settled` is true, else alternative(*arguments). The alternative is only
+    evaluated if needed. casadi.if_else would also evaluate what its arguments depend on.
     """
     known = ca.MX.sym("known", *shape)
     inputs = [ca.MX.sym(f"x{i}", alternative.sparsity_in(i)) for i in range(alternative.n_in())]

@@ -1,4 +1,4 @@
-"""Collision-free inverse kinematics of the rig: clearance as a constraint, as a term of the index, or both.
+"""Collision-free inverse kinematics of the rig, with clearance as a constraint, as a term of the cost, or both.
 
 With clearances the index has no closed form. The rolls of a fixed grid are compared, with a penalty on insufficient
 clearance. The lowest local minima of the grid, and the best roll of the closed form, are refined by a pattern search
@@ -30,11 +30,11 @@ from models.shapes.shapes import Box, Capsule
 from models.spatial import FULL_TURN, Expression, expression
 
 KINK = 1e-12
-"""Length that smooths the kink of a distance at zero, m."""
+"""Length over which the kink of a distance at zero is smoothed, m."""
 
 
 class LinkCapsule(NamedTuple):
-    """A link of the rig as a capsule. Its ends are expressions in world, shape (3, 1), m; its radius is in m."""
+    """A capsule that represents a link of the rig: its radius, m, and the world positions of its ends, (3, 1), m."""
 
     radius: float
     start: Expression
@@ -42,18 +42,18 @@ class LinkCapsule(NamedTuple):
 
 
 def _finite_axes(point: Expression, box: Box) -> Expression:
-    """Return the coordinates of a point (in world) in a box's frame, along the axes in which the box is finite."""
+    """Return the coordinates of a world point in the frame of a box, along the axes in which the box is finite."""
     inside = ca.mtimes(ca.DM(box.rotation).T, expression(point) - ca.DM(box.position))
     return ca.vertcat(*[inside[k] for k in range(3) if np.isfinite(box.size[k])])
 
 
 def _half_size(box: Box) -> Expression:
-    """Return half the edge lengths of a box along its finite axes, m."""
+    """Return half of each finite edge length of a box, m."""
     return ca.DM(box.size[np.isfinite(box.size)] / 2)
 
 
 def box_distance(point: Expression, box: Box) -> Expression:
-    """Return the signed distance of a point to a box, a convex function of the point. Shape (1, 1), m."""
+    """Return the signed distance of a point from a box, a convex function of the point. Shape (1, 1), m."""
     over = ca.fabs(_finite_axes(point, box)) - _half_size(box)
     outside = ca.fmax(over, 0)
     deepest = reduce(ca.fmax, ca.vertsplit(over))
@@ -89,13 +89,13 @@ def capsule_to_box(capsule: LinkCapsule | Capsule, box: Box) -> Expression:
 
 
 def capsule_in_box(capsule: LinkCapsule | Capsule, walls: Box) -> Expression:
-    """Return the distance of a capsule inside a hollow box to the nearest wall, negative beyond it. Shape (1, 1), m."""
+    """Return the signed distance of a capsule inside a hollow box from the nearest wall of the box. Shape (1, 1), m."""
     gaps = [_half_size(walls) - ca.fabs(_finite_axes(end, walls)) for end in (capsule.start, capsule.end)]
     return reduce(ca.fmin, ca.vertsplit(ca.vertcat(*gaps))) - capsule.radius
 
 
 def capsule_to_capsule(first: LinkCapsule | Capsule, second: LinkCapsule | Capsule) -> Expression:
-    """Return the signed distance between two capsules, m. Shape (1, 1).
+    """Return the signed distance between two capsules. Shape (1, 1), m.
 
     If their axes cross, the distance is minus the sum of the radii. Closest points of two segments in closed form
     (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
@@ -124,7 +124,7 @@ def _clip(x: Expression) -> Expression:
 
 @dataclass(frozen=True)
 class ClearanceSearch:
-    """Settings of the search for a collision-free roll.
+    """Settings of the search for a collision-free roll angle.
 
     Attributes:
         samples: Number of rolls in the grid.
@@ -152,7 +152,7 @@ SEARCH = ClearanceSearch()
 
 @dataclass(frozen=True)
 class Radii:
-    """Radii of the rig's capsules, m: yaw links, pitch link, goose-neck and sting."""
+    """Radii of the capsules that represent yaw links, pitch link, goose-neck and sting of the rig, m."""
 
     yaw: float = 2.0 * INCH
     pitch: float = 1.5 * INCH
@@ -165,7 +165,7 @@ class Radii:
 
 @dataclass(frozen=True)
 class CollisionScene:
-    """Obstacles around the rig.
+    """Obstacles around the rig: tunnel walls, boxes and capsules.
 
     Attributes:
         walls: The hollow tunnel; its floor is a wall. None for no walls.
@@ -185,7 +185,7 @@ class CollisionScene:
 
 
 def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[str, LinkCapsule]:
-    """Return the capsules of the rig's links, from yaw link 1 to the sting, keyed by the name of the link."""
+    """Return the capsules that represent the rig's links, from yaw link 1 to the sting, by name of the link."""
     require.instance("rig: rig", rig, Rig)
     radii = Radii() if radii is None else require.instance("rig: radii", radii, Radii)
     frames = dh_frames(rig, checked_vector("q", q, 6, "one entry for each joint of the rig"))
@@ -206,7 +206,7 @@ def rig_capsules(rig: Rig, q: Expression, radii: Radii | None = None) -> dict[st
 def clearances(
     rig: Rig, q: Expression, scene: CollisionScene, radii: Radii | None = None
 ) -> dict[tuple[str, str], Expression]:
-    """Return the distance of every link to every obstacle, keyed by (link, obstacle). Each of shape (1, 1), m.
+    """Return the signed distance of every link from every obstacle, keyed by (link, obstacle). Shape (1, 1) each, m.
 
     Raises:
         ModelError: The scene is empty.
@@ -227,7 +227,9 @@ def clearances(
 
 
 def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
-    """Return a cost term, weight exp(-gap / width), that grows as the gap to the scene closes; gap and width in m.
+    """Return a cost term that grows as the gap between rig and obstacles closes: weight exp(-gap / width).
+
+    The gap and the width are in m.
 
     Raises:
         ModelError: The weight is negative or not finite, or the width is not positive.
@@ -238,7 +240,7 @@ def proximity_cost(gap: Expression, weight: float, width: float) -> Expression:
 
 
 def checked_clearance(clearance: float) -> float:
-    """Return `clearance`, m; raise a ModelError unless it is a finite distance, or -inf for no constraint."""
+    """Return a required clearance, m; raise a ModelError unless it is finite, or -inf for no constraint."""
     if require.number("rig: clearance", clearance, finite=False) == np.inf:
         message = f"clearance {clearance} m must be a finite distance or -inf for none"
         raise ModelError(message, name="clearance", value=clearance)
@@ -247,7 +249,7 @@ def checked_clearance(clearance: float) -> float:
 
 @dataclass(frozen=True)
 class Avoidance:
-    """Settings by which the rig avoids obstacles: clearance as a constraint, as a term of the index, or both.
+    """Settings of obstacle avoidance for the rig: clearance as a constraint, as a term of the cost index, or both.
 
     Attributes:
         scene: Obstacles.
@@ -277,7 +279,7 @@ class Avoidance:
 def collision_free_inverse(
     rig: Rig, tunnel: Tunnel, avoidance: Avoidance, branch: Branch = HOME, *, rate_weight: float = 0.0
 ) -> Any:
-    """Return the casadi Function that computes the joint positions for a target at the best collision-free roll.
+    """Return the casadi Function that computes the joint positions for a target at the best collision-free roll angle.
 
     (target, previous) -> (joints, cost, active, status, gap).
 
@@ -339,7 +341,7 @@ def collision_free_inverse(
 
 
 def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the Function that selects the lowest local minima of the merit on the grid of rolls.
+    """Return inputs and outputs of the Function that selects the lowest local minima of the merit on a grid of rolls.
 
     (merits) -> columns (angle, merit, step), one for each minimum.
     """
@@ -360,7 +362,7 @@ def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
 
 
 def _least_value(count: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the Function that selects the angle of the least value from a row of angles.
+    """Return inputs and outputs of the Function that selects from a row of roll angles the one of least value.
 
     (angles, values) -> (best angle, least value, whether it is the first).
     """
@@ -374,7 +376,7 @@ def _least_value(count: int) -> tuple[list[Any], list[Any]]:
 
 
 def _pattern_search(merit: Any) -> Any:
-    """Return the Function that reduces the merit function from several rolls, each by a pattern search.
+    """Return the Function that minimises the merit function by pattern searches from several roll angles.
 
     (states, inputs) -> states. A state is (angle, merit, step); the inputs are target and previous roll.
     """

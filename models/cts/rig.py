@@ -1,4 +1,4 @@
-"""Kinematics of a captive trajectory rig: six joints P-R-R-R-R-R that hold a store model on a goose-neck sting.
+"""Kinematics of a captive trajectory rig, whose six joints (P-R-R-R-R-R) move a store model on a goose-neck sting.
 
 Source: Lee, Lee 2017. Equation numbers are the paper's; misprints are corrected by comparison with the D-H product.
 Joints 2 and 3 produce yaw, 4 and 5 pitch, and 6 alone roll. The task does not specify the roll, the rotation about the
@@ -26,7 +26,7 @@ LENGTHS = ("yaw_link_1", "yaw_link_2", "yaw_offset", "pitch_link", "sting", "goo
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Dimensions and joint limits of a rig.
+    """Dimensions and joint limits of a captive trajectory rig.
 
     Attributes:
         yaw_link_1, yaw_link_2: Ly1 and Ly2, the links after joints 2 and 3. m.
@@ -69,15 +69,15 @@ class Rig:
                 warn_of_degrees(f"rig: limit of joint {joint}", (low, high), f"joint {joint}")
 
     def limited(self, joint: int) -> bool:
-        """Return whether a revolute joint, 2 to 6, has limits less than a full turn apart."""
+        """Return whether the limits of a revolute joint (number 2 to 6) are less than a full turn apart."""
         return bool(self.upper[joint - 1] - self.lower[joint - 1] < FULL_TURN)
 
     def limit(self, joint: int, upper: bool) -> float:
-        """Return the lower or upper limit of a joint, 1 to 6, in m or rad; infinite if there is none."""
+        """Return the lower or upper limit of a joint (number 1 to 6), m or rad; infinite if there is no limit."""
         return float((self.upper if upper else self.lower)[joint - 1])
 
     def middle_and_half(self, joint: int) -> tuple[float, float]:
-        """Return the mid-range position and half the range of a joint, 1 to 6, that has both limits, m or rad."""
+        """Return the middle and half the length of the range of a joint (number 1 to 6) with both limits, m or rad."""
         low, high = self.limit(joint, False), self.limit(joint, True)
         return (low + high) / 2, (high - low) / 2
 
@@ -88,7 +88,7 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Tunnel:
-    """Data of the index I1, the weighted squared distance of the goose-neck's corner from the tunnel's centre.
+    """Data of the cost index I1, the weighted squared distance of the goose-neck's corner from the tunnel's centre.
 
     Attributes:
         center: P_C of equation (35) in world. Shape (3,), m.
@@ -110,7 +110,7 @@ class Tunnel:
 
     @property
     def scale(self) -> Array:
-        """Diagonal of the weight matrix D of the index I1: weights / ranges^2. Shape (3,), 1/m^2."""
+        """Diagonal of the weight matrix D of the cost index I1: weights / ranges^2. Shape (3,), 1/m^2."""
         return np.asarray(self.weights / self.ranges**2)
 
 
@@ -136,7 +136,7 @@ def checked_branch(branch: Branch) -> Branch:
 
 
 class RigConfiguration(NamedTuple):
-    """Positions of joints 1, 2 and 4 and of the goose-neck's corner for a target, a roll and a branch.
+    """Positions of joints 1, 2 and 4 and of the goose-neck's corner for a target, a roll angle and a branch.
 
     Attributes:
         corner: P_G, the goose-neck's corner, in world. Shape (3, 1), m.
@@ -157,7 +157,7 @@ class RigConfiguration(NamedTuple):
 
 
 def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
-    """Return the link frames 0 to 6 and the tool frame in world as products of Denavit-Hartenberg transformations.
+    """Return link frames 0 to 6 and the tool frame in the world as products of Denavit-Hartenberg transformations.
 
     Equations (1) to (4) of the paper, without joint offsets.
 
@@ -184,7 +184,7 @@ def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
 
 
 def forward(rig: Rig, q: Expression) -> Expression:
-    """Return the pose (x, y, z, yaw, pitch, roll) of the tool frame in world. Shape (6, 1), m and rad.
+    """Return the pose (x, y, z, yaw, pitch, roll) of the tool frame in the world. Shape (6, 1), m and rad.
 
     Equations (16) to (22) of the paper. Yaw and pitch are the sums of the joint angles, not reduced to one turn.
     """
@@ -203,7 +203,10 @@ def forward(rig: Rig, q: Expression) -> Expression:
 
 
 def task_jacobian(rig: Rig, q: Expression) -> Expression:
-    """Return the Jacobian (5, 6) of (x, y, z, yaw, pitch) with respect to the joint positions; Table 3 of the paper."""
+    """Return the Jacobian (Table 3 of Lee, Lee 2017) of the target coordinates with respect to the joint positions.
+
+    The target coordinates are (x, y, z, yaw, pitch). Shape (5, 6).
+    """
     joints = ca.SX.sym("q", 6)
     jacobian = ca.Function("task_jacobian", [joints], [ca.jacobian(forward(rig, joints)[:5], joints)])
     return jacobian(q)
@@ -213,19 +216,25 @@ def task_jacobian(rig: Rig, q: Expression) -> Expression:
 
 
 def goose_neck_corner(rig: Rig, target: Expression, roll: Expression) -> Expression:
-    """Return the goose-neck's corner in world (3, 1), m, for a target and roll; equations (32) to (34) of the paper."""
+    """Return the position of the goose-neck's corner in the world for a target and a roll angle. Shape (3, 1), m.
+
+    Equations (32) to (34) of the paper.
+    """
     roll = expression(roll)
     return corner_of_roll(rig, expression(target), ca.cos(roll), ca.sin(roll))
 
 
 def corner_of_roll(rig: Rig, target: Expression, c: Expression, s: Expression) -> Expression:
-    """Return the position of the goose-neck's corner in world for a roll given by cosine and sine. Shape (3, 1), m."""
+    """Return the world position of the goose-neck's corner for a roll given by cosine and sine. Shape (3, 1), m."""
     axle, cosine_part, sine_part = corner_circle(rig, target)
     return axle + rig.goose_neck * (c * cosine_part + s * sine_part)
 
 
 def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression, Expression]:
-    """Return the circle of the goose-neck's corner over all rolls: centre (m), cosine and sine axis. (3, 1) each."""
+    """Return the circle that the goose-neck's corner describes over all rolls: its centre (m) and two unit axes.
+
+    The corner is centre + goose_neck (cos(roll) first axis + sin(roll) second axis). Shape (3, 1) each.
+    """
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     c_pitch, s_pitch = ca.cos(target[4]), ca.sin(target[4])
     axle = target[:3] - rig.sting * ca.vertcat(c_yaw * c_pitch, s_yaw * c_pitch, -s_pitch)
@@ -234,7 +243,7 @@ def corner_circle(rig: Rig, target: Expression) -> tuple[Expression, Expression,
 
 
 def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression, *, branch: Branch) -> RigConfiguration:
-    """Return the rig's configuration for a roll given by cosine and sine. Equations (23), (25), (27) of the paper."""
+    """Return the rig's configuration for a target and a roll angle, by equations (23), (25), (27) of Lee, Lee 2017."""
     corner = corner_of_roll(rig, target, c, s)
     c_yaw, s_yaw = ca.cos(target[3]), ca.sin(target[3])
     sin4 = -corner[2] / rig.pitch_link
@@ -247,7 +256,7 @@ def configuration_at(rig: Rig, target: Expression, c: Expression, s: Expression,
 
 
 def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOME) -> tuple[Expression, Expression]:
-    """Return the joint positions that reach a target with a given roll, and the margins of reach.
+    """Return the joint positions for a target and a roll angle, and the reach margins of the yaw and pitch links.
 
     Equations (23) to (27) of the paper.
 
@@ -268,7 +277,7 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
 
 
 def joints_of(rig: Rig, target: Expression, roll: Expression, configuration: RigConfiguration) -> Expression:
-    """Return the joint positions of a configuration, each angle in the full turn nearest to mid-range. (6, 1)."""
+    """Return the joint positions of a configuration, each angle in the turn nearest to mid-range. Shape (6, 1)."""
     q2 = ca.atan2(configuration.sin2, configuration.cos2)
     q4 = ca.atan2(configuration.sin4, configuration.cos4)
     angles = [q2, target[3] - q2 - np.pi / 2, q4, target[4] - q4 + np.pi / 2]
@@ -279,7 +288,7 @@ def joints_of(rig: Rig, target: Expression, roll: Expression, configuration: Rig
 
 
 def nearest_turn(angle: Expression, middle: Expression) -> Expression:
-    """Return the angle plus the full turns that bring it nearest to `middle`, rad."""
+    """Return the angle nearest to `middle` that differs from `angle` by full turns, rad."""
     return angle - FULL_TURN * ca.floor((angle - middle) / FULL_TURN + 0.5)
 
 

@@ -1,4 +1,4 @@
-"""Feasible rolls of the rig for a target, and the indices I1 and I2 by which they are compared.
+"""Feasible roll angles of the rig for a target, and the cost indices I1 and I2 by which they are compared.
 
 The roll is the rotation of the store about the tool axis, which the task leaves free. At a given target, that is
 position, yaw and pitch, it determines the positions of all joints up to the branch. It is represented as a point
@@ -47,27 +47,27 @@ from models.spatial import FULL_TURN, Expression
 
 LIMIT_NAMES = tuple(f"joint {joint} {side}" for joint in range(1, 7) for side in ("lower", "upper"))
 ACTIVE = ("free", "pitch reach", "yaw reach", *LIMIT_NAMES, "clearance")
-"""Names of the constraints that may be active at a roll, in the order of their codes."""
+"""Names of the constraints that may be active at a roll angle, in the order of their codes."""
 
 STATUS = ("ok", "not a number", "pitch link out of reach", "yaw link out of reach", "joint limits", "clearance")
-"""Status of a target, in the order of the codes: "ok", or the reason why it has no feasible roll."""
+"""Status of a target, in the order of the codes: "ok", or the reason why the target has no feasible roll angle."""
 
 ANGLE_INSET = 1e-10
 REACH_INSET = 1e-13
-"""Distances inside a limit at which ends of roll intervals are placed, so that the strict check accepts them.
+"""Distances inside a limit at which ends of roll intervals are placed, so that a strict limit check accepts the ends.
 
-The first is in rad or m, the second applies to a sine or cosine.
+ANGLE_INSET is in rad or m, REACH_INSET applies to a sine or cosine.
 """
 
 SQUARED_POLISH_STEP = 1e-5
 SINE_ROUNDING = 2e-15
-"""Bound of the rounding error of sin q4."""
+"""Upper bound of the rounding error of sin q4."""
 COSINE_SLACK = 1e-7
-"""Tolerance of a cosine in the check of joint limits at a possible end of a roll interval."""
+"""Tolerance of the cosine by which a joint limit is checked at a possible end of a roll interval."""
 
 
 class Candidate(NamedTuple):
-    """A candidate for the best roll: cosine, sine, and the code in ACTIVE of the constraint that is active there."""
+    """A candidate for the best roll angle: cosine, sine, and the index in ACTIVE of the active constraint."""
 
     c: Expression
     s: Expression
@@ -75,7 +75,7 @@ class Candidate(NamedTuple):
 
 
 class ConstraintCheck(NamedTuple):
-    """Boolean expressions that say which reach and joint limits a roll satisfies."""
+    """Boolean expressions that tell which reach constraints and joint limits are satisfied at a roll angle."""
 
     pitch: Expression
     yaw: Expression
@@ -85,11 +85,11 @@ class ConstraintCheck(NamedTuple):
     slide_upper: Expression
 
     def all_but_slide(self) -> Expression:
-        """Return whether all constraints are satisfied, not counting the limits of joint 1 (the slide)."""
+        """Return whether all constraints but the limits of joint 1 (the slide) are satisfied."""
         return ca.logic_and(self.pitch_joints(), ca.logic_and(self.yaw, self.yaw_angles))
 
     def pitch_joints(self) -> Expression:
-        """Return whether the target is within reach of the pitch link and joints 4, 5 and 6 are within limits."""
+        """Return whether the pitch link reaches the target and joints 4, 5 and 6 are within their limits."""
         return ca.logic_and(self.pitch, self.pitch_angles)
 
     def angles(self) -> Expression:
@@ -102,7 +102,7 @@ class ConstraintCheck(NamedTuple):
 
 
 class ArcEndLevel(NamedTuple):
-    """A value of cos q2 at which an interval of feasible rolls may end.
+    """A value of cos q2 at which an interval of feasible roll angles may end.
 
     Attributes:
         cosine: The value.
@@ -118,12 +118,12 @@ class ArcEndLevel(NamedTuple):
 
 
 def limit_code(joint: int, upper: bool) -> int:
-    """Return the index in ACTIVE, the names of the constraints, of the lower or upper limit of a joint, 1 to 6."""
+    """Return the code, an index in ACTIVE, of the lower or upper position limit of a joint (number 1 to 6)."""
     return 3 + 2 * (joint - 1) + int(upper)
 
 
 def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
-    """Return the index I1, equation (36) of the paper, as a trigonometric polynomial of the roll with two harmonics."""
+    """Return the cost index I1 as a trigonometric polynomial of the roll angle. Equation (36) of Lee, Lee 2017."""
     axle, e_c, e_s = corner_circle(rig, target)
     offset = axle - ca.DM(tunnel.center)
     weight = ca.DM(tunnel.scale)
@@ -142,7 +142,7 @@ def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
 def check_constraints(
     rig: Rig, target: Expression, configuration: RigConfiguration, *, c: Expression, s: Expression
 ) -> ConstraintCheck:
-    """Return which constraints a configuration satisfies; an angle is compared by its cosine relative to mid-range."""
+    """Return which reach constraints and joint limits a configuration satisfies; angles are compared by cosines."""
     p = configuration
     pair3 = _difference(ca.sin(target[3]), -ca.cos(target[3]), p.sin2, p.cos2)  # yaw - pi/2 - q2
     pair5 = _difference(-ca.sin(target[4]), ca.cos(target[4]), p.sin4, p.cos4)  # pitch + pi/2 - q4
@@ -158,7 +158,7 @@ def check_constraints(
 
 
 def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expression:
-    """Return the code in STATUS of the reason why a target has no feasible roll: reach of a link or joint limits."""
+    """Return an index in STATUS: the reason (reach of a link, joint limits) why a target has no feasible roll."""
     rig = rig.unlimited()
     axle, e_c, _ = corner_circle(rig, target)
     pitch = ca.fabs(axle[2]) - rig.goose_neck * ca.fabs(e_c[2]) <= rig.pitch_link
@@ -172,7 +172,7 @@ def infeasibility_code(rig: Rig, target: Expression, branch: Branch) -> Expressi
 
 
 def arc_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candidate]:
-    """Return rolls that include all ends of the intervals of feasible rolls, except those at limits of joint 1."""
+    """Return roll angles that include all ends of the feasible intervals except the ends at limits of joint 1."""
     ends = closed_form_ends(rig, target, branch)
     chart = yaw_chart(rig, branch)
     for level in yaw_levels(rig, target, branch):
@@ -206,7 +206,7 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
 
 
 def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel]:
-    """Return the values of cos q2 at which an interval of feasible rolls may end.
+    """Return the values of cos q2 at which an interval of feasible roll angles may end.
 
     They are due to the limits of joints 2 and 3 and to the reach of the yaw link.
     """
@@ -214,7 +214,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
     def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Append a value of cos q2 to `levels`; it is relevant only if joint 3 is within its limits there."""
+        """Append a value of cos q2 to `levels`, marked as relevant only if joint 3 is then within its limits."""
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
@@ -238,10 +238,10 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
 
 
 def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
-    """Return four approximate rolls, as (cos, sin), that give joint 2 a prescribed cosine at a fixed target.
+    """Return four approximate roll angles, as (cos, sin), at which joint 2 has a given cosine for a fixed target.
 
-    They are roots of the squared equation cos q2 = `cosine`. It is smooth near a stretched pitch link, where cos q2 is
-    not; near yaw 0 it has nearly double roots, where cos q2 has simple ones.
+    They are roots of the squared equation cos q2 = `cosine`. The squared equation is smooth near a stretched pitch
+    link, where cos q2 is not; near yaw 0 it has nearly double roots, where cos q2 has simple ones.
     """
     axle, e_c, e_s = corner_circle(rig, target)
     lg, lp = rig.goose_neck, rig.pitch_link
@@ -276,12 +276,12 @@ def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Exp
 
 
 def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
-    """Return a position of a joint slightly inside one of its limits, m or rad."""
+    """Return a position of a joint slightly inside its lower or upper limit, m or rad."""
     return rig.limit(joint, upper) + (-1 if upper else 1) * ANGLE_INSET
 
 
 def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = COSINE_SLACK) -> Expression:
-    """Return whether an angle, given by sine and cosine, is within a joint's limits, to a tolerance of the cosine."""
+    """Return whether an angle, given by sine and cosine, is within a joint's limits up to `slack` of the cosine."""
     if not rig.limited(joint):
         return 1
     middle, half = rig.middle_and_half(joint)
@@ -289,7 +289,7 @@ def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: f
 
 
 def _allows(rig: Rig, joint: int, angle: float) -> bool:
-    """Return whether an angle, or the angle plus full turns, is within the limits of a joint."""
+    """Return whether an angle, possibly shifted by full turns, is within the limits of a joint."""
     if not rig.limited(joint):
         return True
     middle, half = rig.middle_and_half(joint)
@@ -297,10 +297,10 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return a casadi Function that evaluates cos q2, q1 and cos q4 at a roll, with derivatives for root finding.
+    """Return a casadi Function that evaluates cos q2, q1 and cos q4 at a roll angle, and slopes for Newton's method.
 
-    (target, cosine, sine of the roll) -> (cos q2, its derivative, q1, its derivative, cos q4), with derivatives with
-    respect to the roll. Other functions take it as their argument `chart`.
+    (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4); a slope is a derivative with
+    respect to the roll. Other functions take the Function as their argument `chart`.
     """
     t, c, s = ca.SX.sym("target", 5), ca.SX.sym("c"), ca.SX.sym("s")
     configuration = configuration_at(rig, t, c, s, branch=branch)
@@ -310,12 +310,12 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 
 def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Return the roll at which cos q2 (`output` 0) or q1 (`output` 2) has a given value, by Newton steps."""
+    """Return the roll angle at which cos q2 (`output` 0) or q1 (`output` 2) has a given value, by Newton steps."""
     return polish(point, chart_residual(chart, target, output, value))
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the roll at which cos q2 has a given value, kept on its feasible side despite rounding errors.
+    """Return the roll angle at which cos q2 reaches a limit, on the feasible side despite rounding errors.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     is satisfied above the value, -1 if below.
@@ -327,9 +327,10 @@ def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expressi
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return the function of the roll whose root `polish` finds: cos q2 or q1 minus a given value, and its derivative.
+    """Return a function of the roll angle: cos q2 or q1 minus a given value. `polish` finds the root of the function.
 
-    `output` is 0 for cos q2 and 2 for q1. The function takes cosine and sine of the roll.
+    `output` is 0 for cos q2 and 2 for q1. The function takes cosine and sine of the roll and also returns the
+    derivative.
     """
 
     def function(c: Expression, s: Expression) -> Point:
@@ -349,9 +350,10 @@ def _not_zero(x: Expression) -> Expression:
 
 
 def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
-    """Return a casadi Function (target) -> rolls that include all ends of feasible intervals at one limit of joint 1.
+    """Return a casadi Function that computes the roll angles at which joint 1 is at its lower or upper limit.
 
-    Output shape (2, 8): rows cosine and sine of the roll.
+    The angles include all ends of feasible intervals at the limit. (target) -> (2, 8), rows cosine and sine of the
+    roll.
     """
     t, points = ca.SX.sym("target", 5), ca.SX.sym("points", 2, 8)
     slope = chart_residual(yaw_chart(rig, branch), t, 2, inside_limit(rig, 1, upper))
@@ -363,7 +365,7 @@ def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
 
 
 def slide_points(rig: Rig, upper: bool) -> Any:
-    """Return a casadi Function (target) -> approximate rolls at which joint 1 is at a limit. Output shape (2, 8)."""
+    """Return a casadi Function that approximates the roll angles at which joint 1 is at a limit. Output (2, 8)."""
     limit = inside_limit(rig, 1, upper)
     t = ca.SX.sym("target", 5)
     axle, e_c, e_s = corner_circle(rig, t)
@@ -389,7 +391,9 @@ def slide_points(rig: Rig, upper: bool) -> Any:
 
 
 def checked_gain(rate_weight: float) -> float:
-    """Return w4 / (2 pi), the factor of the squared change of roll in the index I2, equation (37) of the paper.
+    """Return the factor of the squared change of roll in the cost index I2, which is the rate weight over a full turn.
+
+    The factor is w4 / (2 pi), equation (37) of the paper.
 
     Raises:
         ModelError: The weight w4, `rate_weight`, is negative or not finite.
@@ -398,7 +402,7 @@ def checked_gain(rate_weight: float) -> float:
 
 
 def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) -> Expression:
-    """Return the angle of a roll given by cosine and sine: within joint 6's limits and nearest to `previous`."""
+    """Return the roll angle, given by cosine and sine, that is within joint 6's limits and nearest to `previous`."""
     angle = ca.atan2(s, c)
     if rig.limited(6):
         return nearest_turn(angle, rig.middle_and_half(6)[0])
@@ -406,7 +410,7 @@ def unwrap_roll(rig: Rig, c: Expression, s: Expression, previous: Expression) ->
 
 
 def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]:
-    """Return the interval of rolls within joint 6's limits, at most a turn long, that is nearest to a previous roll."""
+    """Return the ends of the interval of admissible roll angles, at most a turn long, nearest to the previous roll."""
     start, low, high = previous - np.pi, rig.limit(6, False), rig.limit(6, True)
     if not np.isfinite(low):
         return start, start + FULL_TURN
@@ -415,7 +419,7 @@ def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]
 
 
 def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
-    """Return a casadi Function (target, previous roll) -> rolls that include all minima of the index I2.
+    """Return a casadi Function of target and previous roll that computes five rolls, including all minima of I2.
 
     I2 = I1 + gain (roll - previous)^2. Output shape (5, 1), rad. If I2 is convex there is one minimum. Otherwise the
     window of rolls is split where I1'' = -2 gain, and each convex interval has its own minimum.
@@ -439,7 +443,7 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
 def minimize_convex(
     f: Harmonics, gain: float, previous: Expression, bracket: Point, *, start: Expression, steps: int
 ) -> Expression:
-    """Return the roll of least index I2 in an interval where I2 is convex, by Newton steps in a shrinking bracket."""
+    """Return the roll angle of least I2 on an interval where I2 is convex, by Newton steps in a shrinking bracket."""
     a, b = bracket
     slope, bend = f.derivative(), f.derivative().derivative()
     x = start
@@ -454,7 +458,7 @@ def minimize_convex(
 
 
 def _inflections(f: Harmonics, gain: float, start: Expression, end: Expression) -> list[Expression]:
-    """Return the rolls in [start, end] at which the index I2 changes between convex and concave: I1'' = -2 gain."""
+    """Return the roll angles from `start` to `end` at which I2 changes between convex and concave: I1'' = -2 gain."""
     bend = f.derivative().derivative()
     points = roots(bend._replace(a0=2 * gain))
     return [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in points]

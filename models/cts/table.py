@@ -1,4 +1,4 @@
-"""Inverse kinematics of the rig for tables of targets, intervals of feasible rolls, and export to C.
+"""Inverse kinematics of the rig for tables of targets, intervals of feasible roll angles, and export to C code.
 
 `solve_table` converts a table of targets to a table of joints; rows without a solution have the reason as their status.
 `rig_functions` and `export` serve controllers without Python. The generated C needs only the mathematics library. It is
@@ -74,7 +74,9 @@ def solve_table(
     rate_weight: float = 0.0,
     avoidance: Avoidance | None = None,
 ) -> Table:
-    """Return the joint positions of least index for every target; a target without a solution affects no other.
+    """Return the joint positions of least cost index for every target of a table.
+
+    A target without a solution does not affect the others.
 
     Args:
         targets: Shape (samples, 5), m and rad; rows may hold nan.
@@ -122,7 +124,10 @@ def solve_table(
 
 
 def _best_branch(results: list[Any]) -> Array:
-    """Return each target's best result: joints, cost, branch number, active constraint, status. Shape (samples, 10)."""
+    """Return the result of the best branch for each target. Shape (samples, 10).
+
+    Columns: joint positions (6), cost, branch number, codes of active constraint and status.
+    """
     best: Array | None = None
     for number, (joints, cost, active, status, *_) in enumerate(results):
         columns = [np.array(part, dtype=float) for part in (joints, cost, active, status)]
@@ -142,7 +147,7 @@ def _best_branch(results: list[Any]) -> Array:
 
 @dataclass(frozen=True)
 class RollInterval:
-    """An interval of rolls at which the rig reaches the target within all joint limits.
+    """An interval of roll angles at which the rig reaches a target within all joint limits.
 
     Attributes:
         start, end: rad, end >= start; a full turn is -pi .. pi.
@@ -155,7 +160,7 @@ class RollInterval:
 
 
 def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list[RollInterval]:
-    """Return all intervals of roll, modulo a full turn, in which the rig reaches a target within its joint limits.
+    """Return the intervals of roll angles, modulo a full turn, in which the rig reaches a target within joint limits.
 
     Every interval starts in [-pi, pi).
 
@@ -192,7 +197,7 @@ def reachable_rolls(rig: Rig, target: ArrayInput, branch: Branch = HOME) -> list
 
 @lru_cache(maxsize=16)
 def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
-    """Return two casadi Functions: the possible ends of feasible roll intervals, and whether a roll is feasible.
+    """Return casadi Functions for the possible ends of feasible roll intervals and for the feasibility of a roll.
 
     (target) -> points, with rows cosine, sine and code of the constraint in roll.ACTIVE; (target, roll) -> feasible.
     """
@@ -211,9 +216,9 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
 
 
 def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Branch, Array]]:
-    """Return every branch that reaches a target with a given roll, and its joint positions, regardless of joint limits.
+    """Return every branch of inverse kinematics that reaches a target with a given roll angle, with joint positions.
 
-    The joint positions have shape (6,).
+    Joint limits are not checked. The joint positions have shape (6,).
 
     Raises:
         ModelError: The target or roll is not finite, or no branch reaches the pose (names the link).
@@ -236,19 +241,19 @@ def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Bran
 
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
-    """Return targets (x, y, z, yaw, pitch), shape (samples, 5); raise a ModelError about the first invalid row."""
+    """Return targets (x, y, z, yaw, pitch), one per row of an array; raise a ModelError about the first invalid row."""
     rows = require.array("table: targets", targets, ("samples", 5), entries="finite" if finite else "any")
     warn_of_degrees("table: yaw or pitch", rows[:, 3:], "targets")
     return rows
 
 
 def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: float = 5.0) -> dict[str, Any]:
-    """Return the casadi Functions of a rig's kinematics by their names; `.map(samples)` applies one to a table.
+    """Return the casadi Functions of a rig's kinematics, by name.
 
-    forward: (joints) -> (pose). inverse: (target, roll) -> (joints, reach), see `rig.inverse`. corner: (target, roll)
-    -> (P_G). arc_ends, feasible: see `roll_interval_functions`. optimal_inverse_i1_free, optimal_inverse_i1,
-    optimal_inverse_i2: (target, previous) -> (joints, cost, active, status), see `best_roll.optimal_inverse`; I2 with
-    `rate_weight`.
+    `.map(samples)` applies a Function to a table. forward: (joints) -> (pose). inverse: (target, roll) -> (joints,
+    reach), see `rig.inverse`. corner: (target, roll) -> (P_G). arc_ends, feasible: see `roll_interval_functions`.
+    optimal_inverse_i1_free, optimal_inverse_i1, optimal_inverse_i2: (target, previous) -> (joints, cost, active,
+    status), see `best_roll.optimal_inverse`; I2 with `rate_weight`.
     """
     q, target, roll = ca.SX.sym("joints", 6), ca.SX.sym("target", 5), ca.SX.sym("roll")
     functions = [

@@ -23,12 +23,12 @@ Slope = Callable[[Expression, Expression], tuple[Expression, Expression]]
 """A function of a point of the unit circle that returns a value and its derivative with respect to the angle."""
 
 SMALLEST_DIVISOR = 1e-300
-"""Added to divisors that may be zero; it changes no other number."""
+"""Number added to divisors that may be zero; it is too small to change any other divisor."""
 
 
 @dataclass(frozen=True)
 class RootSettings:
-    """Settings of the root finding for trigonometric polynomials, which bound its number of operations.
+    """Settings of the root finding for trigonometric polynomials; they bound the number of operations.
 
     Attributes:
         min_second_harmonic: Smallest relative second harmonic in the pencil of conics; a smaller one is raised, and the
@@ -67,7 +67,7 @@ class Harmonics(NamedTuple):
     b2: Expression
 
     def value(self, c: Expression, s: Expression) -> Expression:
-        """Return the value of the polynomial at the angle with cosine c and sine s."""
+        """Return the value of the polynomial at the angle with a given cosine and sine."""
         return self.a0 + self.a1 * c + self.b1 * s + self.a2 * (c * c - s * s) + 2 * self.b2 * c * s
 
     def derivative(self) -> Harmonics:
@@ -75,12 +75,12 @@ class Harmonics(NamedTuple):
         return Harmonics(0.0, self.b1, -self.a1, 2 * self.b2, -2 * self.a2)
 
     def slope_bound(self) -> Expression:
-        """Return an upper bound of the second derivative's magnitude: hypot(a1, b1) + 4 hypot(a2, b2)."""
+        """Return an upper bound of the magnitude of the second derivative, hypot(a1, b1) + 4 hypot(a2, b2)."""
         return ca.sqrt(self.a1**2 + self.b1**2) + 4 * ca.sqrt(self.a2**2 + self.b2**2)
 
 
 def square_of_first_harmonic(a0: Expression, a1: Expression, b1: Expression) -> Harmonics:
-    """Return the square of the trigonometric polynomial a0 + a1 cos x + b1 sin x of an angle x."""
+    """Return the square of a trigonometric polynomial of one harmonic, a0 + a1 cos x + b1 sin x."""
     mean = a0 * a0 + (a1 * a1 + b1 * b1) / 2
     return Harmonics(mean, 2 * a0 * a1, 2 * a0 * b1, (a1 * a1 - b1 * b1) / 2, a1 * b1)
 
@@ -145,10 +145,10 @@ def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
-    """Return the rotation of axes (cosine, sine) that removes the term x y of f, and f's coefficients p, q, r in them.
+    """Return the rotation of axes that removes the mixed term x y of a polynomial, and the coefficients in these axes.
 
-    With (x, y) on the unit circle f = a0 + p x + q y + r (x^2 - y^2), r > 0, in the rotated axes. `shift` is added to
-    a2, so that the second harmonic has a direction.
+    The rotation is (cosine, sine). With (x, y) on the unit circle f = a0 + p x + q y + r (x^2 - y^2), r > 0, in the
+    rotated axes. `shift` is added to a2, so that the second harmonic has a direction.
     """
     a2 = f.a2 + shift
     r = ca.sqrt(a2 * a2 + f.b2 * f.b2)
@@ -160,7 +160,7 @@ def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expr
 
 
 def least_point(f: Harmonics) -> Point:
-    """Return the point (cos, sin) of the unit circle at which a polynomial f has its global minimum.
+    """Return the point (cos, sin) of the unit circle at which a trigonometric polynomial f has its global minimum.
 
     In axes with f = a0 + p x + q y + r (x^2 - y^2), r > 0, mirroring x or y only changes the terms p x and q y, so the
     minimum is in the quadrant where neither is positive. There f has exactly one stationary point, the root of
@@ -205,7 +205,7 @@ def polish(
     max_polish_step: float = ROOTS.max_polish_step,
     floor: float = SMALLEST_DIVISOR,
 ) -> Point:
-    """Refine a root on the unit circle by Newton steps of limited size (rad).
+    """Refine an approximate root, a point of the unit circle, by Newton steps of limited size (rad).
 
     `function` returns value and derivative with respect to the angle. If the square of the derivative is below `floor`
     the steps vanish.
@@ -227,7 +227,7 @@ def _sign(x: Expression) -> Expression:
 
 
 def _pencil(a0: Expression, p: Expression, q: Expression, r: Expression) -> Expression:
-    """Return the parameter in [-1, 1] at which the pencil of conics in `roots` contains a pair of real lines.
+    """Return the parameter in [-1, 1] at which the pencil of conics that `roots` uses contains a pair of real lines.
 
     The parameter t = l / r is a root of the cubic 4 r (r t - a0) (t^2 - 1) + p^2 (t - 1) + q^2 (t + 1) = 0.
     """
@@ -348,7 +348,10 @@ def series_roots(degree: int) -> Any:
 
 
 def _steps(step: Any, count: int) -> Any:
-    """Return the Function of `count` steps on all roots: (roots, coefficients) -> (roots, excess of the last step)."""
+    """Return the Function that performs `count` steps of the simultaneous iteration on all roots of `series_roots`.
+
+    (roots, coefficients) -> (roots, excess of the last step over the tolerance).
+    """
     z, unit = ca.MX.sym("z", *step.size_in(0)), ca.MX.sym("scaled", *step.size_in(1))
     iterates, longest = z, None
     for _ in range(count):

@@ -1,4 +1,4 @@
-"""Collision scenes: the bodies of a machine, static and moving obstacles, and the pairs of them that may collide.
+"""Collision scenes: the bodies of a machine, static and moving obstacles, and the pairs of bodies that may collide.
 
 Each pair is considered in its reference frame, that of the last link that carries both bodies, or the world: only the
 joints between that link and the bodies move them relative to each other.
@@ -33,7 +33,8 @@ MIN_SOFTNESS_M = 1e-6
 
 
 class Levers(NamedTuple):
-    """Upper bounds on the relative velocities of n pairs of bodies, per unit rate of each base and joint coordinate.
+    """Upper bounds on the relative velocities of the bodies of n pairs, per unit rate of each base and joint
+    coordinate.
 
     A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
     turn times |r|.
@@ -51,7 +52,7 @@ class Levers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CollisionScene:
-    """The bodies of a machine and the obstacles, with the pairs that are checked for collision.
+    """The bodies of a machine, the obstacles, and the pairs of these that are checked for collision.
 
     Attributes:
         machine: Any machine; the <collision> shapes of its robot are its bodies, see `models.shapes.bodies`.
@@ -133,14 +134,14 @@ class CollisionScene:
         self._place(own, checked, with_obstacles)
 
     def with_locked(self, machine: Machine) -> CollisionScene:
-        """Return the scene of the same machine with some joints locked; pairs that no longer move are left out.
+        """Return the scene with some joints locked, without pairs that can no longer move relative to each other.
 
         A scene of its own would take links as adjacent that only the locked joints connect.
         """
         return replace(self, machine=machine)
 
     def _ignored_pairs(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
-        """Return the ignored pairs of two links, and those of a link and an obstacle."""
+        """Return the pairs that the user excludes: pairs of two links, and pairs of a link and an obstacle."""
         names = {f"obstacle {number}" for number in range(len(self.obstacles))}
         ignored = [_pair(each, number) for number, each in enumerate(_checked_list(self.ignored, "ignored"))]
         with_obstacle = {pair for pair in ignored if names & set(pair)}
@@ -152,7 +153,7 @@ class CollisionScene:
     def _pairs_with_obstacles(
         self, own: Sequence[Body], ignored: set[tuple[str, str]]
     ) -> tuple[list[tuple[int, int]], dict[tuple[str, str], Reason]]:
-        """Return index pairs (body, obstacle) that may collide, and the reasons why other pairs are excluded."""
+        """Return the index pairs (body, obstacle) that may collide, and the reasons why others are excluded."""
         pairs, excluded = [], dict[tuple[str, str], Reason]()
         for number, obstacle in enumerate(self.obstacles):
             name = f"obstacle {number}"
@@ -220,7 +221,7 @@ class CollisionScene:
         return tuple((self.bodies[i].name, self.bodies[j].name) for i, j, _ in self.pairs)
 
     def pair_names(self, pair: int) -> tuple[str, str]:
-        """Return the names of a pair in the form of `ignored`: two links, or a link and an obstacle."""
+        """Return the two names of a pair as the field `ignored` states them: two links, or a link and an obstacle."""
         bodies = [self.bodies[body] for body in self.pairs[pair, :2]]
         own = range(len(self._carriers))
         first, second = (self._carriers[body.frame] if body.frame in own else body.name for body in bodies)
@@ -228,12 +229,12 @@ class CollisionScene:
 
     @property
     def disabled(self) -> list[tuple[str, str]]:
-        """Pairs of links that the SRDF file disables."""
+        """Pairs of links whose collision check the SRDF file disables."""
         return [pair for pair, reason in self.left.items() if reason == SRDF]
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Reason for each pair of links, "A and B", that is excluded by assumption, without proof."""
+        """Pairs of links, named "A and B", that are excluded without a proof, with the reason for each."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value
@@ -247,7 +248,10 @@ class CollisionScene:
         return any(isinstance(obstacle, MovingObstacle) for obstacle in self.obstacles)
 
     def placements(self, base: Expression, q: Expression, time: Expression = 0.0) -> Expression:
-        """Return the frames of links and moving obstacles, stacked (rotation by columns, position). Shape (12 F, 1)."""
+        """Return the frames of links and moving obstacles in the world, stacked in one column. Shape (12 F, 1).
+
+        Each of the F frames has its rotation matrix, column by column, and then its position.
+        """
         frames = self._frames(base, q, time)
         columns = [part for frame in frames for part in (ca.vec(frame.rotation), frame.position)]
         return ca.densify(ca.vertcat(*columns)) if columns else expression(q)[:0]
@@ -261,9 +265,10 @@ class CollisionScene:
         pairs: Sequence[int] | None = None,
         rounding: float = 0.0,
     ) -> Expression:
-        """Return the signed distances of pairs of bodies, m, exact or lower bounds, see `distance`. Shape (n, 1).
+        """Return the signed distances of n pairs of bodies. Shape (n, 1), m.
 
-        For two hulls of meshes it is the distance of their covers, a lower bound.
+        They are exact or lower bounds, see `distance`. For two hulls of meshes the distance is that of their covers, a
+        lower bound.
 
         Args:
             base, q: Configuration of the machine.
@@ -298,12 +303,13 @@ class CollisionScene:
         return ca.vertcat(*distances) if distances else expression(q)[:0]
 
     def distance_gradients(self, *, pairs: Sequence[int] | None = None, rounding: float = 0.0) -> Any:
-        """Return the CasADi Function from (base, q, time) to signed distances of pairs of bodies and their gradients.
+        """Return the CasADi Function that computes the signed distances of pairs of bodies and their gradients.
 
-        Distances have shape (n, 1), m, gradients for base and q shape (n, base_size + joint_size). All pairs of the
-        same two kinds of shapes are evaluated together, and only frames are differentiated: a distance of rigid bodies
-        changes only with their relative twist, through a wrench. That is about fifteen times faster than `distances`
-        and its Jacobian. For a base with a quaternion, gradients hold along rates that keep it a unit quaternion.
+        (base, q, time) -> distances (n, 1), m, and gradients for base and q, (n, base_size + joint_size). All pairs of
+        the same two kinds of shapes are evaluated together, and only frames are differentiated: a distance of rigid
+        bodies changes only with their relative twist, through a wrench. That is about fifteen times faster than
+        `distances` and its Jacobian. For a base with a quaternion, gradients hold along rates that keep it a unit
+        quaternion.
 
         Args, Raises: As in `distances`.
         """
@@ -314,7 +320,7 @@ class CollisionScene:
         return distance_gradients(self.machine, self.bodies, self._carriers, self._obstacle_frames, **options)
 
     def _checked_request(self, pairs: Sequence[int] | None, rounding: float) -> tuple[list[int], float]:
-        """Return the indices of the requested pairs (all for None) and the smoothing width, after checking both."""
+        """Return the indices of the requested pairs (None requests all) and the smoothing width after checking both."""
         indices = np.arange(len(self.pairs))
         if isinstance(pairs, list | tuple) and not pairs:
             indices = indices[:0]
@@ -324,7 +330,7 @@ class CollisionScene:
 
     @cached_property
     def levers(self) -> Levers:
-        """Bounds on the relative motion of each pair per unit rate of base and joint coordinates, see `Levers`.
+        """Bounds on the relative velocity of each pair of bodies per unit rate of base and joint coordinates.
 
         Raises:
             ModelError: A prismatic joint without limits.
@@ -344,7 +350,7 @@ class CollisionScene:
         return Levers(base, base_turns, joints, turns)
 
     def check_motions(self, begin: float, end: float) -> None:
-        """Raise ModelError if the pose of a moving obstacle is invalid at a sampled time between two times, s."""
+        """Raise ModelError if a moving obstacle's pose is invalid at a sampled time between `begin` and `end`, s."""
         for obstacle in self.obstacles:
             if isinstance(obstacle, MovingObstacle):
                 obstacle.check(begin, end)
@@ -355,16 +361,17 @@ class CollisionScene:
         return [*(frames[link] for link in self._carriers), *self._obstacle_frames(time)]
 
     def _obstacle_frames(self, time: Expression) -> list[Frame]:
-        """Return the frames of the moving obstacles in world at a time (s)."""
+        """Return the frames of the moving obstacles in the world at a time (s)."""
         return [obstacle.frame(time) for obstacle in self.obstacles if isinstance(obstacle, MovingObstacle)]
 
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
-        """Return the pairs of bodies with a mesh and at most three joints between them, to be checked by convex hulls.
+        """Return the pairs of bodies that are checked by the convex hulls of their meshes instead of the meshes'
+        covers.
 
-        Such links may be only millimetres apart by design, closer than the covers of their meshes allow. So the hulls
-        of meshes are checked, as are those of meshes whose covers always collide.
+        They have at most three joints between them and may be only millimetres apart by design, closer than the covers
+        of their meshes allow. Pairs of meshes whose covers always collide are included as well.
         """
         pairs: dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]] = {}
         for i, j in checked:
@@ -376,11 +383,11 @@ class CollisionScene:
         return pairs
 
     def _moves(self, link: str) -> bool:
-        """Return whether a link can move in the world, with the base or by a joint."""
+        """Return whether a link can move in the world, because the base moves or a moving joint carries the link."""
         return bool(self.machine.base_size) or any(joint.moves for joint in self.machine.robot.path_to(link))
 
     def _levers_of(self, placed: PlacedShape, reference: int) -> Levers:
-        """Return the velocity bounds (`Levers`) of one body in a reference frame: that of a link, or the world (-1)."""
+        """Return the velocity bounds (`Levers`) of one body relative to the frame of a link, or to the world (-1)."""
         robot, parts, size = self.machine.robot, self._parts, self.machine.base_size
         joints, turns, base, base_turns = np.zeros(robot.dof), np.zeros(robot.dof), np.zeros(size), np.zeros(size)
         levers = Levers(base, base_turns, joints, turns)
@@ -410,7 +417,7 @@ class CollisionScene:
 
 
 def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tuple[Body, ...]]:
-    """Return the bodies that cover each mesh, by its link and its index among the link's collision shapes."""
+    """Return the bodies that cover each mesh, keyed by link and index of the mesh among the link's collision shapes."""
     covers: dict[tuple[str, int], tuple[Body, ...]] = {
         (link.name, number): ()
         for link in robot.links

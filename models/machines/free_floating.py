@@ -110,7 +110,7 @@ class FreeFloating:
         return PLANAR_ROWS if self.base == "planar" else list(range(6))
 
     def base_home(self) -> Array:
-        """Return the base configuration at the world's origin, with parallel axes. Shape (base_size,)."""
+        """Return the base configuration in which root frame and world frame coincide. Shape (base_size,)."""
         return np.zeros(3) if self.base == "planar" else np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
     def world_from_base(self, base: Expression) -> Frame:
@@ -130,7 +130,7 @@ class FreeFloating:
 
     @on_scalars
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the generalized Jacobian G, the matrix from joint rates to the tip's twist without the drift.
+        """Return the generalized Jacobian, which maps joint rates to the tip's twist less the drift due to momentum.
 
         Equation (25) of the paper. Shape (6, joint_size).
         """
@@ -138,7 +138,7 @@ class FreeFloating:
 
     @on_scalars
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the tip's twist: generalized Jacobian times joint rates, plus drift by momentum. Shape (6, 1)."""
+        """Return the tip's twist: generalized Jacobian times joint rates, plus drift due to momentum. Shape (6, 1)."""
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
         return self._tip_motion(base, self._reaction(q, rates, base, tip=True))
 
@@ -168,7 +168,7 @@ class FreeFloating:
 
     @on_scalars
     def twist_of_rate(self, base: Expression, base_rate: Expression) -> Expression:
-        """Return the base twist for a rate of the base configuration. Shape (6, 1), or (3, 1) if planar."""
+        """Return the base twist for a given time derivative of the base configuration. Shape (6, 1) or (3, 1)."""
         rate = checked_vector("base_rate", base_rate, self.base_size, "the derivative of the base configuration")
         base = self._checked_base(base)
         if self.base == "planar":
@@ -177,7 +177,9 @@ class FreeFloating:
 
     @on_scalars
     def momentum_matrices(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return the matrices E1 and E2 of the total momentum E1 base_twist + E2 joint_rates, equation (24).
+        """Return the matrices that map the base twist and the joint rates to the total momentum.
+
+        The momentum is E1 base_twist + E2 joint_rates, equation (24) of the paper.
 
         Returns:
             E1 of shape (6, 6), E2 of shape (6, joint_size), rows (moment of momentum about the world's origin, linear
@@ -253,7 +255,9 @@ class FreeFloating:
 
     @on_scalars
     def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return F1 and F2 of the tip's twist F1 base_twist + F2 joint_rates (25), with base and joints independent.
+        """Return the Jacobians of the tip for the base twist and for the joint rates, taken as independent.
+
+        The tip's twist is F1 base_twist + F2 joint_rates, equation (25) of the paper.
 
         Returns:
             F1 of shape (6, 6), (6, 3) for a planar base; F2 of shape (6, joint_size).
@@ -277,14 +281,14 @@ class FreeFloating:
         return ca.densify(ca.vertcat(angular, linear))
 
     def _checked_base(self, base: Expression) -> Expression:
-        """Return the base configuration as a column; raise ModelError for another size."""
+        """Return the base configuration as a column; raise ModelError if the size is wrong."""
         meaning = "(x, y, angle)" if self.base == "planar" else "(x, y, z, qw, qx, qy, qz)"
         return checked_vector("base", base, self.base_size, meaning)
 
     def _spatial_momentum(self) -> tuple[Expression, Expression] | None:
-        """Return the conserved momentum (angular about the centre of mass, linear) in world axes; None if it is zero.
+        """Return the conserved momentum as angular (about the centre of mass) and linear part, or None if it is zero.
 
-        Shape (3, 1) each.
+        World axes, shape (3, 1) each.
         """
         momentum = np.asarray(self.conserved_momentum)
         if not momentum.any():
@@ -296,7 +300,10 @@ class FreeFloating:
     def _reaction(
         self, q: Expression, joint_rates: Expression | None, base: Expression = None, tip: bool = False
     ) -> _Reaction:
-        """Return the base motion for given joint rates and the conserved momentum, or for unit joint rates if None."""
+        """Return the base motion that given joint rates and the conserved momentum cause.
+
+        Without joint rates, it is the base motion at zero momentum for a unit rate of each joint.
+        """
         carried = None
         if joint_rates is not None and (momentum := self._spatial_momentum()) is not None:
             turn = self.world_from_base(base).rotation
@@ -305,9 +312,10 @@ class FreeFloating:
 
 
 class _Reaction(NamedTuple):
-    """Velocities of base and tip in base axes: one column per joint for unit rates, or one column for given rates.
+    """Velocities of base and tip, in base axes, that follow from joint rates.
 
-    The latter includes the effect of the conserved momentum. The motion of the tip is None unless requested.
+    There is one column per joint for unit rates, or one column for given rates, which includes the effect of the
+    conserved momentum. The motion of the tip is None unless requested.
     """
 
     base_angular: Expression

@@ -1,4 +1,4 @@
-"""The protocol of machines that planners use, robots on a fixed base as its simplest case, and reaction wheels.
+"""The machine protocol that planners use, the robot on a fixed base as its simplest case, and reaction wheels.
 
 A reaction wheel is an ordinary joint with a rotor. The motor's torque is the joint's effort limit, and the momentum
 h = I w at which the wheel saturates gives its speed limit w. So momentum, torques and limits follow from the robot, for
@@ -33,7 +33,7 @@ from models.spatial import Expression, Frame, expression, on_scalars
 
 
 class Machine(Protocol):
-    """A robot on a base that moves only as a consequence of joint motion and conserved momentum.
+    """A robot whose base is fixed, or moves only as a consequence of joint motion and conserved momentum.
 
     `base` is the configuration of the base in the world, shape (base_size, 1): empty for a fixed base, (x, y, angle)
     for a planar one, position and unit quaternion [w, x, y, z] for a spatial one. `q` are the joint positions, shape
@@ -57,7 +57,7 @@ class Machine(Protocol):
         """Number of independently moving joints."""
 
     def base_home(self) -> Array:
-        """Return the base configuration at the world's origin. Shape (base_size,)."""
+        """Return the base configuration at the world's origin, empty for a fixed base. Shape (base_size,)."""
 
     def world_from_base(self, base: Expression) -> Frame:
         """Return the pose of the root link's frame in the world."""
@@ -66,22 +66,22 @@ class Machine(Protocol):
         """Return the frame of the tip in the world: rotation (3, 3), position (3, 1) in m."""
 
     def tip_jacobian(self, base: Expression, q: Expression) -> Expression:
-        """Return the matrix from joint rates to the tip's twist, including the base motion that the joints cause.
+        """Return the matrix from joint rates to the tip's twist, including the base motion that joint motion causes.
 
         Shape (6, joint_size).
         """
 
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the tip's twist for given joint rates, including the drift by conserved momentum.
+        """Return the tip's twist for given joint rates, including the drift due to conserved momentum.
 
         It is tip_jacobian times joint_rates, in fewer operations, plus the drift. Shape (6, 1).
         """
 
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the rate of the base configuration, including the drift by momentum. Shape (base_size, 1)."""
+        """Return the rate of the base configuration, including the drift due to momentum. Shape (base_size, 1)."""
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-        """Return the manipulability of a task that fixes some rows of the tip's twist, see jacobian_manipulability.
+        """Return the manipulability of a task that fixes components of the tip's twist, see jacobian_manipulability.
 
         Shape (1, 1).
         """
@@ -112,7 +112,7 @@ class FixedBase:
 
     @property
     def base_size(self) -> int:
-        """Length of the base configuration: always 0."""
+        """Length of the base configuration: 0, because the base is fixed."""
         return 0
 
     @property
@@ -121,7 +121,7 @@ class FixedBase:
         return self.robot.dof
 
     def base_home(self) -> Array:
-        """Return the empty base configuration. Shape (0,)."""
+        """Return the base configuration, which is empty because the base is fixed. Shape (0,)."""
         return np.zeros(0)
 
     def world_from_base(self, base: Expression = ()) -> Frame:
@@ -141,7 +141,7 @@ class FixedBase:
 
     @cached_property
     def _pose_function(self) -> Any:
-        """Cached CasADi Function from joint positions to the tip's pose, faster than building its expressions anew."""
+        """Cached CasADi Function from joint positions to the tip's pose, because rebuilding the expression is slow."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_pose", [q], [*map(ca.densify, tip_pose(self.robot, q, self.world_from_base()))])
 
@@ -158,7 +158,10 @@ class FixedBase:
 
     @on_scalars
     def base_rate(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
-        """Return the empty rate of the base configuration, of the type of the joint rates. Shape (0, 1)."""
+        """Return the rate of the base configuration: an empty column, because the base is fixed. Shape (0, 1).
+
+        It has the type of the joint rates.
+        """
         return type(joint_vector(self.robot, joint_rates, "joint_rates"))(0, 1)
 
     def manipulability(self, base: Expression, q: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
@@ -184,7 +187,7 @@ def with_tip(
 
 
 def hold_joints(machine: Machine, positions: Mapping[str, float]) -> Machine:
-    """Return the machine with some joints, and those that mimic them, locked at positions (rad or m) by name.
+    """Return the machine with some joints, and those that mimic them, locked at given positions (rad or m, by name).
 
     Raises:
         ModelError: As `models.robot.rebuild.lock_joints`; or as `with_tip` for the machine.
@@ -193,7 +196,7 @@ def hold_joints(machine: Machine, positions: Mapping[str, float]) -> Machine:
 
 
 def _with_robot(machine: Machine) -> Any:
-    """Return the machine after checking that it is a dataclass with a field `robot`, which can be replaced."""
+    """Return the machine after checking that it is a dataclass whose field `robot` can be replaced."""
     if not is_dataclass(machine) or isinstance(machine, type) or "robot" not in {each.name for each in fields(machine)}:
         message = f"{type(machine).__name__} is no dataclass with a field 'robot', which cannot be replaced"
         raise ModelError(message, name="machine", value=machine)
@@ -219,9 +222,10 @@ def with_wheels(
     translations: ArrayInput | None = None,
     link: str | None = None,
 ) -> Robot:
-    """Return the robot with reaction wheels; their joints come last, and the tip is unchanged.
+    """Return the robot with reaction wheels mounted on one of its links.
 
-    The joints are called "wheel1", ..., without names that exist already, and the links "wheel1_rotor", ...
+    Their joints come last, and the tip is unchanged. The joints are called "wheel1", ..., without names that exist
+    already, and the links "wheel1_rotor", ...
 
     Args:
         axes: Axes of the wheels in the link that carries them, of any non-zero length. Shape (k, 3).
@@ -263,7 +267,7 @@ def with_wheels(
 
 
 def find_wheels(robot: Robot) -> dict[str, float]:
-    """Find the joints whose angle has no effect, such as reaction wheels; return their inertia (kg m^2) by name.
+    """Find the joints whose angle has no effect, such as reaction wheels; return rotor inertias (kg m^2) by joint.
 
     Such a joint is unbounded and moves a single body, symmetric about the joint axis with its centre of mass on it,
     that carries neither the tip nor a collision shape.

@@ -49,9 +49,9 @@ def distance_gradients(
     rounding: float,
     softness: float,
 ) -> Any:
-    """Return the CasADi Function from (base, q, time) to distances of pairs of bodies and their gradients.
+    """Return the CasADi Function that computes the distances of pairs of bodies and their gradients.
 
-    Distances have shape (n, 1), m, and gradients shape (n, size of base and q).
+    (base, q, time) -> distances (n, 1), m, and gradients for base and q, shape (n, size of base and q).
 
     Args:
         machine: Machine that carries the bodies.
@@ -103,7 +103,7 @@ def distance_gradients(
 def _reduce_groups(
     value: Expression, gradient: Expression, positions: list[int], counts: list[int], softness: float
 ) -> tuple[Expression, Expression]:
-    """Return the soft minimum of the distances of each group of pairs of shapes, and its gradient."""
+    """Return the soft minimum of the distances in each group of pairs of shapes, and the gradient of the minimum."""
     values, rows, order = [value], [gradient], []
     for begin, end in pairwise(accumulate(counts, initial=0)):
         members = positions[begin:end]
@@ -121,7 +121,7 @@ def _reduce_groups(
 def _motion_signs(
     machine: Machine, bodies: Sequence[PlacedShape], carriers: Sequence[str], pairs: Array, joints: Sequence[str]
 ) -> Array:
-    """Return 1 where a base coordinate or joint moves only the first body of a pair, -1 only the second, else 0."""
+    """Return 1 where a coordinate (base or joint) moves only the first body of a pair, -1 only the second, else 0."""
     size = machine.base_size
     carried = np.zeros((len(bodies), size + len(joints)))
     for k, body in enumerate(bodies):
@@ -132,7 +132,7 @@ def _motion_signs(
 
 
 def _leader_columns(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
-    """Return the matrix that adds columns of mimic joints to those of the joints they mimic; None if there are none."""
+    """Return the matrix that adds the columns of mimic joints to those of their leaders, or None if no joint mimics."""
     robot, size = machine.robot, machine.base_size
     matrix = np.zeros((size + len(joints), size + robot.dof))
     matrix[:size, :size] = np.eye(size)
@@ -143,9 +143,9 @@ def _leader_columns(machine: Machine, joints: Sequence[str]) -> ca.DM | None:
 
 
 def _base_twists(world_from_base: Frame, base: Expression) -> Expression:
-    """Return the base twist for a unit rate of each base coordinate, angular and linear, in world axes.
+    """Return the twist of the base, in world axes, for a unit rate of each base coordinate. Shape (6, size).
 
-    Shape (6, size).
+    A column is (angular velocity, velocity at the world's origin).
     """
     orientation, position = (ca.SX(part) for part in world_from_base)
     twists = []

@@ -89,7 +89,7 @@ class Scara:
 
     @cached_property
     def robot(self) -> Robot:
-        """Kinematic tree of the arm, without mass."""
+        """Kinematic tree of the arm, whose links have no mass."""
         links = tuple(Link(name) for name in ("base", "upper arm", "forearm", "quill", "tool"))
         origins = (tuple(self.mount), (self.upper_arm, 0.0, 0.0), (self.forearm, 0.0, 0.0), (0.0, 0.0, 0.0))
         kinds: tuple[Any, ...] = ("revolute", "revolute", "prismatic", "revolute")
@@ -100,7 +100,7 @@ class Scara:
         return Robot(links, tuple(joints))
 
     def forward(self, joints: Expression) -> Frame:
-        """Return the frame of the tool in world for joint positions of shape (4,), CasADi or numbers."""
+        """Return the frame of the tool in the world for joint positions, CasADi or numbers, of shape (4,)."""
         q = checked_vector("joints", joints, 4, f"one entry for each of {list(self.names)}")
         bend = q[0] + q[1]
         x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
@@ -139,7 +139,7 @@ class Scara:
         return q
 
     def whole_turn(self, joint: int, least: float, most: float) -> float | None:
-        """Return the multiple of 2 pi that shifts a range of joint positions into the joint's limits, else None.
+        """Return the multiple of 2 pi that shifts a range of joint positions into the joint's limits, or None.
 
         The tolerance is 1e-9. The result is always 0 for the quill, which is prismatic.
 
@@ -156,9 +156,10 @@ class Scara:
         return turn if low <= least + turn and most + turn <= high else None
 
     def inverse_expression(self, pose: Expression, elbow: Elbow = "left") -> Expression:
-        """Return the joint positions for a tool pose (x, y, z, yaw) in world in closed form, unchecked. Shape (4, 1).
+        """Return closed-form joint positions for a tool pose (x, y, z, yaw) in the world. Shape (4, 1).
 
-        sin q2 is computed from the product of the distances to both ends of the reach, which is accurate near them.
+        Reach and limits are not checked. sin q2 is computed from the product of the distances to both ends of the
+        reach, which is accurate near them.
         """
         require.choice("scara: elbow", elbow, get_args(Elbow))
         p = checked_vector("pose", pose, 4, "x, y, z and yaw")
@@ -175,9 +176,10 @@ class Scara:
         return ca.vertcat(shoulder, bend, z, p[3] - shoulder - bend)
 
     def inverse_rates(self, elbow: Elbow = "left") -> Any:
-        """Return the CasADi Function from tool pose (x, y, z, yaw) and derivatives to joint positions and derivatives.
+        """Return the CasADi Function from tool pose and its derivatives to joint positions and their derivatives.
 
-        Three derivatives each, with respect to the same parameter; inputs and outputs have 4 entries each.
+        A pose is (x, y, z, yaw). Three derivatives each, with respect to the same parameter; inputs and outputs have 4
+        entries each.
         """
         inputs = [ca.SX.sym(name, 4) for name in ("pose", "first", "second", "third")]
         at = ca.SX.sym("at")
@@ -190,7 +192,7 @@ class Scara:
         return ca.Function("inverse_rates", inputs, ca.cse([ca.densify(ca.simplify(value)) for value in here]))
 
     def check_reach(self, radius: float, what: str) -> None:
-        """Raise ModelError naming `what` unless the arm reaches points at `radius` (m) from the shoulder axis."""
+        """Raise ModelError, which names `what`, unless the arm reaches points `radius` (m) from the shoulder axis."""
         if not self.inner * (1 - 1e-12) <= radius <= self.outer * (1 + 1e-12):
             message = (
                 f"scara: {what} is {radius:g} m from the shoulder axis, unreachable: the arm reaches from "
@@ -200,11 +202,14 @@ class Scara:
 
 
 ANGLES = [0, 1, 3]
-"""Indices of the revolute joints."""
+"""Indices of the revolute joints of a SCARA arm."""
 
 
 class JointsAlong(NamedTuple):
-    """Joint positions along a path and three arc-length derivatives. Shape (M, 4) each, rad and m, per m, m^2, m^3."""
+    """Joint positions along a path and their first three derivatives with respect to arc length.
+
+    Shape (M, 4) each, rad and m, per m, m^2, m^3.
+    """
 
     position: Array
     first: Array
@@ -234,11 +239,11 @@ class ScaraPath:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the joints."""
+        """Names of the arm's joints."""
         return self.scara.names
 
     def at(self, distance: ArrayInput) -> JointsAlong:
-        """Return joint positions, with continuous angles, and their derivatives at arc lengths (m) of shape (M,)."""
+        """Return joint positions with continuous angles, and derivatives, at given arc lengths, shape (M,), m."""
         s = self.path.checked_distance(distance)
         values = [np.array(v).T for v in self.rates.map(len(s))(*_poses(self.path, s))]
         table_s, table_q = self.table
@@ -250,7 +255,7 @@ class ScaraPath:
 
 
 def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, clearance: float = 1e-3) -> ScaraPath:
-    """Compute the joint positions of a SCARA arm along a path of its tool, with the elbow always on one side.
+    """Compute the joint positions of a SCARA arm along a path of its tool, keeping the elbow on one side.
 
     Args:
         scara: The arm.
@@ -292,7 +297,7 @@ def scara_along(scara: Scara, path: SmoothPath, elbow: Elbow = "left", *, cleara
 
 
 def _poses(path: SmoothPath, s: Array) -> list[Any]:
-    """Return the tool poses (x, y, z, yaw) of a path and three derivatives at M arc lengths. Shape (4, M) each."""
+    """Return the tool poses (x, y, z, yaw) along a path and three derivatives at M arc lengths. Shape (4, M) each."""
     position, orientation = path.at(s), path.turn(s)
     yaw = 2 * np.arctan2(orientation.quaternion[:, 3], orientation.quaternion[:, 0])
     angular = (yaw, orientation.rate[:, 2], orientation.acceleration[:, 2], orientation.jerk[:, 2])
@@ -300,7 +305,7 @@ def _poses(path: SmoothPath, s: Array) -> list[Any]:
 
 
 def _turns(joints_along: ScaraPath) -> Array:
-    """Return the multiples of 2 pi that bring the joint positions along the path into their limits. Shape (4,), rad."""
+    """Return the multiples of 2 pi that bring joint positions along a path into the joint limits. Shape (4,), rad."""
     turns, scara, (s, q) = np.zeros(4), joints_along.scara, joints_along.table
     for joint, (name, low, high) in enumerate(zip(scara.names, scara.lower, scara.upper, strict=True)):
         if np.isneginf(low) and np.isposinf(high):
@@ -324,7 +329,7 @@ def _turns(joints_along: ScaraPath) -> Array:
 
 
 def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
-    """Raise ModelError for a path out of reach, or too close to a singularity."""
+    """Raise ModelError if a path is out of the arm's reach or too close to a singularity."""
     s = path.sample_distances(8, 32)
 
     def radius(lengths: Array) -> Array:
@@ -345,7 +350,9 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
 
 
 def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:
-    """Return arc length and value of a function's maximum (sign 1) or minimum (-1), refined between the samples.
+    """Return arc length and value at which a sampled function has its maximum (sign 1) or minimum (-1).
+
+    The extremum is refined between the samples.
 
     Args:
         function: Of arc lengths, shape (M,) to (M,).

@@ -29,7 +29,7 @@ from models.spatial import Expression, Frame, cross
 __all__ = ["Foot", "Foothold", "Stance"]
 
 SAMPLES = 5
-"""Number of random motions that show which load components and centers of pressure the joints can change."""
+"""Number of random motions sampled to find which load components and centers of pressure the joints can change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Foot:
 
     @classmethod
     def of(cls, robot: Robot, link: str, rotation: ArrayInput = None) -> Self:
-        """Return the foot formed by the lowest collision shapes of a link, see `models.footprint`.
+        """Return the foot whose sole is formed by the lowest collision shapes of a link, see `models.footprint`.
 
         The origin of the sole's frame is below that of the link's frame.
 
@@ -75,7 +75,7 @@ class Foot:
 
     @cached_property
     def corners(self) -> Array:
-        """Corners of the sole in the sole's frame; the origin of that frame for a grip. Shape (k, 3), m."""
+        """Corners of the sole in the sole's frame; only the origin of that frame for a grip. Shape (k, 3), m."""
         if self.sole is None:
             return np.zeros((1, 3))
         plane = np.asarray(self.sole.vertices)
@@ -84,7 +84,7 @@ class Foot:
 
 @dataclass(frozen=True, eq=False)
 class Foothold:
-    """Pose of the frame of a foot's sole in the world while the foot is fixed on the ground.
+    """Pose, in the world, of the frame of a foot's sole while the foot is fixed on the ground.
 
     Attributes:
         position: Origin of the frame in the world. Shape (3,), m.
@@ -100,7 +100,7 @@ class Foothold:
 
     @classmethod
     def level(cls, x: float, y: float, heading: float = 0.0, height: float = 0.0) -> Self:
-        """Return a foothold on level ground at x, y and a height (m), turned left by a heading (rad)."""
+        """Return a foothold on level ground at x, y and a height (m), rotated by a heading (rad) about the vertical."""
         numbers = {"x": x, "y": y, "heading": heading, "height": height}
         x, y, heading, height = (require.number(f"foothold: {name}", value) for name, value in numbers.items())
         turn = [[np.cos(heading), -np.sin(heading), 0.0], [np.sin(heading), np.cos(heading), 0.0], [0.0, 0.0, 1.0]]
@@ -109,7 +109,7 @@ class Foothold:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stance(FixedBase):
-    """A robot standing on some of its feet: a machine on a fixed base, rooted at the first of them.
+    """A robot standing on some of its feet: a machine on a fixed base whose root link is the first standing foot.
 
     Create it by `Stance.on`. A load of a foot is the wrench (moment about the origin of its sole's frame, force) that
     the foothold exerts on it, in world axes, shape (6, 1), N m and N. In addition to the attributes of FixedBase
@@ -169,11 +169,11 @@ class Stance(FixedBase):
 
     @cached_property
     def bodies(self) -> Robot:
-        """The robot with links on fixed joints merged, which has the same dynamics and is faster to evaluate."""
+        """The robot with links merged that fixed joints connect: the dynamics are the same and faster to evaluate."""
         return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:
-        """Return a foot by its name; raise ModelError, with similar names, if there is none."""
+        """Return the foot with a given name; raise ModelError, which lists similar names, if there is none."""
         if not isinstance(name, str) or name not in self.feet:
             raise require.unknown("foot", name, self.feet)
         return self.feet[name]
@@ -184,25 +184,25 @@ class Stance(FixedBase):
         return tuple(self.footholds)[1:]
 
     def sole_frame(self, name: str, q: Expression) -> Frame:
-        """Return the frame of any foot's sole, standing or in the air, in the world."""
+        """Return the frame of a foot's sole in the world, whether the foot stands or is in the air."""
         foot = self.foot(name)
         link = link_frames(self.bodies, q, self.world_from_base())[foot.link]
         return Frame(ca.mtimes(link.rotation, ca.DM(foot.rotation)), link.point(ca.DM(foot.translation)))
 
     def sole_corners(self, name: str, q: Expression) -> Expression:
-        """Return the corners of any foot's sole in the world, one column each. Shape (3, k), m."""
+        """Return the corners of a standing or lifted foot's sole in the world, as columns. Shape (3, k), m."""
         frame = self.sole_frame(name, q)
         corners = ca.DM(self.foot(name).corners.T)
         return ca.mtimes(frame.rotation, corners) + ca.repmat(frame.position, 1, corners.shape[1])
 
     def center_of_mass(self, q: Expression) -> Expression:
-        """Return the centre of mass in the world. Shape (3, 1), m."""
+        """Return the robot's centre of mass in the world. Shape (3, 1), m."""
         return center_of_mass(self.bodies, q, self.world_from_base())
 
     def loads(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> dict[str, Expression]:
-        """Return the contact loads of all standing feet during a motion, given those of all feet but the first."""
+        """Return the contact loads of all standing feet during a motion, given the loads of all but the first foot."""
         reaction = base_reaction(
             self.bodies,
             q,
@@ -220,7 +220,7 @@ class Stance(FixedBase):
     def joint_torques(
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> Expression:
-        """Return the joint torques (or forces) of a motion, given the loads of all feet but the first. Shape (n, 1)."""
+        """Return the joint torques (or forces) of a motion, given the loads of all but the first foot. Shape (n, 1)."""
         return inverse_dynamics(
             self.bodies,
             q,
@@ -249,10 +249,10 @@ class Stance(FixedBase):
 
     @cached_property
     def load_rows(self) -> dict[str, tuple[int, ...]]:
-        """Indices of the twist components (world axes) that the joints can change, for each foot but the first.
+        """Indices of those components of a foot's twist that the joints can change, for each foot but the first.
 
-        They are all six, or three in a plane, also for feet in the air. The load of a foot has the same rows: nothing
-        resists the others.
+        In world axes, they are all six, or three in a plane, also for feet in the air. The load of a foot has the same
+        rows: nothing resists the others.
 
         Raises:
             ModelError: These rows are dependent in every configuration, because the robot's plane is oblique to the
@@ -282,7 +282,7 @@ class Stance(FixedBase):
         return rows_of_feet
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """Return the full load (6, 1) of a foot from its components in `load_rows`; the other components are zero."""
+        """Return all six components of a foot's load from those in `load_rows`; the others are zero. Shape (6, 1)."""
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
@@ -295,7 +295,7 @@ class Stance(FixedBase):
         return self.load_in_sole(name, load)[1][2]
 
     def edge_moments(self, name: str, load: Expression, margin: float = 0.0) -> Expression:
-        """Return the moments of a load about the edges of its sole; they are nonnegative if the foot does not tip.
+        """Return the moments of a foot's load about the edges of its sole, nonnegative while the foot does not tip.
 
         Each is the distance of the center of pressure from an edge, less a margin, times the pressure, N m. Only edges
         from which motion can change that distance count. Shape (k, 1); none for a grip.
@@ -317,7 +317,7 @@ class Stance(FixedBase):
         return rows[self._edges(name, margin)]
 
     def _edges(self, name: str, margin: float) -> list[int]:
-        """Return the indices of the sole's edges towards which motion can shift the center of pressure."""
+        """Return the indices of the sole's edges for which motion can change the distance of the center of pressure."""
         sole = self.feet[name].sole
         assert sole is not None
         distances = self._sampled_pressures[name] @ sole.normals.T - (sole.normals * sole.vertices).sum(axis=1)
@@ -333,7 +333,7 @@ class Stance(FixedBase):
 
     @cached_property
     def _sampled_pressures(self) -> dict[str, Array]:
-        """Centers of pressure of each standing sole, in its frame, for random motions. Shape (samples, 2) each, m."""
+        """Centers of pressure of each standing foot, in its sole's frame, for random motions. Shape (samples, 2), m."""
         rng = np.random.default_rng(0)
         points_by_foot: dict[str, list[Array]] = {name: [] for name in self.footholds}
         for _ in range(SAMPLES):
@@ -366,7 +366,7 @@ class Stance(FixedBase):
 
     @cached_property
     def support(self) -> Support | None:
-        """Convex hull of all standing soles, seen from above; None if a foot is a grip."""
+        """Convex hull of all standing soles, seen from above; None if a standing foot is a grip."""
         if any(self.feet[name].sole is None for name in self.footholds):
             return None
         points = [
@@ -376,9 +376,9 @@ class Stance(FixedBase):
         return Support(convex_hull(np.vstack(points)))
 
     def zero_moment_point(self, loads: Mapping[str, Expression]) -> Expression:
-        """Return the point about which the feet's loads have no horizontal moment, at the height of the first foothold.
+        """Return the zero moment point of the feet's loads at the height of the first foothold. Shape (2, 1), m.
 
-        Shape (2, 1), m.
+        The loads have no horizontal moment about this point.
         """
         moment, force = ca.DM(3, 1), ca.DM(3, 1)
         positions = [np.asarray(self.footholds[name].position) for name in loads]

@@ -34,11 +34,11 @@ from models.robot.robot import Robot
 from models.spatial import Expression, expression
 
 External: TypeAlias = Callable[[Expression, Expression], Sequence[Wrench]]
-"""Function from time (s) and the tip's position in the world (3, 1) to external wrenches."""
+"""Function from time (s) and the tip's position in the world, shape (3, 1), to a list of external wrenches."""
 
 
 def wrenches_at(external: External | None, time: Expression, tip: Expression) -> tuple[Wrench, ...]:
-    """Return the external wrenches at a time and tip position, () if `external` is None.
+    """Return the external wrenches at a time and tip position, an empty tuple if `external` is None.
 
     Raises:
         ModelError: `external` is neither None nor a function that returns wrenches.
@@ -67,7 +67,10 @@ class ZmpRows(NamedTuple):
     right: Expression
 
     def needed(self, qd: Expression) -> Expression:
-        """Return the moments that joint accelerations must produce, J_m q'' = C - q'^T H_m q'. Shape (2, 1), N m."""
+        """Return the moments that joint accelerations must produce to fix the zero moment point. Shape (2, 1), N m.
+
+        They are J_m q'' = C - q'^T H_m q'.
+        """
         qd = expression(qd)
         return self.right - ca.vertcat(*(ca.mtimes([qd.T, plane, qd]) for plane in self.hessians))
 
@@ -122,7 +125,7 @@ class Standing(FixedBase):
         return np.array([0.0, 0.0, -self.gravity])
 
     def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
-        """Return the robot with links on fixed joints merged, except links with wrenches, for faster evaluation."""
+        """Return the robot with links merged that fixed joints connect, except links on which wrenches act."""
         keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
         if keep not in self._bodies:
             self._bodies[keep] = simplify(self.robot, keep)
@@ -144,7 +147,7 @@ class Standing(FixedBase):
     def zero_moment_point(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
-        """Return the zero moment point: the ground point about which the reaction has no horizontal moment.
+        """Return the zero moment point, about which the ground reaction has no horizontal moment.
 
         Equations (2), (3) and, corrected, (35), (36) of the paper. Shape (2, 1), m. Only meaningful while the vertical
         force is positive.
@@ -161,15 +164,18 @@ class Standing(FixedBase):
         )
 
     def stability_index(self, point: Expression) -> Expression:
-        """Return the stability indices in x and y of a zero moment point: 1 at the most stable point, 0 at half_widths.
+        """Return the stability indices of a zero moment point in x and y. Shape (2, 1).
 
-        1 - ((point - most_stable_point) / half_widths)^2, equations (5) and (6) of the paper. Shape (2, 1).
+        1 - ((point - most_stable_point) / half_widths)^2, equations (5) and (6) of the paper: 1 at the most stable
+        point, 0 at the half-widths from it.
         """
         offset = checked_vector("point", point, 2, "x and y on the ground") - ca.DM(self.most_stable_point)
         return 1 - (offset / ca.DM(self.half_widths)) ** 2
 
     def zmp_rows(self, q: Expression, qd: Expression, point: Expression, wrenches: Sequence[Wrench] = ()) -> ZmpRows:
-        """Return the acceleration constraint that fixes the zero moment point at `point`, equation (18) of the paper.
+        """Return the joint acceleration constraint that fixes the zero moment point at `point`.
+
+        Equation (18) of the paper.
 
         Args:
             q, qd: Shape (n, 1) each.
@@ -190,7 +196,7 @@ class Standing(FixedBase):
         x, y = ca.vertsplit(point)
 
         def moments(velocity: Expression, acceleration: Expression) -> Expression:
-            """Return the reaction's moments about `point` as in equations (11) and (12) of the paper. Shape (2, 1)."""
+            """Return the ground reaction's moments about `point`, (11), (12) of Yoo et al. 2004. Shape (2, 1)."""
             reaction = self.ground_reaction(q, velocity, acceleration) - external
             return ca.vertcat(-reaction[1] - x * reaction[5], reaction[0] - y * reaction[5])
 
@@ -223,11 +229,11 @@ class Standing(FixedBase):
 
     @property
     def moving_axes(self) -> tuple[int, ...]:
-        """Coordinates of the zero moment point that joint motion can change: 0 (x), 1 (y), both, or none."""
+        """Indices of the coordinates of the zero moment point that joint motion can change: 0 for x, 1 for y."""
         return tuple(axis for axis in (0, 1) if self.moving_directions[:, axis].any())
 
     def nearest_reachable(self, point: ArrayInput) -> Array:
-        """Return the point nearest to `point` to which motion can shift the zero moment point. Shape (2,), m."""
+        """Return the zero moment point, reachable by joint motion, that is nearest to `point`. Shape (2,), m."""
         target = require.array("standing machine: point", point, (2,))
         projection = self.moving_directions.T @ self.moving_directions
         return np.asarray(projection @ target + (np.eye(2) - projection) @ self._sampled_points.mean(axis=0))
@@ -238,13 +244,16 @@ class Standing(FixedBase):
 
 
 def center_of_pressure(reaction: Expression) -> Expression:
-    """Return the zero moment point (x, y) of a reaction (moment about the world's origin, force). Shape (2, 1), m."""
+    """Return the zero moment point (x, y) of a ground reaction (moment about the world's origin, force).
+
+    Shape (2, 1), m.
+    """
     reaction = checked_vector("reaction", reaction, 6, "moment about the world's origin and force")
     return ca.vertcat(-reaction[1], reaction[0]) / reaction[5]
 
 
 def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> External:
-    """Return the external wrench function of a spring at the tip, with the force -stiffness (tip - rest) in each axis.
+    """Return the external wrench function of a spring at the tip, which exerts the force -stiffness (tip - rest).
 
     Args:
         stiffness: Along world x, y, z. Shape (3,), N/m.
@@ -257,7 +266,7 @@ def tip_spring(machine: Standing, stiffness: ArrayInput, rest: ArrayInput) -> Ex
 
 
 Rows: TypeAlias = Sequence[int] | Callable[[Expression], Expression]
-"""Task whose manipulability is reported: rows of the tip's twist, or a Jacobian (m, n) as a function of q."""
+"""Task whose manipulability is reported: components of the tip's twist, or a function from q to a Jacobian (m, n)."""
 
 
 @dataclass(frozen=True)
@@ -298,7 +307,10 @@ class StandingMotion:
 
     @property
     def friction(self) -> Array:
-        """Required coefficient of friction, horizontal over vertical ground force; inf without contact. Shape (M,)."""
+        """Coefficient of friction that the motion requires; inf without contact. Shape (M,).
+
+        It is the horizontal over the vertical ground force.
+        """
         vertical = self.ground_force[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.linalg.norm(self.ground_force[:, :2], axis=1) / vertical
@@ -321,11 +333,11 @@ class StandingMotion:
 
     @property
     def stands(self) -> bool:
-        """Whether the machine neither lifts off nor tips; a stability index of 1 does not imply that."""
+        """Whether the machine neither lifts off nor tips. A stability index of 1 does not imply this."""
         return self.stays_on_ground and self.stays_in_foot
 
     def summary(self) -> dict[str, float | bool]:
-        """Return the extreme values of the motion's quantities, and whether it stands, by name."""
+        """Return the extreme values of the motion's quantities, and whether the machine stands, by name."""
         zmp = self.zero_moment_point
         return {
             "stands": self.stands,
@@ -369,9 +381,10 @@ class StandingMotion:
 
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
-    """Return the CasADi Function from (time, q, qd, qdd) to the computed attributes of a `StandingMotion`.
+    """Return the CasADi Function that computes the derived quantities of a `StandingMotion` by name.
 
-    The joint torques come first. Its symbols are SX, or MX if `external` requires it.
+    (time, q, qd, qdd) -> joint torques, then the other computed attributes. Its symbols are SX, or MX if `external`
+    requires it.
     """
     try:
         return _motion_function(machine, external, rows, ca.SX)
@@ -389,7 +402,7 @@ def standing_motion(
     external: External | None = None,
     rows: Rows = (3, 4, 5),
 ) -> StandingMotion:
-    """Compute torques, ground reaction and stability of a standing machine's motion, given at sampled times.
+    """Compute joint torques, ground reaction and stability of a standing machine from samples of its motion.
 
     Args:
         machine: Standing machine.
@@ -410,7 +423,10 @@ def standing_motion(
 
 
 def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, *, qdd: Array) -> dict[str, Array]:
-    """Return the outputs of a function of `motion_function` at M times, by name. Shape (M, k), or (M,) for scalars."""
+    """Evaluate the result of `motion_function` at M times; return the outputs by name.
+
+    Shape (M, k), or (M,) for scalars.
+    """
     outputs = function.map(len(t))(t[None, :], q.T, qd.T, qdd.T)
     names = [function.name_out(i) for i in range(function.n_out())]
     values = {name: np.array(ca.DM(value)).T for name, value in zip(names, outputs, strict=True)}

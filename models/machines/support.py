@@ -82,7 +82,7 @@ class Support:
 
     @cached_property
     def inner_radius(self) -> float:
-        """Radius of the largest circle inside the polygon, m: the largest `margin` of any point."""
+        """Radius of the largest circle inside the polygon, m, which is the largest `margin` of any point."""
         offsets = (self.normals * self.vertices).sum(axis=1)
         best = 0.0
         for indices in combinations(range(len(offsets)), 3):  # the circle touches three edges
@@ -101,16 +101,16 @@ class Support:
         return np.asarray(np.column_stack([-edges[:, 1], edges[:, 0]]) / np.linalg.norm(edges, axis=1)[:, None])
 
     def distances(self, point: Expression) -> Expression:
-        """Return the signed distance of a point from each edge's line, positive inside. Shape (k, 1), m."""
+        """Return the signed distance of a point from the line of each edge, positive inside. Shape (k, 1), m."""
         point = checked_vector("point", point, 2, "x and y on the ground")
         offsets = (self.normals * self.vertices).sum(axis=1)
         return ca.mtimes(ca.sparsify(ca.DM(self.normals)), point) - ca.DM(offsets)
 
     def margin(self, point: Expression) -> Expression:
-        """Return how far a point may move before it leaves the polygon: the least of its :meth:`distances`.
+        """Return the least signed distance of a point from the lines of the polygon's edges. Shape (1, 1), m.
 
-        Outside it is negative; its size is the distance from the farthest line, which is at most that from the polygon.
-        Shape (1, 1), m.
+        Inside, it is how far the point may move before it leaves the polygon. Outside it is negative; its size is the
+        distance from the farthest line, which is at most that from the polygon.
         """
         return ca.mmin(ca.densify(self.distances(point)))
 
@@ -230,7 +230,7 @@ def footprint(
 
 
 def convex_hull(points: ArrayInput) -> Array:
-    """Return the corners of the convex hull of points in the plane, counter-clockwise, by Qhull. Shape (k, 2).
+    """Return the corners of the convex hull of points in the plane, counter-clockwise. Shape (k, 2).
 
     Fewer than three corners if all points are collinear to rounding.
     """
@@ -241,7 +241,7 @@ def convex_hull(points: ArrayInput) -> Array:
 
 
 def _corners(shape: CollisionShape) -> Array:
-    """Return the points of a primitive shape that may touch the ground, in the world. Shape (k, 3), m."""
+    """Return the world coordinates of points of a primitive shape that may touch the ground. Shape (k, 3), m."""
     down = -np.asarray(shape.rotation)[2]  # in the shape's axes
     if shape.kind == "box":
         corners = np.array(np.meshgrid(*([-1, 1] for _ in range(3)))).reshape(3, -1).T * shape.size / 2

@@ -1,4 +1,4 @@
-"""Task paths of lines, arcs and helices with tool orientation and rounded corners, as functions of the distance."""
+"""Task paths of lines, arcs and helices with tool orientation and rounded corners, as functions of distance."""
 
 from models.paths.blends import gamma, rest_to_rest
 from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function

@@ -64,15 +64,18 @@ BlendKind: TypeAlias = Literal["cubic", "quintic"]
 Ends: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 End: TypeAlias = tuple[Array, Array, Array]
 PAPER_SHAPE = 3.0
-"""Shape factor of the cubic in the paper, for continuous curvature between lines."""
+"""Shape factor at which the cubic has continuous curvature between lines, the value of Lee, Ryu, Cheong 2006."""
 LARGEST_SHAPE: dict[str, float] = {"cubic": 6.0, "quintic": 30 / 7}
-"""Shape factors at which the curve between two lines has a cusp in its middle."""
+"""Shape factors at which a blend between two lines has a cusp in its middle, by kind of blend."""
 MIDDLE_FACTORS: dict[str, float] = {"cubic": 1 / 4, "quintic": 5 / 16}
-"""Factors c in the distance of the blend's middle (u = 1/2) from the vertex, |1 - c shape| cos(angle/2), eq. (8)."""
+"""Factors, by kind of blend, that relate the shape factor to the distance of a blend's middle from the vertex.
+
+The distance at u = 1/2 is |1 - c shape| cos(angle/2) times the remaining distance, eq. (8).
+"""
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
-    """Return the checked shape factors of the blends, from one factor for all or one for each vertex. Shape (count,).
+    """Return the checked shape factors of blends; a single given factor holds for all vertices. Shape (count,).
 
     Raises:
         ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
@@ -89,10 +92,10 @@ def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
 
 
 def rest_to_rest(s: Expression) -> Expression:
-    """Return the minimum-jerk time scaling 10 s^3 - 15 s^4 + 6 s^5 at the fraction s, 0 to 1, of the duration.
+    """Return the minimum-jerk time scaling from rest to rest at a fraction of the duration.
 
-    It is the polynomial of least degree whose velocity and acceleration are zero at both ends. Accepts numbers, arrays
-    and expressions.
+    10 s^3 - 15 s^4 + 6 s^5 for the fraction s, 0 to 1, is the polynomial of least degree whose velocity and
+    acceleration are zero at both ends. Accepts numbers, arrays and expressions.
     """
     if not isinstance(s, ca.SX | ca.MX | ca.DM):
         s = require.array("rest_to_rest: s", s)
@@ -100,9 +103,9 @@ def rest_to_rest(s: Expression) -> Expression:
 
 
 def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array:
-    """Return the coefficients of the cubic with given end points and, at the ends, derivatives with respect to u.
+    """Return the coefficients of the cubic curve with given end points and first derivatives at the ends.
 
-    Equations (1) to (7) of the paper; u is the curve parameter. Shapes (..., 3) to (..., 6, 3).
+    Equations (1) to (7) of the paper; the derivatives are in the curve parameter u. Shapes (..., 3) to (..., 6, 3).
     """
     chord = end - start
     zero = np.zeros_like(chord)
@@ -112,9 +115,10 @@ def cubic(start: Array, start_rate: Array, end: Array, end_rate: Array) -> Array
 
 
 def quintic(start: End, end: End) -> Array:
-    """Return the coefficients of the quintic with given end points and, at the ends, two derivatives with respect to u.
+    """Return the coefficients of the quintic curve with given end points and first and second derivatives at the ends.
 
-    An end is (point, first derivative, second derivative); u is the curve parameter. Shapes (..., 3) to (..., 6, 3).
+    An end is (point, first derivative, second derivative), with respect to the curve parameter u. Shapes (..., 3) to
+    (..., 6, 3).
     """
     (start_value, start_rate, start_second), (end_value, end_rate, end_second) = start, end
     value = end_value - start_value - start_rate - start_second / 2
@@ -134,7 +138,7 @@ def quintic(start: End, end: End) -> Array:
 
 
 def polynomial(coefficients: Array, u: Array, order: int = 0) -> Array:
-    """Return points or derivatives of polynomial curves at the parameter u. Shapes (..., 6, 3), (...) to (..., 3)."""
+    """Return points or derivatives of polynomial curves at parameters u. Shapes (..., 6, 3), (...) to (..., 3)."""
     factors = _falling_factorials(order)
     value = coefficients[..., 5, :] * factors[5]
     u = np.asarray(u, dtype=float)[..., None]
@@ -149,10 +153,10 @@ def _falling_factorials(order: int) -> list[float]:
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
-    """Return the distance of a blend between two lines from the vertex, divided by that of its ends, eq. (8).
+    """Return the distance of the vertex from a blend between two lines over its distance from the ends of the blend.
 
-    |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic: the distance at u = 1/2,
-    which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
+    |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic, eq. (8): the distance at u
+    = 1/2, which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
     """
     for name, value in (("shape", shape), ("angle", angle)):
         require.positive(f"corner: {name}", value)
@@ -163,14 +167,14 @@ def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
 
 
 def curvature(coefficients: Array, u: Array) -> Array:
-    """Return the curvature of polynomial curves at the parameter u. Shapes (..., 6, 3), (...) to (...), 1/m."""
+    """Return the curvature of polynomial curves at curve parameters u. Shapes (..., 6, 3), (...) to (...), 1/m."""
     first, second = polynomial(coefficients, u, 1), polynomial(coefficients, u, 2)
     bend = np.linalg.norm(np.cross(first, second), axis=-1)
     return np.asarray(bend / np.linalg.norm(first, axis=-1) ** 3)
 
 
 def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the position of polynomial curves at u, and its first three derivatives with respect to arc length."""
+    """Return points of polynomial curves at curve parameters u, and three derivatives with respect to arc length."""
     position, first, second, third = (polynomial(coefficients, u, order) for order in range(4))
     rate = np.linalg.norm(first, axis=-1, keepdims=True)
     rate_u = (first * second).sum(axis=-1, keepdims=True) / rate
@@ -182,7 +186,7 @@ def derivatives_by_arc_length(coefficients: Array, u: Array) -> tuple[Array, Arr
 
 @dataclass(frozen=True)
 class ShapeSearch:
-    """Settings of the search for the shape factor of least peak curvature.
+    """Settings of the search for the shape factor that gives a blend the least peak curvature.
 
     Attributes:
         narrowest, widest: Range searched for the factor times remaining distance over the chord; between two lines the
@@ -213,7 +217,7 @@ SEARCH = ShapeSearch()
 
 
 def corner_shape(angle: Array) -> Array:
-    """Return the shape factors of least peak curvature of quintic blends between two lines.
+    """Return the shape factors with which quintic blends between two lines have the least peak curvature.
 
     `angle` has the interior angles, rad. Shapes (V,) to (V,).
     """
@@ -223,9 +227,9 @@ def corner_shape(angle: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[Array, Array]:
-    """Return the table that `corner_shape` interpolates: interior angles (rad), and shape factors over the chord.
+    """Return the table that `corner_shape` interpolates: interior angles (rad), and shape factors divided by the chord.
 
-    The chord is that at unit remaining distance.
+    The chord, the distance between the ends of the blend, is that at unit remaining distance.
     """
     angles = np.linspace(SEARCH.least_angle, np.pi, SEARCH.table_angles)
     zero = np.zeros((SEARCH.table_angles, 3))
@@ -303,7 +307,9 @@ MAX_STEPS = 4
 
 
 class Cells(NamedTuple):
-    """Intervals of the parameter u into which polynomial curves are split to compute arc lengths, by curve and u.
+    """Intervals of the curve parameter u (cells) into which polynomial curves are split to compute arc lengths.
+
+    They are in the order of the curves, then of u.
 
     Attributes:
         curve: Index of the curve. Shape (C,).
@@ -318,7 +324,7 @@ class Cells(NamedTuple):
 
 
 def speed(coefficients: Array, u: Array) -> Array:
-    """Return the parametric speed |dr/du| of curves at the parameter u. Shapes (M, 6, 3), (M,) to (M,), m."""
+    """Return the parametric speed |dr/du| of curves at curve parameters u. Shapes (M, 6, 3), (M,) to (M,), m."""
     return _speed(_derivative(coefficients), u)
 
 
@@ -343,7 +349,7 @@ def _speed(derivative: Array, u: Array) -> Array:
 
 
 def _half_square_slope(derivative: Array, u: Array) -> Array:
-    """Return half the derivative of the squared speed with respect to u. Shapes (3, 5, M), (M,) to (M,)."""
+    """Return half of the derivative of the squared speed with respect to u. Shapes (3, 5, M), (M,) to (M,)."""
     total: Array = np.zeros(np.shape(u))
     for terms in derivative:
         value, slope = terms[4] * u + terms[3], terms[4].copy()
@@ -360,7 +366,7 @@ def _lengths(derivative: Array, start: Array, width: Array) -> Array:
 
 
 def cells(coefficients: Array) -> Cells:
-    """Split polynomial curves (B, 6, 3) into intervals of u in which the arc length can be inverted reliably.
+    """Split polynomial curves, shape (B, 6, 3), into intervals of u on which the arc length can be inverted reliably.
 
     Raises:
         ModelError: A curve has a cusp, which no finite number of cells resolves.
@@ -397,7 +403,7 @@ def cells(coefficients: Array) -> Cells:
 
 
 def parameter(coefficients: Array, start: Array, width: Array, *, length: Array, distance: Array) -> Array:
-    """Return the parameter u at which the arc length from the start of an interval of u (a cell) equals `distance`.
+    """Return the parameter u at which the arc length from the start of a cell, an interval of u, equals `distance`.
 
     Shapes: coefficients (M, 6, 3), all others (M,). A cubic Hermite guess from the cell's ends is refined by Chebyshev
     iterations, which converge cubically, with the 10-point rule. The result is accurate to rounding for distances from
@@ -422,7 +428,7 @@ def parameter(coefficients: Array, start: Array, width: Array, *, length: Array,
 
 
 def arc_length(coefficients: Array, u: Array) -> Array:
-    """Return the arc length of one curve, shape (6, 3), from parameter 0 to u. Shapes (M,) to (M,), m."""
+    """Return the arc length of a curve, shape (6, 3), from u = 0 to parameters u. Shapes (M,) to (M,), m."""
     curve = coefficients[None]
     parts = cells(curve)
     index = np.clip(np.searchsorted(parts.start, u, side="right") - 1, 0, len(parts.start) - 1)

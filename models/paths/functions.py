@@ -25,11 +25,11 @@ from models.spatial import angular_velocity_from_quaternion, quaternion_product
 __all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
 
 MAX_TERMS = 100
-"""Largest number of corrector steps or quadrature nodes, with which the expression of a mapping grows."""
+"""Largest allowed number of corrector steps or quadrature nodes, since a mapping's expression grows with them."""
 
 
 def path_function(path: SmoothPath) -> Any:
-    """Return the casadi Function of a distance (m) that evaluates position, tangent and curvature of a path.
+    """Return the casadi Function that evaluates position, tangent and curvature of a path at a distance (m) along it.
 
     Outputs: position (3, m), tangent (3), curvature vector (3, 1/m), its derivative (3, 1/m^2). It is an MX function
     with the tables of the path in it; distances outside the path are clamped to it. It computes the same as
@@ -44,7 +44,7 @@ def path_function(path: SmoothPath) -> Any:
 
 
 def turn_function(path: SmoothPath) -> Any:
-    """Return the casadi Function of a distance (m) that evaluates the tool orientation on a path and its rates.
+    """Return the casadi Function that evaluates tool orientation and its rates at a distance (m) along a path.
 
     Outputs as `SmoothPath.turn`: quaternion (4), rate, acceleration, jerk (3 each, rad/m, rad/m^2, rad/m^3). It is an
     MX function like `path_function`.
@@ -59,7 +59,7 @@ def turn_function(path: SmoothPath) -> Any:
 
 
 def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
-    """Return the column of a table for the interval between knots that contains a distance, by binary search.
+    """Return the table column for the interval between knots that contains a distance, found by binary search.
 
     The tables are interpolants, since CasADi copies a constant matrix whenever it evaluates a function.
     """
@@ -72,7 +72,7 @@ def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
 
 
 def _clamp(distance: Any, length: float) -> Any:
-    """Return the distance clamped to the path; the derivative stays 1 at both ends."""
+    """Return the distance clamped to the path, as an expression whose derivative stays 1 at both ends of the path."""
     return ca.if_else(distance > length, length, ca.if_else(distance < 0, 0.0, distance))
 
 
@@ -122,7 +122,7 @@ def _cell_function() -> Any:
 
 
 def _derivative(columns: Any) -> Any:
-    """Return the coefficients of a polynomial's derivative, one column for each power."""
+    """Return the coefficients of a polynomial's derivative; the coefficients of each power form one column."""
     return ca.horzcat(*[power * columns[:, power] for power in range(1, columns.shape[1])])
 
 
@@ -134,11 +134,12 @@ def _horner(columns: Any, u: Any) -> Any:
 
 
 def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
-    """Return the table of `path_function`: start distances of the path's parts, then its length, and a column per part.
+    """Return the table of `path_function`: distances at which the parts of the path start, and a data column for each.
 
-    A part is what remains of a segment, or a cell of a blend. For a segment: its start point, the axial, tangential and
-    inward vectors of its screw, and its rotation rate. For a blend: the coefficients, three a power. For both:
-    distance, length, whether it is a blend; u at the start, width in u, speeds at both ends.
+    The length of the path follows the distances. A part is what remains of a segment, or a cell of a blend. For a
+    segment: its start point, the axial, tangential and inward vectors of its screw, and its rotation rate. For a blend:
+    the coefficients, three a power. For both: distance, length, whether it is a blend; u at the start, width in u,
+    speeds at both ends.
     """
     on_segment = np.flatnonzero(path.piece_segment >= 0)
     count, segment, task, cells = len(on_segment), path.piece_segment[on_segment], path.path, path.cells
@@ -163,10 +164,10 @@ def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
 
 
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
-    """Return the mapping of Lee, Ryu, Cheong 2006 from the distance along a blend to its parameter u.
+    """Return the predictor-corrector mapping from the distance along a blend to the curve parameter u.
 
-    Predictor (15), then `corrections` correctors (13). It does not control its error: with the
-    trapezoid rule (12) the sample drifts from its distance.
+    Lee, Ryu, Cheong 2006: predictor (15), then `corrections` correctors (13). The mapping does not control its error:
+    with the trapezoid rule (12) the sample drifts from its distance.
 
     Args:
         degree: Degree of the blend, 3 or 5.
@@ -192,7 +193,7 @@ def _predictor_corrector(degree: int, corrections: int) -> Any:
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """Return the default mapping from the distance along a blend to its parameter u, by a predictor and Newton steps.
+    """Return the default mapping from distance along a blend to curve parameter u, by a predictor and Newton steps.
 
     The predictor is equation (15), the Newton steps solve for the arc length. Arguments and result as for
     `predictor_corrector`, except `nodes`: the number of quadrature nodes over one control step, for each Newton step.
@@ -219,7 +220,7 @@ def _gauss_newton(degree: int, nodes: tuple[int, ...]) -> Any:
 
 
 def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
-    """Return the parameters u of a blend at increasing distances (m) from its start, step by step. Shape (M,).
+    """Return the curve parameters u of a blend at increasing distances (m) from its start, step by step. Shape (M,).
 
     Args:
         mapping: Result of `predictor_corrector` or `gauss_newton`.
@@ -257,7 +258,7 @@ def _predict(state: Any, steps: Any, rate: Any) -> Any:
 
 
 def exponential(vector: Any) -> Any:
-    """Return the unit quaternion of a rotation vector (rad), a casadi expression. Shape (4, 1).
+    """Return the unit quaternion of a rotation vector (rad) as a casadi expression. Shape (4, 1).
 
     A power series in the squared angle, without branches or roots, which is smooth at zero and accurate to rounding for
     angles up to 2 pi.
@@ -273,7 +274,7 @@ def exponential(vector: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def orientation_function() -> Any:
-    """Return the casadi Function that evaluates the tool orientation and its rates on one segment or blend.
+    """Return the casadi Function that evaluates the tool orientation and its rates on one segment or blend of a path.
 
     Inputs: reference (4); theta (3, 6) as 18 entries column by column, ascending powers of distance over length; length
     (m); distance over length. Outputs: unit quaternion (4); in world axes the angular rate per metre (3, rad/m), its

@@ -1,4 +1,4 @@
-"""Task paths of connected segments, and the treatment of points at which they reverse their direction.
+"""Task paths of connected segments, and the treatment of points at which a path reverses its direction.
 
 No smooth curve rounds a reversal (a corner of 180 deg). `split_at_reversals` ends the path there, or inserts a bulb
 turn of three arcs of 60, 300 and 60 degrees. The bulb leaves the vertex in the direction of arrival and returns to it
@@ -24,7 +24,10 @@ from models.spatial import rotation_from_quaternion
 __all__ = ["Path", "Reversal", "split_at_reversals"]
 
 SMALLEST_ANGLE = 1e-6
-"""Interior angle (rad) below which a corner is a reversal: its blend would have the curvature 4e12 / remaining."""
+"""Interior angle (rad) below which a corner is a reversal, because its blend would be curved too sharply.
+
+The curvature would be 4e12 / remaining.
+"""
 FRAME = ("start", "tangent", "normal", "curvature", "torsion")
 NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -70,7 +73,7 @@ class Path:
 
     @classmethod
     def through(cls, points: ArrayInput, orientations: ArrayInput | None = None) -> Path:
-        """Return the path of straight lines through points.
+        """Return the path of straight lines through given points.
 
         Args:
             points: Points in world, at least two. Shape (n, 3), m.
@@ -95,7 +98,7 @@ class Path:
 
     @property
     def length(self) -> float:
-        """Sum of the segments' lengths before any blending, m."""
+        """Sum of the lengths of the segments, before corners are rounded, m."""
         return float(self.lengths.sum())
 
     @property
@@ -109,7 +112,8 @@ class Path:
         return any(s.start_orientation is not None or s.end_orientation is not None for s in self.segments)
 
     def at(self, index: Any, distance: ArrayInput) -> tuple[Array, Array, Array, Array]:
-        """Return position and its first three derivatives with respect to distance, at distances (m) along segments.
+        """Return points on segments and three derivatives with respect to distance, at distances (m) along the
+        segments.
 
         Shapes: index (M,) of int, distance (M,), each result (M, 3).
         """
@@ -119,12 +123,12 @@ class Path:
         return screw(*frame, curvature=self.curvature[index], torsion=self.torsion[index], distance=along)
 
     def corner_angles(self) -> Array:
-        """Return the interior angle at each vertex, pi for a continuous tangent. Shape (n - 1,), rad."""
+        """Return the interior angle at each vertex, which is pi for a continuous tangent. Shape (n - 1,), rad."""
         index = np.arange(len(self.segments) - 1)
         return _angles(self.at(index, self.lengths[:-1])[1], self.tangent[1:])
 
     def placed(self, position: ArrayInput = (0.0, 0.0, 0.0), orientation: ArrayInput = (1.0, 0.0, 0.0, 0.0)) -> Path:
-        """Return the path moved to a given pose in world; tool orientations rotate with it.
+        """Return the path moved to a given pose in the world; tool orientations rotate with the path.
 
         Args:
             position: Origin of the path's axes in world. Shape (3,), m.
@@ -198,7 +202,7 @@ class Path:
 
 
 def checked_segments(segments: Any) -> tuple[Segment, ...]:
-    """Return `segments` as a tuple; raise a ModelError unless it holds Lines, Arcs or Helices, and at least one."""
+    """Return segments as a tuple; raise a ModelError if there are none or one is not a Line, Arc or Helix."""
     try:
         check_entries(segments)
         checked = tuple(segments)
@@ -215,7 +219,7 @@ def checked_segments(segments: Any) -> tuple[Segment, ...]:
 
 
 def interior_angles(segments: Sequence[Segment]) -> Array:
-    """Return the interior angle between each segment and the next, as `Path.corner_angles`. Shape (n - 1,), rad."""
+    """Return the interior angle between each segment and the next, pi if they join smoothly. Shape (n - 1,), rad."""
     start, tangent, normal, k, w, length = (
         np.array([getattr(each, name) for each in segments]) for name in (*FRAME, "length")
     )
@@ -228,13 +232,13 @@ def _angles(before: Array, after: Array) -> Array:
 
 
 Reversal: TypeAlias = Literal["split"] | float
-"""Treatment of a reversal: "split" ends the path there; a width (m) inserts a bulb turn."""
+"""Treatment of a reversal of direction: "split" ends the path at it; a width (m) inserts a bulb-shaped turn."""
 
 
 def split_at_reversals(
     segments: Sequence[Segment], reversal: Reversal = "split"
 ) -> tuple[tuple[Path, NDArray[np.intp]], ...]:
-    """Split connected segments into paths at reversals of direction, or join them there by bulb turns.
+    """Split connected segments into paths at reversals of direction, or insert bulb-shaped turns at the reversals.
 
     Args:
         segments: At least one; each starts at the end of the one before.

@@ -67,7 +67,7 @@ SETTINGS = RoundingSettings()
 
 
 class _Corners(NamedTuple):
-    """Vertices of a path and the kind of blends that round them.
+    """Vertices of a path, and the kind and shape factors of the blends that round them.
 
     Attributes:
         shape: Shape factors. Shape (V,).
@@ -97,7 +97,7 @@ class _Corners(NamedTuple):
         return p0, n0, k0, p1, n1, k1
 
     def blends(self, remaining: Array) -> Array:
-        """Return the polynomial coefficients of the blends with given remaining distances, (V,). Shape (V, 6, 3)."""
+        """Return the coefficients of blends with given distances from vertex to blend end. Shape (V, 6, 3)."""
         p0, n0, k0, p1, n1, k1 = self.ends(remaining)
         rate = (self.shape * remaining)[:, None]
         if self.kind == "cubic":
@@ -105,7 +105,7 @@ class _Corners(NamedTuple):
         return quintic((p0, rate * n0, rate**2 * k0), (p1, rate * n1, rate**2 * k1))
 
     def with_best_shape(self, remaining: Array) -> _Corners:
-        """Return the corners with the shape factor of each that gives its quintic blend the least peak curvature."""
+        """Return the corners with the shape factors that give each quintic blend the least peak curvature."""
         shape, curved = corner_shape(self.path.corner_angles()[self.vertices]), self.curved
         subset = self.subset(curved)
         shape[curved] = best_shape(subset.ends(remaining[curved]), remaining[curved])
@@ -115,9 +115,9 @@ class _Corners(NamedTuple):
 def _remaining_distances(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """Return the corners, with best shape factors if `free`, and the remaining distances of their blends, (n - 1,), m.
+    """Return the corners, and the distance from each vertex to the ends of its blend. Shape (n - 1,), m.
 
-    Arguments as for `smooth`.
+    The corners have the best shape factors if `free`. Other arguments as for `smooth`.
     """
     require.choice("path: overlap", overlap, get_args(Overlap))
     if (remaining is None) == (deviation is None):
@@ -138,7 +138,7 @@ def _remaining_distances(
 
 
 def _within_tolerance(corners: _Corners, tolerance: Array, overlap: Overlap) -> Array:
-    """Return the largest distances from vertex to blend end at which the deviation is within tolerance. (V,), m."""
+    """Return the largest distances from vertex to blend end for which each blend is within tolerance. Shape (V,), m."""
     path = corners.path
     # at most the segment length, so that every trial curve exists
     longest = np.minimum(path.lengths[:-1], path.lengths[1:])
@@ -212,7 +212,7 @@ def _initial_distances(corners: _Corners, tolerance: Array, longest: Array) -> A
 
 
 def _solve_distances(corners: _Corners, tolerance: Array, longest: Array) -> Array:
-    """Return distances from vertex to blend end, up to `longest`, at which the deviation is at most the tolerance."""
+    """Return distances from vertex to blend end, at most `longest`, at which the deviation is within `tolerance`."""
     low, high, trial = np.zeros_like(longest), longest.copy(), longest.copy()
     todo = np.arange(len(longest))
     for number in range(SETTINGS.iterations):
@@ -237,7 +237,7 @@ def _solve_distances(corners: _Corners, tolerance: Array, longest: Array) -> Arr
 
 
 def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
-    """Return the distance of the vertex from its blend, and the largest distance of the blend from its two segments.
+    """Return the distance of each vertex from its blend, and the largest distance of the blend from its two segments.
 
     Together they bound the deviation between smooth path and task in both directions. They are sampled uniformly and
     again about the maximum. The first is never below the true value, the second by at most 0.1 %. Shape (V,), m.
@@ -260,7 +260,7 @@ def _deviations(corners: _Corners, remaining: Array) -> tuple[Array, Array]:
 
 
 def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
-    """Return the largest distance of each blend from the points of the path that it replaces. Shape (V,), m."""
+    """Return the largest distance from a blend to the points of the path that the blend replaces. Shape (V,), m."""
     path, result = corners.path, np.empty(len(remaining))
     u, v = np.linspace(0, 1, 4 * SETTINGS.samples), np.linspace(0, 1, SETTINGS.samples)
     for first in range(0, len(remaining), SETTINGS.block):
@@ -287,7 +287,7 @@ def _task_to_blend(corners: _Corners, remaining: Array) -> Array:
 
 
 def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remaining: Array) -> Array:
-    """Return the distances from points (V, S, 3) of each blend to the closer of the two path parts that it replaces."""
+    """Return how far points (V, S, 3) of blends are from the closer of the two path parts that the blend replaces."""
     return np.minimum(
         _distance_to_segment(path, vertices, points, path.lengths[vertices] - remaining, path.lengths[vertices]),
         _distance_to_segment(path, vertices + 1, points, np.zeros(len(vertices)), remaining),
@@ -295,9 +295,9 @@ def _blend_to_task(path: Path, vertices: NDArray[np.intp], points: Array, remain
 
 
 def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distances of points (V, S, 3) from parts of path segments, one part for each row of points.
+    """Return the distances of points, shape (V, S, 3), from V parts of path segments. Shape (V, S), m.
 
-    A part extends from the distance `first` to the distance `last` along its segment. Shape (V, S), m.
+    Each part, for one row of points, extends from the distance `first` to the distance `last` along its segment.
     """
     helices = np.flatnonzero(path.torsion[index] != 0)
     if helices.size:
@@ -325,7 +325,10 @@ def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, fir
 
 
 def _distance_to_helix(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return distances as `_distance_to_segment` does, for helices, by Newton's method from the closest sample."""
+    """Return the distances of points from parts of helices, by Newton's method from the closest sample.
+
+    Arguments and shapes are those of `_distance_to_segment`.
+    """
     if len(index) > SETTINGS.block:
         parts = [slice(k, k + SETTINGS.block) for k in range(0, len(index), SETTINGS.block)]
         return np.concatenate([_distance_to_helix(path, index[p], points[p], first[p], last[p]) for p in parts])

@@ -72,12 +72,12 @@ class Line:
 
     @property
     def normal(self) -> Array:
-        """Zero, since a line has no normal. Shape (3,)."""
+        """Zero vector, because a line has no normal. Shape (3,)."""
         return np.zeros(3)
 
 
 class _Circular:
-    """Properties that an arc and a helix share."""
+    """Properties that arcs and helices share."""
 
     start: ArrayInput
     center: ArrayInput
@@ -94,7 +94,7 @@ class _Circular:
 
     @property
     def end(self: Any) -> Array:
-        """End point in world. Shape (3,), m."""
+        """End point of the arc or helix in the world. Shape (3,), m."""
         frame = self.start, self.tangent, self.normal
         return np.asarray(screw(*frame, curvature=self.curvature, torsion=self.torsion, distance=self.length)[0])
 
@@ -253,7 +253,7 @@ class Helix(_Circular):
 
     @property
     def torsion(self) -> float:
-        """Torsion of the helix, 1/m; positive for a right-handed one."""
+        """Torsion of the helix, 1/m; positive for a right-handed helix."""
         return self.rise * self.sweep / self.length**2
 
 
@@ -293,7 +293,7 @@ def screw(
 def screw_axes(
     tangent: Array, normal: Array, curvature: float | Array, torsion: float | Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the vectors and the rotation rate of the screw motion that describes a line, arc or helix.
+    """Return vectors and rotation rate of the screw motion whose path is a line, arc or helix.
 
     The axial and tangential components of the tangent and the vector towards the screw axis, shape (..., 3) each; the
     rotation rate, shape (...), rad/m. Arguments as for `screw`.
@@ -310,7 +310,7 @@ def screw_axes(
 
 
 def _set_circle(segment: Any, owner: str) -> float:
-    """Check and set start, center and axis of an arc or a helix. Return its radius, m."""
+    """Check and set start, center and axis of an arc or a helix; return the radius, m."""
     for name in ("start", "center", "axis"):
         object.__setattr__(segment, name, require.array(f"{owner}: {name}", getattr(segment, name), (3,)))
     norm = float(np.linalg.norm(segment.axis))
@@ -342,7 +342,7 @@ def _set_orientations(segment: Segment, owner: str) -> None:
 
 
 LARGEST_TURN = np.pi - 1e-3
-"""Largest angle (rad) between two orientations; near pi the shorter rotation between them is ambiguous."""
+"""Largest angle (rad) allowed between two orientations; near pi the shorter of the two rotations is ambiguous."""
 
 
 def unit_quaternion(value: ArrayInput, what: str) -> Array:
@@ -356,9 +356,10 @@ def unit_quaternion(value: ArrayInput, what: str) -> Array:
 
 
 def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orientation") -> Array:
-    """Return the shorter rotation from `first` to `second`, in the axes of `first`: second = first exp(vector).
+    """Return the vector of the shorter rotation from one orientation to another, in the axes of the first. Shape (3,),
+    rad.
 
-    Shape (3,), rad.
+    second = first exp(vector).
 
     Raises:
         ModelError: The orientations differ by nearly half a turn, so the shorter rotation is ambiguous.
@@ -385,7 +386,7 @@ def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orienta
 
 
 def product(first: ArrayInput, second: ArrayInput) -> Array:
-    """Return the product `first` * `second` of two quaternions [w, x, y, z] or of rows of them. Shape (..., 4)."""
+    """Return the product of two quaternions [w, x, y, z], or of two arrays of quaternions. Shape (..., 4)."""
     p, q = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
     scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
     vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])

@@ -1,4 +1,4 @@
-"""Paths with rounded corners as functions of the distance along them.
+"""Paths with rounded corners as functions of the distance along the path.
 
 On each piece of a path, a blend or what remains of a segment, the tool orientation is q(s) = reference exp(theta(s)),
 where the rotation vector theta is a polynomial of the distance s. For a segment that turns at a constant rate about a
@@ -25,7 +25,7 @@ from models.paths.path import Path
 __all__ = ["Blend", "PathPoint", "SmoothPath", "Turn"]
 
 BLOCK_SIZE = 50_000
-"""Number of samples processed at once, which bounds the memory."""
+"""Number of samples processed at once; it bounds the memory use."""
 
 
 class PathPoint(NamedTuple):
@@ -121,17 +121,17 @@ class SmoothPath:
 
     @property
     def piece_lengths(self) -> Array:
-        """Lengths of the pieces: remaining parts of segments and blends, in order. Shape (P,), m."""
+        """Lengths of the pieces of the path, which are blends and remaining parts of segments. Shape (P,), m."""
         return np.diff(self.bounds)
 
     @cached_property
     def blend_starts(self) -> NDArray[np.intp]:
-        """Index in `bounds` at which each blend begins. Shape (V,)."""
+        """Index in `bounds` of the distance at which each blend begins. Shape (V,)."""
         return np.flatnonzero(self.piece_blend >= 0)
 
     @cached_property
     def cell_bounds(self) -> Array:
-        """Distance along the path at which each quadrature cell of the blends begins. Shape (C,), m."""
+        """Distance along the path at which each quadrature interval (cell) of the blends begins. Shape (C,), m."""
         before = np.cumsum(self.cells.length) - self.cells.length
         first = np.searchsorted(self.cells.curve, np.arange(len(self.coefficients)))
         # to the last bit, the bound of a blend's first cell must equal the blend's own, or points fall before the blend
@@ -139,7 +139,7 @@ class SmoothPath:
         return np.asarray(self.bounds[self.blend_starts][self.cells.curve] + inside)
 
     def blend(self, vertex: int) -> Blend:
-        """Return the blend at a vertex, 0 being the end of the first segment; raise a ModelError if there is none."""
+        """Return the blend at a vertex (0: end of the first segment); raise a ModelError for an unknown vertex."""
         count = len(self.remaining)
         if not isinstance(vertex, int | np.integer) or isinstance(vertex, bool) or not 0 <= vertex < count:
             message = f"vertex {vertex!r} does not exist; the path has {count}"
@@ -156,7 +156,7 @@ class SmoothPath:
         )
 
     def at(self, distance: ArrayInput) -> PathPoint:
-        """Return position, tangent, curvature and its derivative at distances from the start. Shape (M,), m.
+        """Return position, tangent, curvature and curvature rate at distances from the start, shape (M,), m.
 
         Raises:
             ModelError: A distance is nan, or outside the path by more than rounding.
@@ -164,13 +164,13 @@ class SmoothPath:
         return PathPoint(*_in_blocks(self._at, self.checked_distance(distance), (3, 3, 3, 3)))
 
     def curvature(self, distance: ArrayInput) -> Array:
-        """Return the curvature at distances from the start. Shape (M,), 1/m."""
+        """Return the curvature at given distances from the start of the path. Shape (M,), 1/m."""
         return _in_blocks(self._curvature, self.checked_distance(distance), (1,))[0][:, 0]
 
     def turn(self, distance: ArrayInput) -> Turn:
-        """Return tool orientation and its rates at distances from the start. Shape (M,), m.
+        """Return tool orientation and its rates at given distances from the start of the path, shape (M,), m.
 
-        They are continuous up to the acceleration.
+        Orientation, rate and acceleration are continuous.
         """
         s = self.checked_distance(distance)
         if not self.path.turns:
@@ -179,16 +179,16 @@ class SmoothPath:
         return Turn(*_in_blocks(self._turn, s, (4, 3, 3, 3)))
 
     def parameter(self, distance: ArrayInput) -> Array:
-        """Return the curve parameter u of the blends at distances from the start; nan on segments. Shape (M,)."""
+        """Return the curve parameter u of the blend at each distance from the start; nan on segments. Shape (M,)."""
         s = self.checked_distance(distance)
         u, curved = np.full(len(s), np.nan), self.piece_blend[self._piece(s)] >= 0
         u[curved] = _in_blocks(lambda at: (self._parameter(at)[1][:, None],), s[curved], (1,))[0][:, 0]
         return u
 
     def sample_distances(self, per_cell: int = 16, per_segment: int = 2) -> Array:
-        """Return distances for sampling the path, such as for plots: equidistant in each segment and cell of a blend.
+        """Return distances at which to sample the path, for example for a plot. Shape (M,), m.
 
-        Shape (M,), m. A cell is a quadrature interval of a blend.
+        They are equidistant in each segment and in each cell, a quadrature interval, of a blend.
         """
         for name, number in (("per_cell", per_cell), ("per_segment", per_segment)):
             require.count(f"path: {name}", number)
@@ -204,9 +204,9 @@ class SmoothPath:
         return np.append(inside, self.length)
 
     def by_piece(self, of_segments: ArrayInput) -> Array:
-        """Return the speed on every segment and blend from that on the segments; a blend has its lower neighbour's.
+        """Return the speed on every segment and blend, given the speeds on the segments. Shape (P,).
 
-        Shape (P,).
+        A blend has the lower speed of its two neighbours.
 
         Raises:
             ModelError: The number of values differs from the number of segments.
@@ -217,12 +217,12 @@ class SmoothPath:
         return np.where(self.piece_blend >= 0, blends, values[self.piece_segment])
 
     def curvature_jumps(self) -> Array:
-        """Return the jump of the curvature vector between consecutive segments and blends. Shape (P - 1,), 1/m."""
+        """Return the magnitudes of curvature jumps between consecutive segments and blends. Shape (P - 1,), 1/m."""
         left, right = self._end_curvatures(1.0)[:-1], self._end_curvatures(0.0)[1:]
         return np.asarray(np.linalg.norm(right - left, axis=1))
 
     def checked_distance(self, distance: ArrayInput) -> Array:
-        """Return `distance` as an array within the path; raise a ModelError if it is outside."""
+        """Return distances as an array after checking that they are within the path; raise a ModelError otherwise."""
         s = require.array("path: distance", distance, ("distances",), least=0, entries="any")
         slack = 1e-9 * self.length
         wrong = s[~((s >= -slack) & (s <= self.length + slack))]
@@ -272,12 +272,12 @@ class SmoothPath:
         return along_piece(reference[piece], theta[piece], length, (s - self.bounds[piece]) / length)
 
     def _on_segment(self, segment: NDArray[np.intp], distance: Array) -> tuple[Array, ...]:
-        """Return position and derivatives on segments, at distances from the ends of the preceding blends."""
+        """Return points of segments and derivatives, at distances from the end of the blend before each segment."""
         start_offset = np.concatenate([[0.0], self.remaining])[segment]
         return self.path.at(segment, start_offset + distance)
 
     def _end_curvatures(self, u: float) -> Array:
-        """Return the one-sided curvature vector of each segment and blend at its start (u = 0) or end (u = 1)."""
+        """Return the curvature vector of each segment and blend at its own start (u = 0) or end (u = 1)."""
         result = np.empty((len(self.piece_segment), 3))
         parts = np.flatnonzero(self.piece_segment >= 0)
         result[parts] = self._on_segment(self.piece_segment[parts], u * self.piece_lengths[parts])[2]
@@ -287,7 +287,7 @@ class SmoothPath:
 
     @cached_property
     def charts(self) -> tuple[Array, Array]:
-        """Reference quaternions and rotation vector polynomials of the tool orientation on each segment and blend.
+        """Tool orientation on each segment and blend: reference quaternions and polynomials of the rotation vector.
 
         Shapes (P, 4) and (P, 6, 3). The variable of the polynomials is distance / length.
         """
@@ -311,7 +311,7 @@ class SmoothPath:
 
 
 def _in_blocks(function: Callable[[Array], tuple[Array, ...]], s: Array, widths: tuple[int, ...]) -> list[Array]:
-    """Return the results of a function at many distances, in blocks to bound its memory. Shapes (M,) to (M, width)."""
+    """Evaluate a function at many distances in blocks, to bound the memory. Shapes (M,) to (M, width)."""
     results = [np.empty((len(s), width)) for width in widths]
     for first in range(0, len(s), BLOCK_SIZE):
         part = slice(first, first + BLOCK_SIZE)
@@ -324,10 +324,11 @@ SERIES_TERMS = 18
 
 
 def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) -> tuple[Array, Array, Array, Array]:
-    """Return tool orientation and its rates at M samples, computed in numpy as `orientation_function` does in casadi.
+    """Return the tool orientation and its rates at M samples on segments and blends of a path.
 
-    omega = theta' + B theta x theta' + C theta x (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and
-    a = |theta|, in the axes of the reference. B and C are entire functions of a^2.
+    It is computed in numpy as `orientation_function` does in casadi. omega = theta' + B theta x theta' + C theta x
+    (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and a = |theta|, in the axes of the reference. B and
+    C are entire functions of a^2.
 
     Args:
         reference: Shape (M, 4).
@@ -369,7 +370,10 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    """Return the series of (-x)^k / (2 k + start)! at x = `square`, and its first two derivatives with respect to x."""
+    """Return a power series that occurs in derivatives of orientations, and its first two derivatives.
+
+    The sum of (-x)^k / (2 k + start)! over k at x = `square`; derivatives are with respect to x.
+    """
     value, first, second = (np.zeros_like(square) for _ in range(3))
     for k in reversed(range(SERIES_TERMS)):
         second = second * square + 2 * first

@@ -173,7 +173,7 @@ def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Ex
 
 
 def _twist_and_rate(base_motion: tuple[Expression, Expression] | None) -> tuple[Expression | None, Expression | None]:
-    """Return the twist of the base and its time derivative; raise ModelError unless `base_motion` is such a pair."""
+    """Return the twist of the base and its time derivative; raise ModelError unless `base_motion` is a pair of both."""
     if base_motion is None:
         return None, None
     if not isinstance(base_motion, tuple | list) or len(base_motion) != 2:
@@ -243,9 +243,9 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Return acceleration of the origin less gravity (3, 1) and acceleration field (3, 3) of each link, by link name.
+    """Return the acceleration of each link's origin less gravity, and the link's acceleration field, by link name.
 
-    Both are in the axes of the link; `_field` explains the field.
+    Shapes (3, 1) and (3, 3), in the axes of the link; `_field` explains the field.
     """
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
@@ -278,7 +278,7 @@ def _motions_in_links(
 
 
 def _mass_sums(link: Link) -> tuple[Expression, Expression]:
-    """Return the first and second mass moments of a link in its frame. Shapes (3, 1), kg m, and (3, 3), kg m^2."""
+    """Return first and second mass moments of a link in the link's frame. Shapes (3, 1), kg m, and (3, 3), kg m^2."""
     center, inertia = link.center_of_mass, link.inertia
     about_center = np.trace(inertia) / 2 * np.eye(3) - inertia
     return constant(link.mass * center), constant(about_center + link.mass * np.outer(center, center))
@@ -311,7 +311,7 @@ class MassMoments(NamedTuple):
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """Return (angular momentum about the world's origin, linear momentum) if all bodies move with one twist."""
+        """Return (angular momentum about the world's origin, linear momentum) of the bodies for a common twist."""
         angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
         return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
@@ -340,13 +340,13 @@ def momentum_matrix(robot: Robot, q: Expression, world_from_base: Placement | No
 
 
 def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the spatial inertia of the robot with locked joints about the world's origin, world axes. Shape (6, 6)."""
+    """Return the spatial inertia of the robot with locked joints about the world's origin. World axes, shape (6, 6)."""
     frames = link_frames(robot, q, world_from_base)
     return ca.densify(subtree_moments(robot, frames)[robot.root].spatial_inertia())
 
 
 def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
-    """Return the mass moments about the world's origin of each link and all links that it carries, by link name."""
+    """Return the mass moments of each link together with the links it carries, about the world's origin, by name."""
     moments: dict[str, MassMoments] = {}
     for link in robot.links:
         turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)
@@ -363,7 +363,7 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
 def joint_momenta(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
 ) -> Expression:
-    """Return the momentum matrix from given joint axes (frames_and_axes) and mass moments (subtree_moments)."""
+    """Return the momentum matrix, given joint axes (from frames_and_axes) and mass moments (from subtree_moments)."""
     children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
     momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
     return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, momenta))
@@ -378,7 +378,7 @@ def momentum(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return (angular momentum about a point of the world, linear momentum). Shape (6, 1), N m s and N s."""
+    """Return the robot's momentum: (angular about a point of the world, linear). Shape (6, 1), N m s and N s."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     motions = propagate_motions(robot, frames, axes, qd=qd, qdd=ca.DM(robot.dof, 1))
     place = checked_vector("about", about, 3, "a point of the world")

@@ -26,7 +26,7 @@ Placement = tuple[Expression, Expression]
 
 
 class _Turn(NamedTuple):
-    """Rotation about consecutive parallel joint axes: orientation before the first, common axis, sum of the angles."""
+    """Rotation about consecutive parallel joint axes: initial orientation, common axis and sum of the joint angles."""
 
     before: Expression
     axis: Array
@@ -64,7 +64,7 @@ def checked_vector(label: str, value: Expression, size: int, meaning: str) -> Ex
 
 
 def checked_placement(placement: Placement | None) -> Frame:
-    """Return the pose of the root link as a frame (the identity if None); raise ModelError if it is invalid."""
+    """Return the pose of the root link as a frame (the identity if None); raise ModelError if the pose is invalid."""
     if placement is None:
         return Frame(ca.DM.eye(3), ca.DM(3, 1))
     try:
@@ -93,7 +93,7 @@ def each_joint(robot: Robot, vector: Expression, what: str = "q") -> dict[str, E
 
 
 def by_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> list[Expression]:
-    """Reduce quantities of all moving joints, such as Jacobian columns or forces, to one per entry of the joint vector.
+    """Reduce quantities of all moving joints, such as forces or Jacobian columns, to one for each joint vector entry.
 
     Each entry is that of the joint itself plus multiplier times those of the joints that mimic it.
     """
@@ -162,7 +162,7 @@ def frame_jacobian(
 
 
 def link_jacobians(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> dict[str, Expression]:
-    """Return the Jacobians of the origins of all link frames, as frame_jacobian, by link name. Shape (6, dof) each."""
+    """Return the geometric Jacobians of the origins of all link frames, by link name. Shape (6, dof) each."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     return {link: ca.densify(point_jacobian(robot, axes, link, frame.position)) for link, frame in frames.items()}
 
@@ -179,7 +179,10 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 def point_jacobian(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
 ) -> Expression:
-    """Return the Jacobian of a link's point (in world) from given joint axes (frames_and_axes). Shape (6, dof)."""
+    """Return the geometric Jacobian of a point of a link from given joint axes. Shape (6, dof).
+
+    The point is in world; the axes are those of frames_and_axes.
+    """
     carriers = {joint.name for joint in robot.path_to(link)}
     columns = {
         name: ca.vertcat(angular, linear + cross(angular, point)) if name in carriers else ca.DM(6, 1)
@@ -189,7 +192,7 @@ def point_jacobian(
 
 
 def joint_frames(robot: Robot, q: Expression) -> dict[str, Frame]:
-    """Return the frame of each joint's child link in its parent link, by joint name."""
+    """Return the frame of each joint's child link relative to its parent link, by joint name."""
     positions, frames = _positions(robot, q), {}
     for joint in robot.joints:
         orientation, position = constant(joint.rotation), constant(joint.translation)
@@ -213,7 +216,7 @@ def _positions(robot: Robot, q: Expression) -> dict[str, Expression]:
 def frames_and_axes(
     robot: Robot, q: Expression, world_from_base: Placement | None = None
 ) -> tuple[dict[str, Frame], dict[str, tuple[Expression, Expression]]]:
-    """Return the frames of all links, and the motion vectors of all moving joints, also of mimic joints, both by name.
+    """Return the frames of all links and the motion vectors of all moving joints, including mimic joints, by name.
 
     A motion vector is (angular velocity, velocity at the world's origin) per unit rate of the joint, world axes.
     """
@@ -252,7 +255,7 @@ def constant(array: Array) -> Expression:
 
 
 class LinkMotion(NamedTuple):
-    """Position, velocities and accelerations of a link and its centre of mass, in world axes.
+    """Motion of a link in world axes: position, velocity and acceleration of its centre of mass, and its rotation.
 
     Attributes:
         center: Position of the centre of mass. Shape (3, 1), m.
@@ -338,9 +341,10 @@ TWIST_SIZE = 6
 
 
 def joint_limit_index(robot: Robot, q: Expression) -> Expression:
-    """Return the joint-limit index, the sum of ((q - middle) / range)^2 over all joints with two position limits.
+    """Return the joint-limit index, which grows from 0 as joints leave the middle of their ranges. Shape (1, 1).
 
-    Equation (23) of Yoo et al. 2004. Each joint adds 0 at the middle of its range, 1/4 at a limit. Shape (1, 1).
+    The sum of ((q - middle) / range)^2 over all joints with two position limits, equation (23) of Yoo et al. 2004. A
+    joint adds 1/4 at a limit.
     """
     q = joint_vector(robot, q)
     width = robot.upper - robot.lower
@@ -350,7 +354,7 @@ def joint_limit_index(robot: Robot, q: Expression) -> Expression:
 
 
 def joint_excess(robot: Robot, q: Expression) -> Expression:
-    """Return the largest violation of joint position limits; negative within all, -inf without limits. Shape (1, 1)."""
+    """Return the largest violation of a position limit; negative within limits, -inf without limits. Shape (1, 1)."""
     q = joint_vector(robot, q)
     lower, upper = np.flatnonzero(np.isfinite(robot.lower)).tolist(), np.flatnonzero(np.isfinite(robot.upper)).tolist()
     if not lower and not upper:
@@ -360,7 +364,7 @@ def joint_excess(robot: Robot, q: Expression) -> Expression:
 
 @on_scalars
 def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TWIST_SIZE)) -> Expression:
-    """Return the manipulability of a task that fixes some rows of the tip's twist; zero where the task is singular.
+    """Return the manipulability of a task that fixes components of the tip's twist; zero where the task is singular.
 
     sqrt(det(G_r G_r')) of the rows r of the tip Jacobian G (Yoshikawa 1985).
 
@@ -379,7 +383,7 @@ def jacobian_manipulability(jacobian: Expression, rows: Sequence[int] = range(TW
 
 @on_scalars
 def manipulability_of(task: Expression) -> Expression:
-    """Return Yoshikawa's manipulability, sqrt(det(G G')), of a task Jacobian G of shape (m, n). Shape (1, 1)."""
+    """Return Yoshikawa's manipulability sqrt(det(G G')) of a task Jacobian G with shape (m, n). Shape (1, 1)."""
     square = ca.mtimes(task, task.T)
     if square.shape[0] <= 7:  # division-free
         volume = determinant(square)
@@ -392,7 +396,7 @@ def manipulability_of(task: Expression) -> Expression:
 
 
 def checked_rows(rows: Sequence[int]) -> list[int]:
-    """Return twist row indices as a list; raise ModelError if there are none, one is repeated or one is not 0 to 5."""
+    """Return indices of twist components as a list; raise ModelError for an empty list, repeated or unknown indices."""
     try:
         check_entries(rows)
         numbers = floats(list(rows))

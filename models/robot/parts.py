@@ -19,7 +19,7 @@ Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic"]
 ShapeKind: TypeAlias = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 
 SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3}
-"""Number of entries of `size` for each kind of collision shape."""
+"""Number of entries of the field `size` of a collision shape, by kind of shape."""
 INERTIA_TOLERANCE = 1e-6
 """Relative tolerance of the inertia checks, so that inertias printed to six digits pass."""
 
@@ -69,7 +69,7 @@ class CollisionShape:
         warn_of_millimetres(f"{owner}: size", size)
 
     def placed(self, rotation: Array, translation: Array) -> Self:
-        """Return the shape in another frame, given the pose of its link there: rotation (3, 3), translation (3,), m."""
+        """Return the shape in another frame, given the pose of its link in that frame: shapes (3, 3) and (3,), m."""
         turn = require.rotation("placed shape: rotation", rotation)
         shift = require.array("placed shape: translation", translation, (3,)) + turn @ self.translation
         return replace(self, translation=shift, rotation=turn @ self.rotation)
@@ -77,7 +77,7 @@ class CollisionShape:
 
 @dataclass(frozen=True, eq=False)
 class VisualShape(CollisionShape):
-    """A shape for display only.
+    """A shape of a link for display only.
 
     Attributes:
         kind, size, file, translation, rotation, folder: As in CollisionShape; any size is accepted.
@@ -272,7 +272,7 @@ class Joint:
         return (turn @ np.array(ca.DM(rotation(self.axis, position))) if self.moves else turn), shift
 
     def locked(self, position: float) -> Joint:
-        """Return this joint fixed at a given position (rad or m), which may violate its limits.
+        """Return this joint fixed at a given position (rad or m), which may be outside the joint's limits.
 
         Raises:
             ModelError: The joint is already fixed, or the position is not finite.
@@ -285,7 +285,7 @@ class Joint:
 
 
 def massless_error(consequence: str) -> ModelError:
-    """Return the error for a robot without mass; `consequence` says what that makes impossible."""
+    """Return the error about a robot without mass; `consequence` states what is impossible without mass."""
     message = f"the robot has no mass, {consequence}: give its links masses; in URDF none has an <inertial>"
     return ModelError(message, name="mass", value=0.0, limit=0.0)
 

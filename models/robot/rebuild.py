@@ -36,7 +36,7 @@ def lock_joints(robot: Robot, positions: Mapping[str, float]) -> Robot:
 def move_tip(
     robot: Robot, tip: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Robot:
-    """Return the robot with its tip at another frame, fixed in the link `tip`."""
+    """Return the robot with its tip at another frame, which is fixed in the link named `tip`."""
     return replace(robot, tip=_robot(robot).link(tip).name, tip_translation=translation, tip_rotation=_turn(rotation))
 
 
@@ -109,7 +109,7 @@ def merge_robots(
     translations: Mapping[str, ArrayInput] | None = None,
     rotations: Mapping[str, ArrayInput] | None = None,
 ) -> Robot:
-    """Join several robots, such as arms, on one base; the tip is that of the first one, see move_tip.
+    """Join several robots, such as arms, on one base; the tip of the first robot becomes the tip of the result.
 
     Args:
         base: A link or a robot that carries the arms.
@@ -156,16 +156,17 @@ def add_prefix(robot: Robot, prefix: str) -> Robot:
 
 
 def reroot(robot: Robot, root: str) -> Robot:
-    """Return the robot with another root link; links keep their frames, joints their names, limits and signs.
+    """Return the robot with another link as the root of its tree.
 
-    See `models.robot.tree.reroot_tree` for the massless links that this adds.
+    Links keep their frames, joints their names, limits and signs. See `models.robot.tree.reroot_tree` for the massless
+    links that this adds.
     """
     links, joints = reroot_tree(_robot(robot).links, robot.joints, robot.root, root)
     return replace(robot, links=links, joints=joints)
 
 
 def subtree(robot: Robot, root: str, tip: str | None = None) -> Robot:
-    """Return a link, with all links that it carries, as a robot of its own.
+    """Return a link, with all links that it carries, as a separate robot.
 
     Joints that mimic a removed joint are treated as by `prune`.
 
@@ -201,7 +202,7 @@ def prune(robot: Robot, keep: Iterable[str] = ()) -> Robot:
 
 
 def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
-    """Return the robot with links on fixed joints merged into their carriers; motion and dynamics stay the same.
+    """Return the robot with links on fixed joints merged into the links that carry them; its dynamics stay the same.
 
     The tip frame, the names and order of the moving joints and the frames of their links are unchanged.
 
@@ -242,7 +243,7 @@ def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
 
 
 def _merge_links(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
-    """Return a link into which other links are merged with mass and shapes, at given poses (rotation, translation)."""
+    """Merge masses and shapes of other links, at given poses (rotation, translation), into a link and return it."""
     shapes = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.collisions)
     visuals = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.visuals)
     link = replace(link, collisions=(*link.collisions, *shapes), visuals=(*link.visuals, *visuals))

@@ -95,7 +95,7 @@ class Robot:
 
     @property
     def tip_link(self) -> str:
-        """Name of the link that carries the tip; raises ModelError if there is none."""
+        """Name of the link that carries the tip; raises ModelError if the robot has no tip."""
         if self.tip is None:
             message = (
                 f"{self.name!r} has no tip, which is needed here: its tree has the leaves {self._leaves}; say which "
@@ -187,7 +187,7 @@ class Robot:
 
     @cached_property
     def couplings(self) -> dict[str, JointCoupling]:
-        """Coupling of each moving joint, also if it mimics another, to an entry of the joint vector, by joint name."""
+        """Coupling of each moving joint, including mimic joints, to an entry of the joint vector, by joint name."""
         return joint_couplings(self.joints)
 
     @property
@@ -196,12 +196,12 @@ class Robot:
         return tuple(joint.name for joint in self.moving_joints)
 
     def unit(self, per: str = "") -> str:
-        """Return the units of the joint positions, "rad", "m" or "rad, m", each with a suffix `per` such as "/s"."""
+        """Return the units of the joint positions, "rad", "m" or "rad, m", each followed by `per`, such as "/s"."""
         return ", ".join(dict.fromkeys(joint.unit + require.text("unit: per", per) for joint in self.moving_joints))
 
     @property
     def effort_unit(self) -> str:
-        """Units of the joint torques and forces: "N m", "N", or both, separated by a comma, in order of appearance."""
+        """Units of joint torques and forces: "N m", "N", or both separated by a comma in the order of the joints."""
         return ", ".join(dict.fromkeys(joint.effort_unit for joint in self.moving_joints))
 
     @property
@@ -220,17 +220,17 @@ class Robot:
 
     @property
     def lower(self) -> Array:
-        """Lower position limits of the joints, raised by those of joints that mimic them. Shape (dof,), rad or m."""
+        """Lower position limits of the joints, raised by limits of joints that mimic them. Shape (dof,), rad or m."""
         return self._limits["lower"].copy()
 
     @property
     def upper(self) -> Array:
-        """Upper position limits of the joints, lowered by those of joints that mimic them. Shape (dof,), rad or m."""
+        """Upper position limits of the joints, lowered by limits of joints that mimic them. Shape (dof,), rad or m."""
         return self._limits["upper"].copy()
 
     @property
     def velocity(self) -> Array:
-        """Joint speed limits, lowered by those of mimic joints; infinite if unknown. Shape (dof,), rad/s or m/s."""
+        """Joint speed limits, lowered by limits of mimic joints; infinite if unknown. Shape (dof,), rad/s or m/s."""
         return self._limits["velocity"].copy()
 
     @property
@@ -251,19 +251,19 @@ class Robot:
         return {joint.child: joint for joint in self.joints}
 
     def link(self, name: str) -> Link:
-        """Return the link with a given name; raise ModelError, which lists similar names, if there is none."""
+        """Return the link with a given name; raise ModelError, which lists similar names, for an unknown name."""
         if not isinstance(name, str) or name not in self._links_by_name:
             raise require.unknown("link", name, self._links_by_name)
         return self._links_by_name[name]
 
     def joint(self, name: str) -> Joint:
-        """Return the moving or fixed joint with a given name; raise ModelError with similar names if there is none."""
+        """Return the moving or fixed joint with a given name; raise ModelError, listing similar names, if unknown."""
         if not isinstance(name, str) or name not in self._joints_by_name:
             raise require.unknown("joint", name, self._joints_by_name)
         return self._joints_by_name[name]
 
     def path_to(self, name: str) -> tuple[Joint, ...]:
-        """Return the joints from the root to a link, root first; raise ModelError for an unknown link."""
+        """Return the joints from the root to a link, beginning at the root; raise ModelError for an unknown link."""
         self.link(name)
         path: list[Joint] = []
         while name != self.root:
@@ -321,7 +321,7 @@ def planar_chain(
     mount: ArrayInput = (0.0, 0.0),
     base: Link | None = None,
 ) -> Robot:
-    """Return a planar arm of revolute joints about z whose links lie along x at zero joint angles.
+    """Return a planar arm of revolute joints about z; its links lie along x if all joint angles are zero.
 
     Centres of mass are at mid-link.
 

@@ -96,7 +96,7 @@ def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
 def reroot_tree(
     links: Sequence[Link], joints: Sequence[Joint], old: str, new: str
 ) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
-    """Return the links and joints of the same tree with the link `new` as its root instead of `old`.
+    """Return the links and joints of a kinematic tree after making the link `new`, instead of `old`, its root.
 
     Joints between the two are reversed. Every link keeps its frame, and every joint its name, its limits and the sign
     of its position: a moving joint J then carries a massless link "J_frame" at the joint's frame, to which the former
@@ -139,7 +139,7 @@ LIMITS = ("lower", "upper", "velocity", "effort")
 
 
 class JointCoupling(NamedTuple):
-    """Coupling of a joint to the joint vector: its position is multiplier times one entry, plus offset (rad or m).
+    """Coupling of a joint to the joint vector: its position is multiplier times an entry of the vector, plus offset.
 
     Attributes:
         column: Index of that entry.
@@ -153,7 +153,7 @@ class JointCoupling(NamedTuple):
 
 
 def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
-    """Return the coupling of each mimic joint, by name, to the independent joint at the end of its chain of mimics.
+    """Return the coupling of each mimic joint to the independent joint that it finally follows, by joint name.
 
     Raises:
         ModelError: A joint that follows an unknown joint, or itself through others.
@@ -180,10 +180,11 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
 
 
 def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
-    """Return all joints after locking those with a given position (rad or m, by name), and the joints that mimic them.
+    """Lock the joints that have a given position and the joints that mimic these; return all joints.
 
-    Other joints that cannot move are locked too: those that mimic a fixed joint (which counts as being at 0), or any
-    joint with multiplier 0. A mimic joint that is locked by its own name is no longer coupled.
+    Positions are in rad or m, by joint name. Other joints that cannot move are locked too: those that mimic a fixed
+    joint (which counts as being at 0), or any joint with multiplier 0. A mimic joint that is locked by its own name is
+    no longer coupled.
 
     Raises:
         ModelError: As `ties_to_leaders` and `Joint.locked`.
@@ -199,7 +200,7 @@ def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float])
 
 
 def prune_joints(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, ...]:
-    """Return the joints whose child link is in `kept`, with the couplings of mimic joints adapted.
+    """Return the joints whose child link is in `kept`, with mimic joints coupled to joints that are kept.
 
     Mimics of a removed joint stay coupled: to its leader if that is kept, else to the first of them, which becomes
     their leader. So the remaining joints can reach the same positions as before; limits of removed joints are lost.
@@ -222,7 +223,7 @@ def prune_joints(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, 
 
 
 def joint_couplings(joints: Sequence[Joint]) -> dict[str, JointCoupling]:
-    """Return the coupling of each moving joint, by name, to the vector of the independent joints in their order."""
+    """Return, by joint name, the coupling of each moving joint to the vector of the independent joints' positions."""
     leaders = [joint.name for joint in joints if joint.moves and joint.mimic is None]
     columns = {name: column for column, name in enumerate(leaders)}
     couplings = {joint.name: Mimic(joint.name) for joint in joints if joint.moves} | ties_to_leaders(joints)

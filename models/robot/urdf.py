@@ -51,7 +51,7 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "capsule": ("radius", "length"),
     "mesh": ("filename", "scale"),
 }
-"""Known attributes, by element, of the URDF elements that are checked for misspelt attributes."""
+"""Known attributes of those URDF elements that are checked for misspelt attributes, by element."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +119,14 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
 
 
 def _is_virtual(floating: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> bool:
-    """Return whether a floating joint connects the whole robot to a massless root, so that both can be omitted."""
+    """Return whether a floating joint connects the whole robot to a massless root link; both can then be omitted."""
     base = next((link for link in links if link.name == floating.parent), None)
     alone = all(joint is floating for joint in joints if floating.parent in (joint.parent, joint.child))
     return base is not None and alone and not base.mass and not base.inertia.any()
 
 
 def _without_world(floating: Joint, links: tuple[Link, ...]) -> tuple[Link, ...]:
-    """Return the links other than the massless root to which a floating joint connects the robot."""
+    """Return the links without the massless root link to which a floating joint connects the robot."""
     base = next(link for link in links if link.name == floating.parent)
     if base.collisions:
         message = (
@@ -213,7 +213,7 @@ def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> 
 
 
 def _write_origin(element: ElementTree.Element, translation: Array, rotation: Array) -> None:
-    """Write an <origin> element, without rpy if there is no rotation, so that zeros stay exact."""
+    """Write an <origin> element; omit rpy if there is no rotation, so that zeros stay exact."""
     rpy = {} if np.array_equal(rotation, np.eye(3)) else {"rpy": _text(_rpy(rotation))}
     ElementTree.SubElement(element, "origin", {"xyz": _text(translation)} | rpy)
 
@@ -235,7 +235,7 @@ def _text(numbers: Any) -> str:
 
 
 def parse_urdf(source: Source) -> ElementTree.Element:
-    """Return the <robot> element of a URDF text or file, without namespaces; raise ModelError if it cannot be read."""
+    """Return the <robot> element of a URDF text or file, without namespaces; raise ModelError if it is unreadable."""
     text, lines_before = "", 0
     data: str | bytes = b""
     if isinstance(source, str):
@@ -306,7 +306,7 @@ def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[L
 
 
 def _link_arguments(element: ElementTree.Element, folder: str, colors: dict[str | None, Array]) -> dict[str, Any]:
-    """Return the arguments of Link for a <link> element; `colors` are those of the robot's materials, by name."""
+    """Return the arguments of Link for a <link> element; `colors` are the colours of the robot's materials by name."""
     name = name_of(element)
     owner = f"link {name!r}"
     shapes = tuple(_shape(each, owner, folder, CollisionShape) for each in element.findall("collision"))
@@ -331,7 +331,7 @@ def _link_arguments(element: ElementTree.Element, folder: str, colors: dict[str 
 
 
 def _color(material: ElementTree.Element) -> Array | None:
-    """Return red, green, blue and opacity, each 0 to 1, of a <material>, or None if it has no valid color."""
+    """Return red, green, blue and opacity, each 0 to 1, of a <material> element, or None without a valid colour."""
     try:
         color = np.array((material.find("color").get("rgba") or "").split(), dtype=float)  # type: ignore[union-attr]
     except (AttributeError, ValueError):
@@ -388,16 +388,16 @@ def _joint(element: ElementTree.Element) -> Joint:
 
 
 def _axis(element: ElementTree.Element) -> Array | None:
-    """Return the axis of a <joint> element, shape (3,), or None if it gives none."""
+    """Return the axis of a <joint> element, shape (3,), or None if the element gives no axis."""
     owner = f"joint {name_of(element)!r}"
     axis = _only(element, "axis", owner)
     return None if axis is None else numbers_of(axis, "xyz", owner, 3)
 
 
 def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
-    """Return descriptions of unknown attributes in a <link> or <joint>, of elements that also lack a known attribute.
+    """Return descriptions of unknown attributes in a <link> or <joint> that may stand for missing known attributes.
 
-    Unknown attributes in addition to all known ones are an extension and are skipped, like unknown elements.
+    Unknown attributes of an element that has all known ones are an extension and are skipped, like unknown elements.
 
     Raises:
         ModelError: An unknown attribute that resembles a missing one, or nearly equals a known one: a misspelling.
@@ -419,7 +419,7 @@ def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
 
 
 def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
-    """Return position (3,), m, and rotation (3, 3) of an element's <origin>; warn if its rpy looks like degrees."""
+    """Return position (3,), m, and rotation (3, 3) of an element's <origin>; warn if the angles look like degrees."""
     origin = _only(element, "origin", owner)
     shift, angles = np.zeros(3), np.zeros(3)
     if origin is not None:
@@ -436,7 +436,7 @@ def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
 
 
 def _only(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element | None:
-    """Return the only child element with a tag, or None; raise ModelError naming `owner` if there are several."""
+    """Return the only child element with a given tag, or None; raise ModelError naming `owner` if there are several."""
     children = element.findall(tag)
     if len(children) > 1:
         message = f"{owner} has {len(children)} <{tag}> elements in <{element.tag}>; it takes one at most"
@@ -450,7 +450,7 @@ def name_of(element: ElementTree.Element) -> str:
 
 
 def child_of(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element:
-    """Return the only child element with a tag; raise ModelError naming `owner` if there is none, or several."""
+    """Return the only child element with a given tag; raise ModelError naming `owner` unless there is exactly one."""
     child = _only(element, tag, owner)
     if child is None:
         raise ModelError(f"{owner}: <{element.tag}> has no <{tag}>", name=tag, value=0, limit=1)
@@ -466,12 +466,12 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
 
 
 def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
-    """Return an attribute of an element as one number, perhaps inf or nan; else raise ModelError naming `owner`."""
+    """Return an attribute of an element as one number, possibly inf or nan; raise ModelError if it is no number."""
     return _numbers(element, key, owner, 1)[0]
 
 
 def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int) -> Array:
-    """Return an attribute of an element as finite numbers, shape (count,); else raise ModelError naming `owner`."""
+    """Return an attribute of an element as `count` finite numbers; raise ModelError for any other content."""
     values = _numbers(element, key, owner, count)
     if not all(map(isfinite, values)):
         raise ModelError(f"{_where(element, key, owner)} is not finite", name=key, value=element.get(key))

@@ -1,4 +1,4 @@
-"""Collision bodies of a robot's links, and its rigid parts with the joints between them.
+"""Collision bodies of a robot's links, and the rigid parts of a robot with the joints between them.
 
 `collision_bodies` converts the collision elements of a robot description to shapes in the frames of the links.
 `RigidParts` merges links that no moving joint separates. `lever_arms` bounds the distance of a body from the joint axes
@@ -47,7 +47,7 @@ class LinkMesh:
 
     @cached_property
     def hull(self) -> Mesh:
-        """Convex hull of the mesh in link axes; coplanar points are first replaced by cubes of half-edge 1 um."""
+        """Convex hull of the mesh in link axes; coplanar points are first thickened to cubes of half-edge 1 um."""
         try:
             return Mesh.around(convex_hull(self.points))
         except ModelError:
@@ -56,7 +56,7 @@ class LinkMesh:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A collision shape of a link.
+    """A collision body: a shape that a link of the robot carries.
 
     Attributes:
         link: Name of the link that carries the shape.
@@ -207,7 +207,7 @@ def _mesh_bodies(link: Link, shape: CollisionShape, number: int, folders: Folder
 
 
 class JointStep(NamedTuple):
-    """A moving joint between two rigid parts (`RigidParts`), one above it in the tree and one below.
+    """A moving joint between two rigid parts of a robot (`RigidParts`): the part above and the part below the joint.
 
     Attributes:
         joint: Its child link names the part below.
@@ -223,7 +223,7 @@ class JointStep(NamedTuple):
 
 @dataclass(frozen=True)
 class RigidParts:
-    """Sets of links that no moving joint separates, each named after its link nearest to the root.
+    """Sets of links that no moving joint separates; each set is named after the link nearest to the root.
 
     Attributes:
         of_link: The part of each link.
@@ -271,7 +271,7 @@ class RigidParts:
         return steps
 
     def adjacent(self, bodied: set[str]) -> set[frozenset[str]]:
-        """Return the pairs of parts with bodies that a joint, or a chain of parts without bodies, connects directly."""
+        """Return the pairs of parts with bodies between which there are only joints and parts without bodies."""
         neighbours: dict[str, set[str]] = defaultdict(set)
         for part, step in self.step.items():
             neighbours[part].add(step.above)
@@ -294,7 +294,7 @@ class RigidParts:
 def lever_arms(
     robot: Robot, chain: Sequence[tuple[JointStep, bool]], end: Shape, *, low: Array, high: Array
 ) -> tuple[list[float], float]:
-    """Return upper bounds of the distances of a body's points from the joint axes of the chain that carries it.
+    """Return upper bounds of the distances of a body's points from the axes of the joints that carry the body.
 
     Args:
         chain: Joints in order, with True where the chain passes the joint down the tree and False where up.

@@ -18,14 +18,14 @@ import casadi as ca
 from models.spatial import Expression
 
 Triple: TypeAlias = tuple[Expression, Expression, Expression]
-"""A vector as three scalars or columns; constants are floats, so that products with zero and one vanish."""
+"""A vector as three scalars or columns. Constants are floats, so that products with zero and one are simplified."""
 StopGradient: TypeAlias = Callable[[Expression], Expression]
-"""Function that makes an expression constant to differentiation (`StoppedGradients`), or returns it unchanged."""
+"""Function that makes an expression constant for differentiation (`StoppedGradients`), or returns it unchanged."""
 
 KINK = 1e-12
-"""Length that smooths the kink of an exact distance at zero, m."""
+"""Length over which the kink of an exact distance at zero is smoothed, m."""
 PARALLEL = 1e-18
-"""Squared sine of the angle between two edges below which their cross product gives no separating axis."""
+"""Squared sine of the angle between two edges below which their cross product is not used as a separating axis."""
 
 
 class SegmentCore(NamedTuple):
@@ -89,25 +89,31 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
 
 
 def _root(square: Expression, excess: float = 0.0) -> Expression:
-    """Return a distance from its square; a lower bound of it if the square is up to `excess` > 0 too large."""
+    """Return a distance from its square, or a lower bound if the square may be too large by up to `excess` > 0."""
     root = ca.sqrt(square + (excess or KINK**2))
     return (square - excess) * (1 / root) if excess else root - KINK
 
 
 def _negative_part(gap: Expression, rounding: float) -> Expression:
-    """Return min(gap, 0), or a smooth lower bound within rounding/4 of it; zero for gaps of at least `rounding`."""
+    """Return the smaller of a gap and zero, or a smooth lower bound of this minimum.
+
+    The smoothing width `rounding` bounds the error by rounding / 4; gaps of at least `rounding` give zero.
+    """
     if rounding == 0:
         return ca.fmin(gap, 0)
     return ca.fmin(gap + rounding, 0) - _clip(rounding - gap, 0.0, 2 * rounding) ** 2 * (0.25 / rounding)
 
 
 def _positive_part(gap: Expression, rounding: float) -> Expression:
-    """Return a smooth lower bound of max(gap, 0) within rounding/2 of it; zero for negative gaps."""
+    """Return a smooth lower bound of the larger of a gap and zero; the bound is zero for negative gaps.
+
+    The smoothing width `rounding` bounds the error by rounding / 2.
+    """
     return ca.fmax(gap - rounding, 0) + _clip(gap, 0.0, rounding) ** 2 * (0.5 / rounding)
 
 
 def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopGradient) -> Expression:
-    """Return the largest of several gaps, or a smooth lower bound of it within `rounding`."""
+    """Return the largest of several gaps, or a smooth lower bound at most the smoothing width `rounding` below it."""
     largest = reduce(ca.fmax, gaps)
     if rounding == 0 or len(gaps) == 1:
         return largest
@@ -121,7 +127,7 @@ def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopG
 def distance_of_segments(
     first: SegmentCore, second: SegmentCore, rounding: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the distance of two points, of a point and a segment, or of two segments; zero for crossing segments."""
+    """Return the distance of two points, a point and a segment, or two segments; it is zero for crossing segments."""
     if len(first.points) < len(second.points):
         first, second = second, first
     p, q = first.points[0], second.points[0]
@@ -137,7 +143,7 @@ def distance_of_segments(
 
 
 def _segments_square(gap: Triple, u: Triple, v: Triple, weight: float, stop_gradient: StopGradient) -> Expression:
-    """Return the least squared distance of two segments, smoothed by a penalty on the positions if `weight` > 0.
+    """Return the least squared distance of two segments, smoothed by a penalty on the closest points if `weight` > 0.
 
     The minimum over s, t in 0..1 of |gap + s u - t v|^2 + weight ((s - 1/2)^2 + (t - 1/2)^2). The unconstrained s is
     clipped to 0..1, then t is optimised for it and clipped, then s for that t (Ericson, Real-Time Collision Detection,
@@ -195,7 +201,7 @@ def distance_to_box(
 
 
 def _in_box_axes(core: SegmentCore | BoxCore, box: BoxCore) -> tuple[Triple, list[Triple], Sequence[Expression]]:
-    """Return centre, axes and half extents of a point (no axes), segment or box, in the axes of another box."""
+    """Return centre, axes (a point has none) and half extents of a point, segment or box in the axes of another box."""
     if isinstance(core, BoxCore):
         centre = in_axes(subtract(core.centre, box.centre), box.axes)
         return centre, [in_axes(axis, box.axes) for axis in core.axes], core.half
@@ -209,10 +215,11 @@ def _in_box_axes(core: SegmentCore | BoxCore, box: BoxCore) -> tuple[Triple, lis
 def _separating_gaps(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, slack: Expression
 ) -> list[Expression]:
-    """Return the gaps of a segment or box to a box along possible separating axes (Gottschalk, Lin & Manocha 1996).
+    """Return the gaps between a segment or box and another box along possible separating axes.
 
-    These are the face normals of both and the cross products of their edges. The absolute values of cosines have kinks
-    at aligned boxes; a positive slack replaces them by smooth upper bounds, at most the slack above.
+    These are the face normals of both and the cross products of their edges (Gottschalk, Lin & Manocha 1996). The
+    absolute values of cosines have kinks at aligned boxes; a positive slack replaces them by smooth upper bounds, at
+    most the slack above.
     """
     sizes = [triple(smooth_abs(share, slack) for share in axis) for axis in axes]
     sums = [sum(h * size[i] for h, size in zip(halves, sizes, strict=True)) for i in range(3)]
@@ -233,12 +240,12 @@ def _separating_gaps(
 
 
 def smooth_abs(x: Expression, slack: Expression) -> Expression:
-    """Return |x|, or a smooth upper bound of it within `slack`."""
+    """Return the absolute value of x, or a smooth upper bound that is at most `slack` larger."""
     return ca.fabs(x) if isinstance(slack, float) and slack == 0 else ca.sqrt(x * x + slack * slack)
 
 
 def _point_box_square(x: Triple, half: Triple, stop_gradient: StopGradient) -> Expression:
-    """Return the squared distance of a point to a box, in the box's axes."""
+    """Return the squared distance of a point from a box; the point is given in the axes of the box."""
     away = triple(part - stop_gradient(_clip(part, -h, h)) for part, h in zip(x, half, strict=True))
     return dot(away, away)
 
@@ -246,7 +253,7 @@ def _point_box_square(x: Triple, half: Triple, stop_gradient: StopGradient) -> E
 def _segment_box_square(
     middle: Triple, u: Triple, half: Triple, weight: float, stop_gradient: StopGradient
 ) -> Expression:
-    """Return the least squared distance of a segment to a box, in the box's axes, plus a penalty if `weight` > 0.
+    """Return the squared distance of a segment (in the box's axes) from a box, plus a penalty if `weight` > 0.
 
     The minimum over s in -1/2..1/2 of the squared distance of middle + s u, plus weight s^2. Half the derivative is
     weight s plus a term for each axis, u_k times the excess of x_k over the box. A term is zero while x_k is inside the
@@ -274,12 +281,12 @@ def _segment_box_square(
 
 
 def _without_derivative(s: Expression) -> Expression:
-    """Return a position along a segment, -1/2..1/2, rounded to multiples of 2^-53 so that its derivative vanishes."""
+    """Return a position along a segment, rounded to a multiple of 2^-53 so that its derivative is zero."""
     return ca.floor(s * 2.0**53) / 2.0**53
 
 
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
-    """Return an indicator of the largest component: 1 for that with the largest |over| / size, 0 for the others."""
+    """Return an indicator of the component with the largest |over| / size: 1 for this component, 0 for the others."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])
@@ -289,7 +296,7 @@ def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
 def _edge_squares(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, stop_gradient: StopGradient
 ) -> list[Expression]:
-    """Return the squared distances of the edges of one box to another box.
+    """Return the squared distances of the edges of one box from another box.
 
     Together with the corners of the other box they suffice: from a closest point inside a face one can slide along the
     face, at constant distance, to a corner or an edge.
@@ -305,7 +312,7 @@ def _edge_squares(
 
 
 def _corner_squares(first: BoxCore, second: BoxCore, stop_gradient: StopGradient) -> list[Expression]:
-    """Return the squared distances of the corners of one box to another box."""
+    """Return the squared distances of the corners of one box from another box."""
     centre, axes, halves = _in_box_axes(first, second)
     reaches = [triple(h * part for part in axis) for axis, h in zip(axes, halves, strict=True)]
     squares = []

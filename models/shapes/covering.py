@@ -1,4 +1,4 @@
-"""Covers of a triangle mesh by a few capsules or by one box, whose distances are exact and fast.
+"""Covers of a triangle mesh by a few capsules or one box, whose distances can be computed exactly and fast.
 
 First, one capsule of least volume is fitted to the mesh. Then the mesh is split across the plane that lowers the
 covered volume most, each side gets its own capsule, the largest one is split again, and so on up to a few parts. The
@@ -118,7 +118,7 @@ def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
 
 
 def fit_cover(triangles: Array) -> tuple[Cover, ...]:
-    """Return the capsules, or the box, that cover triangles of shape (n, 3, 3), in m, without using the cache."""
+    """Compute the capsules, or the box, that cover triangles of shape (n, 3, 3), m, without using the cache."""
     middle, size = _centre_and_size(triangles.reshape(-1, 3))
     unit = (triangles - middle) / size
     points = _points(unit)
@@ -153,7 +153,7 @@ def fit_cover(triangles: Array) -> tuple[Cover, ...]:
 
 
 def exceedance(shape: CoverShape, points: Array) -> Array:
-    """Return the amount by which points lie outside a capsule or box; zero or negative inside. Shape (n,), m."""
+    """Return how far points lie outside a capsule or box; values are zero or negative inside. Shape (n,), m."""
     if isinstance(shape, Capsule):
         return np.asarray(_segment_distances(points, np.asarray(shape.start), np.asarray(shape.end)) - shape.radius)
     own = np.abs((points - shape.position) @ shape.rotation) - shape.size / 2
@@ -164,7 +164,7 @@ def exceedance(shape: CoverShape, points: Array) -> Array:
 
 
 def _fit_capsule(points: Array) -> Capsule:
-    """Return a capsule of nearly least volume around points, optimised for the extreme points among them."""
+    """Return a capsule of nearly least volume around points; the optimisation uses only the extreme points."""
     frame = _principal_axes(points)
     extreme_points = points[_extreme_indices(points, frame)]
     bases = _bases(np.concatenate([frame.T, _sphere_points(SETTINGS.directions, half=True) @ frame.T]))
@@ -185,7 +185,7 @@ def _fit_capsule(points: Array) -> Capsule:
 
 
 def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, float, float, Array, Array]:
-    """Return the capsule around points for given parameters: volume, radius, ends along the axis, axis, axis point.
+    """Return the capsule around points that parameters describe: volume, radius, ends, axis, and a point of the axis.
 
     The parameters, shape (5,), are two slopes of the axis (near z), its position across, and the root of the excess
     radius. A radius larger than the enclosing cylinder's lets the caps begin earlier.
@@ -207,7 +207,7 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
 
 
 def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Array]:
-    """Return approximate volume, axis position and relative excess radius of capsules around points along k axes."""
+    """Return approximate capsules around points along k axes: volumes, axis positions and relative excess radii."""
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
     rows = np.arange(len(bases))
@@ -227,7 +227,7 @@ def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Ar
 
 
 def _approximate_capsule(points: Array, bases: Array) -> Capsule:
-    """Return the smallest approximate capsule around points along one of the last axes of k bases (k, 3, 3)."""
+    """Return the smallest approximate capsule around points whose axis is the last axis of one of k given bases."""
     volumes, centres, excess = _approximate_capsules(points, bases)
     k = int(volumes.argmin())
     return _capsule_from_parameters(points, np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])]), bases[k])
@@ -239,7 +239,7 @@ def _capsule_from_parameters(points: Array, parameters: Array, basis: Array) -> 
 
 
 def _enclosing_capsule(capsule: Capsule, points: Array) -> Capsule:
-    """Return the capsule with its radius increased so that it certainly contains every given point."""
+    """Return the capsule with its radius increased until it certainly contains every given point."""
     start, end = np.asarray(capsule.start), np.asarray(capsule.end)
     radius = max(capsule.radius, float(_segment_distances(points, start, end).max())) + SETTINGS.growth
     return Capsule(radius, start, end)
@@ -312,7 +312,7 @@ def _covered_share(shapes: Sequence[CoverShape], grid: Array) -> float:
 
 
 def _representative_triangles(triangles: Array, frame: Array) -> Array:
-    """Return the triangles; if there are many, only the largest ones, and extreme vertices as degenerate triangles."""
+    """Return all triangles or, of many, the largest triangles and extreme vertices as degenerate triangles."""
     if len(triangles) <= SETTINGS.max_triangles:
         return triangles
     length = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
@@ -322,7 +322,7 @@ def _representative_triangles(triangles: Array, frame: Array) -> Array:
 
 
 def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array, Array]:
-    """Split triangles at the plane axis . x = level; return those below and those above it. Shapes (m, 3, 3)."""
+    """Split triangles, shape (m, 3, 3), at the plane axis . x = level; return the lower and the upper triangles."""
     heights = triangles @ axis - level
     below = heights <= 0
     count = below.sum(axis=1)
@@ -380,7 +380,7 @@ def _fit_box(points: Array, extreme_points: Array) -> Box:
 
 
 def _enclosing_box(box: Box, points: Array) -> Box:
-    """Return the box with its edges lengthened so that it certainly contains every given point."""
+    """Return the box with its edges lengthened until it certainly contains every given point."""
     return Box(
         box.size + 2 * max(0.0, float(exceedance(box, points).max())) + 2 * SETTINGS.growth, box.position, box.rotation
     )
@@ -403,7 +403,7 @@ def _overhang(shape: CoverShape, hull: Array) -> float:
 
 
 def _hull_vertices(points: Array) -> Array:
-    """Return vertices of the convex hull; of a large mesh, only extreme ones, which overestimates overhangs."""
+    """Return the vertices of the convex hull; of a large mesh, only extreme points, which overestimates overhangs."""
     if len(points) > SETTINGS.max_triangles:
         points = points[_extreme_indices(points, _principal_axes(points), 2 * SETTINGS.extremes)]
     try:
@@ -425,7 +425,7 @@ def _centre_and_size(points: Array) -> tuple[Array, float]:
 
 
 def _principal_axes(points: Array) -> Array:
-    """Return the principal axes of points, longest extent first, as columns of a rotation."""
+    """Return the principal axes of points as columns of a rotation matrix, the axis of largest variance first."""
     centred = points - points.mean(axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)
     axes = axes[:, ::-1]
@@ -452,7 +452,7 @@ def _sphere_points(count: int, half: bool = False) -> Array:
 
 
 def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes) -> Any:
-    """Return the indices of points that are extreme in one of `count` directions; `count` is a multiple of 32."""
+    """Return the indices of points that are extreme in one of `count` directions, where `count` is a multiple of 32."""
     if len(points) <= count:
         return np.arange(len(points))
     directions = np.split(_sphere_points(count) @ frame.T, count // 32)  # in blocks, which bounds the memory
@@ -460,7 +460,7 @@ def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes
 
 
 def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:
-    """Return a shape of the normalised mesh converted to the mesh's units, enlarged by a bound of rounding errors."""
+    """Return a shape of the normalised mesh in the mesh's units, enlarged by a bound of the rounding errors."""
     margin = 16 * float(np.finfo(float).eps * (np.abs(middle).max() + size))
     if isinstance(shape, Capsule):
         return Capsule(shape.radius * size + margin, middle + size * shape.start, middle + size * shape.end)
@@ -474,7 +474,7 @@ def _to_json(each: Cover) -> dict[str, Any]:
 
 
 def _from_json(value: Any, points: Array) -> tuple[Cover, ...] | None:
-    """Return covers read from the cache, or None if they are invalid or do not contain all points of the mesh."""
+    """Return the covers read from a cache entry, or None if they are invalid or miss a point of the mesh."""
     if not isinstance(value, list) or not 0 < len(value) <= SETTINGS.parts:
         return None
     try:

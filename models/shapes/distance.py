@@ -63,9 +63,9 @@ class PlaneCore(NamedTuple):
 Core: TypeAlias = SegmentCore | BoxCore | HullCore | PlaneCore
 
 COLUMNS: dict[type[Shape], int] = {Sphere: 4, Capsule: 7, Box: 15, HalfSpace: 6}
-"""Number of entries of the vector that describes a shape (see `column`), by kind of shape."""
+"""Number of entries of the column that describes a shape (see `column`), by kind of shape."""
 VECTORS: dict[type[Shape], tuple[int, int]] = {Sphere: (1, 0), Capsule: (2, 0), Box: (1, 3), HalfSpace: (1, 1)}
-"""Numbers of points and of directions with which the vector that describes a shape begins, by kind of shape."""
+"""Numbers of points and of directions at the beginning of the column that describes a shape, by kind of shape."""
 
 
 def distance(
@@ -118,7 +118,7 @@ def distance(
 
 
 def column(shape: Shape, frame: Frame | None = None) -> Expression:
-    """Return a sphere, capsule, box or half-space in world as a column of numbers or expressions, for `pair_function`.
+    """Return a sphere, capsule, box or half-space in the world as the column of numbers that `pair_function` takes.
 
     Sphere: position, radius. Capsule: start, end, radius. Box: position, its three axes, half of its edges. Half-space:
     point, normal. Shapes (4, 1), (7, 1), (15, 1), (6, 1).
@@ -141,7 +141,7 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
 
 
 def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0) -> Any:
-    """Return the CasADi Function from the columns of two shapes (see `column`) to their `distance`, for given kinds.
+    """Return the CasADi Function that computes the `distance` of two shapes of given kinds from their `column`s.
 
     `pair_function(Capsule, Box).map(n)` evaluates n pairs, side by side as columns. One small function that is called
     often evaluates and compiles several times faster than one graph of all pairs.
@@ -158,13 +158,13 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
 
 
 def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, count: int) -> Any:
-    """Return the CasADi Function from the columns of n pairs of shapes to their distances and gradients (wrenches).
+    """Return the CasADi Function that computes the distances of n pairs of shapes, and their gradients as wrenches.
 
-    Pairs are rows: columns have shapes (n, COLUMNS[kind]), distances (n, 1), m, and wrenches (n, 6). A wrench w is
-    (moment about the world's origin, force); the distance changes at the rate w . (first twist - second twist), with
-    twists (angular, linear at the world's origin). The closest points slide along the shapes without changing the
-    distance, so only the positions of the shapes are differentiated (envelope theorem). All pairs are evaluated by
-    vectorised operations, several times faster in an interpreter than one pair after the other.
+    Pairs are rows of the inputs: columns (see `column`) have shapes (n, COLUMNS[kind]), distances (n, 1), m, and
+    wrenches (n, 6). A wrench w is (moment about the world's origin, force); the distance changes at the rate w . (first
+    twist - second twist), with twists (angular, linear at the world's origin). The closest points slide along the
+    shapes without changing the distance, so only the positions of the shapes are differentiated (envelope theorem). All
+    pairs are evaluated by vectorised operations, several times faster in an interpreter than one pair after the other.
 
     Args:
         first, second, rounding: As for `pair_function`.
@@ -207,7 +207,7 @@ def _pair_wrenches(kinds: tuple[Any, Any], rounding: float, count: int) -> Any:
 
 
 class StoppedGradients:
-    """Values that differentiation treats as constants, because symbols replace them until they are restored.
+    """Expressions that differentiation treats as constants, because symbols replace them until they are restored.
 
     A distance is a minimum over positions or a maximum over directions, whose motion does not change it to first order
     (envelope theorem).
@@ -295,7 +295,7 @@ def _distance_of_columns(
 
 @on_scalars
 def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, rounding: float) -> Expression:
-    """Return the signed distance of two shapes, one a mesh or a cylinder. `poses`: rotation, position of each."""
+    """Return the signed distance of two shapes, one a mesh or cylinder; `poses` are their rotations and positions."""
     one, other = _core_in_frame(first, *poses[:2]), _core_in_frame(second, *poses[2:])
     if isinstance(one, PlaneCore):
         gap = _least_height(other, one.normal, one.point, rounding)
@@ -315,7 +315,7 @@ def _core_in_frame(shape: Shape, turn: Expression, place: Expression) -> Core:
 
 
 def _core_of_column(kind: type[Shape], entries: Sequence[Expression]) -> Core:
-    """Return the core of a shape of the given kind from its column of numbers."""
+    """Return the core of a shape of the given kind from the column that describes it."""
     parts = [triple(entries[3 * k : 3 * k + 3]) for k in range(len(entries) // 3)]
     if kind is Box:
         return BoxCore(parts[0], tuple(parts[1:4]), parts[4])
@@ -327,7 +327,7 @@ def _scalars(vector: Expression) -> Triple:
 
 
 def _as_number(entry: Expression) -> Expression:
-    """Return a scalar, as a float if it is a constant expression."""
+    """Return a scalar expression, converted to a float if it is constant."""
     return float(entry) if entry.is_constant() else entry
 
 
@@ -335,7 +335,7 @@ def _as_number(entry: Expression) -> Expression:
 
 
 def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) -> Expression:
-    """Return the least height of a core above a plane, or a smooth lower bound of it within `rounding`."""
+    """Return the least height of a core above a plane, or a lower bound smoothed with the width `rounding`."""
     if isinstance(core, SegmentCore):
         heights = [dot(normal, subtract(end, point)) for end in core.points]
         middle, reaches = sum(heights) / len(heights), [(heights[-1] - heights[0]) / 2][: len(heights) - 1]
@@ -350,7 +350,7 @@ def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) ->
 
 
 def _smooth_minimum(values: Sequence[Expression], rounding: float) -> Expression:
-    """Return the smallest of several values, or a smooth lower bound of it within `rounding`."""
+    """Return the smallest of several values, or a smooth lower bound that is at most `rounding` smaller."""
     if rounding == 0 or len(values) == 1:
         return reduce(ca.fmin, values)
     return soft_minimum(values, rounding / log(len(values)))
@@ -372,10 +372,10 @@ def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
 
 
 def _edge_directions(hull: Hull) -> Array:
-    """Return the bisectors of normals of faces that meet, if all these normals differ by more than pi/4. Shape (k, 3).
+    """Return the bisectors of the normals of faces that meet at a sharp edge or corner of a hull. Shape (k, 3).
 
-    Beyond an edge whose faces' normals differ by an angle a, the normals alone see at most cos(a/2) of a distance, 92 %
-    at pi/4.
+    All normals at a sharp edge or corner differ by more than pi/4. Beyond an edge whose faces' normals differ by an
+    angle a, the normals alone see at most cos(a/2) of a distance, 92 % at pi/4.
     """
     a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
     face = (np.cross(b - a, c - a) @ hull.normals.T).argmax(axis=1)

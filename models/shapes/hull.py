@@ -24,9 +24,9 @@ __all__ = ["gap_along", "is_box", "nearest_directions"]
 
 
 GAP_TOLERANCE = 1e-12
-"""Relative difference between a distance and its lower bound, the gap, below which the search has converged."""
+"""Relative difference between a distance and its lower bound, the gap, at which the distance search ends."""
 DEGENERATE = 1e-14
-"""Squared area or volume, relative to the squared edges, below which a triangle or tetrahedron is degenerate."""
+"""Squared area or volume, relative to squared edge lengths, below which a triangle or tetrahedron is degenerate."""
 EDGE_I, EDGE_J = np.triu_indices(3, 1)
 
 
@@ -103,7 +103,7 @@ def _convex_hull(points: Array) -> Hull:
 
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of the distinct normals, and for each normal its index among these. Shapes (f,), (k,)."""
+    """Return the indices of distinct normals, and which of these each normal equals. Shapes (f,), (k,)."""
     close_pairs = scipy.spatial.cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
     links = scipy.sparse.coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
     _, same = scipy.sparse.csgraph.connected_components(links, directed=False)
@@ -113,7 +113,7 @@ def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def gap_along(direction: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the gaps of K pairs of hulls along unit vectors that point from the first hull to the second.
+    """Return the gaps between K pairs of hulls along unit vectors that point from the first hull to the second.
 
     Args:
         direction: Shape (K, 3).
@@ -127,7 +127,7 @@ def gap_along(direction: np.ndarray, first: np.ndarray, second: np.ndarray) -> n
 
 
 def is_box(points: np.ndarray) -> bool:
-    """Return whether points (m, 3) are the 8 corners of a box, in the order of `Box.core`."""
+    """Return whether points, shape (m, 3), are the 8 corners of a box in the order of `Box.core`."""
     if len(points) != 8:
         return False
     edges = points[[4, 2, 1]] - points[0]
@@ -181,9 +181,9 @@ def nearest_directions(
 
 
 def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of K pairs of segments (K, 2, 3), and the vectors between them. Shape (K, 3) each.
+    """Return the closest points of K pairs of segments, and the vectors between these points. Shape (K, 3) each.
 
-    Source: Ericson, Real-Time Collision Detection, 2005, 5.1.9.
+    Segments have shape (K, 2, 3). Source: Ericson, Real-Time Collision Detection, 2005, 5.1.9.
     """
     u, v, w = first[:, 1] - first[:, 0], second[:, 1] - second[:, 0], first[:, 0] - second[:, 0]
     a, e, b = (u * u).sum(axis=1), (v * v).sum(axis=1), (u * v).sum(axis=1)
@@ -199,11 +199,12 @@ def _between_segments(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray
 
 
 def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of segments (K, 2, 3) and boxes, given by corners (K, 8, 3), like `_between_segments`.
+    """Return the closest points of K pairs of a segment and a box, and the vectors between these points. Shape (K, 3)
+    each.
 
-    Half the derivative of the squared distance in the position s along the segment is increasing and piecewise linear.
-    It has its kinks where the segment enters or leaves a slab of the box. It is evaluated at the kinks, between two of
-    which its root is interpolated.
+    Segments have shape (K, 2, 3), corners of boxes (K, 8, 3). Half the derivative of the squared distance in the
+    position s along the segment is increasing and piecewise linear. It has its kinks where the segment enters or leaves
+    a slab of the box. It is evaluated at the kinks, between two of which its root is interpolated.
     """
     centre = (box[:, 0] + box[:, 7]) / 2
     axes = box[:, [4, 2, 1]] - box[:, :1]
@@ -229,7 +230,7 @@ def _segment_beside_box(rod: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _point_beside_box(point: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of points (K, 1, 3) and boxes (K, 8, 3) or other points, like `_between_segments`."""
+    """Return the closest points of K pairs of a point and a box (or a second point), and the vectors between them."""
     on_point = point[:, 0]
     if box.shape[1] == 1:
         return on_point, box[:, 0], box[:, 0] - on_point
@@ -243,7 +244,7 @@ def _point_beside_box(point: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the closest points of hulls (K, m, 3) and (K, l, 3) by the GJK algorithm, like `_between_segments`."""
+    """Return the closest points of K pairs of hulls, and the vectors between these points, by the GJK algorithm."""
     on_first, on_second = first[:, 0].astype(float), second[:, 0].astype(float)
     active = np.arange(len(first))
     a, b = np.repeat(on_first[:, None], 4, axis=1), np.repeat(on_second[:, None], 4, axis=1)
@@ -282,7 +283,7 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the barycentric weights of the point of a simplex nearest to the origin, and the point itself.
+    """Return, for each simplex, the barycentric weights of the point nearest to the origin, and this point.
 
     Shape (K, 4, 3) to (K, 4) and (K, 3). The vertices may coincide. Only faces that contain the last vertex are tried.
     """
@@ -325,7 +326,7 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _least_overlap(first: np.ndarray, second: np.ndarray, boxes: tuple[bool, bool]) -> np.ndarray:
-    """Return the unit vectors (K, 3), from first to second hull, along which overlapping hulls overlap least.
+    """Return unit vectors from the first hull to the second along which overlapping hulls overlap least. Shape (K, 3).
 
     Candidates are the line between the centroids, the edges of both hulls, their cross products and the coordinate
     axes. The edges of a hull are those from its first point to the next three; of a box, those from its first corner.

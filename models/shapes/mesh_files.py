@@ -36,7 +36,7 @@ __all__ = ["read_collada"]
 Faces: TypeAlias = NDArray[np.intp]
 
 STL_HEADER_BYTES = 84
-"""Bytes before the first record of a binary STL file."""
+"""Number of bytes before the first record of a binary STL file."""
 STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -60,7 +60,7 @@ def without_colors(vertices: Array, faces: Faces) -> Triangles:
 
 
 def join_meshes(parts: Sequence[Triangles]) -> Triangles:
-    """Return several triangle meshes joined to one."""
+    """Join several triangle meshes into one mesh."""
     if not parts:
         return without_colors(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp))
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -70,20 +70,20 @@ def join_meshes(parts: Sequence[Triangles]) -> Triangles:
 
 
 def mesh_error(file: Path, what: str, value: object = None, limit: object = None) -> ModelError:
-    """Return the ModelError about a fault, `what`, of a mesh file."""
+    """Return the ModelError about a mesh file; `what` describes the fault."""
     bound = f", limit {limit}" if isinstance(limit, int) else ""
     return ModelError(f"mesh {str(file)!r}: {what}{bound}", name=str(file), value=value, limit=limit)
 
 
 def numbered_lines(file: Path, data: bytes) -> Iterator[tuple[int, str]]:
-    """Return an iterator over (line number from 1, line) of a text file; raise a ModelError if it is too long."""
+    """Return an iterator over (number from 1, line) of a text file; raise a ModelError if the file is too long."""
     if len(data) > INPUT_LIMITS.mesh_text_bytes:
         raise mesh_error(file, f"it has {len(data)} bytes of text", len(data), INPUT_LIMITS.mesh_text_bytes)
     return enumerate(TextIOWrapper(BytesIO(data), "utf-8", errors="replace"), start=1)
 
 
 def parse_numbers(file: Path, words: Sequence[str], line: int) -> list[float]:
-    """Return words as numbers; raise a ModelError that names the line if one is no number."""
+    """Convert words of a line to numbers; raise a ModelError, which names the line, if a word is no number."""
     values = []
     for word in words:
         try:
@@ -96,7 +96,7 @@ def parse_numbers(file: Path, words: Sequence[str], line: int) -> list[float]:
 def find_mesh(
     file: str, folder: str | os.PathLike[str] | None, folders: Sequence[str | os.PathLike[str]] = ()
 ) -> Path | None:
-    """Return the path of a mesh file that a URDF names, or None if it is not found.
+    """Return the path of a mesh file that a URDF names, or None if there is no such file.
 
     A name is a relative or absolute path, file://PATH, or package://NAME/REST. A package is searched in `folders`, then
     in the URDF file's folder and its parents, last in installed packages: those of ROS by ROS_PACKAGE_PATH and
@@ -149,7 +149,7 @@ def _is_file(path: Path) -> bool:
 
 
 def read_mesh(path: str | os.PathLike[str]) -> tuple[Array, Faces]:
-    """Return vertices and triangles of a mesh file, as `read_painted_mesh` reads it.
+    """Return the vertices and triangles of a mesh file, without the colours that `read_painted_mesh` reads.
 
     Returns:
         Vertices, all finite and referenced, shape (n, 3), m; triangles as indices of vertices, shape (m, 3).
@@ -159,7 +159,7 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[Array, Faces]:
 
 
 def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
-    """Return vertices, triangles and colours of a mesh file, in the file's axes.
+    """Return vertices, triangles and colours of a mesh file; coordinates are in the axes of the file.
 
     The suffix tells the format: .stl, .obj or .dae. Collada's <unit> is applied, so that lengths are in m. Its
     <up_axis> is ignored, as by RViz, MoveIt and other readers of URDF, for which robots' files are made. Polygons
@@ -204,7 +204,7 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
 
 
 def _read_stl(file: Path, data: bytes) -> Triangles:
-    """Read a binary or text STL file. The number of triangles decides, as both kinds may begin with "solid"."""
+    """Read a binary or text STL file, told apart by the size of the file, since both kinds may begin with "solid"."""
     count = (
         int.from_bytes(data[STL_HEADER_BYTES - 4 : STL_HEADER_BYTES], "little") if len(data) >= STL_HEADER_BYTES else -1
     )
@@ -248,7 +248,7 @@ def _read_stl_text(file: Path, data: bytes) -> Triangles:
 
 
 def _merge_vertices(corners: Array) -> Triangles:
-    """Return the mesh of triangles given by three rows of `corners` each, with coincident corners merged."""
+    """Return a triangle mesh, given three rows of `corners` for each triangle; coincident corners are merged."""
     vertices, faces = np.unique(corners, axis=0, return_inverse=True)
     return without_colors(vertices, faces.reshape(-1, 3).astype(np.intp))
 
@@ -292,7 +292,7 @@ def _read_obj(file: Path, data: bytes) -> Triangles:
 
 
 def _material_colors(file: Path, name: str) -> Iterator[tuple[str, Array]]:
-    """Yield the names and diffuse colours in the material library of an OBJ file; none if it cannot be read."""
+    """Yield names and diffuse colours of the materials in an OBJ file's library, or nothing if it is unreadable."""
     try:
         data = read_regular(file.parent / name, INPUT_LIMITS.mesh_text_bytes)
     except (OSError, ValueError):
@@ -310,7 +310,7 @@ def _material_colors(file: Path, name: str) -> Iterator[tuple[str, Array]]:
 
 
 def _vertex_index(file: Path, entry: str, count: int, line: int) -> int:
-    """Return the vertex index, from zero, of a face corner in an OBJ file: "v", "v/vt" or "v/vt/vn".
+    """Return the vertex index, from zero, of a face corner that an OBJ file states as "v", "v/vt" or "v/vt/vn".
 
     The number v counts from one, or backwards from the last vertex if negative.
     """
@@ -325,7 +325,7 @@ def _vertex_index(file: Path, entry: str, count: int, line: int) -> int:
 
 
 def read_collada(file: Path, data: bytes) -> Triangles:
-    """Return the triangles of the scene of a Collada file, or of all its geometries if it has no scene.
+    """Return the triangles of a Collada file's scene, or of all geometries if the file has no scene.
 
     Raises:
         ModelError: pycollada is not installed, the file is no Collada document or too large, or it contains elements
@@ -375,7 +375,7 @@ def read_collada(file: Path, data: bytes) -> Triangles:
 
 
 def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
-    """Return a Collada document reduced to the elements that pycollada may read, and its unit of length, m.
+    """Return a Collada document reduced to elements that pycollada may read, and the document's unit of length, m.
 
     Instances of nodes are replaced by the nodes, and effects are reduced to a colour. Elements that pycollada would
     misinterpret are refused.
@@ -401,7 +401,7 @@ def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
 
 
 def _check_numbers(file: Path, root: ElementTree.Element) -> None:
-    """Reject elements that pycollada reads in part or misinterprets; normalise the axes of rotations."""
+    """Reject elements that pycollada reads only in part or misinterprets; normalise the axes of rotations."""
     for part in root.iter():
         several = part.tag in ("triangles", "polylist") and len(part.findall("p")) > 1
         if several or part.tag in ("lookat", "skew", "ph"):
@@ -431,7 +431,7 @@ def _check_numbers(file: Path, root: ElementTree.Element) -> None:
 
 
 def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
-    """Replace instances of nodes by the nodes; limit their number, because nested instances multiply it."""
+    """Replace instances of nodes by the nodes; limit the number of nodes, because nested instances multiply it."""
     nodes = {each.get("id"): each for each in root.iter("node")}
     counts: dict[ElementTree.Element, int] = {}
 

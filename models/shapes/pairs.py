@@ -24,13 +24,13 @@ from models.shapes.shapes import Box, Shape
 
 
 class Reason(StrEnum):
-    """Reason why a pair of bodies is not checked."""
+    """Reason why a pair of bodies is not checked for collision."""
 
     NEIGHBOURS = "adjacent links"
     RIGID = "same rigid part"
     ALWAYS = "always in collision"
     COVERED = "always in collision, perhaps only in their covers"
-    """The covers of two meshes overlap in every sample, but in some by no more than they protrude from the meshes."""
+    """Two meshes' covers overlap in all samples, but in some by no more than the covers protrude from the meshes."""
     NEVER = "never in collision"
     SRDF = "the SRDF file"
     IGNORED = "ignored by request"
@@ -39,9 +39,9 @@ class Reason(StrEnum):
 
 NEIGHBOURS, RIGID, ALWAYS, COVERED, NEVER, SRDF, IGNORED, IMMOBILE = Reason
 ASSUMED = (ALWAYS, COVERED)
-"""Reasons assumed without a proof: the bodies collide in each of many random configurations."""
+"""Reasons that are assumed without proof, because the bodies collide in each of many random configurations."""
 MARGIN_M = 1e-6
-"""Margin above the rounding errors of a proof that two bodies stay apart, m."""
+"""Distance beyond the clearance that a proof of separation must show, m; it is larger than rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def checked_pairs(
     seed: int = 0,
     samples: int = 1000,
 ) -> Pairs:
-    """Return the pairs of a robot's bodies that collide in some configuration but not in all.
+    """Return the pairs of a robot's bodies that may collide in some configuration but do not collide in all.
 
     Not checked are:
 
@@ -208,7 +208,7 @@ def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
 
 
 def _disabled_pairs(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[str]]:
-    """Return the pairs of links that an SRDF file disables (<disable_collisions>), except those of unknown links."""
+    """Return the pairs of links whose collision check an SRDF file disables, except pairs with unknown links."""
     known = {link.name for link in robot.links}
     elements = parse_urdf(source).findall("disable_collisions")
     pairs = [frozenset(text_of(each, key, "SRDF") for key in ("link1", "link2")) for each in elements]
@@ -248,14 +248,14 @@ class _Lever(NamedTuple):
     arm: float
 
     def moved(self, half: Array) -> Array:
-        """Return the largest change of the bodies' distance when the entry changes by at most `half`, rad or m."""
+        """Return the largest change of the bodies' distance for a joint displacement of up to `half`, rad or m."""
         turned = np.minimum(abs(self.ratio) * half, np.pi)
         return np.asarray(2 * self.arm * np.sin(turned / 2) if self.arm else abs(self.ratio) * half)
 
 
 @dataclass(frozen=True)
 class _PairClassifier:
-    """Classifier of the pairs of bodies that need no collision check, by random configurations and then by proofs."""
+    """Classifier that decides, by random configurations and then by proofs, which pairs of bodies need no check."""
 
     robot: Robot
     parts: RigidParts
@@ -268,10 +268,11 @@ class _PairClassifier:
     _poses: dict[str, Poses] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why a pair need not be checked, None if it must; and whether its covers always collide, its hulls not.
+        """Return why a pair need not be checked for collision, None if it must be checked.
 
-        Covers of meshes protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are
-        therefore classified by the convex hulls of meshes.
+        The second result tells whether the covers of the pair always collide but the hulls do not. Covers of meshes
+        protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are therefore classified
+        by the convex hulls of meshes.
         """
         pair = self._pair(first.link, first.shape, second.link, second.shape)
         overhang = first.overhang + second.overhang
@@ -308,7 +309,7 @@ class _PairClassifier:
         return self._placed[key]
 
     def _pose(self, part: str) -> Poses:
-        """Return the pose of a rigid part relative to the root link for each of the first random configurations."""
+        """Return a rigid part's poses relative to the root link in the random configurations tried before a proof."""
         if part not in self._poses:
             q = self.configurations[: SETTINGS.first_configurations]
             step = self.parts.step.get(part)
@@ -318,7 +319,7 @@ class _PairClassifier:
 
 
 class _PlacedBody:
-    """A body in the frame of its rigid part, and a ball around it, given by its centre and radius."""
+    """A body in the frame of its rigid part, with centre and radius of a bounding ball."""
 
     def __init__(self, shape: Shape) -> None:
         self.shape, core = shape, shape.core
@@ -328,7 +329,7 @@ class _PlacedBody:
 
 @dataclass(frozen=True)
 class _BodyPair:
-    """Two bodies, the joints between their rigid parts, and their relative poses at random configurations."""
+    """Two bodies, the joints between their rigid parts, and the parts' relative poses at random configurations."""
 
     robot: Robot
     first: _PlacedBody
@@ -338,7 +339,7 @@ class _BodyPair:
     start: Poses = (np.eye(3)[None], np.zeros((1, 3)))
 
     def classify(self, low: Array, high: Array, configurations: Array, margin: float, overhang: float) -> Reason | None:
-        """Return why the bodies need not be checked: ALWAYS, COVERED or NEVER in collision; None if they must be."""
+        """Return why the bodies need no collision check (ALWAYS, COVERED or NEVER), or None if they need one."""
         colliding = self.bounds_at(self.start)[0] <= 0
         if colliding.all():
             largest = float(self.distance_bounds(*self._relative(configurations)).max())
@@ -347,7 +348,7 @@ class _BodyPair:
         return None if colliding.any() or not self._proves_apart(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
-        """Classify two hulls on a grid of joint positions: NEVER if they are apart at all points of all refined grids.
+        """Return NEVER if two hulls are apart at all points of successively refined grids of joint positions.
 
         Returns ALWAYS for hulls that overlap on the whole first grid, else None.
         """
@@ -373,14 +374,14 @@ class _BodyPair:
         return None if (self.bounds(configurations)[0] > 0).any() else ALWAYS
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds of the distance at joint vectors (k, dof), and where bounding balls did not suffice.
+        """Return lower bounds of the distance at given joint vectors, and where bounding balls did not suffice.
 
-        Bounding balls suffice where they prove a distance greater than `above`, m.
+        Joint vectors have shape (k, dof). Bounding balls suffice where they prove a distance greater than `above`, m.
         """
         return self.bounds_at(self._relative(q), above)
 
     def bounds_at(self, poses: Poses, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return distance bounds as `bounds` does, for given relative poses of the two rigid parts."""
+        """Return lower bounds of the distance for given relative poses of the two rigid parts, as `bounds` does."""
         (turn, shift), first, second = poses, self.first, self.second
         bounds = np.linalg.norm(shift + turn @ second.centre - first.centre, axis=1) - first.radius - second.radius
         close: NDArray[np.bool_] = np.asarray(bounds <= above + MARGIN_M)
@@ -389,7 +390,7 @@ class _BodyPair:
         return bounds, close
 
     def distance_bounds(self, turn: Array, shift: Array) -> Array:
-        """Return lower bounds of the distance for given poses of the second body, exact where the search converged."""
+        """Return lower bounds of the distance for given poses of the second body, exact if the search has converged."""
         shapes = self.first.shape, self.second.shape
         first, second = (np.repeat(each.core, 2, axis=0) if len(each.core) == 1 else each.core for each in shapes)
         first, second = (
@@ -400,7 +401,7 @@ class _BodyPair:
         return gap_along(direction, first, second) - (shapes[0].swept_radius + shapes[1].swept_radius)
 
     def _relative(self, q: Array) -> Poses:
-        """Return the poses of the second body's rigid part in that of the first, at joint vectors (k, dof)."""
+        """Return the poses of the second body's part relative to the first body's part at joint vectors (k, dof)."""
         first = second = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
         for step in self.up[::-1]:
             first = _poses_behind(self.robot, first, step, q)

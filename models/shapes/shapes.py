@@ -43,7 +43,7 @@ class _SweptCore:
         return 0.0
 
     def reach(self, point: ArrayInput) -> float:
-        """Return the largest distance of the shape's points from a point. Shape (3,), m; inf if it is unbounded."""
+        """Return the largest distance of the shape's points from a given point (3,), m; inf for an unbounded shape."""
         centre = require.array("shape: point", point, (3,))
         return float(np.linalg.norm(self.core - centre, axis=1).max()) + self.swept_radius
 
@@ -52,7 +52,7 @@ class _Posed(_SweptCore):
     """Base class of shapes with a position and a rotation of their own."""
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
-        """Return the shape in another frame, given the pose of its present frame there: (3, 3) and (3,), m."""
+        """Return the shape in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
         turn, shift = _motion(rotation, translation)
         own: Any = copy(self)  # shares the hull, which is costly to compute
         object.__setattr__(own, "position", freeze(turn @ own.position + shift))
@@ -90,7 +90,7 @@ class Sphere(_SweptCore):
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Sphere:
-        """Return the sphere in another frame, given the pose of its present frame there: (3, 3) and (3,), m."""
+        """Return the sphere in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
         turn, shift = _motion(rotation, translation)
         return Sphere(self.radius, turn @ self.position + shift)
 
@@ -130,7 +130,7 @@ class Capsule(_SweptCore):
         return self.radius
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Capsule:
-        """Return the capsule in another frame, given the pose of its present frame there: (3, 3) and (3,), m."""
+        """Return the capsule in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
         turn, shift = _motion(rotation, translation)
         return Capsule(self.radius, turn @ self.start + shift, turn @ self.end + shift)
 
@@ -217,7 +217,7 @@ class Box(_Posed):
         return np.asarray(self.position + (CORNERS * size / 2) @ self.rotation.T)
 
     def reach(self, point: ArrayInput) -> float:
-        """Return the largest distance of the box's points from a point. Shape (3,), m; inf for an infinite box."""
+        """Return the largest distance of the box's points from a given point (3,), m; inf for an infinite box."""
         return super().reach(point) if np.isfinite(self.size).all() else np.inf
 
 
@@ -250,7 +250,7 @@ class HalfSpace(_SweptCore):
         return np.array([self.point])
 
     def placed(self, rotation: ArrayInput, translation: ArrayInput) -> HalfSpace:
-        """Return the half-space in another frame, given the pose of its present frame there: (3, 3) and (3,), m."""
+        """Return the half-space in a new frame, given the pose of its old frame in the new one: (3, 3) and (3,), m."""
         turn, shift = _motion(rotation, translation)
         return HalfSpace(turn @ self.normal, turn @ self.point + shift)
 
@@ -408,7 +408,7 @@ class MovingObstacle:
             require.rotation("moving: rotation", turn)
 
     def frame(self, time: Expression) -> Frame:
-        """Return the frame of the shape in world at a time (s)."""
+        """Return the frame of the shape in the world at a time (s)."""
         return Frame(*self._at(time))
 
     def check(self, begin: float, end: float) -> None:

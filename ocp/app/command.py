@@ -1,4 +1,4 @@
-"""The command `selfmotion`: arguments, output and exit status.
+"""Command line of `selfmotion`: its arguments, its output and its exit status.
 
 The status is 0 if all requirements hold, 1 if a check fails or is undetermined or there is no plan, 2 for bad input,
 and 130 after Ctrl-C.
@@ -39,7 +39,7 @@ __all__ = ["main", "parser"]
 
 ABOUT = """Plan motions of kinematically redundant robot arms, and check joint trajectories from any source."""
 PART = re.compile(r"\.[0-9a-f]{8}\.part$")
-"""Suffix of a file's name while it is being written."""
+"""Pattern of the suffix that the name of a file has while the file is being written."""
 CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 EXAMPLES = """examples:
   selfmotion check robot.urdf motion.csv --acceleration 15 --obstacles cell.toml
@@ -50,7 +50,7 @@ EXAMPLES = """examples:
 Exit status: 0 all holds, 1 a check fails or is undetermined, or there is no plan, 2 bad input, 130 Ctrl-C.
 `selfmotion COMMAND --help` shows more examples."""
 CommandFunction: TypeAlias = Callable[[argparse.Namespace, Progress], tuple[int, str, Any]]
-"""Function that runs a subcommand: (options, progress) to (exit status, text to print, contents of the JSON output)."""
+"""Function that runs a subcommand: (options, progress) -> (exit status, text to print, contents of the JSON output)."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -124,12 +124,12 @@ def _report_error(options: argparse.Namespace, error: Exception, status: int) ->
 
 
 def _printable(text: str) -> str:
-    """Escape the control characters in a text, because it may quote files and a terminal would interpret them."""
+    """Escape the control characters in a text, which may quote files, because a terminal would interpret them."""
     return CONTROLS.sub(lambda match: repr(match[0])[1:-1], text)
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON can represent it: null for a number that is not finite, text for any other object."""
+    """Convert a value to what JSON can represent: null for a number that is not finite, text for any other object."""
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Functions that run the subcommands of `selfmotion`; each returns an exit status, a text and contents of JSON."""
+"""Functions that run the subcommands of `selfmotion`; each function returns exit status, text and JSON contents."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
 
 
 def machine_of(options: argparse.Namespace, robot: Robot, raw: RawTrajectory) -> tuple[Machine, list[str]]:
-    """Return the robot on its base as the options specify it, and notes about links assumed to be feet."""
+    """Return the machine (robot and base) that the options specify, and notes about links assumed to be feet."""
     if options.floating:
         return FreeFloating(robot, "planar" if set(PLANAR_BASE) <= set(raw.names) else "spatial"), []
     translation, rotation = base_pose(options)
@@ -170,7 +170,7 @@ def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
 
 
 def motions_of(options: argparse.Namespace) -> list[Any]:
-    """Return the motions in the files given to `selfmotion view`, that of the plan first."""
+    """Read the motions in the files given to `selfmotion view`; the motion of the plan comes first."""
     from ocp.app.view.animation import animate_plan, animate_solution, animate_trajectory
     from ocp.solution import Solution
 
@@ -230,7 +230,7 @@ def run_completion(options: argparse.Namespace, progress: Progress) -> tuple[int
 
 
 def read_robot(options: argparse.Namespace) -> Robot:
-    """Read the robot that the options describe, with locked joints and load."""
+    """Read the robot that the options name, lock its joints and attach its load as the options specify."""
     robot = Robot.from_urdf(options.robot, tip=options.tip)
     if options.lock:
         robot = lock_joints(robot, dict(options.lock))
@@ -240,7 +240,7 @@ def read_robot(options: argparse.Namespace) -> Robot:
 
 
 def base_pose(options: argparse.Namespace) -> tuple[Array, Array]:
-    """Return the base pose in world that the option --mount gives: translation (3,), m, and rotation matrix (3, 3)."""
+    """Return the base pose in world from the option --mount: translation (3,), m, and rotation matrix (3, 3)."""
     numbers = options.mount or [0.0] * 6
     return np.array(numbers[:3]), np.array(rotation_from_rpy(*numbers[3:]), dtype=float)
 
@@ -303,7 +303,7 @@ def run_task(
 
 
 def _segments(result: Plan) -> dict[str, Any]:
-    """Return the JSON entries of a plan's segments and of the reconfigurations between them; {} for other plans."""
+    """Return JSON entries for a plan's segments and the reconfigurations between segments; {} for other plans."""
     if not isinstance(result, SegmentedPlan):
         return {}
     names = ("time", "before", "after", "duration", "failure")
@@ -340,7 +340,7 @@ def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> N
 
 
 def check_period(plan: Plan, period: float) -> None:
-    """Raise ProblemError if a sampling period is not positive or gives too many samples."""
+    """Raise ProblemError if the sampling period of a plan is not positive or gives too many samples."""
     require.positive("period", period)
     count, most = plan.horizon / period, INPUT_LIMITS.count
     if count > most:
@@ -371,5 +371,5 @@ WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
     "urdf": lambda plan, file, period, title: write_text(file, plan.machine.robot.to_urdf()),
     "report": _report,
 }
-"""Writers of each kind of output; arguments are the plan, the file, the sampling period in s, and a title."""
+"""Functions that write each kind of output; arguments are the plan, the file, the sampling period in s, and a title."""
 EXPORT_KINDS = ("csv", "json", "yaml", "mcap", "urdf")

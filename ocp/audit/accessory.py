@@ -28,7 +28,7 @@ __all__ = ["AccessoryProblem", "end_conditions"]
 
 
 class AccessoryProblem:
-    """Linear-quadratic problem in the scaled variations of a plan: dynamics, Hamiltonian and active constraints.
+    """Linear-quadratic problem of the second variation of the cost: dynamics, Hamiltonian and active constraints.
 
     It is stated at the Gauss points. z = (state x, horizon T if free, start x0 if the end conditions contain it); the
     independent variable is the fraction s of the horizon.
@@ -61,7 +61,7 @@ class AccessoryProblem:
         self._switches()
 
     def _units(self) -> None:
-        """Choose scales that make the backward sweep well conditioned; they affect no verdict.
+        """Choose scales that make the backward sweep over the intervals well conditioned; the scales affect no verdict.
 
         Horizon and states are scaled by their sizes; states that hardly move by those of others of the same unit.
         Controls are scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature
@@ -83,14 +83,14 @@ class AccessoryProblem:
         self.unit = np.concatenate([state, horizon, *([state] if self.with_start else []), self.range])
 
     def _into_z(self) -> tuple[list[int], list[int]]:
-        """Return the indices of the states, controls and free horizon in (x, T, u), and their indices in (z, u)."""
+        """Return the indices of states, controls and free horizon in the stacked vectors (x, T, u) and (z, u)."""
         nx = self.nx
         keep = [*range(nx), *([nx] if self.free else [])]
         inputs = range(nx + 1, nx + 1 + self.nu)
         return [*keep, *inputs], [*range(len(keep)), *range(self.nz, self.nz + self.nu)]
 
     def _second_order(self) -> None:
-        """Compute the first and second derivatives of dynamics and Hamiltonian, in scaled variations."""
+        """Compute first and second derivatives of dynamics and Hamiltonian with respect to scaled variations."""
         along, form, m = self.along, self.along.form, len(self.along.s)
         lam, mu = form.sym("lam", form.nx), form.sym("mu", len(form.path))
         multipliers = np.zeros((m, len(form.path)))
@@ -126,7 +126,7 @@ class AccessoryProblem:
 
     @cached_property
     def residual_slope(self) -> np.ndarray:
-        """Residual gradient of T H in the scaled controls; 0 for controls in which H is linear. Shape (M, nu)."""
+        """Remaining gradient of horizon times Hamiltonian in scaled controls; 0 for linear controls. Shape (M, nu)."""
         along = self.along
         multipliers = self.adjoint.control_multipliers
         gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
@@ -134,14 +134,14 @@ class AccessoryProblem:
 
     @property
     def start_slope(self) -> np.ndarray:
-        """Gradient of the cost with respect to start state and horizon, in the scaled variables z. Shape (nz,)."""
+        """Gradient of the cost with respect to start state and horizon, in scaled variables. Shape (nz,)."""
         gradient, nx = self.adjoint.ends.slope, self.nx
         slope = np.concatenate([gradient[:nx], gradient[nx:] if self.free else [], np.zeros(nx * self.with_start)])
         return np.asarray(slope * self.unit[: self.nz])
 
     @property
     def hamiltonian_scale(self) -> float:
-        """Second-order change of the Hamiltonian, in units of cost, if variables change by characteristic sizes."""
+        """Second-order change of the Hamiltonian, in cost units, if variables change by their characteristic sizes."""
         unit = np.concatenate([self.along.sizes.state, [0.0], self.along.sizes.control])
         return float(self.along.share @ (np.abs(self._curves) @ unit**2)) / 2
 
@@ -157,11 +157,11 @@ class AccessoryProblem:
 
     @property
     def control_scale(self) -> float:
-        """Second-order change of the cost if every control changes by as much as its own value, in units of cost."""
+        """Second-order change of the cost if every control is doubled (changed by its own value), in units of cost."""
         return float(self.along.share @ np.sum(np.abs(self._curves[:, self.nx + 1 :]) * self.along.u**2, axis=1)) / 2
 
     def _constraints(self) -> None:
-        """Find the active limits: those with multipliers (strongly active) and those without (weakly active)."""
+        """Find the strongly active limits, which have multipliers, and the weakly active limits, which have none."""
         along, m = self.along, len(self.along.s)
         used, z_of = self._into_z()
         size = self.nz + self.nu
@@ -202,7 +202,7 @@ class AccessoryProblem:
         self.node_normals, self.node_strong = node * self.unit[: self.nz], on_arc & along.node_limits.near
 
     def _switches(self) -> None:
-        """Find the controls that switch between limits in an interval, and the second variation of shifted switches."""
+        """Find controls that switch between limits inside an interval, and the second variation if switches shift."""
         along, nu = self.along, self.nu
         n, q = along.shape
         self.moved, self.switching = np.zeros((n, nu), bool), np.zeros((n, nu))
@@ -234,7 +234,7 @@ def obstacle(form: Formulation) -> str:
 
 
 def curved_ends(form: Formulation) -> Any:
-    """Return the CasADi Function of the Hessians of the end and start constraints, weighted by their multipliers.
+    """Return the CasADi Function of the Hessians of end and start constraints, weighted by the multipliers.
 
     Its arguments are (x, x0, T, p, multipliers of the end rows, multipliers of the start rows); the Hessians are with
     respect to (x, T, x0).
@@ -249,7 +249,7 @@ def curved_ends(form: Formulation) -> Any:
 
 
 def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return Hessian and active rows of the end constraints of a plan, then those of its start constraints.
+    """Return Hessian and active rows of a plan's end constraints, and then the same of its start constraints.
 
     They refer to the scaled variations z. Inequalities are active if they have multipliers, state bounds if the plan
     rests on them.

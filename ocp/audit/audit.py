@@ -39,7 +39,7 @@ COST_LOST = "cost lost, relative"
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check of an audit: the deviation found and the largest allowed one.
+    """Result of one check of an audit: the deviation found and the largest allowed deviation.
 
     Attributes:
         name: What is checked.
@@ -61,7 +61,7 @@ class Finding:
 
     @property
     def passed(self) -> bool:
-        """Whether the value does not exceed the limit, if there is one; nan does not pass."""
+        """Whether the value does not exceed the limit, if there is a limit; nan does not pass."""
         return self.limit is None or bool(self.value <= self.limit)
 
 
@@ -133,7 +133,7 @@ class Audit:
 
     @property
     def sentence(self) -> str:
-        """Verdict of the audit in words, which follow "The plan" in a sentence."""
+        """Verdict of the audit in words that complete a sentence which begins with "The plan"."""
         if not self.feasible:
             worst = next(f for f in self.failures if f.verdict == "feasible")
             where = "" if worst.time is None else f" at {worst.time:.4g} s"
@@ -351,7 +351,7 @@ def integration_finding(motion: Reintegration, limit: float, is_unstable: bool) 
 
 
 def violation_finding(violation: Violation, constraints: float, tolerance: float | None) -> Finding:
-    """Return the finding about the largest violation of a constraint, relative to its size or to a `tolerance`."""
+    """Return the finding about the largest violation of a constraint, judged by its size or by a `tolerance`."""
     if tolerance is not None:
         return _worst(violation.label, violation.excess, violation.t, tolerance)
     k = int(np.argmax(violation.shares))

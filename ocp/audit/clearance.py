@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 MAX_PRINTED = 4
-"""Largest number of pairs of bodies left out by assumption that a text lists; `Clearance.assumed` contains all."""
+"""Largest number of pairs that a text lists as left out of the proof by assumption; `Clearance.assumed` has all."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class ClosestPair:
 
     @property
     def missed(self) -> float:
-        """Largest possible shortfall of the distance below the required one, m."""
+        """Largest possible shortfall of the distance below the required distance, m."""
         return max(self.required - self.least, 0.0)
 
     def __str__(self) -> str:
@@ -96,7 +96,7 @@ class ClosestPair:
 
 
 class Track(NamedTuple):
-    """Motion of the frames that carry the bodies, with bounds of its rates.
+    """Motion of the frames that carry the bodies, and bounds of the rates of the states that move the frames.
 
     Attributes:
         breaks: Ends of the N polynomial segments, as fractions of the horizon from 0 to 1. Shape (N + 1,).
@@ -141,7 +141,7 @@ class Clearance:
 
     @property
     def worst(self) -> ClosestPair | None:
-        """Pair with the smallest difference between its distance and the required one; None if there are no pairs."""
+        """Pair whose distance has the smallest margin over the required distance; None if there are no pairs."""
         return self.pairs[0] if self.pairs else None
 
     def __str__(self) -> str:
@@ -153,14 +153,14 @@ class Clearance:
 
     @property
     def _assumptions(self) -> list[str]:
-        """Description of the pairs left out by assumption, as a list with one text; empty if there are none."""
+        """List of one text about the pairs that are left out by assumption; an empty list if there are none."""
         first = [f"{pair} ({why})" for pair, why in list(self.assumed.items())[:MAX_PRINTED]]
         more = [f"{len(self.assumed) - MAX_PRINTED} more"] if len(self.assumed) > MAX_PRINTED else []
         return [f"left out by assumption: {', '.join([*first, *more])}"] if first else []
 
 
 def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.ndarray) -> Clearance:
-    """Compute a lower bound of the distance of each pair of bodies along a plan, valid at all times.
+    """Compute a lower bound, valid at all times, of the distance between the bodies of each pair along a plan.
 
     Args:
         form: Formulation of the problem.
@@ -172,7 +172,7 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
 
 
 def clearance_along(apart: Separation, track: Track | None, settings: ProofSettings = ProofSettings()) -> Clearance:
-    """Compute a lower bound of the distance of each pair of bodies for a given motion of their frames, at all times.
+    """Compute a lower bound, valid at all times, of the distance between the bodies of each pair on moving frames.
 
     ``track`` may be None if there are no pairs.
     """
@@ -204,7 +204,7 @@ def closest_pairs_along(
 def separation_frames(
     problem: Problem, solution: Solution, times: np.ndarray, suffix: str = ""
 ) -> list[tuple[Separation, Frames]]:
-    """Return each separation constraint of a problem with the poses of its body frames at times (K,), s.
+    """Return each separation constraint of a problem with the poses of its body frames at K times, s.
 
     Args:
         suffix: As in `closest_pairs_along`.
@@ -217,7 +217,7 @@ def separation_frames(
 
 
 def _tracks(problem: Problem, solution: Solution, suffix: str) -> list[tuple[Separation, Track]]:
-    """Return the separation constraints whose states have names with a suffix, each with the motion of its bodies.
+    """Return the separation constraints whose state names end with a suffix, each with the motion of its bodies.
 
     Those without pairs of bodies are left out.
     """
@@ -291,7 +291,7 @@ class _Search:
         return Clearance(self.apart.name, tuple(closest), settled, checked, reason, self.apart.assumed)
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
-        """Return why a prescribed motion prevents sufficient distance bounds on intervals, or "" if none does."""
+        """Return how a prescribed motion prevents sufficient distance bounds on intervals; "" if no motion does."""
         begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         if self.track.prescribed is None:
             return ""
@@ -310,7 +310,10 @@ class _Search:
         return self._closest(self.best)
 
     def _closest(self, bounds: np.ndarray) -> list[ClosestPair]:
-        """Return the closest approach found so far for each pair, with given lower bounds of its distance (n,), m."""
+        """Return, for each pair, the closest approach found so far, with a given lower bound of the distance.
+
+        ``bounds`` are the lower bounds, m. Shape (n,).
+        """
         rotations, positions = self.track.frames(self.when)
         each, frame = np.arange(len(self.apart)), self.apart.pairs[:, 2]
         points = np.einsum("nij,nkj->nki", rotations[each, frame], self.points) + positions[each, frame][:, None]
@@ -335,13 +338,13 @@ class _Search:
         self._evaluate(times[self.bodies.balls(frames, at, pair).reshape(n, -1).argmin(axis=1)])
 
     def _evaluate(self, when: np.ndarray) -> None:
-        """Compute the distance of each pair at a time of its own, given as a fraction of the horizon (n,)."""
+        """Compute the distance of each pair at a separate time, given as a fraction of the horizon in ``when`` (n,)."""
         pair = np.arange(len(self.apart))
         _, gap, points = self.bodies.nearest(self.track.frames(when), pair, pair)
         self._keep(pair, gap, when, points)
 
     def _sufficient_bounds(self) -> np.ndarray:
-        """Return the lower bound of the distance at which each pair needs no further halving. Shape (n,), m.
+        """Return for each pair the lower distance bound that suffices to stop halving its intervals. Shape (n,), m.
 
         The pair with the smallest margin is resolved to a relative accuracy. For the others it suffices that their
         margins are no smaller.
@@ -353,7 +356,7 @@ class _Search:
         return np.where(margin >= 0, self.apart.least + max(smallest - max(share * smallest, finest), 0.0), reduced)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower bounds of the distances of given pairs on given time intervals (K,), and sufficient bounds (n,).
+        """Return lower distance bounds on time intervals, and the sufficient bounds of all pairs. Shapes (K,), (n,), m.
 
         Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. The smallest
         distances are stored.
@@ -383,7 +386,7 @@ class _Search:
         return bound, self._sufficient_bounds()
 
     def _fraction(self, place: np.ndarray, level: int) -> np.ndarray:
-        """Return the starts of the intervals ``place`` (K,) of a bisection level, as fractions of the horizon."""
+        """Return the starts of the intervals with the indices ``place`` of a bisection level, as horizon fractions."""
         if level >= 0:
             return np.asarray(self.breaks[np.minimum(place << level, self.pieces)])
         segment = place >> -level
@@ -418,7 +421,7 @@ class _Search:
 
 
 def _pairwise_maximum(values: np.ndarray) -> np.ndarray:
-    """Return the maximum of every two successive rows; an odd last row stays. Shapes (N, k) to (ceil(N / 2), k)."""
+    """Return the maximum of every two successive rows; a last row without a partner stays. Shape (ceil(N / 2), k)."""
     even = np.concatenate([values, values[-1:]]) if len(values) % 2 else values
     return np.asarray(np.maximum(even[::2], even[1::2]))
 

@@ -25,7 +25,7 @@ __all__ = ["SETTINGS", "IntegratedMotion", "corrected_motion"]
 
 @dataclass(frozen=True)
 class IntegrationSettings:
-    """Accuracy of the re-integration of a plan, and limits of its work.
+    """Accuracy of the re-integration of a plan, and limits of its computational effort.
 
     Attributes:
         tolerance: Error over one grid cell (interval of the fine grid), relative to the size of each state.
@@ -61,17 +61,18 @@ class IntegrationSettings:
 
 SETTINGS = IntegrationSettings()
 INNER = np.array([0.46, 0.53, 0.44, 0.55, 0.48])
-"""Position of the sample inside each of five grid cells, as a fraction of the cell. They are uneven, so that
+"""Positions of the samples inside five successive grid cells, as fractions of the cell. They are uneven, so that
 oscillations in phase with the grid show. One polynomial integrates five cells; an interval has a multiple of five."""
 POINTS = np.append(np.ravel([np.arange(5), np.arange(5) + INNER], "F") / 5, 1.0)
 """Positions of all samples of five successive grid cells, as fractions of their total length."""
 LENGTH = len(POINTS[1:])
 RULE, ROUGH = (quadrature(POINTS, POINTS[1:], degree).T for degree in (LENGTH, LENGTH - 2))
-"""Quadrature weights from 0 to each other position, and those of lower degree: their difference estimates the error."""
+"""Quadrature weights from 0 to each later position in POINTS, and such weights of a lower degree. The difference of
+both estimates the error."""
 
 
 class IntegratedMotion(NamedTuple):
-    """States and running cost that the controls of a plan produce, on its fine grid.
+    """States and running cost that the controls of a plan produce, on the fine grid of the plan.
 
     Attributes:
         local: States integrated over each interval from the plan's own state at its start. Shape (N, cells + 1, nx).
@@ -108,7 +109,7 @@ class _Converged(NamedTuple):
 
 
 class _Newton:
-    """Newton's method for the motion that the controls of a plan produce, on its fine grid."""
+    """Newton's method for the motion that the controls of a plan produce, on the fine grid of the plan."""
 
     def __init__(self, along: Linearisation, grid: FineGrid) -> None:
         self.along, form = along, along.form
@@ -199,7 +200,7 @@ class _Newton:
         return float(np.einsum("k,j,kji,kji->", along.width, along.weight, slope, self.at_gauss @ change))
 
     def _own_error(self, integral: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return the first-order error of states ``x`` that arises within each interval by itself."""
+        """Return the first-order error of states ``x`` that arises within each interval, not in earlier intervals."""
         (n, q), nx = self.along.shape, self.along.form.nx
         defect = integral[..., :nx] - (x - x[:, :1])
         at_gauss = self.at_gauss @ defect
@@ -211,7 +212,7 @@ class _Newton:
         return np.asarray(defect + self._cumulative(_panels(fed), fed.shape))
 
     def _propagate(self, ends: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Propagate the errors of states ``x`` at interval ends (N, nx), and jumps there, through later intervals."""
+        """Propagate state errors at the interval ends, ``ends`` (N, nx), and jumps of ``x`` through later intervals."""
         start = np.zeros(ends.shape)
         jumps = ends[:-1] + x[:-1, -1] - x[1:, 0]
         for k in range(len(jumps)):
@@ -221,7 +222,7 @@ class _Newton:
 
 
 def _panels(values: np.ndarray) -> np.ndarray:
-    """Arrange samples (N, 2 cells + 1, m) in groups of five grid cells for quadrature. Shape (N cells / 5 m, 11)."""
+    """Arrange samples (N, 2 cells + 1, m) in groups of five grid cells for quadrature. Shape (N m cells / 5, 11)."""
     windows = np.lib.stride_tricks.sliding_window_view(values, LENGTH + 1, axis=1)
     return windows[:, ::LENGTH].reshape(-1, LENGTH + 1)
 

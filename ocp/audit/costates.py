@@ -157,7 +157,7 @@ def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, 
 
 
 def interval_end_costates(along: Linearisation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the one-sided limits of the reported costates at start and end of every interval. Shapes (N, nx)."""
+    """Return the one-sided limits of the reported costates at both ends of every interval. Shape (N, nx) each."""
     curve, mesh = along.solution.costate_interpolant, along.mesh
     if len(curve.breaks) == len(mesh) and np.array_equal(curve.breaks, mesh):
         intervals = np.arange(len(mesh) - 1)
@@ -204,7 +204,7 @@ class BackwardIntegration:
         self.drive = np.einsum("k,ij,kja->kia", h, ahead, self.source)
 
     def integrate(self, last: np.ndarray, inside: np.ndarray, atoms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the costates at the Gauss points (N q, nx) and just before the start of every interval (N, nx).
+        """Return the costates at the Gauss points and just before every interval. Shapes (N q, nx) and (N, nx).
 
         Args:
             last: Costates at the ends of the intervals. Shape (N, nx).
@@ -223,7 +223,7 @@ class BackwardIntegration:
         return points.reshape(n * q, nx), start + np.einsum("km,kmi->ki", atoms[:, 0], node[:-1])
 
     def accumulate(self, errors: np.ndarray) -> np.ndarray:
-        """Propagate the costate errors of the intervals (N, nx) backwards; return their sums at the interval starts."""
+        """Propagate costate errors of intervals backwards; return their sums at the interval starts. Shape (N, nx)."""
         (n, q), nx = self.along.shape, self.along.form.nx
         points = (self.inverse @ np.tile(np.eye(nx), (q, 1))).reshape(n, q, nx, nx)
         weight = self.along.weight[:, None, None]
@@ -319,7 +319,7 @@ def _ends(
     cost: float,
     lam1: np.ndarray,
 ) -> Ends:
-    """Return the residuals of the conditions at start and end, with fitted multipliers of admissible sign."""
+    """Return the residuals of the optimality conditions at both ends, with fitted multipliers of admissible sign."""
     form, solution, nx = along.form, along.solution, along.form.nx
     low, high = along.bounds
     places = form.bounds.places

@@ -23,7 +23,7 @@ __all__ = ["Curvature", "curvature"]
 
 
 class RankTolerances(NamedTuple):
-    """Tolerances of singular values by which constraint rows of length 1 count as linearly dependent.
+    """Singular values below which constraint rows, scaled to length 1, count as linearly dependent.
 
     Attributes:
         size: Singular value in the controls of a stage below which constraints on them count as dependent.
@@ -74,9 +74,10 @@ class Curvature:
         return bool(self.least > FLAT_SHARE)
 
     def lost(self, slope: np.ndarray) -> float:
-        """Return the cost, to second order, that a change of start and horizon can save, for a cost gradient (nz,).
+        """Return the cost, to second order, that a change of start and horizon can save.
 
-        Where the cost does not curve, start and horizon change by their scales at most.
+        ``slope`` is the gradient of the cost with respect to the scaled start and horizon. Shape (nz,). Where the cost
+        does not curve, start and horizon change by their scales at most.
         """
         if self.starts is None:
             return 0.0
@@ -87,7 +88,7 @@ class Curvature:
 
 
 def curvature(accessory: AccessoryProblem) -> Curvature:
-    """Compute the second variation of the cost along a plan with known multipliers by a backward sweep."""
+    """Compute, by a backward sweep, the second variation of the cost along a plan with known multipliers."""
     along = accessory.along
     if along.form.indifferent:
         return Curvature(np.inf, None, "", None, along.t)
@@ -116,7 +117,7 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
 
 
 class _Swept(NamedTuple):
-    """Result of one backward sweep: the fields of `Curvature` without ``t``.
+    """Result of one backward sweep, with the fields of `Curvature` except for ``t``.
 
     ``dependent``: Whether it is inconclusive because constraints are nearly dependent.
     """
@@ -134,7 +135,7 @@ class _Swept(NamedTuple):
 def _sweep(
     accessory: AccessoryProblem, stages: _Linearised, weak: bool, tolerances: RankTolerances = FULL_RANK
 ) -> _Swept:
-    """Sweep backwards over all stages (mesh intervals): by linear solves if all are convex, else by eigenvectors.
+    """Sweep backwards over all stages (mesh intervals), by linear solves if all are convex, else by eigenvectors.
 
     Args:
         weak: Whether active limits without multipliers must stay active too.
@@ -228,7 +229,7 @@ def _sweep_stages(
 
 
 class _Linearised(NamedTuple):
-    """Linearised problem of every stage (mesh interval), in terms of the variations of its start and its controls.
+    """Linearised problem of every stage (mesh interval) as a function of variations of the stage's start and controls.
 
     Attributes:
         whole: Variations of (z, u) at the Gauss points. Shape (N, q, nz + nu, nz + q nu).
@@ -251,7 +252,7 @@ class _Linearised(NamedTuple):
 
     @classmethod
     def of(cls, accessory: AccessoryProblem) -> _Linearised:
-        """Express the variations at all Gauss points by those at the interval starts and those of the controls."""
+        """Express the variations at all Gauss points by the variations of the interval starts and of the controls."""
         along, nz, nu = accessory.along, accessory.nz, accessory.nu
         (n, q), h = along.shape, along.width
         # variations at the Gauss points from those at the start of the interval and those of the controls
@@ -371,7 +372,7 @@ def _eliminate_controls(
 
 
 class _Gain(NamedTuple):
-    """Optimal linear feedback of a stage (mesh interval), from a variation of the state to those of the controls."""
+    """Optimal linear feedback of a stage (mesh interval), from a state variation to the control variations."""
 
     lift: np.ndarray
     response: np.ndarray
@@ -390,12 +391,12 @@ def unit_rows(rows: np.ndarray, rank: float) -> np.ndarray:
 
 
 def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
-    """Scale the rows of end conditions to length 1, so that small entries of states that hardly change count."""
+    """Scale the rows of end conditions to length 1, so that rows of states that hardly change count as well."""
     return unit_rows(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 
 class _Variation(NamedTuple):
-    """Variation of the controls and states of a plan, with its effect on the cost and on the constraints.
+    """Variation of the controls and states of a plan, and its effect on the cost and on the constraints.
 
     Attributes:
         curvature: Twice the second variation of the cost per squared length of the control variation.
@@ -444,7 +445,7 @@ def _variation(
 
 
 def _confirm_negative(least: float, at: float | None, variation: _Variation, scale: float) -> _Swept:
-    """Return the result of a sweep with negative curvature, inconclusive unless an admissible variation confirms it.
+    """Return the result of a sweep with negative curvature, which counts only if an admissible variation confirms it.
 
     End conditions that path constraints imply are dependent up to the error of the plan. Their remainder is then no
     freedom.
@@ -455,7 +456,7 @@ def _confirm_negative(least: float, at: float | None, variation: _Variation, sca
 
 
 def _singular(accessory: AccessoryProblem, k: int, controls: np.ndarray) -> str:
-    """Return why the curvature is inconclusive at a stage if the Hamiltonian is linear in a control there, else "".
+    """Return why a stage is inconclusive if the Hamiltonian is linear in one of its controls, else "".
 
     For a control that enters linearly the remaining curvature is of the order of the interval's width. A minimum on a
     singular arc is decided by the generalised Legendre-Clebsch condition, which is not checked here.

@@ -23,13 +23,13 @@ from ocp.tolerances import NEAR_LIMIT_SHARE, RESOLVED_SHARE, SOLVER_SHARE, TIGHT
 __all__ = ["Limits", "Linearisation", "quadrature"]
 
 MIN_POINTS, MAX_POINTS, ENOUGH_POINTS = 3, 5, 150
-"""Smallest and largest number of Gauss points in an interval, and number in the whole plan that is sufficient."""
+"""Smallest and largest number of Gauss points in an interval, and a sufficient number in the whole plan."""
 MAX_DERIVATIVES = 3
 """Largest number of times that a state constraint is differentiated until a control appears in it."""
 
 
 class Limits:
-    """Lower and upper limits of quantities at points of a plan, the distances to them, and which may be active.
+    """Lower and upper limits of quantities at points of a plan, distances to the limits, and which may be active.
 
     A limit that was slightly tightened when the plan was solved may be active where the plan rests on it. The price of
     its multiplier is the distance to the declared limit. Multiplier times distance is the excess cost of the plan to
@@ -76,11 +76,11 @@ class Limits:
 
     @property
     def near(self) -> np.ndarray:
-        """Whether the plan is so near the lower or upper limit that it may be active. Shape (M, m), bool."""
+        """Whether the plan is so near the lower or upper limit that the limit may be active. Shape (M, m), bool."""
         return np.asarray(self.lower | self.upper)
 
     def charge(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the complementarity products, multipliers (M, m) times distances to their limits, never negative."""
+        """Return the complementarity products: absolute multipliers times distances to the limits. Shape (M, m)."""
         gap = np.where(multipliers > 0, self.above, self.below)
         return np.asarray(np.where(multipliers != 0, gap, 0.0) * np.abs(multipliers))
 
@@ -157,7 +157,7 @@ class Linearisation:
 
     @property
     def point(self) -> tuple[Any, ...]:
-        """Arguments of :meth:`Formulation.sampled` at the Gauss points, including the fraction of the horizon."""
+        """States, controls, times and further data at the Gauss points, as arguments of :meth:`Formulation.sampled`."""
         fraction = (self.fraction, self.s[:, None])
         return self.x, self.u, self.t, self.solution.horizon, self.p, fraction
 
@@ -185,7 +185,7 @@ class Linearisation:
         return np.asarray((self.width[:, None] * self.weight).ravel())
 
     def _at_ends(self) -> None:
-        """Compute the start and end constraints, and the derivatives of these and of the terminal cost."""
+        """Compute the start and end constraints, and the derivatives of the constraints and of the terminal cost."""
         form, solution = self.form, self.solution
         x0, x1 = (solution.state_interpolant(np.array([end]))[0] for end in (0.0, 1.0))
         u0, u1 = stack(solution.controls, 2)[[0, -1]]
@@ -194,7 +194,7 @@ class Linearisation:
         self.end_row, self.end_y, self.final_y, self.final_yy = ends[0][:, 0], ends[1], ends[2][:, 0], ends[3]
 
     def _state_sizes(self) -> np.ndarray:
-        """Return the characteristic sizes of the states, also of those constant along the plan. Shape (nx,).
+        """Return the characteristic sizes of the states, including states that stay constant. Shape (nx,).
 
         A state that is constant along the plan has no spread. If its value is free, such as a tool length that is
         stored as a state, its size is the smallest change that changes another quantity by its size, or the cost by
@@ -224,7 +224,7 @@ class Linearisation:
         return result
 
     def _control_sizes(self) -> np.ndarray:
-        """Return the characteristic sizes of the controls, relative to which a limit is near or not. Shape (nu,).
+        """Return the characteristic sizes of the controls, by which distances to limits are judged. Shape (nu,).
 
         An unused control rests on a limit but for the solver's tolerance, so that its spread is not a size. It takes
         the size of other controls of its unit; if all of these are unused, the nearest bound, at most one SI unit.
@@ -326,7 +326,7 @@ def arcs_of(form: Formulation, rows: np.ndarray) -> list[tuple[np.ndarray, Sampl
 
 
 def over_fraction(form: Formulation) -> list[Any]:
-    """Return a symbol for the fraction s of the horizon, and cost, dynamics and path constraints in terms of it.
+    """Return a symbol s for the fraction of the horizon, and cost, dynamics and path constraints in terms of s.
 
     The expressions are T L and T f, with horizon T, running cost L and dynamics f, and the rows of the path.
     """
@@ -336,7 +336,7 @@ def over_fraction(form: Formulation) -> list[Any]:
 
 
 def ends_of(form: Formulation) -> Any:
-    """Return the CasADi Function of the end and start constraints and of derivatives of these and the terminal cost.
+    """Return the CasADi Function of end and start constraints, their derivatives, and derivatives of the terminal cost.
 
     Its arguments are (x, x0, u, u0, T, p). Its outputs are the rows, their derivatives, and the gradient and Hessian
     of the terminal cost.
@@ -351,13 +351,13 @@ def ends_of(form: Formulation) -> Any:
 
 
 def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Runge-Kutta matrix (q, q) and weights (q,) of collocation at positions ``places`` (q,) in 0..1."""
+    """Return the Runge-Kutta matrix and weights of collocation at q positions in 0..1. Shapes (q, q) and (q,)."""
     weights = quadrature(places, np.append(places, 1.0))
     return weights[:-1], weights[-1]
 
 
 def quadrature(places: np.ndarray, ends: np.ndarray, degree: int | None = None) -> np.ndarray:
-    """Return the quadrature weights at ``places`` (q,) for integrals from 0 to each of ``ends`` (m,). Shape (m, q).
+    """Return the quadrature weights at q ``places`` for integrals from 0 to each of m ``ends``. Shape (m, q).
 
     The integrand is the least-squares polynomial of the given degree; by default the interpolating one.
     """

@@ -29,7 +29,8 @@ from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, RESOLVED_SHARE
 __all__ = ["Optimality", "optimality"]
 
 PROXIMITY_WEIGHT = 1e-5
-"""Weight of the relative mean square distance from the reported costates, to select among equally good multipliers."""
+"""Weight of the relative mean square distance from the reported costates, which selects among equally good
+multipliers."""
 SOLVER = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
@@ -72,7 +73,7 @@ def best_multipliers(along: Linearisation, known: Adjoint, curved: np.ndarray, c
 
 
 class _Program:
-    """Sparse convex quadratic program with linear equations and lower bounds, assembled part by part.
+    """Sparse convex quadratic program with linear equations and lower bounds, to which parts are added one by one.
 
     Minimise price . x + weight . x^2 / 2 subject to A x = right and x >= low.
     """
@@ -117,7 +118,7 @@ class _Program:
 
 @dataclass
 class _Multipliers:
-    """Nonnegative multipliers of limits, as variables of a program in which each costs the distance to its limit.
+    """Nonnegative multipliers of limits as variables of a program, where a multiplier costs the distance to its limit.
 
     Attributes:
         point, limit: Indices of the point and of the limit of each multiplier. Shape (K,).
@@ -139,7 +140,7 @@ class _Multipliers:
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
            share: Any = 1.0) -> _Multipliers:  # fmt: skip
-        """Add one multiplier for each side of the ``chosen`` limits (M, m), bool, to a program and return them all.
+        """Add multipliers of both sides of limits that the mask ``chosen`` (M, m) selects to a program; return them.
 
         ``slopes`` (M, m, n) are the derivatives of the limits with respect to variables of the given ``size`` (n,).
         A multiplier per unit of the horizon fraction s costs its gap times the ``share`` (M,) of its point.
@@ -156,7 +157,7 @@ class _Multipliers:
         return cls(point, limit, signs, slope, effect, price, program.variables(len(point), 0.0, price))
 
     def table(self, x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the signed multipliers of all limits for a solution of the program, 0 if not added. Shape (M, m)."""
+        """Return signed multipliers of all limits from a program's solution; 0 for limits without one. Shape (M, m)."""
         values = np.zeros(shape)
         np.add.at(values, (self.point, self.limit), self.sign * x[self.index] / self.reach)
         return values
@@ -278,7 +279,7 @@ class _Dual:
             program.add(rows[self.free], self.end_residual[-1], sign)
 
     def fit(self, x: np.ndarray, known: Adjoint) -> Fit:
-        """Return the multipliers of a plan and its loss from a solution of the program, in units of cost."""
+        """Convert a solution of the program, in units of cost, to multipliers and loss (excess cost) of the plan."""
         along, (n, q), nx, size = self.along, self.along.shape, self.along.form.nx, self.along.state_size
         lost = np.zeros(n)
         for part in self.residual:
@@ -416,12 +417,12 @@ def optimality(
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Return the excess cost of a plan for given multipliers, without what a change of its start could save."""
+    """Return the excess cost of a plan for given multipliers, except for what a change of the start could save."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
 def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
-    """Return the excess cost of a plan for given multipliers plus their errors, by which multipliers are compared."""
+    """Return the excess cost of a plan plus the errors of given multipliers, by which multipliers are compared."""
     assert curved is not None
     loss = control_loss(along, multipliers.costate, multipliers.control_multipliers, curved).sum()
     return float(
@@ -430,7 +431,7 @@ def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray 
 
 
 def _control_curvature(along: Linearisation) -> np.ndarray | None:
-    """Return the Hessian of the Hamiltonian in the controls at the Gauss points, or None if it is not needed.
+    """Return the Hessian of the Hamiltonian in the controls at the Gauss points; None if the Hessian is not needed.
 
     It is T H_uu without path constraints, (M, nu, nu), needed for path inequalities and limits at single points.
     """

@@ -1,4 +1,4 @@
-"""The minimum principle along a plan: does an admissible control lower the Hamiltonian, and what does that save?
+"""The minimum principle along a plan: does an admissible control lower the Hamiltonian, and what cost does that save?
 
 The multipliers of the solver are not used. At each point the multipliers of the limits of the controls are computed by
 least squares, with the signs that the minimum principle demands (Bryson, Ho 1975, chapter 3). The remaining slope of
@@ -65,7 +65,7 @@ def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamilto
 def find_control_multipliers(
     along: Linearisation, costate: np.ndarray, curved: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the control limits that fit given costates (M, nx) at the Gauss points.
+    """Return the multipliers of the control limits that best fit given costates at the Gauss points.
 
     They minimise the gradient of T H in the controls, in units of their sizes. A limit that a plan reaches only at
     single points of an interval, as for piecewise constant controls, may be active across a gap elsewhere, where that
@@ -130,7 +130,10 @@ def pseudo_inverse_of(along: Linearisation, active: np.ndarray) -> np.ndarray:
 
 
 def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Return pseudo-inverses (M, n, m) of matrices (M, m, n) whose rows count as zero if not ``active`` (M, m)."""
+    """Return the pseudo-inverses of matrices (M, m, n) in which rows that are not ``active`` count as zero.
+
+    Shape (M, n, m) for ``active`` of shape (M, m).
+    """
     m, count, n = rows.shape
     inverses = np.zeros((m, n, count))
     for pattern, members in groups(active):
@@ -143,11 +146,11 @@ def pseudo_inverses(rows: np.ndarray, active: np.ndarray) -> np.ndarray:
 def balance(
     gradient: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray, *, inverse: np.ndarray
 ) -> np.ndarray:
-    """Return multipliers (M, m) of admissible sign that best balance a gradient at each point, by least squares.
+    """Return multipliers of admissible sign that best balance a gradient at each point, by least squares.
 
-    They minimise |gradient + directions' multipliers|, and are at least zero for ``upper`` limits (M, m), at most zero
-    for ``lower`` limits and free for both.
-    ``inverse`` (M, n, m) is the pseudo-inverse of the directions of these limits.
+    Shape (M, m). They minimise |gradient + directions' multipliers|, and are at least zero for ``upper`` limits (M, m),
+    at most zero for ``lower`` limits and free for both. ``inverse`` (M, n, m) is the pseudo-inverse of the directions
+    of these limits.
     """
     multipliers = -np.einsum("knm,kn->km", inverse, gradient)
     sign, free, active = np.where(upper, 1.0, -1.0), lower & upper, lower | upper
@@ -160,7 +163,7 @@ def balance(
 
 
 def reduced_slope(along: Linearisation, costate: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return the relative residual of dH/du = 0, the largest of all controls at each point. Shape (M,)."""
+    """Return the largest relative residual of dH/du = 0 over all controls at each point. Shape (M,)."""
     form = along.form
     if not form.nu:
         return np.zeros(len(along.s))
@@ -211,7 +214,7 @@ def nnls(matrix: np.ndarray, target: np.ndarray, price: np.ndarray, free: np.nda
 
 
 def groups(patterns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the distinct rows of boolean patterns (M, m), each with the indices where it occurs."""
+    """Return the distinct rows of a boolean array (M, m), each with the indices of all rows that equal it."""
     if not patterns.size:
         return [(np.zeros(patterns.shape[1], bool), np.arange(len(patterns)))] if len(patterns) else []
     packed = np.ascontiguousarray(np.packbits(patterns, axis=1))

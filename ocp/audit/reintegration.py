@@ -32,7 +32,7 @@ __all__ = ["Reintegration", "Violation", "reintegrate", "violations"]
 
 @dataclass(frozen=True)
 class Reintegration:
-    """States that the controls of a plan produce, re-integrated on its fine grid.
+    """States that the controls of a plan produce, re-integrated on the fine grid of the plan.
 
     Attributes:
         t: Times, s. Every interval is listed from start to end, so that interior mesh times occur twice. Shape (M,).
@@ -272,10 +272,11 @@ class Violation:
 
 
 def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, share: float) -> list[Violation]:
-    """Return the violations of all bounds and constraints along re-integrated states (M, nx) on the fine grid.
+    """Return the violations of all bounds and constraints along re-integrated states on the fine grid.
 
-    If a constraint declares a tolerance, its size is at most that for which the allowed ``share`` equals the tolerance.
-    It is then also judged along the states of the plan itself, which are the ones that are executed.
+    ``states`` have the shape (M, nx). If a constraint declares a tolerance, its size is at most that for which the
+    allowed ``share`` equals the tolerance. It is then also judged along the states of the plan itself, which are the
+    ones that are executed.
     """
     form, sizes, p, horizon, (lower, upper) = along.form, along.sizes, along.p, along.solution.horizon, along.bounds
     places = form.bounds.places
@@ -335,7 +336,7 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
 
 
 def _with_integrals(form: Formulation, kind: str, g: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return constraint values (K, m), with the rows that are watched as integrals integrated over time."""
+    """Return constraint values (K, m) in which those rows that are watched as integrals are integrated over time."""
     return np.where(form.watch_integral, integral(g, t), g) if kind == "watch" else g
 
 
@@ -345,7 +346,7 @@ def excess_over(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.
 
 
 def _violation_of(label: str, name: str, t: np.ndarray, excess: np.ndarray, sizes: np.ndarray) -> Violation:
-    """Return the `Violation` of a constraint from the excess of its rows (K, m) and their sizes (m,) or (K, m)."""
+    """Return the `Violation` of a constraint from the excess (K, m) and the sizes, (m,) or (K, m), of its rows."""
     shares = excess / sizes
     largest = np.argmax(shares, axis=1)[:, None]
     size = np.take_along_axis(np.broadcast_to(sizes, excess.shape), largest, axis=1)[:, 0]

@@ -128,7 +128,7 @@ def sizes(form: Formulation, solution: Solution, p: np.ndarray, bounds: Bounds) 
 
 
 def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndarray, bounds: Bounds) -> Sizes:
-    """Return the characteristic sizes of all quantities for a plan sampled on its fine grid, see `sizes`."""
+    """Return the characteristic sizes of all quantities for a plan sampled on its fine grid; see `sizes`."""
     places = form.bounds.places
     fixed = (_select(bounds, places[kind]) for kind in ("initial", "terminal"))
     ends = [np.where(low == high, low, np.nan) for low, high in fixed]
@@ -165,7 +165,7 @@ def evenly_spaced(grid: FineGrid) -> np.ndarray:
 
 
 def share_sizes(size: np.ndarray, places: Mapping[str, slice], declared: Mapping[str, Variable], below: float) -> None:
-    """Replace characteristic sizes that are much smaller than others of the same unit by the largest one, in place.
+    """Replace, in place, sizes that are much smaller than the largest size of the same unit by this largest size.
 
     Args:
         size: Sizes of all states or controls, changed in place. Shape (n,).
@@ -189,7 +189,7 @@ def _select(bounds: Bounds, index: np.ndarray) -> Bounds:
 def _sizes_of(
     values: np.ndarray, declared: Bounds, ends: list[np.ndarray], free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sizes (n,) of sampled states or controls (M, n), and which of them move or have a nonzero fixed end.
+    """Return the sizes of sampled states or controls, and which move or have a nonzero fixed end. Shape (n,) each.
 
     Entries that are ``free`` (n,) are constant along a plan: like a horizon they have the size of their value.
     """
@@ -204,7 +204,7 @@ def _sizes_of(
 
 
 def nearest_bound(declared: Bounds) -> np.ndarray:
-    """Return the smaller magnitude of the two bounds of each entry, without zero and infinite ones. Shape (n,)."""
+    """Return the smallest magnitude of the finite, nonzero bounds of each entry; inf without any. Shape (n,)."""
     sides = np.abs(np.array(declared))
     return np.asarray(np.where(np.isfinite(sides) & (sides > 0), sides, np.inf).min(axis=0, initial=np.inf))
 
@@ -212,14 +212,14 @@ def nearest_bound(declared: Bounds) -> np.ndarray:
 def _raise_to_floor(
     size: np.ndarray, nonzero: np.ndarray, least: np.ndarray, still: Any = STANDSTILL
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes in which those of entries that stay at zero are raised to a floor, and a mask of other entries."""
+    """Raise the sizes of entries that stay at zero to a floor; return all sizes and a mask of the other entries."""
     moves = nonzero | (size > np.maximum(ROUNDING_SHARE * size.max(initial=0.0), still))
     floor = SOLVER_SHARE * np.minimum(least, size[moves].max() if moves.any() else 1.0)
     return np.where(moves, size, np.maximum(size, floor)), moves
 
 
 def _spread(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the range and the largest absolute value of the finite entries of each column (M, n). Shape (n,) each."""
+    """Return the range and the largest absolute value of the finite entries of each of n columns. Shape (n,) each."""
     finite = np.isfinite(values)
     low = np.where(finite, values, np.inf).min(axis=0, initial=np.inf)
     high = np.where(finite, values, -np.inf).max(axis=0, initial=-np.inf)
@@ -263,7 +263,7 @@ def _rows_of(
 
 
 def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sizes of states and controls, with much smaller ones raised to the largest of the same unit.
+    """Return the sizes of states and controls, with much smaller sizes raised to the largest size of the same unit.
 
     A watched row is judged by the change that its variables could cause. At a singular configuration the joints that
     move may have no effect on it, and those with an effect stand still: their rounding errors do not measure the row.
@@ -277,7 +277,7 @@ def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[n
 def _watched_row_sizes(
     form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray
 ) -> np.ndarray:
-    """Return the sizes of watched constraint rows: the length of their paths, or their change with the variables.
+    """Return the sizes of watched constraint rows: their reference path lengths, or changes with the variables.
 
     Args:
         by_variables: Change of each row when states and controls change by their sizes. Shape (rows,).
@@ -293,7 +293,7 @@ def _watched_row_sizes(
 
 
 def integral(rates: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the integrals of sampled rates (M, n) from the first time to each of the times (M,), by trapezoids."""
+    """Integrate sampled rates from the first time to each sample time by the trapezoidal rule. Shape (M, n)."""
     steps = np.diff(t)[:, None] * (rates[1:] + rates[:-1]) / 2
     return np.vstack([np.zeros((1, rates.shape[1])), np.cumsum(steps, axis=0)])
 

@@ -33,14 +33,14 @@ __all__ = ["RESOLVED", "Conditions", "Newton", "active_sides", "conditions"]
 Sides: TypeAlias = dict[str, np.ndarray]
 """Active limit of each variable (x) and each constraint row (g) of a program: -1 lower, 1 upper, 0 none."""
 RESOLVED = 10 * SOLVER_RESIDUAL
-"""Tolerance of gradients, distances to active limits and residuals of linear systems, in scaled units of the solver.
-The square of the gradient along free directions is the excess cost. The limits meant are active without a multiplier.
-"""
+"""Tolerance, in the solver's scaled units, of gradients, of residuals of linear systems and of distances to limits. The
+square of the gradient along free directions is the excess cost. A limit at a smaller distance is active even without a
+multiplier."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Derivatives, multipliers and active constraints at a solution, which form the first-order conditions; scaled.
+    """Scaled terms of the first-order conditions at a solution: derivatives, multipliers and active constraints.
 
     Attributes:
         hessian: Hessian of the Lagrangian, both triangles. Shape (n, n).
@@ -77,7 +77,7 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
 def scaled_values(
     program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales
 ) -> dict[str, tuple[np.ndarray, ...]]:
-    """Return values, both limits and multipliers of variables (x) and rows (g), in the scaled units of the solver."""
+    """Return values, limits and multipliers of variables (x) and constraint rows (g) in the solver's scaled units."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     result: dict[str, tuple[np.ndarray, ...]] = {}
     slope, jacobian = program.numbers.first(v, p)
@@ -108,7 +108,7 @@ def next_active_set(
     sides: Sides,
     tolerance: float,
 ) -> Sides | None:
-    """Return the active limits for the next iteration: violated ones, and those whose multiplier has the right sign.
+    """Return the limits of the next active set: violated limits, and active limits with multipliers of the right sign.
 
     The active set is right if it does not change. None if the cost still falls along free directions, as when rounding
     ended the solve too early. Primal-dual active set strategy (Hintermueller, Ito, Kunisch 2002).
@@ -128,7 +128,7 @@ def next_active_set(
 
 
 def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Return which values have equal limits, or are at a limit whose multiplier exceeds the distance to the limit."""
+    """Return which values have equal limits, or a limit whose multiplier exceeds the distance from value to limit."""
     with np.errstate(invalid="ignore"):
         below = (multipliers < -SOLVER_RESIDUAL) & (value - lower < -multipliers)
         above = (multipliers > SOLVER_RESIDUAL) & (upper - value < multipliers)
@@ -136,7 +136,7 @@ def at_limit(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, multiplier
 
 
 def scale_matrix(matrix: scipy.sparse.csc_array, rows: np.ndarray, columns: np.ndarray) -> scipy.sparse.csc_array:
-    """Return a sparse matrix with its rows and its columns multiplied by the given factors."""
+    """Return a sparse matrix with rows and columns multiplied by given factors."""
     factors = rows[matrix.indices] * np.repeat(columns, np.diff(matrix.indptr))
     return scipy.sparse.csc_array((matrix.data * factors, matrix.indices, matrix.indptr), shape=matrix.shape)
 
@@ -197,7 +197,7 @@ class Newton:
     def solve_near(
         self, start: Outcome, sides: Sides, arguments: dict[str, np.ndarray], scales: Scales
     ) -> Outcome | None:
-        """Return the optimum for other parameters or bounds, from a nearby plan; None without convergence.
+        """Return the optimum for changed parameters or bounds, found from a nearby plan; None without convergence.
 
         The active limits of the plan are equalities at first. The result determines the next active set (Hintermueller,
         Ito, Kunisch 2002).
@@ -331,7 +331,7 @@ class _Matrix:
     price: float
 
     def step(self, gradient: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the Newton step of scaled variables and multipliers, by iterations of the method of multipliers."""
+        """Compute the Newton step of scaled variables and multipliers by the method of multipliers."""
         place, residual = self.factors.place, self.weight * residual
         side = np.empty_like(gradient)
         side[place] = gradient
@@ -349,7 +349,7 @@ class _Matrix:
 
 
 def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which variables (n,) and rows (m,) count as equalities: those with equal limits or an active limit."""
+    """Return which variables and rows are equalities: those with equal or with active limits. Shapes (n,), (m,)."""
     fixed, held = ((arguments[f"lb{kind}"] == arguments[f"ub{kind}"]) | (sides[kind] != 0) for kind in "xg")
     return fixed, held
 
@@ -360,7 +360,7 @@ def _same(sides: Sides, other_sides: Sides) -> bool:
 
 
 class Bordered:
-    """An order of variables that makes a symmetric matrix banded, except for a few last variables, its border.
+    """An order of variables that makes a symmetric matrix banded, except for the border: a few variables at the end.
 
     Attributes:
         place: Position of each variable. Shape (n,).
@@ -383,7 +383,7 @@ class Bordered:
         self._size = size
 
     def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return the indices of matrix entries (row ``first`` >= column ``second``) in the values for `cholesky`."""
+        """Return where the entries in rows ``first`` and columns ``second`` <= ``first`` are in `cholesky`'s values."""
         band = second * self.width + first
         below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
         return np.asarray(np.where(first < self.inner, band, below))
@@ -423,7 +423,7 @@ class Bordered:
 
 @dataclass(frozen=True)
 class Cholesky:
-    """Cholesky factors of a positive definite matrix with a band and a border of k variables.
+    """Cholesky factors of a banded, positive definite matrix with a border of k variables.
 
     Attributes:
         place: Position of each variable.
@@ -440,7 +440,7 @@ class Cholesky:
     corner: np.ndarray
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Solve the linear system of the matrix for a right-hand side (n,), in the order of :class:`Bordered`."""
+        """Solve the linear system for a right-hand side in the order of variables of :class:`Bordered`. Shape (n,)."""
         n = self.below.shape[1]
         inner = scipy.linalg.cho_solve_banded((self.lower, True), right[:n], check_finite=False) if n else right[:n]
         if not len(self.below):

@@ -25,7 +25,7 @@ __all__ = ["Block", "Derivatives", "Interpolants", "Program", "Stages", "Transcr
 
 @dataclass(frozen=True)
 class Block:
-    """A small function that a nonlinear program applies to several sets of its variables.
+    """Block of a nonlinear program: a small function that is applied to several sets of the program's variables.
 
     Attributes:
         function: casadi Function (v (n), d (nd), p) -> (cost, g (m)).
@@ -158,7 +158,7 @@ class Transcription:
         return self.nodes[:, -1]
 
     def arguments(self, p: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the solver's arguments p, lbx, ubx, lbg and ubg for parameters and the values of the bound table."""
+        """Return the solver arguments p, lbx, ubx, lbg and ubg for given parameters and values of the bound table."""
         lower, upper = bounds
         return {
             "p": p,
@@ -171,7 +171,7 @@ class Transcription:
 
 @dataclass(frozen=True)
 class FunctionSizes:
-    """Thresholds of the number of instructions of a function.
+    """Thresholds of the number of instructions of a function, which decide how the function is built.
 
     Attributes:
         compared: Above this number, the search for common subexpressions takes longer than a solve without it.
@@ -209,7 +209,7 @@ class Program:
 
     @cached_property
     def numbers(self) -> NumericDerivatives:
-        """Evaluator of values and derivatives of the program as arrays."""
+        """Evaluator of the program's values and derivatives as NumPy and SciPy arrays."""
         return NumericDerivatives(self)
 
     @cached_property
@@ -220,7 +220,7 @@ class Program:
 
 
 class NumericDerivatives:
-    """Evaluator of a program's values and derivatives as NumPy and SciPy arrays; it caches those at the last point.
+    """Evaluator of a program's values and derivatives as NumPy and SciPy arrays, with a cache for the last point.
 
     CasADi converts its matrices to Python entry by entry, which takes longer than their evaluation. Here the functions
     write into arrays, and the sparsity patterns are read once.
@@ -242,12 +242,12 @@ class NumericDerivatives:
         return self._cached
 
     def first(self, x: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, scipy.sparse.csc_array]:
-        """Return the first derivatives: gradient of the cost (n,) and Jacobian of the constraint rows (m, n)."""
+        """Return the gradient of the cost and the Jacobian of the constraint rows. Shapes (n,) and (m, n)."""
         _, slope, _, jacobian = self._evaluate(x, p)
         return slope, jacobian
 
     def values(self, x: np.ndarray, p: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the cost and the values of the constraint rows (m,)."""
+        """Return the cost and the values of the m constraint rows. Shape (m,)."""
         cost, _, rows, _ = self._evaluate(x, p)
         return cost, rows
 
@@ -256,7 +256,7 @@ class NumericDerivatives:
         return np.asarray(self._gradient(x, p)[1])
 
     def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> scipy.sparse.csc_array:
-        """Return the upper triangle of the Hessian of ``sigma`` times cost plus ``lam`` times rows. Shape (n, n)."""
+        """Return the upper Hessian triangle of ``sigma`` times the cost plus ``lam`` times the rows. Shape (n, n)."""
         upper: scipy.sparse.csc_array = self._hessian(x, p, np.array([sigma]), lam)[0]
         return upper
 
@@ -265,7 +265,7 @@ class NumericDerivatives:
         return np.asarray(self._running(x, p)[0])
 
     def parametric(self, x: np.ndarray, p: np.ndarray, lam: np.ndarray) -> np.ndarray:
-        """Return the gradient of cost plus ``lam`` times rows with respect to the parameters. Shape (n_p,)."""
+        """Return the gradient of the cost plus ``lam`` times the rows with respect to the parameters. Shape (n_p,)."""
         return np.asarray(self._parametric(x, p, lam)[0])
 
 
@@ -281,7 +281,7 @@ class ArrayFunction:
         ]
 
     def __call__(self, *arguments: np.ndarray) -> list[Any]:
-        """Evaluate the function; columns are returned as arrays (n,), other outputs as sparse matrices.
+        """Evaluate the function; outputs with one column are returned as arrays, other outputs as sparse matrices.
 
         Raises:
             RuntimeError: The evaluation fails, for example in an integrator.
@@ -314,7 +314,9 @@ def dense_column(nonzeros: np.ndarray, rows: np.ndarray, size: int) -> np.ndarra
 
 
 class Derivatives(NamedTuple):
-    """The function of a :class:`Block` and its derivatives, as casadi Functions of variables v, data d, parameters p.
+    """The function of a :class:`Block` and the derivatives of this function, as casadi Functions.
+
+    Their arguments are the variables v, the data d (constants of the block) and the parameters p.
 
     Attributes:
         value: -> (cost, g).
@@ -332,7 +334,7 @@ class Derivatives(NamedTuple):
 
 
 def assemble(transcription: Transcription, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
-    """Return the nonlinear program of a transcription, from given or newly derived derivatives of its blocks.
+    """Assemble the nonlinear program of a transcription from derivatives of block functions, computed unless given.
 
     Raises:
         TimeLimitReached: The time limit is over.
@@ -398,7 +400,7 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
 
 
 def derivatives(function: Any) -> Derivatives:
-    """Return the function of a :class:`Block` together with its exact symbolic derivatives."""
+    """Return the function of a :class:`Block` and the exact symbolic derivatives of this function."""
     symbol = symbols_of(function).sym
     v, d, p = (symbol(name, function.numel_in(i)) for i, name in enumerate(("v", "d", "p")))
     cost, g = function(v, d, p)
@@ -415,7 +417,7 @@ def derivatives(function: Any) -> Derivatives:
 
 
 def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return row, column (upper triangle) and factor of a block's Hessian nonzeros in the Hessian of the program."""
+    """Return where each Hessian nonzero of a block belongs in the program's upper Hessian triangle, and its factor."""
     first, second = places_of(pattern)
     where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")
@@ -432,20 +434,20 @@ def places_of(pattern: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build_function(name: str, arguments: list[Any], outputs: list[Any]) -> Any:
-    """Return a casadi Function with common subexpressions eliminated, unless it is large."""
+    """Return a casadi Function in which common subexpressions are eliminated, unless the function is large."""
     large = ca.Function(name, arguments, outputs).n_instructions() > SIZES.compared
     return ca.Function(name, arguments, outputs, {"cse": not large})
 
 
 def gather(vector: Any, index: np.ndarray) -> Any:
-    """Return the entries of a vector at indices (n, K) as a matrix (n, K)."""
+    """Return the entries of a vector at a matrix of indices, as a matrix of the same shape (n, K)."""
     if index.size == 0:
         return ca.MX(*index.shape)
     return ca.reshape(vector[index.ravel(order="F").tolist()], *index.shape)
 
 
 def evaluate_block(function: Any, block: Block, arguments: list[Any]) -> Any:
-    """Evaluate the function of a block for every column of its arguments; all share the parameters (argument 2)."""
+    """Evaluate the function of a block for every column of its arguments; argument 2, the parameters, is common."""
     check_time()
     count = block.variables.shape[1]
     if count == 1:
@@ -455,13 +457,13 @@ def evaluate_block(function: Any, block: Block, arguments: list[Any]) -> Any:
 
 
 def nonzeros(matrices: list[Any]) -> Any:
-    """Return the nonzeros of all matrices in one vector."""
+    """Return the nonzeros of several matrices, concatenated in one vector."""
     flat = [ca.sparsity_cast(matrix, ca.Sparsity.dense(matrix.nnz(), 1)) for matrix in matrices]
     return ca.vertcat(ca.MX(0, 1), *flat)
 
 
 def scatter(places: list[np.ndarray], matrices: list[Any], size: int) -> Any:
-    """Return a vector to which each nonzero of ``matrices`` is added at its index in ``places``."""
+    """Return a vector of sums: each nonzero of ``matrices`` is added to the entry with its index in ``places``."""
     where = np.concatenate([np.zeros(0, int), *places])
     values = nonzeros(matrices)
     collect = sparse(where, np.arange(where.size), np.ones(where.size), (size, where.size))
@@ -475,7 +477,7 @@ def _scatter_matrix(
     shape: tuple[int, int],
     factors: list[np.ndarray] | None = None,
 ) -> Any:
-    """Return a sparse matrix that sums nonzeros of ``matrices`` times factors at given places, and constant entries."""
+    """Return a sparse matrix: constant entries plus nonzeros of ``matrices`` times factors, at given places."""
     rows = np.concatenate([constant[0], *[at[0] for at in places]]).astype(int)
     columns = np.concatenate([constant[1], *[at[1] for at in places]]).astype(int)
     entries, number = np.unique(columns * shape[0] + rows, return_inverse=True)
@@ -489,7 +491,7 @@ def _scatter_matrix(
 
 
 def sparse(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, shape: tuple[int, int]) -> Any:
-    """Return a constant sparse matrix from rows, columns and values; duplicates are summed."""
+    """Return a constant sparse matrix from row indices, column indices and values; duplicate entries are summed."""
     check_time()
     entries, number = np.unique(columns.astype(np.int64) * shape[0] + rows, return_inverse=True)
     summed = np.bincount(number, weights=values, minlength=entries.size)

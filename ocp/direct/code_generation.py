@@ -1,4 +1,4 @@
-"""C code of a problem: compiled derivatives of the functions of its program, and export for controllers.
+"""C code of a problem: compiled derivatives for its nonlinear program, and export of the problem to controllers.
 
 Derivatives are compiled into shared libraries, each identified by its source data, the compiler and its flags, so that
 meshes, processes and runs share it (:mod:`models.files`). Compiled functions return exactly the numbers of interpreted
@@ -55,7 +55,7 @@ __all__ = ["CompilerError", "Library", "block_derivatives", "build_library", "ge
 
 VERSION = "1"  # of the generated code
 FLAGS = ("-fPIC", "-shared", "-w", "-ffp-contract=off", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
-"""Flags of the C compiler; undefined symbols are errors at link time, as otherwise a call would crash Python."""
+"""Flags of the C compiler; undefined symbols are errors at link time, because otherwise a call would crash Python."""
 LINK = "-lm"  # must follow the source file
 SERIALISED = "casadi:"  # prefix of a serialised function
 WATCHED = """
@@ -63,17 +63,17 @@ exec 3<&0
 (trap "" TERM; read -r _ <&3; kill 0; rm -rf "$PWD"; kill -9 0) &
 exec "$@" </dev/null 3<&-
 """
-"""Shell script that runs a command; if its input closes, as when Python dies, it kills the command and removes the
-folder in which it runs."""
+"""Shell script that runs a command until the standard input of the script closes, as when Python dies. The script then
+kills the command and removes the working folder."""
 
 
 class CompilerError(RuntimeError):
-    """Error that C code cannot be generated, compiled or loaded, with the reason."""
+    """Error with the reason why C code cannot be generated, compiled or loaded."""
 
 
 @dataclass(frozen=True)
 class CodeSizes:
-    """Limits of the length of the C code, in characters.
+    """Limits of the length of generated C code, in characters, for its optimisation and its compilation.
 
     Attributes:
         optimized: Largest code that is optimised, which takes minutes for more and saves a third of the running time.
@@ -156,7 +156,7 @@ def build_library(library: Library) -> Path:
 
 
 _OWN: dict[str, Path] = {}
-"""Paths of the libraries compiled for this process alone, if the cache is not writable, by their key."""
+"""Paths of libraries that are compiled for this process alone because the cache is not writable, by library key."""
 
 
 @lru_cache(1)
@@ -182,7 +182,7 @@ def compiler() -> tuple[str, str]:
 
 @lru_cache
 def _version(command: str, path: str) -> str:
-    """Return the version text that a compiler command on a search path prints; "" if it cannot be run."""
+    """Return the version text that a compiler command on a search path prints; "" if the command cannot be run."""
     try:
         words = [*shlex.split(command), "--version"]
         result = subprocess.run(words, capture_output=True, stdin=subprocess.DEVNULL, timeout=10, check=True)
@@ -216,7 +216,7 @@ def _compile(text: str) -> bytes:
 
 
 def _start_process(words: list[str], place: Path) -> subprocess.Popen[bytes]:
-    """Start a command in a folder, with its output in a file there; the command ends when its input is closed."""
+    """Start a command in a folder and write its output to a file there; closing the input ends the command."""
     with open(place / "words", "wb") as output:
         return subprocess.Popen(
             ["sh", "-c", WATCHED, "sh", *words],
@@ -238,7 +238,7 @@ def _exit_status(process: subprocess.Popen[bytes]) -> int:
 
 
 def function_key(function: Any) -> str:
-    """Return a text that identifies a casadi Function: its serialised form or, without one, its id in this process."""
+    """Return a text that identifies a casadi Function: its serialised form, or else its id in this process."""
     try:
         return SERIALISED + str(function.serialize())
     except RuntimeError:  # of a Callback, say
@@ -287,7 +287,7 @@ def controller_functions(form: Formulation, transcription: Transcription, guess:
 
 
 def write_controller(form: Formulation, transcription: Transcription, guess: np.ndarray, folder: Path) -> Path:
-    """Write the folder of C files that this module describes; each file is written completely or not at all.
+    """Write the C files of a problem for a controller to a folder; each file is written completely or not at all.
 
     Raises:
         ProblemError: Some part of the problem has no C, such as an integrator of variable step.
@@ -463,11 +463,11 @@ plan: main.c plan.c plan.h curves.h problem.h
 
 
 RECIPE = hashlib.sha256(Path(assembly.__file__).read_bytes()).hexdigest()
-"""Hash of the code that derives the functions of blocks: part of the key of a compiled library."""
+"""Hash of the source code that derives the functions of blocks, which is part of the key of a compiled library."""
 
 
 def block_derivatives(transcription: Transcription, compiled: bool) -> list[Derivatives]:
-    """Return the derivatives of each block of a transcription; blocks with the same function share them.
+    """Return the derivatives of each block of a transcription; blocks with the same function share derivatives.
 
     Args:
         transcription: The transcription.
@@ -487,7 +487,7 @@ def block_derivatives(transcription: Transcription, compiled: bool) -> list[Deri
 
 
 def _compile_derivatives(function: Any, text: str) -> Derivatives:
-    """Return the derivatives of a block's function from a compiled library, or interpreted if compilation fails."""
+    """Return a block's derivatives from a compiled library, or as interpreted functions if compilation fails."""
     try:
         path = build_library(
             Library((RECIPE, text), lambda: generate_c(derivatives(function), "unit", header=False)[0])

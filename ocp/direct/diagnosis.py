@@ -32,7 +32,7 @@ REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or 
 
 @dataclass(frozen=True)
 class ElasticSettings:
-    """Settings of the elastic plan (the plan of least constraint violation) and of the report.
+    """Settings of the elastic plan (the plan of least constraint violation) and of the report of conflicts.
 
     Attributes:
         cost: Weight of the problem's own cost, which makes the plan unique.
@@ -167,7 +167,7 @@ def both_bounds(arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 
 def variable_labels(form: Formulation, transcription: Transcription) -> list[str]:
-    """Return for each variable the name of its state, control or horizon; "" for auxiliary variables of stages."""
+    """Return the name of the state, control or horizon that each variable represents; "" for auxiliary variables."""
     names = {"state": form.state_labels, "control": form.control_labels, "horizon": ("horizon",)}
     return [
         names[role][entry] if role else ""
@@ -176,7 +176,7 @@ def variable_labels(form: Formulation, transcription: Transcription) -> list[str
 
 
 def variable_names(form: Formulation, transcription: Transcription) -> list[str]:
-    """Return a description of each variable, such as "state q[2]"; "a stage variable" for auxiliary ones."""
+    """Return a description of each variable: for example "state q[2]", or "a stage variable" if it is auxiliary."""
     return [
         f"{'' if role == 'horizon' else role + ' '}{name}" if role else "a stage variable"
         for role, name in zip(transcription.variable_role, variable_labels(form, transcription), strict=True)
@@ -204,7 +204,7 @@ class Conflict:
 
     @property
     def time(self) -> float | None:
-        """Time of the largest violation, s; None for the horizon itself."""
+        """Time of the largest violation, s; None if the horizon itself is in conflict."""
         return None if self.label == "horizon" else self.fraction * self.horizon
 
     def __str__(self) -> str:
@@ -214,7 +214,7 @@ class Conflict:
 
 @dataclass(frozen=True)
 class Elastic:
-    """The plan of least constraint violation: its variables (n,) and the violated constraints, the worst first."""
+    """The plan of least constraint violation: values of all variables, and violated constraints, the worst first."""
 
     plan: np.ndarray
     conflicts: tuple[Conflict, ...]
@@ -303,7 +303,7 @@ def elastic_plan(
 
 
 class _Soft:
-    """Constraint rows and bounds that an elastic plan may violate: all but dynamics, fixed ends and least horizon.
+    """Rows and bounds that an elastic plan may violate: all but dynamics, fixed ends and the lower horizon bound.
 
     Rows are numbered before variables. Those with one label share a slack variable.
     """
@@ -334,7 +334,7 @@ class _Soft:
         self.fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
 
     def matrices(self, n: int, m: int, k: int) -> tuple[Any, Any]:
-        """Return the two constant matrices that form the rows of the elastic program from rows, variables and slacks.
+        """Return two constant matrices that form the rows of the elastic program from rows, variables and slacks.
 
         The elastic rows are R g(v) + C (v, slack) with the returned matrices R and C.
         """
@@ -358,7 +358,7 @@ class _Soft:
     def conflicts(
         self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float, units: np.ndarray
     ) -> list[Conflict]:
-        """Return the violated constraints, the worst first, each measured in the unit of its row or variable."""
+        """Return the violated constraints in decreasing order of violation, each in the unit of its row or variable."""
         low, high = both_bounds(arguments)
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}

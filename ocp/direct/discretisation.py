@@ -289,9 +289,10 @@ def control_at(form: Formulation, method: MultipleShooting, w: Any, place: Any) 
 
 
 def interval_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Return the casadi Function that integrates an interval; its values are the running cost and minus the end state.
+    """Return the casadi Function that integrates dynamics and running cost over one interval of multiple shooting.
 
-    It is the function of a :class:`Block` with variables v, data d (start and width of the interval) and parameters p.
+    Its values are the running cost and minus the end state. It is the function of a :class:`Block` with variables v,
+    data d (start and width of the interval) and parameters p.
     """
     nw = n_controls_of(form, method)
     step, flat = step_function(form, method)
@@ -309,7 +310,7 @@ def interval_function(form: Formulation, method: MultipleShooting) -> Any:
 
 
 def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, bool]:
-    """Return the casadi Function of an integration step, and whether it is to be inlined as an SX function.
+    """Return the casadi Function of one integration step, and whether to inline the function as an SX function.
 
     It maps (x, w, d, step number, T, p) to the next state and the running cost of the step. Its arguments are state,
     control variables, start and width of the interval as fractions of the horizon, step number, horizon and parameters.
@@ -335,7 +336,7 @@ def step_function(form: Formulation, method: MultipleShooting) -> tuple[Any, boo
 
 
 def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> Any:
-    """Return the casadi Function that integrates an interval by CVODES and returns states and running cost.
+    """Return the casadi Function that integrates dynamics and running cost over one mesh interval by CVODES.
 
     The arguments are those of :func:`step_function`; the step number is not used. The states are those at ``places``
     (0..1) of the interval, side by side.
@@ -355,7 +356,7 @@ def cvodes(form: Formulation, method: MultipleShooting, places: list[float]) -> 
 
 
 def dense_function(form: Formulation, method: MultipleShooting) -> Any:
-    """Return the casadi Function that samples the states inside an interval, by cubic Hermite interpolation.
+    """Return the casadi Function that samples the states inside a mesh interval by cubic Hermite interpolation.
 
     It maps ([x; w], d, T, p), as in :func:`step_function`, to the states at the `THIRDS` of each integration step.
     """

@@ -1,4 +1,4 @@
-"""Initial points of a solver: guesses evaluated for the variables of a transcription, and alternative starts.
+"""Initial points of a solver: guesses evaluated for the variables of a transcription, and alternative initial points.
 
 If the solver fails from the guess, it may start from zeros or from a roll-out of the dynamics.
 """
@@ -26,7 +26,7 @@ Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,)
 
 
 def initial_point(form: Formulation, transcription: Transcription, guess: Guess, bounds: Bounds) -> np.ndarray:
-    """Return the values of all variables of a program from which the solver starts. Shape (size,).
+    """Return the initial point of the solver, a value for every variable of the program, from a guess. Shape (size,).
 
     ``guess`` takes precedence over the guess declared with a variable. Without either the values follow a straight line
     between the fixed ends, or the middle of the bounds. A solution on another grid or by another method is read over
@@ -96,7 +96,7 @@ def guessed_names(form: Formulation, guess: Guess) -> set[str]:
 
 
 def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each variable and constraint row, the index of the same quantity a number of equal intervals later.
+    """Return, for each variable and row, the index of the same quantity a given number of equal intervals later.
 
     Where the horizon ends earlier, it is the index of the variable or row itself.
     """
@@ -118,7 +118,7 @@ def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.nd
 
 
 def _trajectory(name: str, value: Any, size: int, horizon: float, times: Any) -> Trajectory:
-    """Return a guess (a function of time, samples (M, n), or a value) as a function of the horizon fraction."""
+    """Convert a guess (a function of time, a table of samples, or a value) to a function of the horizon fraction."""
     if isinstance(value, Samples) and value.values.shape[1] == size:
         return lambda at: value.over(at * horizon)
     if callable(value):
@@ -139,7 +139,7 @@ def _trajectory(name: str, value: Any, size: int, horizon: float, times: Any) ->
 
 
 def evaluate_guess(name: str, function: Callable[[float], Any], time: float, size: int) -> np.ndarray:
-    """Return the ``size`` entries of a guess function at a time, s; raise ProblemError if it fails."""
+    """Evaluate a guess function of ``size`` entries at a time, s; raise ProblemError if the function fails."""
     try:
         value = function(time)
     except Exception as error:  # any error of the user's function
@@ -161,7 +161,7 @@ class Samples:
     values: np.ndarray
 
     def over(self, times: np.ndarray) -> np.ndarray:
-        """Return the guess at ``times`` (K,), linear between the samples and constant beyond them. Shape (K, n)."""
+        """Return the guess at K times, interpolated linearly between the samples and constant outside. Shape (K, n)."""
         return np.column_stack([np.interp(times, self.t, column) for column in self.values.T])
 
     def __call__(self, time: float) -> np.ndarray:
@@ -198,7 +198,7 @@ def broadcast_guess(name: str, value: Any, size: int) -> np.ndarray:
 
 
 def default_horizon(form: Formulation, bounds: Bounds) -> float:
-    """Return the declared guess of the horizon, or a value inside its bounds."""
+    """Return the declared guess of the horizon, clipped to the bounds, or a default value inside the bounds."""
     place = form.bounds.places["horizon"][0]
     low, high = bounds[0][place], bounds[1][place]
     if form.horizon_guess is not None:
@@ -207,7 +207,7 @@ def default_horizon(form: Formulation, bounds: Bounds) -> float:
 
 
 def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Trajectory:
-    """Return a default guess: a line between fixed ends, else the middle of the bounds or the value nearest to zero."""
+    """Return a default guess: a line between fixed ends, else the middle of the bounds or the value nearest zero."""
 
     def middle(kind: str) -> tuple[np.ndarray, np.ndarray]:
         index = form.bounds.places[kind][place]
@@ -229,7 +229,7 @@ def default(form: Formulation, role: str, place: slice, bounds: Bounds) -> Traje
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Settings of the alternative starts of a solver.
+    """Settings of the alternative initial points of a solver.
 
     Attributes:
         horizon: Factor on the guess of a free horizon when starting from zeros: a long horizon contains a feasible
@@ -252,7 +252,7 @@ def alternative_starts(
     *,
     bounds: tuple[np.ndarray, np.ndarray],
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the name and the variables of each alternative start of the solver, computed on demand.
+    """Yield the name and the variables of each alternative initial point of the solver, computed on demand.
 
     Args:
         point: Values of the variables at the guess.
@@ -264,7 +264,7 @@ def alternative_starts(
 
 
 def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return the guess with its states replaced by a simulation from its start with its controls. Shape (size,).
+    """Return the guess with states replaced by a simulation from its start under its controls. Shape (size,).
 
     Classical Runge-Kutta steps between the fractions of the states. From the first state that is not finite on, the
     states are constant.

@@ -35,8 +35,8 @@ __all__ = [
 ]
 
 SOLVER_RESIDUAL = 1e-8
-"""Accepted residual of gradients and constraint rows where rounding prevents a smaller one, relative to the largest
-multiplier and variable. In scaled units of the solver it is also the smallest significant multiplier."""
+"""Residual of gradients and constraint rows, relative to the largest multiplier and variable, that is accepted where
+rounding prevents a smaller residual. In the solver's scaled units it is also the smallest significant multiplier."""
 IPOPT = {
     "tol": 1e-10,
     "constr_viol_tol": 1e-9,
@@ -67,7 +67,7 @@ WORDS = {
     "iteration limit": SolverStatus.ITERATION_LIMIT,
     "Feasible_Point_Found": SolverStatus.ACCEPTABLE,
 }
-"""Statuses by the status text of SLEQP, and of IPOPT with as many equations as variables."""
+"""Solver statuses by status text: that of SLEQP, and that of IPOPT for as many equations as variables."""
 KINDS = {"IpoptInterface": "ipopt", "FatropInterface": "fatrop", "SLEQPInterface": "sleqp"}
 """Names of solvers by their CasADi class."""
 
@@ -107,7 +107,7 @@ class Outcome:
 def build_solver(
     program: Program, solver: str, options: dict[str, Any], *, stages: Stages | None, title: str
 ) -> tuple[Any, IterationMonitor | FatropMonitor]:
-    """Return the casadi solver of a nonlinear program, and the callback by which it can be stopped.
+    """Return the casadi solver of a nonlinear program, and the callback by which the solver can be stopped.
 
     Raises:
         ProblemError: The solver does not accept an option.
@@ -190,12 +190,12 @@ def fatrop_functions(program: Program, watch: FatropMonitor) -> dict[str, Any]:
 
 
 def finite(expression: Any) -> Any:
-    """Return an expression with infinite entries replaced by huge ones of the same sign, and nan by a huge number."""
+    """Return an expression with infinite entries replaced by huge numbers of the same sign, nan by a huge number."""
     return ca.MX(expression.sparsity(), ca.fmax(ca.fmin(expression.nz[:], 1e20), -1e20))
 
 
 def call_solver(solver: Any, progress: IterationMonitor | FatropMonitor, arguments: dict[str, np.ndarray]) -> Outcome:
-    """Run a solver; Ctrl-C or a time limit stops it between iterations, and its last iterate is returned."""
+    """Run a solver and return its result, which is the last iterate if Ctrl-C or a time limit stops the solver."""
     began = time.monotonic()
     name = KINDS[solver.class_name()]
     progress.open(arguments["lbg"], arguments["ubg"])
@@ -237,7 +237,7 @@ def call_solver(solver: Any, progress: IterationMonitor | FatropMonitor, argumen
 def interrupted_iterate(
     solver: Any, progress: IterationMonitor | FatropMonitor, arguments: dict[str, np.ndarray], began: float
 ) -> Outcome:
-    """Return the last iterate of a solver that was stopped or failed; its multipliers are unknown."""
+    """Return the last iterate of a solver that was stopped or failed, with nan for the unknown multipliers."""
     cost, rows = (np.asarray(v.full()).reshape(-1) for v in solver.oracle()(progress.iterate, arguments["p"]))
     unknown, seconds = np.full(rows.shape, np.nan), time.monotonic() - began
     status = progress.stopped or SolverStatus.STEP_FAILED
@@ -254,7 +254,7 @@ def log_line(words: str) -> None:
 
 
 def has_regularised_hessian(stats: dict[str, Any]) -> bool:
-    """Return whether ipopt modified the Hessian in its last step or made no step; unknown for fatrop."""
+    """Return whether ipopt modified the Hessian in its last step or made no step; False for other solvers."""
     sizes = stats.get("iterations", {}).get("regularization_size", ())
     return len(sizes) > 0 and (len(sizes) == 1 or sizes[-1] > 0)
 
@@ -275,7 +275,7 @@ def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) ->
 
 
 def largest_violation(values: dict[str, np.ndarray], arguments: dict[str, np.ndarray]) -> float:
-    """Return the largest violation of a bound by variables and rows, relative to the largest variable (at least 1)."""
+    """Return the largest violation of a bound of variables or rows, relative to the largest variable (at least 1)."""
     gaps = [(arguments[f"lb{k}"] - values[k], values[k] - arguments[f"ub{k}"]) for k in ("x", "g")]
     worst = max(float(np.max(gap, initial=0.0)) for pair in gaps for gap in pair)
     return worst / max(1.0, float(np.max(np.abs(values["x"]), initial=0.0)))
@@ -300,14 +300,14 @@ def last_line(error: BaseException) -> str:
 
 
 def horizon_of(form: Formulation, transcription: Transcription, outcome: Outcome, p: np.ndarray) -> float:
-    """Return the horizon, that is the final time, of a solver's result, s, whether it is fixed or free."""
+    """Return the horizon (final time) of a solver's result, s, whether the horizon is fixed or free."""
     return float(form.horizon_at(p) if transcription.horizon is None else outcome.variables[transcription.horizon])
 
 
 def solution_of(
     form: Formulation, transcription: Transcription, program: Program, outcome: Outcome, *, p: np.ndarray, **fields: Any
 ) -> Solution:
-    """Return the solution for a solver's result, with interpolants, costates and cost gradients.
+    """Convert a solver's result to a solution with interpolants, costates and cost gradients.
 
     Args:
         fields: Further fields of the solution: method, start, seconds.
@@ -378,7 +378,7 @@ def costates_of(program: Program, transcription: Transcription, outcome: Outcome
 def _cost_gradient(
     form: Formulation, program: Program, transcription: Transcription, outcome: Outcome, p: np.ndarray
 ) -> np.ndarray:
-    """Return the derivative of the optimal cost with respect to parameters, including their effect on active bounds."""
+    """Return the derivative of the optimal cost with respect to parameters, which may also shift active bounds."""
     v, lam = outcome.variables, outcome.multipliers
     direct = program.numbers.parametric(v, p, lam)
     slope, jacobian = program.numbers.first(v, p)
@@ -391,7 +391,7 @@ def _cost_gradient(
 
 
 def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> PiecewisePolynomial:
-    """Return the piecewise polynomial through the reported costates of each interval, with both ends included."""
+    """Return the piecewise polynomial through the reported costates, with both ends of each interval as nodes."""
     interval, place = transcription.report
     n = len(transcription.mesh) - 1
     starts = np.searchsorted(interval + (place == 1.0), np.arange(n))
@@ -402,7 +402,7 @@ def costate_interpolant(transcription: Transcription, costates: np.ndarray) -> P
 
 
 def controls_at(controls: Any, transcription: Transcription, interval: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return the controls at the reported points; at a node between intervals, those of the point's own interval."""
+    """Return the controls at the reported points; at a jump, the value of the interval to which the point belongs."""
     if len(controls.breaks) == len(transcription.mesh):
         return np.asarray(controls.within(interval, place))
     mesh = transcription.mesh

@@ -123,13 +123,13 @@ class Prepared:
         return scaled_program(self.program)
 
     def _built_solver(self, options: dict[str, Any]) -> tuple[Any, Any]:
-        """Return the solver with given options, and the callback by which it can be stopped."""
+        """Return the solver with given options, and the callback by which the solver can be stopped."""
         return build_solver(
             self.scaled, self.solver_name, options, stages=self.transcription.stages, title=self.problem.name
         )
 
     def __reduce__(self) -> Any:
-        """Pickle and copy the object as its arguments, from which it is prepared again."""
+        """Represent the object for pickling and copying by its arguments, from which it is prepared again."""
         return partial(type(self), compiled=self._compiled, scaling=self._scaling), self._arguments
 
     @interruptible
@@ -172,7 +172,7 @@ class Prepared:
 
     @interruptible
     def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
-        """Write a plan, the functions of its problem, and a program that uses both, as C code.
+        """Write C code of a plan, of the functions of its problem, and of a program that uses them.
 
         Args:
             folder: Folder that is created and returned; files of the same names are replaced. Its contents are listed
@@ -197,7 +197,7 @@ class Prepared:
     def _solve(
         self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, shift: int
     ) -> Solution:
-        """Solve by Newton steps from a known plan, else from the guess, alternative starts and the elastic plan."""
+        """Solve by Newton steps near a known plan, or from the guess, other initial points and the elastic plan."""
         form, transcription = self.formulation, self.transcription
         p = form.parameter_vector(require.mapping("parameters", parameters))
         bounds = form.bound_values(p)
@@ -239,7 +239,7 @@ class Prepared:
         ) from decisive.error
 
     def _alternative_attempts(self, first: Attempt, arguments: dict[str, np.ndarray], bounds: Bounds) -> list[Attempt]:
-        """Run the solver from each alternative start until one succeeds or the time limit is reached.
+        """Run the solver from each alternative initial point until a run succeeds or the time limit is reached.
 
         Together they take at most the iterations of the first attempt. If no function is ever finite, the start does
         not matter.
@@ -273,7 +273,7 @@ class Prepared:
         return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
     def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
-        """Return the optimum near a guess that is a plan, shifted by ``shift`` intervals; None if none is found."""
+        """Return the optimum near a guess, a plan shifted by ``shift`` intervals; None if no optimum is found."""
         form = self.formulation
         if not isinstance(guess, Solution) or not self._is_own_plan(guess) or self.solver_name != "ipopt":
             return None
@@ -302,12 +302,12 @@ class Prepared:
 
     @cached_property
     def _newton(self) -> Newton:
-        """Newton's method, for solves whose guess is a plan of this program."""
+        """Newton's method for solves whose guess is a plan of this program."""
         return Newton(self.program, self.transcription)
 
     @cached_property
     def _short_solver(self) -> tuple[Any, Any]:
-        """The solver for alternative starts, with a lower limit of iterations, and its callback."""
+        """The solver for alternative initial points, with a reduced iteration limit, and its callback."""
         return self._built_solver({**self._options, "max_iter": min(STARTS.iterations, self._max_iterations)})
 
     def _attempt(
@@ -319,7 +319,7 @@ class Prepared:
         bounds: Bounds,
         solver: tuple[Any, Any] | None = None,
     ) -> Attempt:
-        """Run a solver, by default the main one, from an initial point, with the scales that this point determines."""
+        """Run a solver (by default the main solver) from an initial point, with scales computed at this point."""
         arguments = {**limits, "x0": np.clip(point, limits["lbx"], limits["ubx"])}
         p, x0 = arguments["p"], arguments["x0"]
         scales = self._scales(x0, names, bounds, p)
@@ -344,7 +344,7 @@ class Prepared:
         return Attempt(start, arguments, names, scales, outcome, solution)
 
     def _scales(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
-        """Return the scales of the program for an initial point; ``names`` is ``intended`` of :func:`sizes_along`."""
+        """Return the scales of the program for an initial point; ``names`` are the variables with intended values."""
         if not self._scaling:
             return unit_scales(self.transcription)
         scales = compute_scales(self._pattern, sizes_along(self._pattern, point, names, bounds=bounds, p=p), point, p)
@@ -359,7 +359,7 @@ class Prepared:
         return {*self.formulation.states, *self.formulation.controls, "horizon"}
 
     def _solution(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:
-        """Return the solution for a solver's result; ``start`` is the name of the initial point."""
+        """Convert a solver's result to a solution; ``start`` is the name of the initial point."""
         seconds = {"build": self.seconds, "solve": outcome.seconds}
         fields = {"method": self.method.settings, "seconds": seconds, "start": start}
         return solution_of(self.formulation, self.transcription, self.program, outcome, p=p, **fields)
@@ -367,7 +367,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One run of the solver from one initial point (start).
+    """One run of the solver from one initial point, the start.
 
     Attributes:
         start: Name of the start.
@@ -406,7 +406,7 @@ class Attempt:
 
 
 def tighten_bounds(arguments: dict[str, np.ndarray], amounts: Mapping[str, np.ndarray]) -> None:
-    """Move lower bounds up and upper bounds down in place, at most to the middle between them; equalities stay."""
+    """Tighten bounds in place by given amounts, at most to the middle of lower and upper bound; equalities stay."""
     for kind in ("x", "g"):
         low, high = arguments[f"lb{kind}"], arguments[f"ub{kind}"]
         is_range = low < high

@@ -70,7 +70,7 @@ SCALING = ScalingSettings()
 
 @dataclass(frozen=True)
 class Scales:
-    """Numbers by which the variables (n,), constraint rows (m,) and cost of a program are divided to scale it."""
+    """Scales of a program: the numbers by which its n variables, its m constraint rows and its cost are divided."""
 
     variables: np.ndarray
     rows: np.ndarray
@@ -84,7 +84,7 @@ class Scales:
         return {**result, "x0": arguments["x0"] / self.variables, "p": p}
 
     def unscale(self, outcome: Outcome) -> Outcome:
-        """Return a solver's result for the scaled program in the units of the problem."""
+        """Convert a solver's result for the scaled program to the units of the problem."""
         return replace(
             outcome,
             variables=outcome.variables * self.variables,
@@ -96,14 +96,14 @@ class Scales:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Typical sizes of the states (nx,), the controls (nu,) and the horizon (s)."""
+    """Typical magnitudes of the nx states, of the nu controls and of the horizon (s)."""
 
     states: np.ndarray
     controls: np.ndarray
     horizon: float
 
     def of_variables(self, transcription: Transcription) -> np.ndarray:
-        """Return the size of each variable of a program; 1 for auxiliary variables of stages."""
+        """Return the typical magnitude of each variable of a program; 1 for auxiliary variables."""
         result = np.ones(transcription.size)
         for role, sizes in (("state", self.states), ("control", self.controls), ("horizon", np.array([self.horizon]))):
             chosen = transcription.variable_role == role
@@ -112,7 +112,7 @@ class Sizes:
 
 
 class Pattern:
-    """Sparsity structure of a program, found once for repeated computation of its scales.
+    """Sparsity structure of a program, determined once for repeated computation of the program's scales.
 
     Attributes:
         rows, columns: Row and column of each nonzero of the Jacobian.
@@ -247,7 +247,7 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
-    """Return the scales of a program for given sizes of its variables; rows and cost are scaled by their changes."""
+    """Return the scales of a program; rows and cost are scaled by their change if variables change by their sizes."""
     program, size_of_variable = pattern.program, sizes.of_variables(pattern.transcription)
     # squares of smaller sizes underflow
     size_of_variable = np.where(size_of_variable > np.sqrt(np.finfo(float).tiny), size_of_variable, 1.0)
@@ -273,7 +273,7 @@ def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
 
 
 def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales: Scales, sizes: Sizes) -> str:
-    """Describe how a solved program is badly scaled; "" if it is not."""
+    """Return a description of how a solved program is badly scaled; "" if the scaling is good."""
     form, transcription = pattern.form, pattern.transcription
     scaled_size = sizes.of_variables(transcription) / scales.variables
     deviation = np.abs(np.log(scaled_size))
@@ -295,7 +295,7 @@ def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales:
 
 
 def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
-    """Return the scales of the variables, with declared sizes, rounded to powers of two, in place of computed ones."""
+    """Replace computed scales of variables by declared sizes, rounded to powers of two, where sizes are declared."""
     form = pattern.form
     declared = Sizes(form.scales[: form.nx], form.scales[form.nx :], 1.0).of_variables(pattern.transcription)
     declared[~np.isin(pattern.transcription.variable_role, ("state", "control"))] = np.nan
@@ -317,7 +317,7 @@ def _evaluate(function: Callable[..., Any], point: np.ndarray, p: np.ndarray) ->
 
 
 class PredeterminedVariables:
-    """Variables of a program that the initial state alone determines, whatever the controls, and the limits on them.
+    """Variables of a program that the initial state determines for all controls, and the limits of these variables.
 
     Variables that are joined to a fixed variable, as the end of the last interval is to a fixed end, are known too.
     """

@@ -28,7 +28,7 @@ __all__ = ["METHODS", "sensitivity"]
 METHODS = {"Collocation": Collocation, "MultipleShooting": MultipleShooting}
 """Classes of the direct methods by the name of the type that a solution stores."""
 SOFTENING = 1e-11
-"""Regularisation of dependent rows in the linear system, relative to their size and to the curvature."""
+"""Regularisation of dependent constraint rows in the linear system, relative to row size and curvature."""
 REFINEMENTS = 4
 """Number of steps of iterative refinement, which correct for the regularisation."""
 
@@ -120,7 +120,10 @@ def sensitivity(solution: Solution, name: str) -> Sensitivity:
 
 
 def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]:
-    """Return formulation, transcription and program whose optimum a plan is; raise ProblemError for any other plan."""
+    """Return the formulation, the transcription and the nonlinear program of which a plan is an optimum.
+
+    Raise ProblemError for any other plan.
+    """
     plan = f"plan {solution.name!r}"
     settings = dict(solution.method)
     method_name = settings.pop("type")
@@ -145,7 +148,7 @@ def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]
 def _by_parameters(
     transcription: Transcription, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return derivatives of the Lagrangian's gradient (n, k) and of the rows (m, k) with respect to parameters."""
+    """Differentiate the Lagrangian's gradient and the rows with respect to k parameters. Shapes (n, k) and (m, k)."""
     slope, change = np.zeros((transcription.size, len(columns))), np.zeros((transcription.n_rows, len(columns)))
     for block in transcription.blocks:
         function = block.function
@@ -166,8 +169,9 @@ def _by_parameters(
 def _solve_system(
     at: Conditions, slope: np.ndarray, change: np.ndarray, at_x: np.ndarray, at_g: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return derivatives of variables (n, k), row multipliers (m, k) and bound multipliers (n, k) with respect to k
-    parameters, all scaled.
+    """Return the scaled derivatives of variables, row multipliers and bound multipliers with respect to k parameters.
+
+    Shapes (n, k), (m, k) and (n, k).
 
     Args:
         slope, change: Derivatives of the gradient of the Lagrangian and of the rows, with fixed variables.
@@ -206,7 +210,7 @@ def _solve_system(
 
 
 def control_rates(transcription: Transcription, solution: Solution, p: np.ndarray, dv: np.ndarray) -> np.ndarray:
-    """Return the derivatives of the controls at the reported times, given those of the variables. Shape (M, nu, k).
+    """Return the derivatives of the controls at the reported times from those of all variables. Shape (M, nu, k).
 
     The controls are linear in the variables, so that differences are exact.
     """

@@ -68,7 +68,7 @@ def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizo
 def _staged_layout(
     intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool
 ) -> Layout:
-    """Return the layout whose stage k has node k, copies of horizon and start, interval k and a copy of its end."""
+    """Return the layout of stages: node k, copies of horizon and start, interval k and a copy of the interval's end."""
     carried = node_size + free_horizon + node_size * keep_initial
     inputs = interval_size + node_size
     stride = carried + inputs
@@ -132,7 +132,7 @@ class TranscriptionBuilder:
     # ---- variables -------------------------------------------------------------------------------------------
 
     def variables(self, role: str, index: np.ndarray, at: np.ndarray, bounds: str | None) -> None:
-        """Declare what the variables of given indices are: entries of a state, a control or the horizon, with bounds.
+        """Declare that variables of given indices are entries of a state, control or the horizon, and set bounds.
 
         Args:
             role: ``state``, ``control`` or ``horizon``.
@@ -172,7 +172,7 @@ class TranscriptionBuilder:
                 self.linear(ties, layout.node[:, :1], -1.0)
 
     def point(self, states: np.ndarray, controls: np.ndarray, stages: np.ndarray) -> np.ndarray:
-        """Return the indices of all variables of K points: states (nx, K), controls (nu, K), and a free horizon."""
+        """Stack the indices of the states (nx, K) and controls (nu, K) of K points, and of a free horizon."""
         horizon = [] if self.layout.horizon is None else [self.layout.horizon[stages][None, :]]
         return np.vstack([states, controls, *horizon])
 
@@ -188,7 +188,7 @@ class TranscriptionBuilder:
         joins: bool = False,
         ends: bool = False,
     ) -> np.ndarray:
-        """Allocate constraint rows with given labels at each of K points, and return their indices (m, K).
+        """Allocate constraint rows with given labels at each of K points, and return their indices. Shape (m, K).
 
         Args:
             bounds: Indices of the bounds of the m rows in the bound table; None for rows that are equal to zero.
@@ -214,7 +214,7 @@ class TranscriptionBuilder:
     def path_rows(
         self, rows: Rows, states: np.ndarray, controls: np.ndarray, stages: np.ndarray, *, at: np.ndarray
     ) -> None:
-        """Declare path constraints at K points, given the indices of the states (nx, K) and controls (nu, K) there."""
+        """Declare path constraints at K points, at which the states (nx, K) and controls (nu, K) have given indices."""
         if len(rows) == 0 or len(at) == 0:
             return
         point_data = self.formulation.point_data(at)
@@ -224,7 +224,7 @@ class TranscriptionBuilder:
         self.blocks.append(Block(function, self.point(states, controls, stages), point_data, index))
 
     def node_rows(self, rows: Rows, controls: np.ndarray, *, first_only: bool = False) -> None:
-        """Declare path constraints at every node; at the first only those that fixed initial states leave undetermined.
+        """Declare path constraints at every node; at the first node, only those that fixed initial states leave open.
 
         ``controls`` (nu, N + 1) are the variables read there; they do not matter for rows without controls.
         """
@@ -378,7 +378,7 @@ class MeshedMethod(ABC):
 
     @abstractmethod
     def transcribe(self, form: Formulation, *, staged: bool = False) -> Transcription:
-        """Return the nonlinear program of a problem; ``staged`` orders it for a structure-exploiting solver."""
+        """Return a problem's nonlinear program, which ``staged`` orders for a structure-exploiting solver."""
 
     @property
     def settings(self) -> dict[str, Any]:

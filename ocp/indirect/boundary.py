@@ -1,4 +1,4 @@
-"""The boundary value problem of the minimum principle for shooting, and Newton's method for it.
+"""Boundary value problem of the minimum principle for shooting methods, and Newton's method for its equations.
 
 Its equations are the canonical equations, the end conditions, and the transversality conditions on the costates.
 """
@@ -94,7 +94,7 @@ class BoundaryProblem:
         return z, data, y_start[: form.nx, :] - data[of["ends"]][form.nx : 2 * form.nx]
 
     def _chain(self, state: Any, data: Any, arcs: ControlArcs, total: int) -> tuple[list[Any], Any]:
-        """Integrate y = [x; lambda] backwards from an end state; return its values at the nodes, in reverse order."""
+        """Integrate states and costates backwards from an end state; return them at all nodes, last node first."""
         form, of = self.form, self._data(arcs)
         horizon = data[of["horizon"]]
         gradient = ca.gradient(form.terminal, form.x)
@@ -109,7 +109,7 @@ class BoundaryProblem:
         return nodes, y
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
-        """Return the integrator data q of all shooting segments, one column per segment."""
+        """Return the integrator's data vectors q of all shooting segments as the columns of a matrix."""
         of, total = self._data(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
         begins, lengths = [], []
@@ -127,14 +127,14 @@ class BoundaryProblem:
         )
 
     def arguments(self, y: Any, at: Any, horizon: Any, q: Any) -> list[Any]:
-        """Return the arguments of the Hamiltonian system's functions at times ``at``, one column per sample."""
+        """Return states, costates, times ``at`` and data as arguments of the Hamiltonian system's functions."""
         sizes = self.ham.sizes
         cuts = np.cumsum([3, *sizes[4:]])
         tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
         return [y[: sizes[0]], y[sizes[0] :], at, horizon, *tail]
 
     def layout(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Return the slice of every part of the vector of unknowns, by name."""
+        """Return, by name, the slice of every part of the vector of unknowns, such as the switch times."""
         form = self.form
         total = sum(arcs.segments)
         sizes = {
@@ -173,7 +173,10 @@ class BoundaryProblem:
         return ca.Function("segment", [y, q], [result["xf"], result["qf"][:, -1]])
 
     def integrate(self, segment: Any, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return states and costates (2 nx, places) and integrals (2,) over a segment; nan if the integration fails."""
+        """Return states and costates at points of a segment, and integrals over the segment; nan after a failure.
+
+        Shapes (2 nx, places) and (2,).
+        """
         try:
             with casadi_silenced():
                 states, integrals = segment(y, q)
@@ -197,7 +200,7 @@ class BoundaryProblem:
     def unpack(
         self, z: np.ndarray, arcs: ControlArcs, data: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Return states and costates at the nodes (2 nx, S + 1), segment data, switch times and horizon of unknowns."""
+        """Convert unknowns to node states and costates (2 nx, S + 1), segment data, switch times and horizon."""
         form, total = self.form, sum(arcs.segments)
         horizon, switches = float(data[0]), np.zeros(0)
         if self.backward:
@@ -220,7 +223,7 @@ class BoundaryProblem:
 
 
 def side_by_side(sizes: dict[str, int]) -> dict[str, slice]:
-    """Return the slice of every part of a stacked vector by name, from the sizes of the parts."""
+    """Return, by name, the slices of consecutive parts of a stacked vector, from the sizes of the parts."""
     cuts = np.cumsum([0, *sizes.values()]).tolist()
     return {name: slice(a, b) for name, (a, b) in zip(sizes, itertools.pairwise(cuts), strict=True)}
 

@@ -23,7 +23,7 @@ __all__ = ["Extremal", "Hamiltonian", "cost_gradient"]
 
 @dataclass(frozen=True)
 class Hamiltonian:
-    """Hamiltonian system of an optimal control problem: its Hamiltonian, and the controls that minimise it.
+    """Hamiltonian system of an optimal control problem: the Hamiltonian H, and the controls that minimise H.
 
     Attributes:
         form: The problem.
@@ -71,7 +71,7 @@ class Hamiltonian:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Sizes of the arguments of `unknowns`, `flow` and `outputs`: x, lam, t, T, p, bang and guess."""
+        """Sizes of the arguments of the functions `unknowns`, `flow` and `outputs`, in the order of the arguments."""
         form = self.form
         return (form.nx, form.nx, 1, 1, form.np, len(self.linear), len(self.smooth) + len(form.path))
 
@@ -97,7 +97,7 @@ class Hamiltonian:
     def multipliers(
         self, free: np.ndarray, x: np.ndarray, u: np.ndarray, lam: np.ndarray, *, t: np.ndarray, horizon: float, p: Any
     ) -> np.ndarray:
-        """Return the path equality multipliers that make H most nearly stationary in the free controls. Shape (K, m).
+        """Return path equality multipliers that make the Hamiltonian nearly stationary in free controls. Shape (K, m).
 
         Args:
             free: Which controls are off their bounds. Shape (K, nu), bool.
@@ -116,7 +116,7 @@ class Hamiltonian:
         return mu
 
     def _eliminate(self, name: str, outputs: list[Any]) -> Any:
-        """Return the CasADi Function of given expressions at the controls and multipliers that minimise H."""
+        """Return the CasADi Function of expressions at the controls and multipliers that minimise the Hamiltonian."""
         form = self.form
         sym = form.sym
         w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])
@@ -132,7 +132,7 @@ class Hamiltonian:
     # ---- the equations that make H stationary in the smooth controls, and their solution ----------------------
 
     def _solve(self) -> tuple[Any, str]:
-        """Return the function that computes the optimal controls and multipliers w, and the name of its method.
+        """Return the function that computes optimal controls and multipliers, and the name of the solution method.
 
         Its arguments are (x, lam, t, T, p, bang, guess).
         """
@@ -167,7 +167,7 @@ class Hamiltonian:
         return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
 
     def _residual(self, w: Any, bang: Any) -> Any:
-        """Return the gradient of H in the smooth controls and, below it, the path equalities. Shape (n + m, 1)."""
+        """Return the Hamiltonian's gradient in the smooth controls, stacked on path equalities. Shape (n + m, 1)."""
         n = len(self.smooth)
         gradient = ca.gradient(self.value, self.form.u)[list(self.smooth)] if n else self.form.problem.symbols(0, 1)
         stacked = ca.densify(ca.vertcat(gradient, self.rows))
@@ -209,13 +209,13 @@ class Hamiltonian:
 
 
 def _assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
-    """Return the control vector of smooth controls, the first entries of ``w``, and linear ones at bounds ``bang``."""
+    """Assemble the control from smooth controls (first entries of ``w``) and linear controls at bounds ``bang``."""
     order = {index: w[i] for i, index in enumerate(smooth)} | {index: bang[i] for i, index in enumerate(linear)}
     return ca.densify(ca.vertcat(form.problem.symbols(0, 1), *[order[i] for i in range(form.nu)]))
 
 
 def check_constraints(form: Formulation) -> None:
-    """Raise ProblemError, naming the constraint, if the indirect method does not support one."""
+    """Raise ProblemError, naming the constraint, for a constraint that the indirect method does not support."""
     for name, place in form.states.items():
         index = form.bounds.places["state"][place]
         low, high = (bound[index] for bound in numeric_bounds(form))
@@ -310,7 +310,7 @@ def positive(matrix: Any) -> bool:
 
 @dataclass(frozen=True)
 class Extremal:
-    """Samples of an extremal (a solution of the equations of the minimum principle), segment by segment.
+    """Samples of an extremal (a solution of the equations of the minimum principle) in each of its segments.
 
     Attributes:
         places: Positions of the samples in each segment, 0..1. Shape (m,). widths: of the segments, s. Shape (K,).

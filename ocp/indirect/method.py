@@ -89,7 +89,7 @@ def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: 
 
 
 def control_derivatives(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list[np.ndarray]:
-    """Return the derivatives of the Hamiltonian in the controls at K samples of an extremal, and the path equalities.
+    """Return control derivatives of the Hamiltonian, and the path equalities, at K samples of an extremal.
 
     These are dH/du (K, nu), the sum of absolute terms of dH/du (K, nu), d2H/du2 (K, nu, nu), the path equalities (K, m)
     and their Jacobian (K, m, nu).
@@ -108,7 +108,7 @@ def control_derivatives(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list
 
 
 def null_space(rows: np.ndarray) -> Any:
-    """Return an orthonormal basis (n, k) of the null space of a matrix ``rows`` (m, n)."""
+    """Return an orthonormal basis of the null space of a matrix with n columns. Shape (n, k)."""
     if rows.shape[0] == 0:
         return np.eye(rows.shape[1])
     _, sizes, directions = np.linalg.svd(rows)
@@ -192,7 +192,7 @@ class PreparedIndirect:
         self.seconds = time.monotonic() - began
 
     def __reduce__(self) -> Any:
-        """Pickle and copy the object as its arguments, from which it is prepared again."""
+        """Represent the object for pickling and copying by its arguments, from which it is prepared again."""
         return type(self), (self.problem, self.method, self._seeding)
 
     @interruptible
@@ -259,7 +259,7 @@ class PreparedIndirect:
         return solution
 
     def _no_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
-        """Raise SolveError because of an unusable seed or, without ``check``, return it as an unsuccessful solution."""
+        """Raise SolveError about an unusable seed or, without ``check``, return the seed as a failed solution."""
         if check or seed is None:
             words = f"problem {self.problem.name!r}: the indirect method failed: {why}{error}"
             details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
@@ -366,7 +366,7 @@ class PreparedIndirect:
         )
 
     def _segments(self, y: np.ndarray, inputs: np.ndarray, bounds: Bounds) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return initial values and data of reported segments: shooting segments, split where controls reach bounds."""
+        """Return initial values and data of reported segments: shooting segments split where controls reach bounds."""
         index = self.formulation.bounds.places["control"]
         low, high = bounds[0][index], bounds[1][index]
 

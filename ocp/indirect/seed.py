@@ -41,7 +41,7 @@ SETTINGS = SeedSettings()
 
 @dataclass(frozen=True)
 class ControlArcs:
-    """Arcs between the switches of bang-bang controls, those in which the Hamiltonian is linear.
+    """Arcs between the switches of bang-bang controls, which are the controls in which the Hamiltonian is linear.
 
     Attributes:
         switches: Fractions of the horizon. Shape (A - 1,).
@@ -70,7 +70,7 @@ class ControlArcs:
 def read_arcs(
     ham: Hamiltonian, outputs: Any, seed: Solution, p: np.ndarray, *, bounds: Bounds, segments: int
 ) -> ControlArcs:
-    """Return the bang-bang arcs that the signs of dH/du along a direct solution (seed) define.
+    """Return the bang-bang arcs between the sign changes of the switching functions dH/du of a direct solution.
 
     Where dH/du > 0, the lower bound is active.
 
@@ -114,7 +114,7 @@ def read_arcs(
 
 
 def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
-    """Return the control bounds under which a seed was computed; they may differ from ``bounds``. Shape (nu,) each."""
+    """Return the control bounds under which a seed was computed, which may differ from ``bounds``. Shape (nu,) each."""
     source = form if seed.problem is None else Formulation(seed.problem)
     try:
         low, high = source.bound_values(source.parameter_vector(seed.parameters))
@@ -212,7 +212,7 @@ def read_unknowns(
 
 
 def sample_seed(form: Formulation, seed: Solution, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return states (K, nx), costates (K, nx) and controls (K, nu) of a direct solution at fractions of its horizon."""
+    """Return states, costates and controls of a direct solution at K fractions of its horizon. Shape (K, size) each."""
     sample = seed.at_fraction(fractions)
     reported = np.hstack([seed.costates[name] for name in form.states])
     lam = np.column_stack([np.interp(fractions * seed.horizon, seed.t, column) for column in reported.T])

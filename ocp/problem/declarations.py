@@ -1,4 +1,4 @@
-"""Declared variables, constraints and cost of a problem by name, and a reader that converts user values to them."""
+"""Declarations of a problem (variables, constraints, cost), and a reader that converts user values to expressions."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Constraint:
-    """A named vector constraint ``lower <= expression <= upper``; equal bounds make it an equality.
+    """A named vector constraint ``lower <= expression <= upper``, an equality if both bounds are equal.
 
     Attributes:
         name: Unique among the constraints of the problem.
@@ -129,7 +129,7 @@ class Constraint:
         return int(self.expression.numel())
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError if expression, bounds, unit or tolerance do not match; see :meth:`Declarations.check`."""
+        """Raise ProblemError if expression, bounds, unit and tolerance do not match; see :meth:`Declarations.check`."""
         what = f"constraint {self.name!r}"
         way = () if self.way is None else (self.way,)
         _require_columns(symbols, self.size, what, self.expression, self.lower, self.upper, *way)
@@ -145,7 +145,7 @@ class Constraint:
 
 @dataclass
 class Horizon:
-    """The declared final time; it is fixed if lower and upper bound are the same expression."""
+    """The declared final time, which is fixed if its lower and upper bounds are the same expression."""
 
     symbol: Any
     lower: Any
@@ -202,7 +202,10 @@ class Declarations:
     terminal: Any = None
 
     def check_new_variable(self, kind: str, name: Any) -> None:
-        """Raise ProblemError if a new variable may not have this name; ``kind`` appears in the message."""
+        """Raise ProblemError if the name of a new variable is invalid, reserved or already used.
+
+        ``kind`` appears in the message.
+        """
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
         if name in RESERVED:
@@ -212,14 +215,14 @@ class Declarations:
                 raise ProblemError(f"{kind} {name!r}: a {pool[:-1]} of this name exists already")
 
     def check_new_constraint(self, kind: str, name: Any) -> None:
-        """Raise ProblemError if a new constraint may not have this name; ``kind`` appears in the message."""
+        """Raise ProblemError if the name of a new constraint is invalid or already used; messages contain ``kind``."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
         if any(name in pool for pool in (self.path, self.start, self.end, self.watch, self.apart)):
             raise ProblemError(f"{kind} {name!r}: a constraint of this name exists already")
 
     def check(self, symbols: Any) -> None:
-        """Raise ProblemError that names the faulty declaration if declarations read from a file are inconsistent.
+        """Raise ProblemError, naming the faulty declaration, if declarations read from a file are inconsistent.
 
         Args:
             symbols: ``casadi.SX`` or ``casadi.MX``, the type of every expression.
@@ -254,7 +257,7 @@ class Declarations:
                 _require(isinstance(variable.unit, str), what)
 
     def _check_equations(self, symbols: Any) -> None:
-        """Check sizes and types of the dynamics, the symbols at the start, the signals and the cost."""
+        """Check sizes and types of the dynamics, the symbols of start values, the signals and the cost."""
         for name, rate in self.dynamics.items():
             _require(name in self.states, f"dynamics of {name!r}")
             _require_columns(symbols, self.states[name].size, f"dynamics of {name!r}", rate)
@@ -269,7 +272,7 @@ class Declarations:
             _require(value is None or (isinstance(value, symbols) and value.numel() == 1), "cost")
 
     def __str__(self) -> str:
-        """Return states, controls, parameters, horizon, dynamics, constraints and cost by name, one a line."""
+        """Return a text with one line for each declared state, control, parameter, constraint and other entry."""
         lines = ["  horizon      not declared" if self.horizon is None else f"  horizon      {self.horizon}"]
         for state in self.states.values():
             ends = [f"; {end} {text}" for end in ENDS if (text := column_text(getattr(state, end))) != "nan"]
@@ -302,13 +305,13 @@ def _require(condition: bool, what: str) -> None:
 
 
 def _require_columns(symbols: Any, size: int, what: str, *values: Any) -> None:
-    """Raise ProblemError unless values are columns of ``size`` expressions of the given type of symbols."""
+    """Raise ProblemError unless each value is a column of ``size`` expressions of a given CasADi type, SX or MX."""
     for value in values:
         _require(isinstance(value, symbols) and value.shape == (size, 1), what)
 
 
 def column_text(value: Any) -> str:
-    """Return a column of numbers or expressions as text; equal entries are written once."""
+    """Return a column of numbers or expressions as text; if all entries are equal, the text is that of one entry."""
     if isinstance(value, ca.MX):
         if ca.symvar(value):
             return shorten(str(value))
@@ -340,7 +343,10 @@ class ExpressionReader:
     parameters: tuple[Any, ...]
 
     def expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
-        """Return a value as a column of expressions in ``known`` symbols; with ``finite``, constants must be finite."""
+        """Return a user value as a column of expressions that contain only the ``known`` symbols.
+
+        With ``finite``, constant entries of an expression must be finite.
+        """
         if value is None or isinstance(value, str):
             raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
         if is_symbolic(value):
@@ -365,7 +371,7 @@ class ExpressionReader:
         return expression
 
     def column(self, what: str, value: Value, size: int, default: float) -> Any:
-        """Return a value, or a default, as a column of expressions in parameters only. Shape (size, 1)."""
+        """Return a user value, or ``default`` for None, as a column of parameter expressions. Shape (size, 1)."""
         if value is None:
             return self.symbols(ca.DM.ones(size, 1) * default)
         if is_symbolic(value):
@@ -380,7 +386,7 @@ class ExpressionReader:
         return ca.densify(ca.vec(expression))
 
     def bounds(self, what: str, size: int, lower: Value, upper: Value) -> tuple[Any, Any]:
-        """Return lower and upper bounds as columns of ``size`` entries, infinite if there are none."""
+        """Return lower and upper bounds as columns of ``size`` entries; a bound that is None becomes infinite."""
         low = self.column(f"{what}: lower", lower, size, -np.inf)
         high = self.column(f"{what}: upper", upper, size, np.inf)
         for label, value in (("lower", lower), ("upper", upper)):
@@ -399,7 +405,7 @@ class ExpressionReader:
         unit: str,
         tolerance: Value,
     ) -> Constraint:
-        """Return a constraint on an expression of the ``known`` symbols; ``kind`` appears in messages."""
+        """Return a constraint on an expression that contains only the ``known`` symbols; messages contain ``kind``."""
         what = f"{kind} constraint {name!r}"
         require.text(f"{what}: unit", unit)
         vector = self.expression(what, expression, known)
@@ -436,7 +442,7 @@ class ExpressionReader:
 
 
 def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> int:
-    """Return the size of a variable: the given one, else the common size of its values, 1 if all are scalars."""
+    """Return the number of entries of a variable: the given size, or the common size of its values (1 for scalars)."""
     if size is not None:
         return require.count(f"{what}: size", size)
     labelled = {f"{what}: {k}": v for k, v in values.items() if v is not None and not callable(v)}
@@ -452,7 +458,7 @@ def number_of_entries(what: str, size: int | None, values: dict[str, Value]) -> 
 
 
 def read_scale(what: str, value: Value, size: int) -> Any:
-    """Return the scales of the entries of a variable, nan if unknown, shape (size,); None if no scale is given."""
+    """Return the scale of each entry of a variable, nan where unknown; None if no scale is given. Shape (size,)."""
     if value is None:
         return None
     array = numeric(f"{what}: scale", value)
@@ -463,7 +469,7 @@ def read_scale(what: str, value: Value, size: int) -> Any:
 
 
 def check_guess(what: str, guess: Any, size: int) -> None:
-    """Raise ProblemError unless a guess is None, a function, or one finite number for all entries or for each."""
+    """Raise ProblemError unless a guess is None, a function, one finite number, or one finite number per entry."""
     if guess is None or callable(guess):
         return
     array = numeric(f"{what}: guess", guess)
@@ -474,7 +480,7 @@ def check_guess(what: str, guess: Any, size: int) -> None:
 
 
 def read_tolerance(what: str, value: Value, size: int) -> list[float] | None:
-    """Return a tolerance for each entry of a constraint, shape (size,); None if no tolerance is given."""
+    """Return a tolerance for each entry of a constraint; None if no tolerance is given. Shape (size,)."""
     if value is None:
         return None
     array = numeric(f"{what}: tolerance", value)
@@ -485,7 +491,7 @@ def read_tolerance(what: str, value: Value, size: int) -> list[float] | None:
 
 
 def signal_function(what: str, track: Callable[[Any], Any]) -> Any:
-    """Return a function of time given by the user as a casadi Function whose value is a column."""
+    """Convert a user's function of time to a casadi Function whose value is a column."""
     time = ca.MX.sym("time")
     try:
         return ca.Function("signal", [time], [ca.densify(ca.vec(ca.MX(track(time))))])

@@ -1,4 +1,4 @@
-"""Interval enclosures of functions of one variable: their range and slopes, also across kinks and jumps.
+"""Interval enclosures of functions of one variable: bounds of values and slopes, also across kinks and jumps.
 
 This is forward-mode differentiation in interval arithmetic. Each instruction carries its range and an interval of
 slopes that contains every difference quotient (x(s) - x(t)) / (s - t) of two places in the interval. A smooth operation
@@ -67,7 +67,10 @@ class Enclosures:
         check_instructions(what, self._function)
 
     def __call__(self, low: np.ndarray, high: np.ndarray) -> Enclosure:
-        """Return bounds of the expressions over M intervals of the symbol with the ends ``low`` and ``high`` (M,)."""
+        """Return bounds of the expressions over M intervals of the symbol.
+
+        The intervals reach from ``low`` to ``high``. Shape (M,) each.
+        """
         jets = self._jets(_Jet(Interval(low, high), constant(1.0, low)))
         return Enclosure(*(np.column_stack([side(jet) for jet in jets]) for side in _SIDES))
 
@@ -130,7 +133,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
 
 @lru_cache(maxsize=4096)
 def _partials(code: int, count: int, exponent: float | None) -> Any:
-    """Return the partial derivatives of an operation as an SX function; a given exponent counts as a constant."""
+    """Return the partial derivatives of an operation as an SX function; ``exponent``, if given, is constant."""
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     if count == 1:
         return ca.Function("partials", [x], [ca.densify(ca.gradient(ca.SX.unary(code, x), x))])
@@ -141,7 +144,7 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
 
 
 def _number(x: Interval) -> float | None:
-    """Return the number of which all intervals consist; None if they are not all the same single number."""
+    """Return the number if all intervals consist of one and the same number; else None."""
     first = float(x.low[0])
     return first if bool((x.low == first).all() and (x.high == first).all()) else None
 
@@ -159,7 +162,7 @@ def _absolute(code: int, x: _Jet) -> _Jet:
 
 
 def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
-    """Return bounds of the value and slope of fmin or fmax; where either argument may be selected, both count."""
+    """Return bounds of the value and slope of fmin or fmax; both slopes count where the selection is unknown."""
     low, high = (x, y) if code == ca.OP_FMIN else (y, x)
     first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
     ends = [
@@ -211,11 +214,11 @@ _KINKED: dict[int, Callable[..., _Jet]] = {
         for name in ("FLOOR", "CEIL", "SIGN", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR")
     },
 }
-"""Rules for the bounds of operations that are not smooth, by the code of casadi's instruction."""
+"""Rules for bounds of operations that are not smooth, by the instruction code of casadi."""
 
 
 FRAME_ENTRIES = 12
-"""Number of entries of a frame: its rotation matrix column by column, then its position."""
+"""Number of entries that describe a frame: its rotation matrix column by column, then its position."""
 
 
 class PrescribedMotion:
@@ -258,7 +261,7 @@ class PrescribedMotion:
                 self._bodies.append((frames.index(moving[0].frame), _coordinates(core)))
 
     def bounds(self, pair: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds of the prescribed motion of the bodies of given pairs during intervals of time.
+        """Return how far the prescribed motion can at most move the bodies of given pairs during time intervals.
 
         Args:
             pair, begin, end: Indices of the pairs, and the ends of the intervals in the unit of the time. Shape (K,).
@@ -295,7 +298,10 @@ class PrescribedMotion:
 
 
 def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[Any], values: Sequence[Any]) -> Any:
-    """Return a frame as an expression of time alone, with numbers for parameters; raise if it depends on states."""
+    """Return a frame that depends only on time as an expression of time, with numbers in place of the parameters.
+
+    Raise ProblemError if the frame also depends on states.
+    """
     known = {identity(symbol) for symbol in ca.symvar(ca.vertcat(time, *parameters))}
     others = [symbol for symbol in ca.symvar(frame) if identity(symbol) not in known]
     if others and ca.depends_on(frame, ca.vertcat(*map(ca.vec, others))):
@@ -306,9 +312,9 @@ def _as_function_of_time(what: str, frame: Any, time: Any, parameters: Sequence[
 
 
 def _coordinates(core: np.ndarray) -> np.ndarray:
-    """Return the matrix that maps the entries of a frame to the world coordinates of a body's C bounding box corners.
+    """Return the matrix that maps the entries of a frame to the corners of a body's bounding box in world coordinates.
 
-    Shape (3 C, 12). ``core`` are the points of the body in the frame.
+    Shape (3 C, 12) for C corners. ``core`` are the points of the body in the frame.
     """
     ends = np.stack([core.min(axis=0), core.max(axis=0)])
     corners = np.unique(np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3), axis=0)
@@ -317,6 +323,9 @@ def _coordinates(core: np.ndarray) -> np.ndarray:
 
 
 def _longest(coordinates: np.ndarray) -> np.ndarray:
-    """Return the largest length of the C vectors in each row (M, 3 C); inf if it is huge. Shape (M,)."""
+    """Return the length of the longest of the C vectors in each row of an array (M, 3 C). Shape (M,).
+
+    A huge length is returned as infinite.
+    """
     lengths = np.linalg.norm(coordinates.reshape(len(coordinates), -1, 3), axis=2).max(axis=1)
     return np.where(lengths < 1e100, lengths, np.inf)

@@ -51,7 +51,7 @@ class Rows:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the declared constraints to which the rows belong, in order."""
+        """Names of the declared constraints to which the rows belong, in the order of declaration."""
         return tuple(dict.fromkeys(self.owners))
 
     def of(self, name: str) -> np.ndarray:
@@ -59,7 +59,7 @@ class Rows:
         return np.array([i for i, owner in enumerate(self.owners) if owner == name])
 
     def select(self, mask: np.ndarray) -> Rows:
-        """Return the rows that a mask (m,) selects."""
+        """Return the constraint rows that a boolean mask of shape (m,) selects."""
         keep = np.flatnonzero(mask)
         expression = self.expression[keep.tolist()] if keep.size else self.expression[:0, :]
         names, owners = (tuple(texts[i] for i in keep) for texts in (self.labels, self.owners))
@@ -69,7 +69,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class BoundTable:
-    """All bounds of a problem in two vectors; variables and rows of a nonlinear program refer to their entries.
+    """All bounds of a problem in two vectors, to whose entries the variables and rows of a nonlinear program refer.
 
     Attributes:
         function: Parameters -> (lower, upper), each of shape (n, 1).
@@ -81,7 +81,7 @@ class BoundTable:
     places: dict[str, np.ndarray]
 
     def pullback(self, p: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-        """Return the derivative, with respect to the parameters, of the sum of bounds times multipliers. Shape (np,).
+        """Return the derivative of the sum of bounds times multipliers with respect to the parameters. Shape (np,).
 
         ``multipliers`` (2, n) are those of the lower and of the upper bounds.
         """
@@ -101,7 +101,7 @@ class BoundTable:
 
 
 class Formulation:
-    """Stacked vectors and functions of a checked problem, which later changes of the problem do not affect.
+    """A checked problem in the form of stacked vectors and functions, unaffected by later changes of the problem.
 
     Attributes:
         x, u, p, t, T: Symbols of states (nx, 1), controls (nu, 1), parameters (np, 1), time, horizon. sym: Creates
@@ -186,7 +186,7 @@ class Formulation:
 
     @classmethod
     def of(cls, problem: Problem) -> Formulation:
-        """Return the formulation cached in a problem, or a new one if the declarations have changed."""
+        """Return the formulation cached in a problem, or a new formulation if the declarations have changed."""
         cached: Formulation | None = checked_problem(problem).formulated
         entries = entries_of(problem.declared)
         if cached is None or list(map(id, cached._entries)) != list(map(id, entries)):
@@ -194,13 +194,16 @@ class Formulation:
         return cached
 
     def cached(self, name: Any, make: Callable[[], Any]) -> Any:
-        """Return the value cached under a name; on the first call, compute it by ``make``."""
+        """Return the value cached under ``name``; on the first call, compute the value by ``make``."""
         if name not in self._cache:
             self._cache[name] = make()
         return self._cache[name]
 
     def function(self, name: str, outputs: list[Any], names: list[str]) -> Any:
-        """Return a casadi Function of state, control, time, horizon and parameters; of MX type if signals occur."""
+        """Return a casadi Function of state, control, time, horizon and parameters that evaluates given expressions.
+
+        The function is of MX type if the expressions contain signals.
+        """
         inputs, labels = [self.x, self.u, self.t, self.T, self.p], ["x", "u", "t", "T", "p"]
         if not (self.signals and ca.depends_on(ca.vertcat(*map(ca.vec, outputs)), self.w)):
             return ca.Function(name, inputs, outputs, labels, names)
@@ -209,16 +212,16 @@ class Formulation:
         return ca.Function(name, symbols, inner.call([*symbols, self._signal(symbols[2])]), labels, names)
 
     def point_data(self, fractions: np.ndarray) -> np.ndarray:
-        """Return the data of a point function at horizon fractions (K,): these and the signals. Shape (1 + nw, K)."""
+        """Return the data of :meth:`point_function` at K points: horizon fraction and signals. Shape (1 + nw, K)."""
         return np.vstack([np.reshape(fractions, (1, -1)), self.signals_at(np.ravel(fractions) * self.duration).T])
 
     def signals_at(self, times: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the signals, or their time derivatives of a given order, at times (M,), s. Shape (M, nw)."""
+        """Return the signals, or their time derivatives of a given order, at M times (s). Shape (M, nw)."""
         times = np.ravel(times).astype(float)
         return self._signals_at(order, times.tobytes()) if self.signals else np.zeros((len(times), 0))
 
     def _evaluate_signals(self, order: int, times: bytes) -> np.ndarray:
-        """Compute :meth:`signals_at`; the times are bytes, because the cache requires a hashable argument."""
+        """Evaluate the signals for :meth:`signals_at`; times are bytes because the cache needs hashable arguments."""
 
         def make() -> Sampler:
             t = ca.MX.sym("t")
@@ -232,13 +235,15 @@ class Formulation:
 
     @property
     def duration(self) -> float:
-        """Horizon, s, if there are signals; else 1, because the horizon may then be unknown."""
+        """Horizon in seconds if the problem has signals; else 1, because the horizon may then be unknown."""
         return float(self.horizon_value) if self.signals else 1.0
 
     def sampled(
         self, outputs: list[Any] | Callable[[], list[Any]], *point: Any, cache_as: Any = None
     ) -> list[np.ndarray]:
-        """Evaluate expressions of the problem's symbols at M samples. Shape (M, entries) each, column by column.
+        """Evaluate expressions of the problem's symbols at M points of a trajectory. Shape (M, entries) each.
+
+        The entries of an expression that is a matrix are in column-major order.
 
         Args:
             outputs: Expressions of the symbols x, u, t, T and p, or a function that returns them.
@@ -257,7 +262,10 @@ class Formulation:
         return list(function(x, u, times, horizon, p, self.signals_at(times), *values))
 
     def sampler(self, outputs: list[Any], *more: Any) -> Sampler:
-        """Return a function that evaluates expressions at many samples of x, u, t, T, p, w and the symbols ``more``."""
+        """Return a function that evaluates expressions at many samples of the problem's symbols and further symbols.
+
+        The arguments of the function are x, u, t, T, p, w and the further symbols ``more``.
+        """
         symbols = self.problem.symbols
         inputs = [self.x, self.u, self.t, self.T, self.p, self.w, *more]
         return Sampler(inputs, [symbols(output) for output in outputs])
@@ -269,7 +277,7 @@ class Formulation:
         return float(function(x, x0, u0, horizon, horizon, p))
 
     def horizon_at(self, p: Any) -> Any:
-        """Return the value of a fixed horizon for parameters that are numbers or symbols."""
+        """Return the fixed horizon for given parameters, which may be numbers or symbols."""
         return self.bounds.function(p)[0][int(self.bounds.places["horizon"][0])]
 
     def point_function(self, name: str, d: Any, cost: Any, g: Any) -> Any:
@@ -312,7 +320,10 @@ class Formulation:
         return vector
 
     def bound_values(self, p: np.ndarray) -> Bounds:
-        """Return the lower and upper bounds in the bound table at given parameters, after checks. Shape (n,) each."""
+        """Return the lower and upper bounds of the bound table for given parameters. Shape (n,) each.
+
+        Raise ProblemError if bounds contradict each other, or if a bound or a fixed value is invalid.
+        """
         lower, upper = (np.asarray(v.full()).reshape(-1) for v in self.bounds.function(p))
         places = self.bounds.places
         what = f"problem {self.name!r} at these parameters"
@@ -340,7 +351,7 @@ class Formulation:
     # ---- flattening ------------------------------------------------------------------------------------------
 
     def flat(self, expression: Any) -> Any:
-        """Return an expression with the declared symbols replaced by entries of the stacked symbols."""
+        """Return an expression with the declared symbols replaced by entries of the stacked vectors."""
         d = self._declared
         old: list[Any] = [self.problem.time]
         new: list[Any] = [self.t]
@@ -373,7 +384,11 @@ class Formulation:
         return ca.Function("signals", [t], [ca.densify(ca.vertcat(*parts))])
 
     def _rows(self, kind: str, pool: dict[str, Constraint], end: float | None = None) -> Rows:
-        """Return the constraint rows of one kind; at an ``end``, 0 or 1, signals are replaced by their values."""
+        """Return the constraint rows of one kind, such as "path".
+
+        ``end`` is 0 for constraints at the start and 1 at the end, where signals are replaced by their values; else
+        None.
+        """
         symbols = self.problem.symbols
         expression = self.flat(ca.vertcat(symbols(0, 1), *[c.expression for c in pool.values()]))
         if self.signals and end is not None:
@@ -435,13 +450,13 @@ class Formulation:
 
 
 def entries_of(declared: Declarations) -> list[Any]:
-    """Return all declared states, controls, parameters, constraints and other parts in one list."""
+    """Return all declarations of a problem (states, controls, parameters, constraints, cost, ...) in one list."""
     pools = [getattr(declared, kind.name) for kind in fields(declared)]
     return [entry for pool in pools for entry in (pool.values() if isinstance(pool, dict) else [pool])]
 
 
 def slices(pool: Mapping[str, Variable | Signal]) -> dict[str, slice]:
-    """Return the slice of each variable in the stacked vector by name."""
+    """Return, by name, the slice that each variable occupies in the stacked vector."""
     places, offset = {}, 0
     for name, variable in pool.items():
         places[name] = slice(offset, offset + variable.size)
@@ -455,7 +470,7 @@ def labels(pool: dict[str, Any]) -> tuple[str, ...]:
 
 
 def units(declared: Declarations) -> dict[str, str]:
-    """Return the units of states, controls and constraints by name; "" for a name with two different units."""
+    """Return the units of states, controls and constraints by name; "" if two of the same name have different units."""
     units_of: dict[str, set[str]] = {}
     for pool in (declared.states, declared.controls, declared.path, declared.start, declared.end, declared.watch):
         for name, item in pool.items():

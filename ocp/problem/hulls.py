@@ -1,4 +1,4 @@
-"""Bodies as convex hulls of points on frames, distances between pairs of them, and declared minimum distances.
+"""Bodies as convex hulls of points, the distances between pairs of bodies, and declarations of minimum distances.
 
 A body is the convex hull of points, its core, inflated by a radius. It moves with a frame whose pose is an expression
 of states and time. For any direction that the search of nearest points returns (:mod:`models.shapes.hull`), the gap
@@ -35,7 +35,7 @@ __all__ = ["Separation", "index_rows", "stack_motion_bounds"]
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A body: the convex hull of points that are fixed in a frame, inflated by a radius; or a half-space.
+    """A body that is fixed in a frame: the convex hull of points, inflated by a radius, or a half-space.
 
     Attributes:
         frame: Index of the frame with which it moves; -1: the world.
@@ -72,22 +72,22 @@ class Hull:
 
     @cached_property
     def middle(self) -> np.ndarray:
-        """Mean of the points of the hull, in its frame. Shape (3,), m."""
+        """Mean of the points of the hull, in the frame of the body. Shape (3,), m."""
         return np.asarray(self.core.mean(axis=0))
 
     @cached_property
     def kind(self) -> int:
-        """Key of hulls evaluated together: 0 for boxes, else the number of points rounded up to a power of two."""
+        """Key of hulls that are evaluated together: 0 for boxes, else the point count rounded up to a power of two."""
         return 0 if is_box(self.core) else 1 << (len(self.core) - 1).bit_length()
 
     @cached_property
     def size(self) -> float:
-        """Radius of the ball around the middle that contains all points, m."""
+        """Radius of the smallest ball around :attr:`middle` that contains all points of the hull, m."""
         return float(np.linalg.norm(self.core - self.middle, axis=1).max())
 
 
 class Frames(NamedTuple):
-    """Poses of frames in world at M samples; the last frame is the world itself.
+    """Poses of frames in world coordinates at M samples; the last frame is the world itself.
 
     Attributes:
         rotations: Shape (M, F + 1, 3, 3). positions: Shape (M, F + 1, 3), m.
@@ -98,7 +98,7 @@ class Frames(NamedTuple):
 
 
 class HullPairs:
-    """Pairs of bodies whose hulls are of two given kinds, see `Hull.kind`.
+    """Pairs of bodies that are evaluated together because their hulls have the same two kinds; see `Hull.kind`.
 
     Attributes:
         has: Whether a pair is in this group. row: Its index in the group. Shape (n,) each.
@@ -143,9 +143,10 @@ class HullPairs:
         return points
 
     def nearest(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return unit vectors from first to second body, gaps and nearest points, in each pair's reference frame.
+        """Return the direction from the first to the second body, the gap and the nearest points of each pair.
 
-        Shapes (K, 3), (K,), m, and (K, 2, 3), m.
+        Directions (unit vectors) and points are in the reference frame of the pair. Shapes (K, 3), (K,), m, and (K, 2,
+        3), m.
         """
         first, second = self.points(frames, at, row)
         along, nearest_first, nearest_second = nearest_directions(first, second, self._boxes)
@@ -154,7 +155,10 @@ class HullPairs:
         return along, gap, np.stack([nearest_first, nearest_second], axis=1)
 
     def distances(self, frames: Frames, at: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Return the distances of pairs at samples, (K,), m; in closed form for a ball and a box or another ball."""
+        """Return the distances between the bodies of given pairs at given samples. Shape (K,), m.
+
+        The distance of a ball from a box or from another ball is computed in closed form.
+        """
         if self._box_side is None:
             return self.nearest(frames, at, row)[1]
         (rotations, positions), box, ball = frames, self._box_side, 1 - self._box_side
@@ -169,12 +173,12 @@ class HullPairs:
         return np.asarray(np.sqrt(outside.sum(axis=1)) + np.minimum(excess.max(axis=1), 0.0) - self.radii[row])
 
     def gaps(self, along: np.ndarray, frames: Frames, at: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Return the gaps between the bodies of pairs along unit vectors (K, 3). Shape (K,), m."""
+        """Return the gap between the two bodies of each pair along a given unit vector. Shape (K,), m."""
         return np.asarray(gap_along(along, *self.points(frames, at, row)) - self.radii[row])
 
 
 class CoveredPairs:
-    """Pairs of bodies, with pairs of smaller shapes that cover some of the bodies for sharper bounds of distances.
+    """Pairs of bodies, and pairs of smaller shapes that cover some of the bodies and give sharper distance bounds.
 
     Covering pairs contain the two bodies between them, so the smallest of their distances is a lower bound of the
     distance of the pair. The distance of the hulls is another one; the larger bound counts. Unlike a hull, covers of
@@ -193,7 +197,7 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return all rows that belong to given pairs: the position of each row's pair in `pair`, and the row's index.
+        """Return two arrays for the rows of given pairs: the position in `pair` of each row's pair, and row indices.
 
         The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow. Shape (R,) each.
         """
@@ -204,7 +208,7 @@ class CoveredPairs:
 
     @staticmethod
     def decisive(place: np.ndarray, gap: np.ndarray, count: int) -> np.ndarray:
-        """Return the index of the row, its hulls or covering shapes, that determines each pair's distance. Shape (K,).
+        """Return for each pair the row (hulls or covering shapes) that determines the distance, by index. Shape (K,).
 
         Args:
             place: As of `of`. gap: Distance of each row. Shape (R,), m. count: K.
@@ -218,7 +222,9 @@ class CoveredPairs:
 
 
 class SeparatingDirections(NamedTuple):
-    """Directions of shortest distance between two bodies, or shapes that cover them, for rows of `CoveredPairs`.
+    """Directions of shortest distance between two bodies or between shapes that cover the bodies.
+
+    Each direction belongs to a row of `CoveredPairs`.
 
     Attributes:
         place, row: As of `CoveredPairs.of`. Shape (R,). along: Unit vectors from the first body to the second, in the
@@ -230,13 +236,13 @@ class SeparatingDirections(NamedTuple):
     along: np.ndarray
 
     def of(self, selected: np.ndarray) -> SeparatingDirections:
-        """Return the directions of those pairs that a mask (K,) selects."""
+        """Return the directions of the pairs that a boolean mask of shape (K,) selects."""
         keep = selected[self.place]
         return SeparatingDirections((np.cumsum(selected) - 1)[self.place[keep]], self.row[keep], self.along[keep])
 
 
 class BodyPairs:
-    """Pairs of bodies with the shapes that cover them, and their distances; see `CoveredPairs`."""
+    """Evaluator of the distances between pairs of bodies, which smaller shapes may cover; see `CoveredPairs`."""
 
     def __init__(self, hulls: Sequence[Hull], pairs: np.ndarray, covers: Mapping[int, np.ndarray]) -> None:
         self._covered = CoveredPairs(pairs, covers)
@@ -251,13 +257,13 @@ class BodyPairs:
         self._normals = np.array([_normal(*pair) for pair in bodies]).reshape(-1, 3)
 
     def balls(self, frames: Frames, at: np.ndarray, pair: np.ndarray) -> np.ndarray:
-        """Return the gaps between the bounding balls of the bodies of given pairs at samples. Shape (K,), m."""
+        """Return the gap between the bounding balls of the two bodies of each pair at a given sample. Shape (K,), m."""
         bodies = self._first[pair], self._second[pair]
         first, second = (self._in_world(frames, at, self._middles[k], self._frames[k]) for k in bodies)
         return self._ball_distance(second - first, pair)
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return the distances of all pairs at all samples; above `near` they may be lower bounds. Shape (M, n), m.
+        """Return the distances of all pairs at all samples; values above `near` may be lower bounds. Shape (M, n), m.
 
         With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
@@ -282,7 +288,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return the distances of given pairs at given samples, (K,), m; above `near` they may be lower bounds."""
+        """Return distances of given pairs at given samples; values above `near` may be lower bounds. Shape (K,), m."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -298,7 +304,10 @@ class BodyPairs:
     def nearest(
         self, frames: Frames, at: np.ndarray, pair: np.ndarray
     ) -> tuple[SeparatingDirections, np.ndarray, np.ndarray]:
-        """Return directions, distances (K,), m, and nearest core points (K, 2, 3), m, of given pairs at samples."""
+        """Return separating directions, distances and nearest points of given pairs of bodies at given samples.
+
+        The points are those of the hulls before inflation. Distances have the shape (K,), m, points (K, 2, 3), m.
+        """
         place, rows = self._covered.of(pair)
         along, gap, points = np.empty((len(rows), 3)), np.empty(len(rows)), np.empty((len(rows), 2, 3))
         for kind, chosen, row in self._by_kind(rows):
@@ -307,7 +316,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the gap of each pair along a given direction, the smaller one of both interval ends. Shape (K,), m.
+        """Return for each pair the smaller gap along a direction at the two ends of a time interval. Shape (K,), m.
 
         The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
         """
@@ -319,7 +328,7 @@ class BodyPairs:
 
     @staticmethod
     def _in_world(frames: Frames, at: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        """Return points on moving frames in world coordinates at given samples."""
+        """Transform points that are fixed in moving frames to world coordinates at given samples."""
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _ball_distance(self, offset: np.ndarray, pair: np.ndarray) -> np.ndarray:
@@ -328,7 +337,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Yield each group of pairs of equal kinds, the positions of its rows in `rows`, and their indices in it."""
+        """Split `rows` by hull kind: yield each group, the positions of its rows in `rows`, and their group indices."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -336,7 +345,10 @@ class BodyPairs:
 
 
 def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
-    """Return groups of pairs (n, 3) by the kinds of their hulls; column three is the reference frame, -1 for world."""
+    """Return pairs of bodies in groups with equal hull kinds.
+
+    A row of ``pairs`` (n, 3) contains the indices of two bodies and of their reference frame, -1 for the world.
+    """
     kinds: dict[tuple[int, int], list[int]] = {}
     for i, (first, second, _) in enumerate(pairs):
         kinds.setdefault((hulls[first].kind, hulls[second].kind), []).append(i)
@@ -344,12 +356,15 @@ def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
 
 
 def _pad_points(core: np.ndarray, count: int) -> np.ndarray:
-    """Return the points of a hull, with the last one repeated until there are `count` points."""
+    """Return the points of a hull, with the last point repeated until there are `count` points."""
     return np.concatenate([core, np.repeat(core[-1:], count - len(core), axis=0)])
 
 
 def frames_of(placements: np.ndarray) -> Frames:
-    """Return frames from samples (M, 12 F) of rotations, column by column, and positions; the last is the world."""
+    """Return the poses of frames from samples of their entries, with the world as an additional last frame.
+
+    In ``placements`` (M, 12 F), each frame is its rotation matrix column by column, then its position.
+    """
     count = len(placements)
     world = np.broadcast_to(np.vstack([np.eye(3), np.zeros(3)]), (count, 1, 4, 3))
     values = np.concatenate([placements.reshape(count, placements.shape[1] // 12, 4, 3), world], axis=1)
@@ -357,7 +372,7 @@ def frames_of(placements: np.ndarray) -> Frames:
 
 
 def _normal(first: Hull, second: Hull) -> np.ndarray:
-    """Return the normal of the half-space in a pair, from the first body to the second; zero if there is none."""
+    """Return the half-space normal of a pair, directed from first to second body; zero if no body is a half-space."""
     return first.normal if first.normal.size else -second.normal if second.normal.size else np.zeros(3)
 
 
@@ -456,7 +471,7 @@ class Separation:
 
 
 def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]:
-    """Return the pairs of shapes that cover bodies, by the index of the covered pair, after checks."""
+    """Check the pairs of shapes that cover pairs of bodies, and return them by the index of the covered pair."""
     covering: dict[int, np.ndarray] = {}
     for pair, rows in require.mapping(f"{what}: covers", covers, object).items():
         if isinstance(pair, bool) or not isinstance(pair, int | np.integer) or not 0 <= pair < count:
@@ -467,7 +482,7 @@ def _checked_covers(what: str, covers: Any, count: int) -> dict[int, np.ndarray]
 
 
 def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return minimum distances or bounds of motion as an array of a given shape; raise ProblemError if invalid."""
+    """Convert minimum distances or motion bounds to an array of a given shape; raise ProblemError if invalid."""
     array = table(f"{what}: {label}", value)
     array = np.broadcast_to(array, shape) if array.ndim == 0 else array.reshape(shape) if not shape[0] else array
     if array.shape != shape:
@@ -480,7 +495,7 @@ def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.nda
 
 
 def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
-    """Return an array of ``count`` integers per row; raise ProblemError for anything else."""
+    """Convert values to an array with rows of ``count`` indices; raise ProblemError if that is impossible."""
     array = table(f"{what}: {label}", values)
     shaped = array.size % count == 0 and (array.ndim != 2 or not array.size or array.shape[1] == count)
     if not shaped or not np.isfinite(array).all() or (array % 1 != 0).any():
@@ -490,7 +505,7 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
 
 
 def stack_motion_bounds(what: str, bounds: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
-    """Return bounds of motion, given by state name, as columns in the order of the movers; missing ones are zero.
+    """Stack motion bounds, given by state name, as columns in the order of ``movers``; missing bounds are zero.
 
     Args:
         movers: Size of each state that moves a body. count: Number of pairs.

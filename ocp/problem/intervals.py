@@ -23,7 +23,7 @@ Array: TypeAlias = np.ndarray
 
 
 class Interval(NamedTuple):
-    """Lower and upper bounds of a number over each of M intervals of the inputs.
+    """Lower and upper bounds of a quantity over each of M intervals of the inputs of a function.
 
     Attributes:
         low, high: The bounds. Shape (M,).
@@ -38,7 +38,7 @@ class Interval(NamedTuple):
 
 
 def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
-    """Return the range of each entry of the (single) output of an SX function over intervals of its inputs.
+    """Return the range of each entry of the single output of an SX function over intervals of its inputs.
 
     Args:
         function: Function of scalars whose instructions are those of `RULES`, see `check_instructions`.
@@ -62,7 +62,7 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
 
 
 def check_instructions(what: str, function: Any) -> None:
-    """Raise ProblemError with the name of the instruction if an SX function has one without an interval rule."""
+    """Raise ProblemError, naming the instruction, if an SX function has an instruction without an interval rule."""
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
         if code not in RULES and code not in (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST):
@@ -75,7 +75,7 @@ def check_instructions(what: str, function: Any) -> None:
 
 
 def _out(low: Any, high: Any) -> Interval:
-    """Return an interval with its bounds widened by possible rounding errors; nan becomes unbounded."""
+    """Return an interval that is widened by possible rounding errors; a bound that is nan becomes infinite."""
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     # the functions of a C library are accurate to four units in the last place
     share, smallest = 4 * np.finfo(float).eps, 1e-300
@@ -84,7 +84,7 @@ def _out(low: Any, high: Any) -> Interval:
 
 
 def constant(value: float, like: Array) -> Interval:
-    """Return a number as an interval, repeated for each entry of an array."""
+    """Return a number as an interval of zero width, repeated for each entry of an array."""
     return Interval(np.full(like.shape, value), np.full(like.shape, value))
 
 
@@ -115,7 +115,7 @@ def _opposite(first: Interval, second: Interval) -> bool:
 
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
-    """Return the range of if_else: that of `yes` where the test holds, of `no` where it fails, else of both."""
+    """Return the range of if_else: `yes` where the test always holds, `no` where it always fails, else both."""
     holds, fails = decided_masks(test)
     low = np.where(holds, yes.low, np.where(fails, no.low, np.minimum(yes.low, no.low)))
     high = np.where(holds, yes.high, np.where(fails, no.high, np.maximum(yes.high, no.high)))
@@ -186,7 +186,7 @@ def _absolute(x: Interval) -> Interval:
 def _increasing_rule(
     function: Callable[[Any], Any], low: float = -np.inf, high: float = np.inf
 ) -> Callable[..., Interval]:
-    """Return the interval rule of an increasing function whose domain is low to high."""
+    """Return the interval rule of an increasing function with the domain from `low` to `high`."""
 
     def rule(x: Interval) -> Interval:
         inside = _clamp(x, low, high)
@@ -198,7 +198,7 @@ def _increasing_rule(
 
 
 def _decreasing_rule(function: Callable[[Any], Any], low: float, high: float) -> Callable[..., Interval]:
-    """Return the interval rule of a decreasing function whose domain is low to high."""
+    """Return the interval rule of a decreasing function with the domain from `low` to `high`."""
     rising = _increasing_rule(lambda x: -function(x), low, high)
 
     return lambda x: _negative(rising(x))
@@ -209,7 +209,7 @@ def _negative(x: Interval) -> Interval:
 
 
 def _contains_multiple(x: Interval, first: float, step: float) -> Any:
-    """Return whether intervals contain `first` plus an integer multiple of `step`, within rounding. Shape (M,)."""
+    """Return which intervals contain `first` plus an integer multiple of `step`, within rounding. Shape (M,)."""
     # multiples of a turn are accurate to fifty units in the last place of the angle
     slack = 1e-14 * (1 + np.maximum(np.abs(x.low), np.abs(x.high)))
     return np.floor((x.high + slack - first) / step) >= np.ceil((x.low - slack - first) / step)
@@ -236,7 +236,7 @@ def _tangent(x: Interval) -> Interval:
 
 
 def _angle(y: Interval, x: Interval) -> Interval:
-    """Return the range of atan2 over rectangles: from its corners, or a full turn if they meet the branch cut."""
+    """Return the range of atan2 over rectangles: from the corner values, or a full turn if the branch cut is met."""
     result = _range_of([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
     crosses_cut = ~((x.low > 0) | (y.low > 0) | (y.high < 0))
     half = float(np.nextafter(np.pi, 4))
@@ -256,7 +256,7 @@ def _copysign(x: Interval, y: Interval) -> Interval:
 
 
 def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tuple[Any, Any]:
-    """Return the rounded quotient x / y, and a mask of the intervals in which it is constant."""
+    """Return the rounded quotient x / y, and a mask of the intervals in which the rounded quotient is constant."""
     quotient = _divide(x, y)
     multiple = rounded(quotient.low)
     known = np.isfinite(multiple) & (multiple == rounded(quotient.high))
@@ -313,7 +313,7 @@ def _or(x: Interval, y: Interval) -> Interval:
 
 
 def _step(function: Callable[[Any], Any]) -> Callable[..., Interval]:
-    """Return the interval rule of an increasing step function with integer values, which are exact."""
+    """Return the interval rule of an increasing step function, whose integer values need no widening for rounding."""
     return lambda x: Interval(function(x.low), function(x.high))
 
 
@@ -367,5 +367,5 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "IF_ELSE_ZERO": _if_else_zero,
 }
 RULES = {getattr(ca, f"OP_{name}"): _without_warnings(rule) for name, rule in _BY_NAME.items()}
-"""Interval rules by the code of casadi's instruction."""
+"""Interval rules of operations, by the instruction code of casadi."""
 NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}

@@ -27,7 +27,7 @@ MAX_DEGREE = 3  # of the polynomials
 
 @dataclass(frozen=True)
 class InvariantSettings:
-    """Settings of the search for first integrals, and for redundant conditions.
+    """Settings of the search for first integrals and for the end conditions that they make redundant.
 
     Attributes:
         monomials: Maximum number of monomials for one coupled part of the dynamics.
@@ -71,7 +71,7 @@ class FirstIntegrals:
         self.monomials, self.factors = np.vstack(bases), scipy.linalg.block_diag(*factors)
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the values (r,) and gradients (r, nx) of the first integrals at a state (nx,)."""
+        """Return the values and the gradients of the first integrals at a state. Shapes (r,) and (r, nx)."""
         gradients = np.zeros((len(self.monomials), len(x) + 1))
         np.add.at(
             gradients,
@@ -82,7 +82,7 @@ class FirstIntegrals:
 
 
 def coupled_parts(form: Formulation) -> list[np.ndarray]:
-    """Return groups of states, coupled by the dynamics, on which relevant first integrals may depend.
+    """Return groups of dynamically coupled states on which first integrals relevant to end conditions may depend.
 
     Only states with end conditions are relevant. If f_i is the only rate among these that contains a control u_j, or
     another state, then grad I . f = 0 for all u_j implies that I does not depend on x_i.
@@ -103,21 +103,21 @@ def coupled_parts(form: Formulation) -> list[np.ndarray]:
 
 
 def monomials(part: np.ndarray) -> np.ndarray:
-    """Return all monomials of given states up to the highest allowed degree, see `FirstIntegrals`. Shape (m, 3)."""
+    """Return all monomials of given states up to the highest allowed degree; see `FirstIntegrals`. Shape (m, 3)."""
     degree = max(d for d in range(MAX_DEGREE + 1) if comb(len(part) + d, d) <= SETTINGS.monomials + 1)
     rows = combinations_with_replacement([0, *(part + 1)], degree)
     return np.array([(0,) * (MAX_DEGREE - degree) + row for row in rows if any(row)], int).reshape(-1, MAX_DEGREE)
 
 
 def factor_derivatives(monomials: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return derivatives of monomials (m, 3) with respect to their factors at states (K, nx). Shape (K, m, 3)."""
+    """Return the derivatives of monomials with respect to each of their three factors at K states. Shape (K, m, 3)."""
     factors = np.pad(x, ((0, 0), (1, 0)), constant_values=1.0)[:, monomials]
     return np.stack([factors[..., 1] * factors[..., 2], factors[..., 0] * factors[..., 2],
                      factors[..., 0] * factors[..., 1]], axis=-1)  # fmt: skip
 
 
 def sample_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most ``count`` random states with finite time derivatives, and these derivatives. Shapes (K, nx)."""
+    """Return at most ``count`` random states with finite time derivatives, and the derivatives. Shapes (K, nx)."""
     rng = np.random.default_rng(0)
     x, u, t = (rng.normal(size=(count, n)) for n in (form.nx, form.nu, 1))
     horizon, p = 1.0, np.exp(0.3 * rng.normal(size=form.np))
@@ -130,7 +130,7 @@ def sample_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
-    """Return all bounds for a solve, with those end conditions relaxed that first integrals make redundant.
+    """Return the bounds of a problem for a solve, relaxed for the end conditions that first integrals make redundant.
 
     Of a redundant set the least informative condition is relaxed, of a quaternion its largest entry, up to a leeway.
     """
@@ -147,7 +147,7 @@ def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
 def implied_conditions(
     form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.ndarray
 ) -> list[tuple[int, float]]:
-    """Return the end conditions that first integrals imply: indices in the bound table, and allowed violations."""
+    """Return the index in the bound table and the allowed violation of end conditions that first integrals imply."""
     nx, places = form.nx, form.bounds.places
     index = np.concatenate([places[kind] for kind in ("initial", "start", "terminal", "end")])
     low, high = (side[index] for side in bounds)
@@ -192,7 +192,7 @@ def implied_conditions(
 
 
 def null_projector(rows: np.ndarray) -> np.ndarray:
-    """Return the orthogonal projector onto the null space of a matrix (k, n). Shape (n, n)."""
+    """Return the orthogonal projector onto the null space of a matrix with n columns. Shape (n, n)."""
     return np.asarray(np.eye(rows.shape[1]) - np.linalg.pinv(rows, rcond=ROUNDING_SHARE) @ rows)
 
 

@@ -34,12 +34,12 @@ from ocp.problem.values import constant, identity, is_symbolic, numeric
 __all__ = ["Phase", "Phases"]
 
 DURATION = "duration"
-"""Name of a free duration among the states of a phase."""
+"""Name of the state that represents the free duration of a phase."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """A phase of :class:`Phases`, with expressions by which constraints can couple it to other phases.
+    """A phase of :class:`Phases`, with the symbols and times for constraints that couple the phase to others.
 
     Attributes:
         name: Name of the phase.
@@ -162,7 +162,7 @@ class Phases(Problem):
             self.end(what, gap, lower=0.0, upper=0.0, unit=unit)
 
     def minimize(self, running: Any = 0, terminal: Any = 0) -> None:
-        """Declare a terminal cost, a function of the states at the ends of phases, in addition to the phases' costs.
+        """Add a terminal cost, a function of the states at the ends of phases, to the sum of the costs of all phases.
 
         Raises:
             ProblemError: ``running`` is not zero: it belongs to the problem of a phase.
@@ -192,7 +192,7 @@ class _PhaseInserter:
         self.guess_duration: float | None = None  # duration over which guesses are read, s; None if unknown
 
     def declare(self, begin: Any) -> PhaseTimes:
-        """Declare the phase in the whole problem, except for its cost; return its times and its cost."""
+        """Declare the phase, except for its cost, in the whole problem; return the times and the cost of the phase."""
         whole, declared = self.whole, self.problem.declared
         for parameter in declared.parameters.values():
             self._parameter(parameter)
@@ -244,7 +244,7 @@ class _PhaseInserter:
         return self.whole.symbols(ca.densify(placed))
 
     def _column(self, values: Any) -> Any:
-        """Return a column in the symbols of the whole problem; entries that are numbers stay numbers."""
+        """Return a column of expressions in the symbols of the whole problem; entries that are numbers stay numbers."""
         entries = ca.vertsplit(values)
         numbers = [not ca.symvar(entry) for entry in entries]
         placed = [
@@ -317,7 +317,7 @@ class _PhaseInserter:
 
 
 def parts_of_phase(phase: str, pool: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those states, controls or other entries that belong to a phase, by their names in it."""
+    """Return those states, controls or other entries that belong to a phase, by their names within the phase."""
     prefix = f"{phase}."
     return {name.removeprefix(prefix): value for name, value in pool.items() if name.startswith(prefix)}
 
@@ -329,5 +329,5 @@ def _by_name(what: str, value: Any) -> Mapping[str, Any]:
 
 
 def _of_fraction(function: Callable[[Any], Any], length: float) -> Callable[[Any], Any]:
-    """Convert a function of a phase's time to a function of its time fraction."""
+    """Convert a function of the time of a phase to a function of the fraction of the phase's duration."""
     return lambda fraction: function(fraction * length)

@@ -43,7 +43,7 @@ Declared = TypeVar("Declared", bound="Problem")
 
 
 def _about_its_name(method: Declare) -> Declare:
-    """Decorate a method of Problem so that its errors contain the name of the declaration."""
+    """Decorate a method of Problem so that its errors contain the name of what is declared, such as a state."""
 
     @wraps(method)
     def declare(self: Any, name: Any, *args: Any, **values: Any) -> Any:
@@ -61,7 +61,10 @@ def checked_problem(problem: Any) -> Problem:
 
 
 def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]], Callable[Arguments, Declared]]:
-    """Return a decorator with which problems store their builder's name and arguments, so that they can be rebuilt."""
+    """Return a decorator that stores the name and arguments of a builder in the problem that the builder returns.
+
+    From them the problem can be built again.
+    """
 
     def decorate(declare: Callable[Arguments, Declared]) -> Callable[Arguments, Declared]:
         parameters = signature(declare)
@@ -109,7 +112,10 @@ class Problem:
         return to_record(self.name, self.symbols, self.time, self.declared)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the problem from data of :meth:`__getstate__`, with new symbols; raise ProblemError if damaged."""
+        """Restore the problem, with new symbols, from the data of :meth:`__getstate__`.
+
+        Raise ProblemError if the data are damaged.
+        """
         kinds = (Variable, Signal, Constraint, Horizon, PhaseTimes, Declarations, Separation, Hull)
         self.name, self.symbols, self.time, self.declared = from_record(state, kinds)
         self.declared.check(self.symbols)
@@ -150,7 +156,7 @@ class Problem:
         unit: str = "",
         scale: Value = None,
     ) -> Any:
-        """Declare a state and return its symbol, shape (n, 1).
+        """Declare a state and return its symbol. Shape (n, 1).
 
         Args:
             name: Unique name.
@@ -184,14 +190,14 @@ class Problem:
         unit: str = "",
         scale: Value = None,
     ) -> Any:
-        """Declare a control and return its symbol, shape (n, 1). Arguments as for :meth:`state`."""
+        """Declare a control and return its symbol. Shape (n, 1). Arguments as for :meth:`state`."""
         bounds = {"lower": lower, "upper": upper}
         self.declared.controls[name] = self._variable("control", name, size, bounds, guess, unit, scale)
         return self.declared.controls[name].symbol
 
     @_about_its_name
     def parameter(self, name: str, size: int = 1) -> Any:
-        """Declare a parameter, whose value is passed to each solve; return its symbol, shape (n, 1)."""
+        """Declare a parameter, whose value is passed to each solve, and return its symbol. Shape (n, 1)."""
         size = require.count(f"parameter {name!r}: size", size)
         self.declared.parameters[name] = Variable(name, self._symbol("parameter", name, size))
         return self.declared.parameters[name].symbol
@@ -207,7 +213,7 @@ class Problem:
         guess: Value = None,
         unit: str = "",
     ) -> Any:
-        """Declare a constant that is optimised with the motion, and return its symbol, shape (n, 1).
+        """Declare a constant that is optimised together with the motion, and return its symbol. Shape (n, 1).
 
         It is a state of zero rate: its costate at the start is the derivative of the cost with respect to it. Arguments
         as for :meth:`state`.
@@ -220,7 +226,7 @@ class Problem:
 
     @_about_its_name
     def integral(self, name: str, rate: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> Any:
-        """Declare ``lower <= integral of rate dt <= upper``; return the integral up to each time, which is a state.
+        """Declare ``lower <= integral of rate dt <= upper``, and return the state that is the integral up to each time.
 
         Args:
             name: Unique among states and constraints.
@@ -244,7 +250,7 @@ class Problem:
 
     @_about_its_name
     def signal(self, name: str, track: Callable[[Any], Any]) -> Any:
-        """Declare a known function of time; return the symbol of its value, shape (n, 1).
+        """Declare a known function of time, and return the symbol of its value. Shape (n, 1).
 
         Use it for expensive functions of time alone, such as interpolants or paths of many segments. Signals are
         evaluated before the solve and never differentiated twice. The function may require MX symbols even if the
@@ -261,7 +267,7 @@ class Problem:
     def horizon(
         self, value: Value = None, *, lower: Value = None, upper: Value = None, guess: float | None = None
     ) -> Any:
-        """Declare the final time as fixed (``value``, s) or free (``lower``, ``upper``, ``guess``); return its symbol.
+        """Declare the final time, s, as fixed (``value``) or free (``lower``, ``upper``, ``guess``); return its symbol.
 
         A free horizon must be positive: so must ``lower`` (default 1e-6 s).
         """
@@ -282,7 +288,10 @@ class Problem:
     # ---- equations -------------------------------------------------------------------------------------------
 
     def dynamics(self, state: Any, derivative: Value) -> None:
-        """Declare ``d state / dt = derivative``, shape (n, 1), in states, controls, parameters, time and horizon."""
+        """Declare ``d state / dt = derivative``, an expression of states, controls, parameters, time and horizon.
+
+        Shape (n, 1).
+        """
         variable = self._find(self.declared.states, state, "dynamics")
         if variable.name in self.declared.dynamics:
             raise ProblemError(f"state {variable.name!r}: dynamics declared twice", name=variable.name)
@@ -428,7 +437,7 @@ class Problem:
             raise ProblemError(f"problem {self.name!r} has no horizon; declare problem.horizon(...)", name="horizon")
 
     def __str__(self) -> str:
-        """Return states, controls, parameters, horizon, dynamics, constraints and cost by name, one a line."""
+        """Return a text with one line for each declared state, control, parameter, constraint and other entry."""
         return f"Problem {self.name!r}\n{self.declared}"
 
     def __repr__(self) -> str:
@@ -450,14 +459,14 @@ class Problem:
 
     @property
     def _reader(self) -> ExpressionReader:
-        """Reader of values as expressions of this problem; bounds may use the parameters declared so far."""
+        """Reader that converts user values to expressions of this problem and of the parameters declared so far."""
         return ExpressionReader(self.symbols, tuple(v.symbol for v in self.declared.parameters.values()))
 
     def _horizon_symbol(self) -> list[Any]:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
 
     def _inner(self) -> list[Any]:
-        """Return the symbols allowed inside the horizon: states, controls, parameters, signals, time, horizon."""
+        """Return the symbols allowed inside the horizon: states, controls, parameters, signals, time and horizon."""
         d = self.declared
         pools = (d.states, d.controls, d.parameters, d.signals)
         return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]
@@ -490,7 +499,7 @@ class Problem:
         tolerance: Value = None,
         known: Sequence[Any] = (),
     ) -> Constraint:
-        """Return a new constraint on symbols inside the horizon and on the ``known`` symbols."""
+        """Return a new constraint on an expression of the symbols inside the horizon and of the ``known`` symbols."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
         return self._reader.constraint(
             kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance

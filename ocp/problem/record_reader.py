@@ -38,11 +38,11 @@ FIRST_BINARY = len(STRUCTURAL) + len(UNARY)
 MAX_OPERATIONS = 2**20
 """Maximum number of operations in a file; rebuilding an operation takes about 5 microseconds and 200 bytes."""
 MAX_WORK = 2**26
-"""Maximum number of operations in one evaluation with all nested calls, which can be many even in a short file."""
+"""Maximum number of operations of one function evaluation with all nested calls, which can be many in a short file."""
 MAX_ENTRIES = 2**20
 """Maximum number of entries of all arguments and results of the functions of a file."""
 OPAQUE = {"never_inline": True}
-"""Options with which functions that are not scalar arithmetic remain calls when applied to scalar symbols."""
+"""CasADi options that keep functions other than scalar arithmetic as calls when applied to scalar symbols."""
 MAX_DIMENSIONS = 6
 """Maximum number of dimensions of an interpolated table."""
 MAX_DEGREE = 9
@@ -55,11 +55,11 @@ INTEGRATOR_OPTIONS: dict[str, tuple[str, type]] = {
     "reltol": ("SundialsInterface::reltol", float),
     "max_num_steps": ("SundialsInterface::max_num_steps", int),
 }
-"""Integrator options that are stored, with their names in CasADi's debugging output and their types."""
+"""Integrator options that a file stores, with their names in CasADi's debugging output and their types."""
 
 
 class FunctionReader:
-    """Builder of CasADi functions from stored records; it rejects all that a `FunctionWriter` does not write.
+    """Builder of CasADi functions from stored records; it rejects records that no `FunctionWriter` writes.
 
     Args:
         records: As of a `FunctionWriter`, from an untrusted source.
@@ -97,7 +97,7 @@ class FunctionReader:
             self._work.append(work)
 
     def _rebuild(self, record: Mapping[str, Any], name: str) -> tuple[Any, int]:
-        """Return a function rebuilt from its stored operations, and how many operations one evaluation takes.
+        """Return a function rebuilt from its stored operations, and the number of operations of one evaluation.
 
         It has SX symbols, or MX symbols if it calls other functions: only these differentiate all calls as CasADi does.
         """
@@ -162,7 +162,7 @@ def _nonzeros(matrix: Any) -> list[Any]:
 
 
 def _declared_entries(record: Mapping[str, Any]) -> int:
-    """Return the number of argument and result entries that a record declares."""
+    """Return the number of entries of all arguments and results that the record of a function declares."""
     if record["kind"] == "operations":
         return sum(abs(shape[0] * shape[1]) for shape in (*record["inputs"], *record["outputs"]))
     sizes = [abs(int(record.get(what, 1))) for what in ("count", "size", "columns")]
@@ -213,7 +213,7 @@ def _floats(values: Any, *, finite: bool = False) -> np.ndarray:
 
 
 def _read_pattern(shape: Any) -> Any:
-    """Return the sparsity pattern stored as [rows, columns] or as [rows, columns, positions of the entries]."""
+    """Return the sparsity pattern of a stored shape: row count, column count and, if sparse, entry positions."""
     if not isinstance(shape, list) or len(shape) not in (2, 3):
         raise ProblemError(f"a shape is expected, not {shape!r:.80}", name="shape")
     rows, columns = (_whole(size, "size", 0, MAX_ENTRIES) for size in shape[:2])
@@ -285,7 +285,7 @@ def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
-    """Rebuild from its record a linear interpolant of a table, or the derivative of one."""
+    """Rebuild from its record a linear interpolant of a table, or the derivative of such an interpolant."""
     grids, values = _grids(record, "grid"), _floats(record["values"])
     cells = int(np.prod([len(grid) for grid in grids], dtype=object))
     if not len(values) or len(values) % cells or any((np.diff(grid) <= 0).any() for grid in grids):
@@ -334,7 +334,7 @@ RECORD_ERRORS = (
     AttributeError, IndexError, KeyError, NotImplementedError, OverflowError, RecursionError, RuntimeError, TypeError,
     ValueError,
 )  # fmt: skip
-"""Errors raised by rebuilding objects from damaged data."""
+"""Errors that rebuilding objects from damaged data may raise."""
 ARRAY_NAMES = ("integers", "numbers")
 """Names of the arrays into which a record is packed."""
 

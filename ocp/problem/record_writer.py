@@ -45,7 +45,7 @@ class FunctionWriter:
         self._alive: list[Any] = []  # keeps functions alive: CasADi reuses the hash of a deleted one
 
     def write(self, function: Any) -> int:
-        """Write a function as a record, unless that has been done, and return the number of the record.
+        """Write a function as a record if this has not been done, and return the number of the record.
 
         Raises:
             ProblemError: The function, or one that it calls, cannot be written, such as a Python callback.
@@ -76,7 +76,7 @@ class FunctionWriter:
         return self._register(key, len(self.records) - 1)
 
     def _forwarded_to(self, record: dict[str, Any]) -> int | None:
-        """Return the number of the function that a record only calls with its own arguments; else None.
+        """Return the number of the function to which a record merely passes its arguments on; else None.
 
         Without this check, each save of a loaded problem would wrap its tables in one more function.
         """
@@ -105,7 +105,7 @@ class FunctionWriter:
         return function
 
     def _call_leaf(self, record: dict[str, Any], entries: Sequence[Any], pattern: Any) -> Any:
-        """Store the record of a function of one column, and return the value of this function for given entries."""
+        """Store the record of a function of one column; return the function's value for given entries of the column."""
         argument = ca.vertcat(*entries) if entries else ca.SX(0, 1)
         return from_entries(pattern, self._leaf(record).call([argument], False, True)[0].nonzeros())
 
@@ -177,7 +177,7 @@ class FunctionWriter:
         return list(step.expand().call(list(arguments)))
 
     def _gather(self, node: Any, arguments: Sequence[Any]) -> Any:
-        """Return expressions for the entries of a table at computed positions, for a constant table as a call."""
+        """Return expressions for table entries at computed positions; a constant table becomes a function call."""
         where, chosen = node.info(), [argument.nonzeros() for argument in arguments[1:]]
         sides = {
             side: [ca.SX(k) for k in range(*(where[side][key] for key in ("start", "stop", "step")))]
@@ -254,7 +254,7 @@ def _unwritable(function: Any) -> ProblemError:
 
 
 def _pattern(pattern: Any) -> list[Any]:
-    """Return number of rows, number of columns and, if sparse, the positions of the entries column by column."""
+    """Return the stored form of a sparsity pattern: row count, column count and, if sparse, entry positions."""
     shape = [pattern.size1(), pattern.size2()]
     return shape if pattern.is_dense() else [*shape, pattern.find()]
 
@@ -264,7 +264,7 @@ def _size(pattern: list[Any]) -> int:
 
 
 def _call_on_scalars(function: Any, inputs: Sequence[Any]) -> list[Any]:
-    """Evaluate any function on SX matrices, as a call if CasADi supports that."""
+    """Evaluate a function of any kind on SX matrices, without inlining the function if CasADi supports that."""
     if function.class_name() == "Switch":  # on scalars CasADi compares the case number, which it otherwise truncates
         case = ca.if_else(inputs[0] < 0, ca.ceil(inputs[0]), ca.floor(inputs[0]))
         inputs = [case, *inputs[1:]]
@@ -280,9 +280,10 @@ def _numbers(matrix: Any) -> np.ndarray:
 
 
 def _fields(function: Any, kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Return fields of a function from CasADi's debugging output, by name and type: `int`, `float` or lists of them.
+    """Return internal fields of a CasADi function, read from CasADi's debugging output, by name.
 
-    The text comes from a function of this process, never from a file.
+    ``kinds`` gives the type of each field: `int`, `float`, or a list of one of them for an array. The text comes from a
+    function of this process, never from a file.
     """
     letters = function.serialize({"debug": True})
     text = bytes(ord(low) - 97 + ((ord(high) - 97) << 4) for low, high in zip(letters[::2], letters[1::2], strict=True))

@@ -44,7 +44,7 @@ def numeric(what: str, value: Any) -> np.ndarray:
 
 
 def table(what: str, value: Any) -> np.ndarray:
-    """Return a numeric value as a float array of its own shape; raise ProblemError for anything else."""
+    """Return a numeric value as a float array without changing its shape; raise ProblemError for anything else."""
     try:
         return floats(value.full() if isinstance(value, ca.DM) else value)
     except NOT_NUMBERS as error:
@@ -80,7 +80,7 @@ def check_order(what: str, lower: np.ndarray, upper: np.ndarray) -> None:
 
 
 def check_inside(what: str, value: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise ProblemError if a value is infinite or outside its bounds; nan marks a free value or unknown bound."""
+    """Raise ProblemError if a value is infinite or outside its bounds; nan stands for a free value or unknown bound."""
     for i, (number, low, high) in enumerate(zip(value, lower, upper, strict=True)):
         details: dict[str, Any] = {"value": float(number), "limit": (float(low), float(high))}
         if np.isinf(number):
@@ -150,7 +150,7 @@ class Sampler:
 def evaluate_in_blocks(
     function: Any, size: int, inputs: np.ndarray, outputs: list[np.ndarray], *, previous: np.ndarray | None = None
 ) -> None:
-    """Call a casadi function that takes ``size`` samples for block after block, and store the results in given arrays.
+    """Call a casadi function of ``size`` samples on one block of samples after another; store results in arrays.
 
     Args:
         inputs, outputs: Input and outputs with samples as rows, in whole blocks. Shape (K size, n) each.

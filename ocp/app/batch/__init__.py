@@ -1,4 +1,4 @@
-"""Run many tasks in processes or on a Dask cluster; tasks are data, and each result is stored once in a folder."""
+"""Run many tasks, given as plain data, in processes or on a Dask cluster, and store each result in a folder."""
 
 from ocp.app.batch.engine import cached
 from ocp.app.batch.run import run_batch

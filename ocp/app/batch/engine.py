@@ -1,4 +1,4 @@
-"""Run tasks with Dask: on a cluster that is started here, one process for each core, or on a given cluster.
+"""Run tasks with Dask on a given cluster, or on a cluster that is started on this machine with one process per core.
 
 Results are sent to the driver, the process that runs the batch, so the machines need no common folder. A cluster
 started here uses TLS with a certificate of its own: no other user of the machine can send it tasks or read results.
@@ -51,7 +51,7 @@ DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 class WorkerFailure(OSError):
-    """Error that a worker failed for a reason other than its task, such as a full disk."""
+    """Error raised when a worker fails for a reason other than its task, such as a full disk."""
 
 
 # ---- one task ----------------------------------------------------------------------------------------------------
@@ -61,7 +61,7 @@ _LOCK = threading.RLock()
 
 
 def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: bool, limit_s: float) -> list[Payload]:
-    """Run jobs (task, guess) one after another in a worker and return their payloads; start none after `limit_s`."""
+    """Run jobs (task, guess) in sequence in a worker and return their payloads; start no job after `limit_s`."""
     began, results = time.perf_counter(), list[Payload]()
     for task, guess in jobs:
         results.append(attempt(function, task, near, guess))
@@ -112,7 +112,7 @@ def failure_payload(status: str, error: str, message: str) -> Payload:
 
 
 def message_of(error: BaseException) -> str:
-    """Return the message of an exception, with the line that raised it unless it is an exception of this package."""
+    """Return an exception's message, with the file and line of its origin unless it is an exception of this package."""
     words = str(error).encode("utf-8", "replace").decode()
     if isinstance(error, DetailedError | ModelError):
         return words
@@ -125,11 +125,11 @@ def message_of(error: BaseException) -> str:
 
 _CACHE: OrderedDict[tuple[Any, str], tuple[Any, dict[str, str | None]]] = OrderedDict()
 _INPUTS: dict[str, str | None] = {}
-"""Inputs of the cached objects that the current task uses: texts that may name files, with the files' digests."""
+"""Texts from which the `cached` objects of the current task were made, with the digests of the files they name."""
 
 
 def cached(make: Function, *arguments: Any) -> Any:
-    """Return ``make(*arguments)``, computed once in each worker: a prepared problem, or a robot read from a file.
+    """Return ``make(*arguments)``, such as a robot read from a file, which each worker computes only once.
 
     The cache holds eight objects. Arguments are data like tasks, and `make` must return the same for the same
     arguments. If an argument names a file, a failed task is repeated when the batch is started after the file has
@@ -166,7 +166,7 @@ def cached(make: Function, *arguments: Any) -> Any:
 
 INSTALL = 'pip install "selfmotion[cluster]", or from a clone pip install ".[cluster]"'
 SCHEMES = ("tcp", "tls", "ucx", "ws", "wss", "inproc")
-"""Protocols of a scheduler's address."""
+"""Protocols with which the address of a Dask scheduler may begin."""
 WORKER_NAME = "Dask Worker"
 """Prefix of the names of Dask's worker processes."""
 
@@ -191,7 +191,7 @@ class EngineSettings:
 
 
 class Job(NamedTuple):
-    """A task to run: its key, its JSON text, and the result of a similar task, or None."""
+    """A task to run, with its key, its JSON text, and the result of a similar task as initial guess (or None)."""
 
     key: str
     task: str
@@ -213,7 +213,8 @@ class Outcome(NamedTuple):
 
 
 class Engine:
-    """Workers of a Dask cluster; a context manager that cancels or ends their work.
+    """Context manager that runs jobs on the workers of a Dask cluster, and on exit cancels the jobs or ends the
+    workers.
 
     Args:
         function: Function that Dask sends to the workers: by name, or by code if it is defined in the script.
@@ -334,7 +335,7 @@ class Engine:
         return not self._running
 
     def free_slots(self) -> int:
-        """Return the number of chunks of jobs that may be sent now: one for each idle thread of the workers.
+        """Return the number of groups of jobs that may be sent now: one group for each idle thread of the workers.
 
         No more are sent, because a worker that ends loses all its jobs, running or not.
         """
@@ -348,11 +349,11 @@ class Engine:
         return max(0, self._threads - len(self._running))
 
     def share(self, ready: int) -> int:
-        """Return how many of the waiting jobs to send together, such that each worker thread gets several chunks."""
+        """Return how many of the waiting jobs to send as one group, so that each worker thread gets several groups."""
         return max(1, min(self._chunk_size, ready // (4 * max(1, self._threads))))
 
     def submit(self, jobs: list[Job]) -> None:
-        """Send jobs to run in sequence on one worker."""
+        """Send jobs to one worker, which runs them in sequence."""
         self._count += 1
         number = self._count
         future = self._client.submit(
@@ -368,7 +369,9 @@ class Engine:
         future.add_done_callback(lambda _: self._finished.put(number))
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """Return the outcomes of the jobs that finish within some seconds, as soon as the first one is available."""
+        """Wait at most some seconds until a job finishes, and return the outcomes of all jobs that have finished by
+        then.
+        """
         self._check_scheduler()
         numbers = []
         with suppress(queue.Empty):
@@ -379,7 +382,7 @@ class Engine:
         return [outcome for future, jobs in finished for outcome in self._outcomes(future, jobs)]
 
     def _outcomes(self, future: Any, jobs: list[Job]) -> list[Outcome]:
-        """Return the outcomes of jobs that were sent together; jobs of a lost worker have no payload."""
+        """Return the outcomes of jobs that were sent together; the payload is None for jobs whose worker was lost."""
         try:
             payloads = [Payload(*each) for each in future.result(timeout=self.settings.patience)]
         except WorkerFailure:
@@ -387,7 +390,7 @@ class Engine:
         except self._dask.KilledWorker as error:
             self._chunk_size = 1
             return [Outcome(job.key, None, error.allowed_failures + 1) for job in jobs]
-        except self._lost:  # together with its worker or the scheduler
+        except self._lost:  # the result was lost with its worker or with the scheduler
             return [Outcome(job.key, None) for job in jobs]
         except Exception as error:  # the function's exceptions are in the payload, so it cannot be loaded
             module, reason = self._function.__module__, str(error.__cause__ or error).partition("\n")[0]
@@ -413,7 +416,7 @@ class Engine:
 
 
 def checked_cluster(cluster: Any) -> Any:
-    """Return a cluster, checked to be the address of a scheduler or a `distributed.Client`, which stays open.
+    """Return `cluster` if it is the address of a Dask scheduler or a `distributed.Client`, which stays open.
 
     Raises:
         ProblemError: It is neither.

@@ -49,21 +49,21 @@ __all__ = [
 ]
 
 MAX_DEPTH = 64
-"""Largest depth of nested data."""
+"""Largest permitted nesting depth of the lists and dictionaries in tasks and results."""
 KINDS: dict[str, type[Plan] | type[Solution]] = {"Plan": Plan, "Solution": Solution}
-"""Types stored in files of their own, by the name in a result's text."""
+"""Types of objects that are stored in files of their own, keyed by the name of the type in a record."""
 DATA = "numbers, texts, True, False, None, and lists and dictionaries by name of these"
 
 
 class Payload(NamedTuple):
-    """A result in the form in which workers send it: the record and the bytes of its files."""
+    """A result in the form in which workers send it: its record, and the contents of the record's files."""
 
     record: dict[str, Any]
     files: tuple[bytes, ...] = ()
 
 
 def as_data(value: Any, where: str, extract: Callable[[Any, tuple[Any, ...]], bool] = lambda value, at: False) -> Any:
-    """Convert a value to plain data: arrays and tuples to lists, NumPy numbers to Python numbers.
+    """Convert a value to plain data: arrays and tuples become lists, NumPy numbers become Python numbers.
 
     Args:
         value: The value.
@@ -115,7 +115,7 @@ def as_data(value: Any, where: str, extract: Callable[[Any, tuple[Any, ...]], bo
 
 
 def canonical_text(value: Any, where: str) -> str:
-    """Return the canonical text of data: names sorted, floats with all digits, 1 and 1.0 distinguished.
+    """Return the same JSON text for equal data: names are sorted, floats have all digits, and 1 differs from 1.0.
 
     Raises:
         ProblemError: As :func:`as_data`.
@@ -171,7 +171,7 @@ def pack_result(value: Any) -> Payload:
 
 
 def unpack_result(payload: Payload) -> Any:
-    """Convert a payload of :func:`pack_result` back to the result; tuples and arrays become lists.
+    """Convert a payload back to the result given to :func:`pack_result`; tuples and arrays have become lists.
 
     Raises:
         ProblemError: A file is damaged.
@@ -207,7 +207,7 @@ def digest_of(path: str) -> str | None:
 
 
 def file_of(value: Plan | Solution) -> bytes:
-    """Return the contents of the file to which a plan or solution is saved."""
+    """Save a plan or solution to a temporary file and return the contents of the file."""
     with tempfile.TemporaryDirectory() as folder:
         value.save(Path(folder) / "result.npz")
         return (Path(folder) / "result.npz").read_bytes()
@@ -232,11 +232,11 @@ RECORD_FIELDS = {
     "neighbour": str | None,
     "inputs": dict,
 }
-"""Fields of the record of a task's result, and the types of their values."""
+"""Names and types of the fields in the record of a task's result."""
 
 
 class ResultStore:
-    """Folder in which the records of the results of one function are stored.
+    """Folder that stores the results of one function, one record for each task.
 
     Attributes:
         folder: The folder.
@@ -248,7 +248,7 @@ class ResultStore:
 
     @classmethod
     def at(cls, folder: Any) -> ResultStore:
-        """Return the existing store in a folder.
+        """Return the store that already exists in a folder.
 
         Raises:
             ProblemError: The folder is invalid, has no store, or has one of another format.
@@ -327,7 +327,7 @@ class ResultStore:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder for the duration of a `with` block; wait if another driver has locked it.
+        """Lock the folder during a `with` block; if another process has locked the folder, wait for its release.
 
         Raises:
             ProblemError: The file system of the folder has no locks.
@@ -352,7 +352,7 @@ class ResultStore:
     # ---- records -----------------------------------------------------------------------------------------------
 
     def read(self, key: str) -> dict[str, Any] | None:
-        """Return the record of a key, or None if it is missing or incomplete; links are not followed."""
+        """Return the record of a key, or None if the record is missing or incomplete; links are not followed."""
         try:
             path = self._place(key)
             record: Any = None if path.parent.is_symlink() else load_json(path)
@@ -374,7 +374,7 @@ class ResultStore:
         return dict(record)
 
     def write(self, record: dict[str, Any], files: Sequence[bytes]) -> None:
-        """Write the files of a record and then the record; replace links of the same names.
+        """Write the files of a record and then the record itself; replace existing links of the same names.
 
         Raises:
             OSError: A file cannot be written; no file is then incomplete.
@@ -391,7 +391,7 @@ class ResultStore:
         write_whole(path, lambda stream: stream.write(text), synced=False)
 
     def payload(self, record: dict[str, Any]) -> Payload:
-        """Return the payload of a record: the record and the contents of its files.
+        """Return the payload of a record, which consists of the record and the contents of its files.
 
         Raises:
             OSError: A file is missing.
@@ -404,11 +404,11 @@ class ResultStore:
         return Payload(record, tuple(files))
 
     def value(self, record: dict[str, Any]) -> Any:
-        """Return the function's result that a record stores."""
+        """Return the result of a task, read from the task's record and the files of the record."""
         return unpack_result(self.payload(record))
 
     def stored_keys(self) -> Iterator[str]:
-        """Yield the keys of all stored records in order."""
+        """Yield the keys of all stored records in sorted order."""
         shards: list[str] = []
         with suppress(FileNotFoundError):
             shards = sorted(os.listdir(self.folder / "results"))
@@ -429,19 +429,19 @@ def load_json(path: Path) -> Any:
 
 
 def finite(text: str) -> float:
-    """Return the number that a text contains; raise ValueError unless it is finite."""
+    """Convert the text of a number to a float; raise ValueError unless the float is finite."""
     if not isfinite(value := float(text)):
         raise ValueError(f"{text} is not a finite number")
     return value
 
 
 def file_at(place: Path, number: int) -> Path:
-    """Return the path of the file with a given number that belongs to a record, of a plan or a solution."""
+    """Return the path of a record's file with a given number, which contains a plan or a solution."""
     return place.with_suffix(f".{number}.npz")
 
 
 def checked_folder(folder: Any) -> Path:
-    """Return the absolute path of a folder, which need not exist.
+    """Return a folder's absolute path after checks; the folder need not exist.
 
     Raises:
         ProblemError: The path is invalid, is that of a file, or of a remote store.

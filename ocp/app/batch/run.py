@@ -181,7 +181,7 @@ class _PendingTasks:
                     bar.set_postfix(failed=self.failures, refresh=False)
 
     def _suspect(self, key: str, deaths: int, max_deaths: int) -> None:
-        """Mark a task that ran when a worker ended, to run it alone; record it as killed if it ends too many."""
+        """Queue a task to run alone, because its worker ended; record the task as killed if too many workers ended."""
         self.deaths[key] += deaths
         if key == self.isolated and self.deaths[key] >= max_deaths:
             self._end(key, failure_payload("killed", "", f"it ended {self.deaths[key]} workers"))
@@ -204,20 +204,20 @@ class _PendingTasks:
             engine.submit([Job(key, self.texts[key], self._guess(key)) for key in keys])
 
     def _guess(self, key: str) -> Payload | None:
-        """Return the stored result of a task's neighbour, which the function takes as its guess, or None."""
+        """Return the stored result of a similar task as initial guess for a task; None if there is no such result."""
         parent = self._neighbour(key)
         record = None if parent is None else self.store.read(parent)
         return None if record is None else self.store.payload(record)
 
     def _neighbour(self, key: str) -> str | None:
-        """Return the key of the first task with a result along the chain of neighbours of a task, or None."""
+        """Follow the chain of similar tasks from a task; return the key of the first that succeeded, or None."""
         parent = self.parents[key]
         while parent is not None and self.results[parent].status != "done":
             parent = self.parents[parent]
         return parent
 
     def _end(self, key: str, payload: Payload) -> None:
-        """Store the outcome of a task, and mark the tasks that wait for it as ready to run."""
+        """Store the result of a finished task, and queue the tasks that waited for this result."""
         record = {"key": key, "task": json.loads(self.texts[key]), "neighbour": self._neighbour(key), **payload.record}
         record["inputs"] = {"source": self.source, **record["inputs"]}
         self.store.write(record, payload.files)
@@ -259,14 +259,14 @@ def worker_count(count: int | None) -> int:
 
 
 def names_of(argument: str, names: Any) -> tuple[str, ...]:
-    """Return an argument that is a list of names as a tuple; raise ProblemError if it is anything else."""
+    """Return a list of names as a tuple; raise ProblemError if the argument is not a list of names."""
     if isinstance(names, str) or not isinstance(names, Collection):
         raise ProblemError(f"{argument} must be a list of names, not {names!r}", name=argument, value=names)
     return tuple(require.text(argument, name) for name in names)
 
 
 def name_of(function: Any) -> str:
-    """Return the name of a function for its store, ``module:name``; a script's module is named after its file.
+    """Return the name under which a function's results are stored, ``module:name``; a script is named after its file.
 
     Raises:
         ProblemError: A worker cannot find the function by name, as for a lambda, a nested function, a method, or a
@@ -298,7 +298,7 @@ def name_of(function: Any) -> str:
 
 
 def source_version(function: Any) -> str:
-    """Return a digest that changes with the code of a function or module; "" if there is no source."""
+    """Return a hash of the source code of a function or module, ignoring comments; "" if there is no source."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError):
@@ -307,7 +307,7 @@ def source_version(function: Any) -> str:
 
 
 def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str | None]:
-    """Return the neighbour of each task, the similar task whose result is its guess, as keys of tasks.
+    """Return for each task the key of its neighbour, the similar task whose result is its initial guess.
 
     The first task has None; neighbours come first in the order of the dictionary. The tasks alone determine the
     neighbours. Ordered by their keys, which looks random, they form generations of 1, 1, 2, 4, 8, ... tasks, and the
@@ -345,7 +345,7 @@ def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str 
 
 
 def coordinates_of(task: Any, names: Sequence[str]) -> Array:
-    """Return the numbers of a task from which its distance to others is computed. Shape (n,)."""
+    """Return the named numbers of a task as a point, to compute distances between tasks. Shape (n,)."""
     parts = []
     for name in names:
         value = task.get(name) if isinstance(task, Mapping) else None

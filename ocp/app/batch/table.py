@@ -1,4 +1,4 @@
-"""Results of a batch of tasks: their table, and the best result of each group of tasks."""
+"""Results of a batch of tasks as a table, and the best result of each group of tasks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Group = str | Callable[[Any], Any]
 
 
 class BatchError(DetailedError, RuntimeError):
-    """Error that some tasks of a batch failed; all other tasks are done, and all results are stored.
+    """Error raised when tasks of a batch failed, after all other tasks are done and all results are stored.
 
     Attributes:
         batch: The results.
@@ -63,7 +63,8 @@ class Result:
 
     @property
     def value(self) -> Any:
-        """Value that the function returned, read from the folder; arrays and tuples are lists, plans are plans.
+        """Value that the function returned, read from the folder; arrays and tuples are lists, plans are `Plan`
+        objects.
 
         Raises:
             SolveError: The task is not done; gives the reason.
@@ -79,7 +80,8 @@ class Result:
         return self._store.value(record)
 
     def row(self) -> dict[str, Any]:
-        """Return the result as a table row: ``COLUMNS``, then numbers and texts as ``task.NAME``, ``result.NAME``.
+        """Return the result as a table row: ``COLUMNS``, entries of the task as ``task.NAME``, of its value as
+        ``result.NAME``.
 
         Longer entries of a task are given as JSON.
         """
@@ -100,7 +102,7 @@ def row_of(record: Mapping[str, Any], store: ResultStore) -> Result:
 
 
 class Batch:
-    """Results of a batch in the order of its tasks; tasks that occur twice have one result.
+    """Results of a batch in the order of its tasks; equal tasks share one result.
 
     Attributes:
         folder: Folder of the results.
@@ -175,7 +177,7 @@ class Batch:
     # ---- tables ------------------------------------------------------------------------------------------------
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return all results as rows with the same columns; None where a result has no value."""
+        """Return all results as table rows with the same columns; a missing value is None."""
         rows = [result.row() for result in self.results]
         columns = dict.fromkeys(COLUMNS) | dict.fromkeys(name for row in rows for name in row)
         return [{name: row.get(name) for name in columns} for row in rows]
@@ -199,7 +201,7 @@ class Batch:
         write_text(path, stream.getvalue())
 
     def write_parquet(self, path: str | os.PathLike[str]) -> None:
-        """Write the rows as Parquet; a column of both numbers and texts becomes one of texts.
+        """Write the rows as a Parquet file; a column that contains both numbers and texts is written as texts.
 
         Raises:
             ProblemError: The path is invalid, or pyarrow is not installed.
@@ -219,7 +221,7 @@ class Batch:
 
 
 def read_batch(folder: str | os.PathLike[str]) -> Batch:
-    """Return all results in a folder, in the order of their keys, without computing anything.
+    """Return all results that are stored in a folder, ordered by their keys, without computing any.
 
     Raises:
         ProblemError: The folder is not that of a batch.
@@ -230,7 +232,7 @@ def read_batch(folder: str | os.PathLike[str]) -> Batch:
 
 
 def entry(task: Any, name: str) -> Any:
-    """Return a named entry of a task; raise ProblemError if it is missing."""
+    """Return a named entry of a task; raise ProblemError if the task has no such entry."""
     if not isinstance(task, dict) or name not in task:
         raise require.unknown("entry of a task", name, task if isinstance(task, dict) else ())
     return task[name]

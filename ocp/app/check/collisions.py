@@ -1,4 +1,4 @@
-"""Check the clearance of a motion, proven between the samples, and the distance of the robot's tip from a path."""
+"""Check the clearance of a motion, with a proof between samples, and the distance of the robot's tip from a path."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from ocp.tolerances import CLEARANCE_TOLERANCE_M
 __all__ = ["clearance_rows", "path_rows", "prove_clearance", "with_wide_limits"]
 
 MAX_REPORTED_PAIRS = 20
-"""Largest number of pairs of bodies that the table lists."""
+"""Largest number of pairs of bodies that are listed in the table of clearances."""
 
 
 def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
-    """Return the machine with joint limits widened to contain a motion, also those of unlimited prismatic joints."""
+    """Return the machine with joint limits that contain a motion, and with finite limits for all prismatic joints."""
     robot = machine.robot
     low, high = (getattr(motion.position.coefficients, side)(axis=(0, 1)) for side in ("min", "max"))
     joints = []
@@ -47,7 +47,7 @@ def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
 
 
 def prove_clearance(scene: CollisionScene, motion: Motion) -> Clearance:
-    """Return the clearance of each pair of bodies along a motion of the joints, and the lower bound that is proven.
+    """Return the smallest distance found for each pair of bodies along a joint motion, and a proven lower bound of it.
 
     The base is stationary.
     """
@@ -67,7 +67,7 @@ def prove_clearance(scene: CollisionScene, motion: Motion) -> Clearance:
 
 
 def clearance_rows(scene: CollisionScene, motion: Motion, bases: Array | None) -> tuple[list[Row], list[Fault]]:
-    """Return the table rows and the faults of a check of the clearance between bodies along a motion.
+    """Check the clearance between bodies along a motion, and return the table rows and the faults.
 
     If the base moves, with configurations `bases` (M, base_size) at the samples, distances are computed at the samples
     and midway between them, without a proof.
@@ -136,7 +136,7 @@ def _with_beginnings(scene: CollisionScene, motion: Motion, faults: list[Fault])
 
 
 def _sampled_rows(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
-    """Check distances between bodies at the samples and midway between them; return table rows and faults."""
+    """Check distances between bodies at the samples and halfway between samples; return table rows and faults."""
     middles = (motion.t[1:] + motion.t[:-1]) / 2
     times = np.concatenate([motion.t, middles])
     joints = motion.position.at(times)
@@ -163,7 +163,7 @@ def _sampled_rows(scene: CollisionScene, motion: Motion, bases: Array) -> tuple[
 def path_rows(
     machine: Machine, motion: Motion, bases: Array | None, path: Waypoints, *, tolerance: float, angle: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Return the table rows and the faults of a check of the tip's distance from a path and of the tool axis.
+    """Check the distance of the tip from a path and the direction of the tool axis; return table rows and faults.
 
     The tip is sampled four times in every interval, and more finely at the largest distance. The path consists of
     straight lines between the waypoints. The angle is that of the z axes, if the waypoints have orientations.
@@ -232,7 +232,9 @@ def _row(name: str, value: float, limit: float, unit: str, time: float | None) -
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:
-    """Return the required z axis of the tool at path parameters (K,), fractional waypoint numbers. Shape (K, 3)."""
+    """Return the required z axes of the tool at places (K,) on the path, given as fractional waypoint numbers. Shape
+    (K, 3).
+    """
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -242,7 +244,7 @@ def _axes(path: Waypoints, parameter: Array) -> Array:
 
 
 def _interpolate(t: Array, values: Array, times: Array) -> Array:
-    """Return base configurations at times, interpolated linearly between samples, quaternions normalised. (K, n)."""
+    """Interpolate base configurations linearly at times (K,), and normalise their quaternions. Shape (K, n)."""
     interpolated = np.column_stack([np.interp(times, t, column) for column in values.T])
     if values.shape[1] == 7:
         interpolated[:, 3:] /= np.linalg.norm(interpolated[:, 3:], axis=1)[:, None]
@@ -250,7 +252,7 @@ def _interpolate(t: Array, values: Array, times: Array) -> Array:
 
 
 def _distances(points: Array, corners: Array) -> tuple[Array, Array]:
-    """Return distances of points (K, 3) from the polyline through corners (M, 3), and the closest places on it.
+    """Return distances of points (K, 3) from a polyline with corners (M, 3), and the closest points on the polyline.
 
     The closest point is given by the number of the corner before it plus the fraction of the edge. Shape (K,) each.
     """

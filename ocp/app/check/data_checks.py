@@ -69,7 +69,7 @@ FACTORS = {
     1e-3: "per millisecond",
     -1.0: "of the opposite sign",
 }
-"""Ratios of the velocities in a file to the derivatives of its positions, and the unit that each suggests, if any."""
+"""Ratios of a file's velocities to the time derivatives of its positions, and the unit that each ratio suggests."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Fault:
 
 @dataclass(frozen=True, eq=False)
 class CleanedTrajectory:
-    """Samples of a trajectory that can be checked, after invalid ones are removed.
+    """Trajectory without its invalid samples, so that the other samples can be checked.
 
     Attributes:
         joints: Indices of its joints in the robot's joint vector. Shape (k,).
@@ -126,13 +126,13 @@ class CleanedTrajectory:
 
 PLANAR_BASE = ("base.x", "base.y", "base.angle")
 BASES = (("base.x", "base.y", "base.z", "base.qw", "base.qx", "base.qy", "base.qz"), PLANAR_BASE)
-"""Names of the columns of a file that contain the configuration of a floating base, spatial or planar."""
+"""Names of the file columns for the configuration of a floating base: first of a spatial, then of a planar base."""
 
 
 def clean_trajectory(
     raw: RawTrajectory, robot: Robot, bounds: JointBounds, *, unit_known: bool = False, unwrap: bool = False
 ) -> CleanedTrajectory:
-    """Return the part of a trajectory that can be checked, with the faults of the rest.
+    """Return the part of a trajectory that can be checked, and the faults of its data.
 
     Args:
         raw: The trajectory as written.
@@ -185,7 +185,9 @@ def clean_trajectory(
 def _columns(
     raw: RawTrajectory, robot: Robot, base: Sequence[str], faults: list[Fault], notes: list[str]
 ) -> tuple[list[int], Indices]:
-    """Match the columns of a file to the robot's joints; return the indices of the used columns and of their joints."""
+    """Match the columns of a file to the robot's joints; return the indices of the matching columns and of their
+    joints.
+    """
     names = robot.joint_names
     joints = [k for k, name in enumerate(names) if name in raw.names]
     missing = [name for name in names if name not in raw.names]
@@ -221,7 +223,7 @@ def _columns(
 
 
 def _finite(raw: RawTrajectory, used: list[int], joints: Indices, faults: list[Fault], notes: list[str]) -> Indices:
-    """Return the indices of the samples without nan or infinite values. Shape (K,)."""
+    """Return the indices of the samples whose values are all finite; add faults for the other samples. Shape (K,)."""
     finite = np.isfinite(raw.t)
     if not finite.all():
         k = int(np.flatnonzero(~finite)[0])
@@ -251,14 +253,14 @@ def _finite(raw: RawTrajectory, used: list[int], joints: Indices, faults: list[F
 
 
 def _count(invalid: Any, raw: RawTrajectory, k: int) -> str:
-    """Return a text that says how many values are not numbers and where the first of them, sample k, is."""
+    """Return a text that states the number of invalid values and where the first one (in sample k) is."""
     count = int(invalid.sum())
     text = f"{count} values are not numbers, the first" if count > 1 else "a value is not a number,"
     return f"{text} at {raw.t[k]:.6g} s (line {raw.lines[k]})"
 
 
 def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> Indices:
-    """Return the indices of the samples with increasing times; add faults for the others."""
+    """Return the indices of the samples in order of increasing time; add faults for times that decrease or repeat."""
     t = raw.t[finite_rows]
     steps = np.diff(t)
     descriptions = (steps < 0, "goes back from {:.6g} s to {:.6g} s"), (steps == 0, "{:.6g} s is repeated")
@@ -273,7 +275,8 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Guess from the joint speeds whether times are in a unit below 1 s; return the unit ("" if not) and the speed.
+    """Return the unit below 1 s ("" if none) in which the times make joint speeds plausible, and the top speed for
+    times in s.
 
     The speed is that of the fastest joint, relative to its limit, if the times are in seconds. Plausible are samples at
     10 kHz or less, and a fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
@@ -285,7 +288,7 @@ def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
 
 
 def _in_seconds(t: Array, q: Array, velocity: Array, faults: list[Fault]) -> Array:
-    """Return the times in seconds; convert whole numbers whose spacing shows that they are in a smaller unit."""
+    """Return the times in seconds; whole numbers that lie far apart are taken for milliseconds or a smaller unit."""
     if len(t) < 3 or not (t == np.rint(t)).all() or (step := float(np.median(np.diff(t)))) < THRESHOLDS.longest_step:
         return t
     unit = likely_unit(t, q, velocity)[0] or ("nanoseconds" if step >= 1e5 else "microseconds")
@@ -334,7 +337,7 @@ def _in_units(
 def _worst_in_degrees(
     t: Array, q: Array, turning: Sequence[int], limits: tuple[Array, Array, Array], margin: Array
 ) -> int | None:
-    """Return the joint with the largest position if the positions are plausible in degrees but not in rad; else None.
+    """Return the joint with the largest position if the positions seem to be in degrees instead of rad; else None.
 
     At least half of the moving joints must be impossible in rad. If no joint has position limits, their velocities are
     compared with the velocity limits instead.
@@ -390,7 +393,7 @@ def _unwrap(
 
 
 def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str], faults: list[Fault]) -> Array:
-    """Return the times in s, converted if the velocities imply a smaller unit; add faults of wrong velocities."""
+    """Return the times in s, converted if the velocities imply a smaller unit; add faults for wrong velocities."""
     if v is None or len(t) < 10:
         return t
     h = np.diff(t)[:, None]
@@ -431,7 +434,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
 def _jumps(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], velocity: Array, faults: list[Fault]
 ) -> None:
-    """Add a fault for each joint that jumps, which means a step far longer than neighbouring steps."""
+    """Add a fault for each joint that jumps, that is, has a step far longer than the neighbouring steps."""
     h = np.diff(t)
     steps = np.diff(q, axis=0)
     speeds = steps / h[:, None]
@@ -446,7 +449,7 @@ def _jumps(
         median = np.nanmedian(neighbours, axis=1)
         spread = np.nanmedian(np.abs(neighbours - median[:, None]), axis=1)
         deviation = np.abs(speeds[:, k] - median)
-        spread = np.maximum(spread, np.median(deviation))  # at least that of the noise
+        spread = np.maximum(spread, np.median(deviation))  # at least the spread of the noise
         is_jump = (deviation > THRESHOLDS.leap * spread) & (deviation > np.abs(median))
         is_jump &= (deviation / h > THRESHOLDS.hardest) | (np.abs(speeds[:, k]) > velocity[k])
         is_jump &= deviation * h > np.maximum(6 * digits[k], 1e-6 * max(1.0, float(np.abs(q[:, k]).max())))
@@ -467,7 +470,7 @@ def _jumps(
 
 
 def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fault]) -> None:
-    """Add a fault for each mimic joint that does not follow its leader."""
+    """Add a fault for each mimic joint that does not follow the joint that it mimics."""
     for joint in robot.joints:
         if joint.mimic is None or not joint.moves or joint.name not in raw.names:
             continue

@@ -51,13 +51,15 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
 
     def at(self, times: Array) -> Array:
-        """Return the values at times (M,), continuous from the right, clipped to the ends. Shape (M, n)."""
+        """Return the values at times (M,), clipped to the range of `t`; a break belongs to the later piece. Shape (M,
+        n).
+        """
         interval = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
         begin, end = self.t[interval], self.t[interval + 1]
         return self.within(interval, np.clip((times - begin) / (end - begin), 0.0, 1.0))
 
     def within(self, interval: Indices, fraction: Array) -> Array:
-        """Return the values in intervals (M,) at fractions (M,), 0 to 1, of their length. Shape (M, n)."""
+        """Return the values in given intervals (M,) at fractions (M,) of the interval length, 0 to 1. Shape (M, n)."""
         degree = self.coefficients.shape[1] - 1
         s = fraction[:, None]
         total = np.zeros((len(interval), self.coefficients.shape[2]))
@@ -67,12 +69,12 @@ class PiecewisePolynomial:
 
     @property
     def greatest(self) -> Array:
-        """Upper bounds of the absolute values in every interval. Shape (N, n)."""
+        """Upper bounds of the absolute values of the polynomials in each interval. Shape (N, n)."""
         return np.asarray(np.abs(self.coefficients).max(axis=1))
 
 
 def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
-    """Return the maxima on [0, 1] of polynomials in Bernstein form (K, d + 1), and their arguments. Shape (K,) each."""
+    """Return maxima on [0, 1] of polynomials in Bernstein form (K, d + 1), and where they occur. Shape (K,) each."""
     first, last = coefficients[:, 0], coefficients[:, -1]
     best, argument = np.maximum(first, last), np.where(last > first, 1.0, 0.0)
     tolerance = 1e-10 * np.abs(coefficients).max(axis=1, initial=0.0)  # far below the accuracy of any limit
@@ -96,7 +98,7 @@ def polynomial_maxima(coefficients: Array) -> tuple[Array, Array]:
 
 
 def _halves(coefficients: Array) -> tuple[Array, Array]:
-    """Return the Bernstein coefficients on both halves of [0, 1] (de Casteljau's algorithm). Shape (K, d + 1) each."""
+    """Return the Bernstein coefficients (K, d + 1) of polynomials on each half of [0, 1] (de Casteljau's algorithm)."""
     left, right, row = [coefficients[:, 0]], [coefficients[:, -1]], coefficients
     for _ in range(coefficients.shape[1] - 1):
         row = (row[:, 1:] + row[:, :-1]) / 2
@@ -190,12 +192,14 @@ class Motion:
 
     @cached_property
     def digits(self) -> tuple[Array, Array, Array]:
-        """Rounding error of the written positions, velocities and accelerations: half a last digit. Shape (n,) each."""
+        """Rounding errors of positions, velocities and accelerations: half of the last digit in the file. Shape (n,)
+        each.
+        """
         none = np.zeros(self.q.shape[1])
         return tuple(none if values is None else half_digits(values) for values in (self.q, self.v, self.a))  # type: ignore[return-value]
 
     def quantity(self, name: str) -> MotionQuantity | None:
-        """Return the "position", "velocity", "acceleration" or "jerk" along the motion; None if samples are too few."""
+        """Return "position", "velocity", "acceleration" or "jerk" along the motion; None for too few samples."""
         h = np.diff(self.t)[:, None]
         eq, ev, ea = self.digits
         smooth = {"linear": 0, "cubic": 1, "quintic": 2}[self.rule]
@@ -218,7 +222,8 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return the least peaks of a quantity and its negative that a motion through the samples has in each interval.
+        """Return the smallest peak that every motion through the samples must have in each interval, of a quantity and
+        of its negative.
 
         Acceleration: a motion between given positions and velocities needs the least if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
@@ -268,7 +273,7 @@ class Motion:
 
 
 def half_digits(values: Array) -> Array:
-    """Return the rounding error of each column: half its last digit, or half a single-precision bit. Shape (n,).
+    """Return the rounding error of each column of numbers: half of its last decimal or binary digit. Shape (n,).
 
     A column of few digits may be exact: columns with digits coarser than a thousandth or with few values count as
     exact.

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
-"""Checked quantities of a joint, and what their units append to rad or m."""
+"""Checked quantities of a joint, and the suffix that turns rad or m into the unit of the quantity."""
 
 
 class RowVerdict(StrEnum):
@@ -58,14 +58,14 @@ class RowVerdict(StrEnum):
     OK = "ok"
     FAILED = "FAILED"
     UNDECIDED = "undetermined"
-    """The file has too few digits, or the proof is inconclusive."""
+    """Verdict if the file has too few digits, or the proof is inconclusive."""
     UNLIMITED = "unlimited"
     INFO = "info"
-    """The value is information without a requirement."""
+    """Verdict on a value that is given as information, without a requirement."""
 
     @classmethod
     def of(cls, failed: Any) -> RowVerdict:
-        """Return the verdict FAILED or OK on a value that has a limit."""
+        """Return the verdict FAILED or OK for a value that has a limit."""
         return cls.FAILED if failed else cls.OK
 
 
@@ -120,7 +120,7 @@ def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> L
 def limit_rows(
     motion: Motion, robot: Robot, joints: Indices, bounds: JointBounds, *, share: float
 ) -> tuple[list[Row], list[Fault], list[str]]:
-    """Return table rows and faults for all limits of the joints, and the quantities that could not be checked.
+    """Check a motion against all joint limits; return table rows, faults, and the quantities that could not be checked.
 
     Args:
         motion: Motion of the joints.
@@ -160,7 +160,7 @@ def audit_rows(audit: Audit) -> list[Row]:
 
 
 class _Side(NamedTuple):
-    """Largest values of a joint's quantity towards its upper or lower limit, one for each interval between samples.
+    """Largest values of one quantity of a joint towards its upper or lower limit, in each interval between samples.
 
     Values and limit are multiplied by `sign`.
 
@@ -180,7 +180,7 @@ class _Side(NamedTuple):
 
     @classmethod
     def of(cls, quantity: MotionQuantity, column: int, sign: float, limit: float, tolerance: float) -> _Side:
-        """Return the largest values of one joint towards one of its limits, with a tolerance of the limit."""
+        """Return the largest values of a joint's quantity towards one limit; `tolerance` is added to the limit."""
         coefficients, t = sign * quantity.pieces.coefficients[:, :, column], quantity.pieces.t
         needed = np.broadcast_to(quantity.needed[0 if sign > 0 else 1], quantity.blur.shape)[:, column]
         ends, enclosed = np.maximum(coefficients[:, 0], coefficients[:, -1]), coefficients.max(axis=1)
@@ -198,19 +198,21 @@ class _Side(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """Largest value minus the limit; -inf if there is no limit."""
+        """Difference between the largest value and the limit; -inf if there is no limit."""
         return float(self.values.max() - self.limit)
 
     @property
     def worst_value(self) -> float:
-        """Largest value towards the limit, with its original sign instead of multiplied by `sign`."""
+        """Largest value towards the limit with its original sign, that is, not multiplied by `sign`."""
         return self.sign * float(self.values.max())
 
 
 def _check_limits(
     quantity: MotionQuantity, column: int, order: str, name: str, unit: str, low: float, high: float, share: float
 ) -> tuple[tuple[float, float | None, str, float | None, RowVerdict], str, list[Fault]]:
-    """Return value, limit, unit, time and verdict of a table row, a remark on tolerated violations, and the faults."""
+    """Check a quantity of one joint; return value, limit, unit, time and verdict of its table row, a remark, and
+    faults.
+    """
     t, blur = quantity.pieces.t, np.asarray(quantity.blur)[:, column]
     tolerance = share * max((abs(one) for one in (low, high) if np.isfinite(one)), default=0.0)
     sides = [_Side.of(quantity, column, *one, tolerance) for one in ((1.0, high), (-1.0, -low))]
@@ -268,7 +270,7 @@ def effort_rows(
 def torque_rows(
     motion: Motion, machine: FixedBase | FreeFloating | Standing, bounds: JointBounds, share: float
 ) -> tuple[list[Row], list[Fault]]:
-    """Return the table rows and the faults of joint torques from inverse dynamics, at five times of every interval.
+    """Check joint torques from inverse dynamics at five times of every interval; return table rows and faults.
 
     With linear interpolation they are evaluated at the samples, with velocities and accelerations by differences. A
     floating base moves as the joints drive it, from rest, without gravity.
@@ -329,7 +331,7 @@ def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.
 
 
 def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
-    """Return times, positions, velocities and accelerations at which to evaluate torques. Shape (K,), (K, n) each."""
+    """Return times (K,), positions, velocities and accelerations (K, n) at which to evaluate the torques."""
     t, h = motion.t, np.diff(motion.t)
     if motion.acceleration is None:
         if len(t) < 3:
@@ -347,7 +349,7 @@ def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
 
 
 def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[list[Row], list[Fault]]:
-    """Return table rows and faults of a standing machine: vertical ground force, zero moment point, friction."""
+    """Check ground force, zero moment point and friction of a standing machine; return table rows and faults."""
     n = machine.joint_size
     q, v, a = (ca.SX.sym(name, n) for name in ("q", "v", "a"))
     reaction = machine.ground_reaction(q, v, a)
@@ -389,7 +391,8 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
 def floating_base_rows(
     machine: FreeFloating, motion: Motion, base: Array | None
 ) -> tuple[Array, list[Row], list[Fault]]:
-    """Return the configurations of a floating base at the samples, shape (M, base_size), with table rows and faults.
+    """Return the configurations (M, base_size) of a floating base at the samples, and the table rows and faults of its
+    check.
 
     If the file gives the base, its momentum is checked; otherwise it moves so that momentum is conserved.
     """
@@ -399,7 +402,8 @@ def floating_base_rows(
 
 
 def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
-    """Return the base configurations at the samples, shape (M, base_size), and table rows of the displacement.
+    """Integrate the motion of a floating base; return its configurations at the samples, (M, base_size), and table
+    rows.
 
     The base starts at its home and moves so that momentum stays zero. The classical Runge-Kutta method takes one step
     in every interval.
@@ -441,7 +445,7 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
 
 
 def momentum_rows(machine: FreeFloating, motion: Motion, bases: Array) -> tuple[list[Row], list[Fault]]:
-    """Return table rows and faults for the total momentum, which must be constant under the given base motion.
+    """Check that the total momentum is constant under the given base motion; return table rows and faults.
 
     The velocity of the base is computed by central differences.
     """

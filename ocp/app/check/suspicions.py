@@ -42,7 +42,8 @@ def doubtful_times(motion: Motion, velocity: Array) -> list[Fault]:
 
 
 def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool = True) -> list[Fault]:
-    """Return a suspicion if the columns of two joints seem exchanged: swapped, they give a far simpler motion.
+    """Return a suspicion if the columns of two joints seem exchanged, because swapping them makes the motion far
+    simpler.
 
     Either one joint is outside its limits most of the time, and all are inside after the exchange. Or the tip moves
     straight or at constant speed only after the exchange. The latter requires three joints that do not move in

@@ -1,4 +1,4 @@
-"""Check a joint trajectory from any source, or a plan: all quantities in one table, and a verdict in one sentence."""
+"""Check a joint trajectory from any source, or a plan; report a table of all quantities and a verdict."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether there are neither faults nor suspicions."""
+        """Whether the trajectory has no faults and no suspicions (signs that the file may have been misread)."""
         return not self.faults and not self.suspicions
 
     @property
@@ -179,7 +179,7 @@ class Interpretation:
 
     @property
     def seconds(self) -> float:
-        """Unit of the times in the file, s."""
+        """Duration of one unit of the file's times, s."""
         unit = self.time_unit
         return UNITS[unit] if isinstance(unit, str) else 1.0 if unit is None else float(unit)
 
@@ -342,14 +342,14 @@ def check_trajectory(
 
 
 def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
-    """Return a sentence about links with missing meshes; empty if there are none."""
+    """Return a list with one text about the links whose meshes are missing; an empty list if none is missing."""
     shapes = [(link.name, shape) for link in robot.links for shape in link.collisions if shape.kind == "mesh"]
     names = [name for name, shape in shapes if find_mesh(shape.file, shape.folder or None, folders) is None]
     return [f"clearance of {', '.join(dict.fromkeys(names))}, whose meshes are missing"] if names else []
 
 
 def _unlimited_quantities(rows: Sequence[Row]) -> tuple[str, ...]:
-    """Return the names of the quantities that have no limit; those of several joints are one entry."""
+    """Return texts that name the quantities without a limit, one text for all joints of a quantity."""
     joints: dict[str, list[str]] = {}
     counts: dict[str, int] = {}
     for row in rows:
@@ -365,7 +365,7 @@ def _unlimited_quantities(rows: Sequence[Row]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class PlanVerdict:
-    """Audit of a plan, and check of its samples against the limits of its machine.
+    """Audit of a plan, and check of the plan's samples against the limits of the machine.
 
     Attributes:
         audit: Audit of the plan against its problem.
@@ -391,7 +391,7 @@ class PlanVerdict:
 
 
 def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> PlanVerdict:
-    """Return the verdict on a plan: its audit, and the check of its samples against the limits of its machine.
+    """Audit a plan, and check samples of the plan against the limits of the machine.
 
     Args:
         plan: The plan.
@@ -403,7 +403,7 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
 
 
 def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
-    """Check the samples of a plan segment by segment, because accelerations are undefined where rates jump."""
+    """Check samples of a plan against the limits of its machine, separately for each segment if there are several."""
     if isinstance(plan, ConsecutivePlans):
         return _worst([_check_segment(piece, sample.t, name) for piece in plan.pieces])
     if isinstance(plan, PathPlan):  # constant rates between waypoints
@@ -416,7 +416,7 @@ def _check(plan: Plan, sample: PlanSample, name: str) -> Check:
 
 
 def _check_segment(piece: Piece, times: Array, name: str) -> Check:
-    """Check the samples of one segment of a plan: its ends, and those of the given times that lie between them."""
+    """Check one segment of a plan at both ends of the segment and at the given times in between."""
     plan, local = piece.plan, times - piece.begin
     inside = local[(local > 0) & (local < plan.horizon)]
     sample = plan.sampled(np.concatenate([[0.0], inside, [plan.horizon]]))
@@ -427,7 +427,7 @@ def _check_segment(piece: Piece, times: Array, name: str) -> Check:
 def _check_samples(
     machine: Machine, robot: Robot, values: tuple[Array, Array, Array | None, Array | None], name: str
 ) -> Check:
-    """Check sampled joint positions, and rates and accelerations if not None, against the limits of a robot.
+    """Check sampled joint positions, rates and accelerations against a robot's limits; the last two may be None.
 
     `values` has the times (M,), positions, rates and accelerations (M, n).
     """
@@ -441,7 +441,7 @@ def _check_samples(
 
 
 def _worst(checks: Sequence[Check]) -> Check:
-    """Merge the checks of several motions: keep all faults and, of each quantity, the worst row."""
+    """Merge the checks of several motions: keep all faults and, for each quantity, the row with the worst value."""
     rows: dict[str, Row] = {}
     for row in (row for check in checks for row in check.rows):
         if row.name not in rows or _severity(row) > _severity(rows[row.name]):
@@ -455,6 +455,6 @@ def _worst(checks: Sequence[Check]) -> Check:
 
 
 def _severity(row: Row) -> tuple[bool, bool, float]:
-    """Return the key by which table rows of one quantity are sorted: failed, undetermined, value over limit."""
+    """Return the sort key of a table row: whether it failed, whether it is undetermined, value relative to limit."""
     size = abs(row.limit) if row.limit else 1.0
     return row.verdict is RowVerdict.FAILED, row.verdict is RowVerdict.UNDECIDED, abs(row.value) / size

@@ -1,4 +1,4 @@
-"""Read G-code as paths: G0 to G3 of three axes, and every word that affects them.
+"""Read G-code as paths: the motions G0 to G3 of three axes, and every word that affects these motions.
 
 The dialect is RS274/NGC as in LinuxCNC (its manual, "G-Codes"), which most CAM postprocessors for mills follow. A word
 that would change the path in an unknown way, such as cutter compensation or a machine's own positions, is an error
@@ -44,7 +44,7 @@ __all__ = ["read_gcode"]
 
 UNITS = {"mm": 1e-3, "inch": 0.0254}
 DEFAULT_GAPS_M = {"mm": 2 * np.sqrt(2) * 1e-5, "inch": 2 * np.sqrt(2) * 2.54e-5}
-"""Difference of an arc's two end radii that is due to numbers rounded to 0.01 mm or 0.001 inch, by unit, m."""
+"""Largest difference of an arc's two end radii that rounding to 0.01 mm or 0.001 inch explains, by unit, m."""
 AXES, OFFSETS, OTHER_AXES = "XYZ", "IJK", "ABCUVW"
 
 
@@ -105,7 +105,7 @@ def read_gcode(
 
 
 class _Reader:
-    """Reader of a G-code file: the modal state, and the sections read so far.
+    """Reader of a G-code file, which keeps the modal state and the sections of the program read so far.
 
     Positions are in metres in the frame of the program's start. `position` is the programmed one; `reached` is the end
     of the path, which differs from it because moves below a nanometre are dropped.
@@ -172,7 +172,7 @@ class _Reader:
             lines.append(self.block.number)
 
     def _run(self) -> bool:
-        """Execute the current block and return whether the program ends there."""
+        """Execute the current block and return whether it ends the program."""
         words = dict(self.block.words)
         codes = {code for letter, code in self.block.codes if letter == "G"}
         self._check_groups(codes)
@@ -200,7 +200,7 @@ class _Reader:
         return self._stop(words)
 
     def _check_groups(self, codes: set[int]) -> None:
-        """Reject unsupported codes and several codes of one modal group."""
+        """Raise ProblemError for unsupported codes and for several codes of one modal group."""
         code_of_group: dict[str, int] = {}
         for code in sorted(codes):
             if code in UNSUPPORTED_CODES:
@@ -245,7 +245,7 @@ class _Reader:
             self._note("G64: P is the tolerance of rounding" if tolerance else "G64: the caller's tolerance applies")
 
     def _set_system(self, code: int) -> None:
-        """Set the work coordinate system; raise ProblemError if the program has already used another one."""
+        """Set the work coordinate system; raise ProblemError if the program has already used another system."""
         if self.system is None and not self.moved and not self.moves:
             self.system = code
         if code != (540 if self.system is None else self.system):
@@ -274,7 +274,7 @@ class _Reader:
         self._note("G4: P is read as seconds")
 
     def _to_machine_position(self, code: int, words: dict[str, float]) -> None:
-        """Move to a position in the machine's own coordinates; if that is unknown, note the line and ignore it."""
+        """Move to a position in the machine's own coordinates; if it is unknown, ignore the move and add a note."""
         if code in (281, 301):
             self._refuse(f"{code_name(code)} stores a position of the machine; {REPOST}")
         axes = [i for i, axis in enumerate(AXES) if axis in words]
@@ -303,7 +303,7 @@ class _Reader:
         self._rapid(target)
 
     def _shift(self, codes: set[int], words: dict[str, float]) -> None:
-        """Set the offset so that the current position has the given coordinates (G92), or clear it (G92.1, G92.2)."""
+        """Set the offset so that the current position gets the given coordinates (G92), or reset the offset."""
         if 920 not in codes:
             self.offset = np.zeros(3)
             return
@@ -354,7 +354,7 @@ class _Reader:
             self._arc(words)
 
     def _rapid(self, target: Array) -> None:
-        """Add a rapid move."""
+        """Add a rapid move to a target point."""
         self._end_path()
         if np.linalg.norm(target - self.reached) > SHORTEST_SEGMENT:
             self.sections.append(Rapid(self.reached, target, self.block.number))
@@ -362,13 +362,13 @@ class _Reader:
         self.position, self.moved = target, True
 
     def _line(self, target: Array) -> None:
-        """Add a straight move at the feed."""
+        """Add a straight move to a target point at the current feed."""
         self.position = target
         if np.linalg.norm(target - self.reached) > SHORTEST_SEGMENT:
             self._add((Line(self.reached, target),), target)
 
     def _arc(self, words: dict[str, float]) -> None:
-        """Add an arc or a helix at the feed."""
+        """Add an arc or a helix at the current feed."""
         start, unit = self.reached, UNITS[self.unit]
         target, plane = self._target(words), PLANES[self.plane]
         in_plane = list(plane[:2])
@@ -410,7 +410,7 @@ class _Reader:
             self._end_path()
 
     def _stop(self, words: dict[str, float]) -> bool:
-        """Execute the M words and reject unused words; return whether the program ends."""
+        """Execute the M words of a block and reject unused words; return whether the program ends."""
         is_end = False
         for code in (code for letter, code in self.block.codes if letter == "M"):
             kind, name = M_WORDS.get(code, ""), f"M{code // 10}"

@@ -45,13 +45,13 @@ __all__ = [
 ]
 
 PLANES = {170: (0, 1, 2), 180: (2, 0, 1), 190: (1, 2, 0)}
-"""First axis, second axis and normal of G17, G18, G19: right-handed, so that G3 turns about the normal."""
+"""First axis, second axis and normal of the planes G17, G18, G19: right-handed, so that G3 turns about the normal."""
 RADIUS_SHARE = 1e-3
-"""Difference of an arc's two end radii, relative to the radius, that is accepted for numbers of few digits."""
+"""Accepted difference of the two end radii of an arc in a file with few digits, relative to the radius."""
 
 
 class ArcError(Exception):
-    """Error that numbers do not describe an arc.
+    """Error raised when numbers do not describe an arc.
 
     Attributes:
         why: Reason.
@@ -85,7 +85,7 @@ def center_from_radius(start: Array, end: Array, radius: float, *, clockwise: bo
 def arcs_about_center(
     start: Array, end: Array, center: Array, *, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
 ) -> list[Arc | Helix]:
-    """Return arcs or helices from start to end: one, or two halves if no single centre fits both ends.
+    """Return one arc or helix from start to end, or two halves if no single centre fits both ends.
 
     Two are needed if a circle nearly closes but ends nearer to the centre than it starts.
 
@@ -135,7 +135,7 @@ def arcs_about_center(
 
 
 def _equidistant_center(center: Array, first: Array, last: Array) -> Array:
-    """Return the point equidistant from two points that is nearest to `center`. Shape (2,) each."""
+    """Return the point nearest to `center` that is equidistant from two given points. Shape (2,) each."""
     chord = last - first
     square = float(chord @ chord)
     return center if square == 0 else np.asarray(center - ((center - (first + last) / 2) @ chord) / square * chord)
@@ -144,7 +144,7 @@ def _equidistant_center(center: Array, first: Array, last: Array) -> Array:
 def _arc_of_sweep(
     start: Array, end: Array, center: Array, clockwise: bool, sweep: float, plane: tuple[int, int, int]
 ) -> Arc | Helix:
-    """Return the arc from `start` that turns by `sweep`; it is a helix if it rises or exceeds a full turn."""
+    """Return the arc from `start` that turns by `sweep`, or a helix if it rises or exceeds a full turn."""
     axis, middle = np.zeros(3), start.copy()
     axis[plane[2]] = -1.0 if clockwise else 1.0
     middle[list(plane[:2])] = center
@@ -162,7 +162,7 @@ def _sweep(first: Array, last: Array, clockwise: bool) -> float:
 
 
 MOTIONS = (0, 10, 20, 30)
-"""Codes of the motions G0, G1, G2 and G3, in tenths."""
+"""Codes of the motions G0, G1, G2 and G3, as ten times their numbers."""
 
 GROUPS: dict[int, str] = {
     **dict.fromkeys((*MOTIONS, 330, 331, 382, 383, 384, 385, 730, 760, *range(810, 900, 10), 50, 51, 52, 53), "motion"),
@@ -175,7 +175,7 @@ GROUPS: dict[int, str] = {
     **dict.fromkeys((*range(540, 600, 10), 591, 592, 593), "coordinate system"),
     **dict.fromkeys((400, 410, 411, 420, 421), "cutter compensation"),
 }
-"""Modal group of each G code (in tenths); a line may have one code of each group."""
+"""Modal group of each G code, keyed by ten times its number; a line may have one code of each group."""
 
 REPOST = "post the program without it"
 UNSUPPORTED_CODES: dict[int, str] = {
@@ -211,9 +211,9 @@ M_WORDS = {
     **dict.fromkeys((20, 300), "end"),
     **dict.fromkeys((970, 980, 990), "call"),
 }
-"""M words that affect the path; all others are ignored."""
+"""M words that affect the path, keyed by ten times their numbers; all other M words are ignored."""
 MACHINE_CODES = (280, 281, 300, 301, 530)
-"""G words that lead to, or store, positions that only the machine knows."""
+"""G codes, as ten times their numbers, that move to, or store, positions that only the machine knows."""
 
 WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+))")
 COMMENT = re.compile(r"\([^()]*\)")

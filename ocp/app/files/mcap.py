@@ -100,7 +100,7 @@ def write_mcap(plan: Plan, file: str | os.PathLike[str], period: float = 0.01, *
 
 
 def _header(stamp: int, frame: str) -> dict[str, Any]:
-    """Return the header of a message with a time stamp in ns."""
+    """Return the header of a ROS 2 message with a time stamp in ns and the name of a frame."""
     seconds, nanoseconds = divmod(stamp, 10**9)
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
 
@@ -109,7 +109,7 @@ def _header(stamp: int, frame: str) -> dict[str, Any]:
 
 
 def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) -> tuple[str, list[tuple[int, Any]]]:
-    """Read joint states or joint trajectories from a log; return their topic, and time stamp (ns) and fields of each.
+    """Read joint states or trajectories from a log; return their topic, and time stamp (ns) and fields of each message.
 
     A stamp is that of the message's header, or the log time if that is zero.
 
@@ -167,7 +167,7 @@ def read_joint_messages(file: str | os.PathLike[str], topic: str | None = None) 
 
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
-    """Yield the records of a log in the order of its file, including those in chunks.
+    """Yield the records of an MCAP log in file order, including the records inside chunks.
 
     Raises:
         ValueError: A record, or the unpacked log, is too large.
@@ -189,7 +189,7 @@ def _records(stream: IO[bytes]) -> Iterator[Any]:
 
 
 def _decompress(chunk: Any) -> bytes:
-    """Return the decompressed contents of an MCAP chunk; raise ValueError if they differ from its declared size."""
+    """Return the decompressed contents of an MCAP chunk; raise ValueError if their size is not the declared one."""
     data, size = chunk.data, chunk.uncompressed_size
     if chunk.compression == "zstd":
         zstd = import_module("zstandard").ZstdDecompressor(max_window_size=INPUT_LIMITS.log_record_bytes)
@@ -211,7 +211,7 @@ def _fields(message: Any) -> Any:
 
 
 REQUIRED_NAMES = ("LineStrips3D", "Points3D", "Scalars", "TimeColumn", "log", "send_columns")
-"""Names of the module rerun that are used (0.23 or later)."""
+"""Names that the module rerun (0.23 or later) must provide."""
 
 
 def log_rerun(plan: Plan, rerun: Any, period: float = 0.01, *, entity: str = "plan", timeline: str = "time") -> None:

@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 DEFAULT_TOLERANCE_M = 5e-5
-"""Deviation allowed when neither the file nor the caller gives one: a usual contour tolerance of machine tools."""
+"""Default deviation of a rounded path, m, which is a usual contour tolerance of machine tools."""
 
 
 class Note(NamedTuple):
@@ -72,7 +72,7 @@ class Cut:
         return f"cut, lines {self.lines[0]} to {self.lines[-1]}"
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> SmoothPath:
-        """Return the path with rounded corners, see `Program.smooth`."""
+        """Return the path of the cut with rounded corners; the arguments are those of `Program.smooth`."""
         deviation = np.fmin(self.tolerances[:-1], self.tolerances[1:])
         if tolerance is not None:
             deviation = np.fmin(deviation, require.positive("tolerance", tolerance))
@@ -184,7 +184,7 @@ class Program:
         return Program(tuple(sections), start, self.notes)
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> tuple[SmoothPath, ...]:
-        """Return every path with rounded corners.
+        """Return the paths of all cuts with rounded corners.
 
         Args:
             tolerance: Largest deviation from the path, m. A smaller tolerance in the file (G64 P) takes precedence.
@@ -230,7 +230,7 @@ class Program:
 
 
 def checked_reversal(owner: str, value: Any) -> Reversal:
-    """Return the treatment of path reversals; raise ProblemError unless it is "split" or a bulb's width, m."""
+    """Return the treatment of path reversals after a check: "split", or the width (m) of a bulb-shaped turn."""
     if isinstance(value, str):
         require.choice(f"{owner}: reversal", value, ("split",))
         return "split"
@@ -238,20 +238,20 @@ def checked_reversal(owner: str, value: Any) -> Reversal:
 
 
 def _count_text(number: int, noun: str) -> str:
-    """Return a number with its noun, in the plural if necessary."""
+    """Return a text with a number and its noun, in the plural if necessary."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _transform(points: Array, position: ArrayInput, orientation: ArrayInput) -> Array:
-    # lines from the origin along the axes check the pose and give its rotation
     """Transform points (k, 3) by a pose."""
+    # lines from the origin along the axes check the pose and give its rotation
     frame = [Path.through([(0, 0, 0), axis]).placed(position, orientation).segments[0] for axis in np.eye(3)]
     origin = np.asarray(frame[0].start)
     return np.asarray(origin + points @ np.array([np.asarray(line.end) - origin for line in frame]))
 
 
 def smooth_path(path: Path, deviation: ArrayInput, options: dict[str, Any]) -> SmoothPath:
-    """Return a path with its corners rounded within a deviation; errors of models.smooth become ProblemError."""
+    """Round the corners of a path within a deviation; raise ProblemError for errors of `models.smooth`."""
     known = {"kind", "shape", "overlap"}
     if unknown := [name for name in options if name not in known]:
         message = f"smooth: unknown option {unknown[0]!r}; known: {', '.join(sorted(known))}"
@@ -298,7 +298,7 @@ class TimedProgram:
 
     @cached_property
     def bounds(self) -> Array:
-        """Start times of the sections, and the end. Shape (K + 1,), s."""
+        """Start times of the sections, and the end time of the program. Shape (K + 1,), s."""
         pairs = zip(self.program.sections, self.schedules, strict=True)
         durations = [each.duration if timed is None else timed.duration for each, timed in pairs]  # type: ignore[union-attr]
         return np.concatenate([[0.0], np.cumsum(durations)])
@@ -347,7 +347,7 @@ class TimedProgram:
         )
 
     def _rest(self, which: int) -> Array:
-        """Return the position during a pause: the end of the previous move."""
+        """Return the position of the tool during a pause, which is the end of the previous move."""
         for each in reversed(self.program.sections[:which]):
             if isinstance(each, Rapid):
                 return each.end

@@ -42,7 +42,7 @@ __all__ = [
 FileName = str | PathLike[str]
 BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 QUOTED_CHARACTERS = 120
-"""Largest number of characters of a line that a message quotes."""
+"""Largest number of characters that an error message quotes from a line of a file."""
 
 
 def read_lines(
@@ -88,14 +88,14 @@ def read_lines(
 
 
 def line_error(file: Any, number: int, text: str, why: str, *, limit: Any = None) -> ProblemError:
-    """Return the ProblemError about a line of a file, with the line's number and text and the reason `why`."""
+    """Return a ProblemError about a line of a file, which states the line's number and text and the reason `why`."""
     quoted = text.strip()
     quoted = quoted if len(quoted) <= QUOTED_CHARACTERS else quoted[:QUOTED_CHARACTERS] + " ..."
     return ProblemError(f"{file}, line {number}, {quoted!r}: {why}", name=f"line {number}", value=quoted, limit=limit)
 
 
 def missing_package(task: str, package: str, extra: str) -> ProblemError:
-    """Return the error that a task needs an optional package which is not installed."""
+    """Return a ProblemError that says that a task needs an optional package, and how to install it."""
     commands = f'pip install "selfmotion[{extra}]", or from a clone pip install ".[{extra}]"'
     return ProblemError(f"{task} needs the package {package}: {commands}", name=extra, value=package)
 
@@ -168,13 +168,13 @@ def _yaml(text: str) -> Any:
 
 
 class _Container:
-    """A list or mapping that is still being read, with the number of values in it."""
+    """A YAML list or mapping that is still being read, and the number of values that it contains so far."""
 
     def __init__(self, value: Any, anchor: str | None) -> None:
         self.value, self.anchor, self.count, self.key = value, anchor, 1, _NO_KEY
 
     def add(self, value: Any, count: int) -> None:
-        """Append a list value, or the key or value of a mapping entry; it counts as `count` values."""
+        """Append a list value, or the key or value of a mapping entry; `count` is the number of values in it."""
         self.count += count
         _check_count(self.count)
         if isinstance(self.value, list):
@@ -190,7 +190,7 @@ class _Container:
 
 
 def _first_document(events: Any) -> Any:
-    """Return the tree of the first document from the events of a parser, or None if there is none."""
+    """Return the tree of the first YAML document from the events of a parser, or None if there is no document."""
     anchors: dict[str, tuple[Any, int]] = {}
     root = _Container([], None)
     open_containers = [root]
@@ -244,7 +244,7 @@ def _check_count(count: int) -> None:
 
 
 def checked_depth(tree: Any) -> Any:
-    """Return a tree of values; raise ValueError if it is nested deeper than INPUT_LIMITS.nesting."""
+    """Return a tree of values; raise ValueError if the tree is nested deeper than INPUT_LIMITS.nesting."""
     level = [tree]
     for _ in range(INPUT_LIMITS.nesting + 1):
         level = [child for node in level for child in children_of(node)]
@@ -275,11 +275,11 @@ SIGNATURES = {
     "urdf": re.compile(rf"<\?xml [^>]*>\n<!-- {MARK} -->\n".encode()),
     "report": re.compile(rb'<!doctype html>\n<html[^>]*>\s*<head>\s*<meta name="generator" content="selfmotion">'),
 }
-"""First bytes of files that selfmotion writes, by kind."""
+"""Patterns of the first bytes of files that selfmotion writes, by kind of file."""
 
 
 def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None = None, force: bool = False) -> Path:
-    """Return the path to which an output is written, with links resolved.
+    """Return the path to which an output is written, after checks and with links resolved.
 
     Args:
         kind: Kind of the output, a key of SUFFIXES.
@@ -308,7 +308,7 @@ def checked_output(kind: str, file: str | os.PathLike[str], folder: Path | None 
 
 
 def _is_own(kind: str, path: Path) -> bool:
-    """Return whether an existing file was written by selfmotion, and may be overwritten."""
+    """Return whether an existing file was written by selfmotion and may therefore be overwritten."""
     try:
         if kind == "plan":
             return "head" in read_arrays(path)

@@ -119,7 +119,7 @@ def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
 
 
 def rotation_of(entries: TomlTable) -> Array:
-    """Return the rotation matrix of the entry `rpy`; the identity if it is missing. Shape (3, 3)."""
+    """Return the rotation matrix of the entry `rpy` (roll, pitch, yaw); the identity if it is missing. Shape (3, 3)."""
     angles = entries.vector("rpy", 3, "three angles, rad", (0.0, 0.0, 0.0))
     return np.array(rotation_from_rpy(*(float(angle) for angle in angles)), dtype=float)
 
@@ -157,7 +157,7 @@ LIMIT_UNITS = {
     "torque": "N m or N",
     "power": "W",
 }
-"""Quantities that the limits of joints may bound, and their units."""
+"""Quantities for which a task file can limit the joints, and their units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +306,7 @@ def _task(entries: TomlTable, folder: Path) -> TipTask:
 
 
 def _path_limit(entries: TomlTable, name: str, unit: str, default: Any = None) -> Any:
-    """Read a speed, acceleration or other limit along the path; reject values that no machine has."""
+    """Read a limit along the path, such as the speed; raise ProblemError if it is not between 1e-6 and 1e6."""
     return entries.number(name, f"a number above 0, {unit}, of 1e-6 to 1e6", default, least=0.999e-6, most=1e6)
 
 
@@ -362,7 +362,7 @@ def _each(entries: TomlTable, name: str, names: tuple[str, ...], default: float,
 
 
 def _check_joints(entries: TomlTable, name: str, by_joint: dict[str, float], names: tuple[str, ...]) -> None:
-    """Raise ProblemError if a name is not that of a moving joint."""
+    """Raise ProblemError if a key of an entry is not the name of an independent joint of the robot."""
     for joint in by_joint:
         if joint not in names:
             table = entries.table(name)

@@ -42,7 +42,7 @@ class TomlTable:
         return name in self._values
 
     def error(self, name: str | None, why: str) -> ProblemError:
-        """Return the error about an entry or the table, with the line, its text, and the reason."""
+        """Return a ProblemError about an entry, or about the table itself, with the line, its text, and the reason."""
         place = self.place if name is None else (*self.place, name)
         number = next((self._lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in self._lines), 1)
         text = self._texts[number - 1] if number <= len(self._texts) else ""
@@ -51,7 +51,7 @@ class TomlTable:
         return error
 
     def missing(self, name: str, expected: str) -> ProblemError:
-        """Return the error about a missing entry; it names an unknown entry that is spelled similarly."""
+        """Return the error about a missing entry, or about an unknown entry with a similar spelling if there is one."""
         unknown = [key for key in self._values if key not in self._read_names]
         if similar := get_close_matches(name, unknown, n=1, cutoff=0.5):
             return self.error(similar[0], f"unknown entry {similar[0]}; did you mean {name}? It is {expected}")
@@ -61,7 +61,7 @@ class TomlTable:
         return self.error(None, why) if self.place else ProblemError(f"{self.file}: {why}", name=name)
 
     def _read(self, name: str, default: Any, expected: str, is_valid: Callable[[Any], bool]) -> Any:
-        """Return an entry, or its default; raise ProblemError if it is missing but required, or invalid."""
+        """Return the value of an entry or its default; raise ProblemError if it is invalid, or missing but required."""
         self._read_names.append(name)
         if name not in self._values:
             if default is REQUIRED:
@@ -106,7 +106,7 @@ class TomlTable:
         return self._read(name, default, expected, fits)
 
     def vector(self, name: str, size: int | None, expected: str, default: Any = None) -> Any:
-        """Return the entry of this name as a vector of `size` numbers, or of any number of them if `size` is None."""
+        """Return the entry of this name as a vector of `size` numbers, or of any length if `size` is None."""
 
         def fits(value: Any) -> bool:
             try:
@@ -119,7 +119,7 @@ class TomlTable:
         return value if value is None or value is default else np.array(value, dtype=float)
 
     def numbers_by_name(self, name: str, expected: str) -> dict[str, float]:
-        """Return the entry of this name as a table of numbers by name; empty if it is missing."""
+        """Return the entry of this name as a dictionary of numbers by name; empty if the entry is missing."""
         table = self.table(name, expected)
         values = {} if table is None else table._values
         for key, value in values.items():
@@ -149,16 +149,16 @@ class TomlTable:
         return self._read(name, default, "", lambda value: True)
 
     def table(self, name: str, expected: str = "a table", default: Any = None) -> TomlTable | None:
-        """Return the table of this name within this one, or None if it is missing."""
+        """Return the nested table of this name, or None if it is missing."""
         values = self._read(name, default, expected, lambda value: isinstance(value, dict))
         return None if values is None else self._inner(values, name)
 
     def _inner(self, values: Any, *place: Any) -> TomlTable:
-        """Return a nested table that knows its place in the file, so that its errors name the line."""
+        """Return a nested table with its place in the file, so that its errors name the line."""
         return TomlTable(self.file, values, place=(*self.place, *place), texts=self._texts, lines=self._lines)
 
     def tables(self, name: str) -> list[TomlTable]:
-        """Return the tables of the array [[name]]."""
+        """Return all tables of the array of tables [[name]]."""
         tables = self._read(
             name,
             [],
@@ -168,7 +168,7 @@ class TomlTable:
         return [self._inner(values, name, k) for k, values in enumerate(tables)]
 
     def only(self, *names: str) -> None:
-        """Raise ProblemError for entries with other names than the given ones, before any entry is read.
+        """Raise ProblemError if the table has entries with names other than the given ones, before any entry is read.
 
         Raises:
             ProblemError: An entry is unknown; names its line and the known entries.
@@ -177,7 +177,7 @@ class TomlTable:
         self.done()
 
     def done(self) -> None:
-        """Raise ProblemError if an entry has not been read, because it is then unknown.
+        """Raise ProblemError if the table has an entry that was not read, because such an entry is unknown.
 
         Raises:
             ProblemError: An entry is unknown; names its line and the known entries.

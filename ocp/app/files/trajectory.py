@@ -1,4 +1,4 @@
-"""Read joint trajectories from any source: CSV, JointTrajectory as JSON or YAML, MCAP.
+"""Read joint trajectories from CSV tables, from JointTrajectory messages in JSON or YAML, and from MCAP logs.
 
 Faults of the motion are kept for the check that reports them: values that are not numbers, times that do not increase,
 and joints that the robot does not have.
@@ -189,7 +189,7 @@ def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str
 def _meanings(
     file: FileName, head: list[str], joints: frozenset[str]
 ) -> tuple[tuple[int, float] | None, dict[tuple[str, str], tuple[int, float]], list[str]]:
-    """Identify the columns of a table: time and its unit, the values of each joint by kind; add notes."""
+    """Identify the time column and the columns of each joint; return them with their factors to SI units, and notes."""
     if joint_names := table_joints(head):  # our own table: the names of its joints are not interpreted
         columns = [(name, kind) for kind in KINDS[:3] for name in joint_names]
         return (0, 1.0), {key: (column, 1.0) for column, key in enumerate(columns, 1)}, []
@@ -226,7 +226,7 @@ def _meanings(
 
 
 def _kind(name: str) -> tuple[str, str]:
-    """Return the joint and the kind of value that the name of a column denotes."""
+    """Return the joint and the kind of value, such as "velocities", that the name of a column denotes."""
     for sign in "./:_ ":
         prefix, _, last = name.rpartition(sign)
         if prefix and last.lower() in WORDS:
@@ -241,7 +241,7 @@ def _kind(name: str) -> tuple[str, str]:
 
 
 def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
-    """Find the outermost mapping with joint names and points in a tree of values."""
+    """Find the outermost mapping with joint names and points in the contents of a JSON or YAML file."""
     level, visited = [tree], set[int]()
     for _ in range(depth + 1):
         next_level: list[Any] = []
@@ -257,7 +257,7 @@ def _trajectory_in(tree: Any, depth: int = 6) -> Mapping[str, Any] | None:
 
 
 def _from_points(file: FileName, tree: Any) -> RawTrajectory:
-    """Return the trajectory in a tree of values that has joint names and trajectory points."""
+    """Convert the contents of a file, or a message, with joint names and trajectory points to a trajectory."""
     message = _trajectory_in(tree)
     if message is None:
         words = f"{file} contains no joint trajectory; joint_names and points are expected"
@@ -313,7 +313,7 @@ def _rows(file: FileName, word: str, points: list[Any], width: int) -> Array:
 
 
 def _seconds(file: FileName, number: int, point: Mapping[str, Any]) -> float:
-    """Return the time of a point: a duration as in ROS 2 or ROS 1, or a number of seconds."""
+    """Return the time of a trajectory point, s, from a duration as in ROS 2 or ROS 1, or from a number."""
     duration = point.get("time_from_start")
     try:
         if isinstance(duration, Mapping):
@@ -332,7 +332,7 @@ def _seconds(file: FileName, number: int, point: Mapping[str, Any]) -> float:
 
 
 def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) -> RawTrajectory:
-    """Return the trajectory that the messages of a topic give: one joint state each, or the first joint trajectory."""
+    """Convert all joint-state messages of a topic, or the first joint-trajectory message, to a trajectory."""
     notes = []
     first = messages[0][1]
     if "points" in first:

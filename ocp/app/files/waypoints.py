@@ -1,4 +1,4 @@
-"""Read waypoints from tables: positions, with tool orientations, tool axes or times where the table has them.
+"""Read waypoints of a tool from tables that give positions and optionally orientations, tool axes or times.
 
 The header names the columns in any order. A unit may follow a name, as in `x [mm]`, `y (mm)`, `z_mm` or `rx/deg`:
 
@@ -85,7 +85,7 @@ class Waypoints:
 
     @property
     def free_roll(self) -> bool:
-        """Whether the file gives only the tool axis, so that the roll about it is arbitrary."""
+        """Whether the file gives only the tool axis, so that the rotation of the tool about this axis is arbitrary."""
         return self.axes is not None
 
     def paths(self, *, reversal: Reversal = "split") -> tuple[Path, ...]:
@@ -140,7 +140,7 @@ class Waypoints:
     def smooth(
         self, tolerance: float = DEFAULT_TOLERANCE_M, *, reversal: Reversal | None = None, **options: Any
     ) -> SmoothPath:
-        """Return the path with rounded corners.
+        """Return the path through the waypoints with rounded corners.
 
         Args:
             tolerance: Largest deviation from the path, m.
@@ -153,7 +153,7 @@ class Waypoints:
         return smooth_path(self.path(reversal=reversal), require.positive("tolerance", tolerance), options)
 
     def _check_still(self, last: int, i: int) -> None:
-        """Raise ProblemError if the tool turns on the spot, without a change of position."""
+        """Raise ProblemError if the tool turns between two waypoints without a change of position."""
         if self.orientations is None:
             return
         turn = np.pi
@@ -168,7 +168,7 @@ class Waypoints:
 
 
 def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence[str] | None = None) -> Waypoints:
-    """Read a table of waypoints in the format of this module.
+    """Read waypoints of a tool from a table, whose format the docstring of this module describes.
 
     Args:
         file: Name of the file.
@@ -222,7 +222,7 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
 
 
 def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
-    """Return number, text and cells of each row; the first row may be a comment that names the columns."""
+    """Return line number, text and cells of each row of a table; a comment that names the columns is the first row."""
     rows: list[tuple[int, str, list[str]]] = []
     delimiter: str | None = None
     last_comment = (0, "")
@@ -243,7 +243,7 @@ def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
 
 
 def _name(cell: str) -> str:
-    """Return the standard name of a column from its cell in the header, or "" if it has none."""
+    """Return the standard name of a column from its cell in the header, or "" if the cell is no valid name."""
     match = HEAD.match(" ".join(cell.lower().split()))
     name = match[1].removeprefix("pose.") if match else ""
     return OTHER_NAMES.get(name, name)
@@ -252,7 +252,7 @@ def _name(cell: str) -> str:
 def _head(
     file: FileName, rows: list[tuple[int, str, list[str]]], columns: Sequence[str] | None
 ) -> tuple[list[str], int]:
-    """Return the names of the columns as written, and the index of the first data row."""
+    """Return the column names that the header or the caller gives, and the index of the first data row."""
     cells = rows[0][2]
     has_header = any(cell and not is_number(cell) for cell in cells)
     if columns is not None:
@@ -272,13 +272,13 @@ def _head(
 
 
 def _unit(cell: str) -> str | None:
-    """Return the unit in a column's header, or None."""
+    """Return the unit that the header cell of a column states, or None."""
     match = HEAD.match(" ".join(cell.lower().split()))
     return match[2] if match else None
 
 
 def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[list[str], list[float], tuple[str, ...]]:
-    """Return for each column the standard name ("" if ignored) and the factor to SI units, and the ignored columns."""
+    """Return standard name ("" if ignored) and factor to SI units of each column, and the names of ignored columns."""
     names: list[str] = []
     scales: list[float] = []
     ignored: list[str] = []
@@ -316,7 +316,7 @@ def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[lis
 
 
 def _table(file: FileName, rows: list[tuple[int, str, list[str]]], used: Sequence[bool]) -> Array:
-    """Return the rows of the table as numbers, which are zero in columns that are not used. Shape (M, columns)."""
+    """Return the cells of a table as numbers, with zeros in unused columns. Shape (M, number of columns)."""
     if not rows:
         raise ProblemError(f"{file}: the file has a header but no waypoint", name="file", value=str(file))
     width = len(used)
@@ -340,7 +340,7 @@ def _table(file: FileName, rows: list[tuple[int, str, list[str]]], used: Sequenc
 
 
 def _quaternions(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
-    """Return normalised quaternions; raise ProblemError if a norm is not 1 within 0.01."""
+    """Normalise quaternions; raise ProblemError if the norm of a quaternion differs from 1 by more than 0.01."""
     norm = np.linalg.norm(values, axis=1)
     norm_tolerance = 1e-2  # a larger deviation is not explained by rounding in the file
     invalid = np.abs(norm - 1) > norm_tolerance
@@ -367,13 +367,13 @@ def _from_vectors(vectors: Array) -> Array:
 
 
 def _align_signs(quaternions: Array) -> Array:
-    """Return quaternions with the sign of each chosen to bring it nearest to its predecessor."""
+    """Choose the sign of each quaternion so that the quaternion is as close as possible to the previous one."""
     signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(quaternions * np.cumprod(np.concatenate([[1.0], signs]))[:, None])
 
 
 def _least_roll(file: FileName, axes: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
-    """Return orientations whose z axes are the given tool axes, with least roll from row to row."""
+    """Return orientations with the given tool axes as z axes and with least rotation about these axes."""
     previous = np.vstack([[0.0, 0.0, 1.0], axes[:-1]])
     steps = np.column_stack([1 + (previous * axes).sum(axis=1), np.cross(previous, axes)])
     opposite = steps[:, 0] < 1e-7  # 1 + cosine; half of the digits of double precision

@@ -1,4 +1,4 @@
-"""Sample a motion for display: a plan, the solution of any problem, or a joint trajectory from any source.
+"""Sample a motion for display; the motion is a plan, the solution of any problem, or any joint trajectory.
 
 Every motion is sampled once, together with its targets, limits, costs, closest bodies and audit, as far as they are
 known. Curves over time show the joints, torques, costs and the motion of the base with their limits.
@@ -41,7 +41,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A quantity over the time of a motion.
+    """A quantity as a function of time along a motion.
 
     Attributes:
         group: Curves of one group share a diagram.
@@ -80,7 +80,7 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Contact polygon of a standing machine, with its zero moment points.
+    """Contact polygon of a standing machine, and the zero moment points during its motion.
 
     Attributes:
         corners: Corners of the contact area. Shape (k, 2), m.
@@ -94,7 +94,7 @@ class GroundContact:
 
 
 def joint_curves(machine: Machine, bounds: JointBounds, samples: MotionSamples) -> list[Curve]:
-    """Return curves of positions, velocities and torques of all joints with their limits."""
+    """Return curves of the positions, velocities and torques of all joints, with the limits of these quantities."""
     robot, curves = machine.robot, []
     torques = _torques(machine, samples)
     torque_group = "Torques, without external forces" if isinstance(machine, Standing) else "Torques"
@@ -111,7 +111,7 @@ def joint_curves(machine: Machine, bounds: JointBounds, samples: MotionSamples) 
 
 
 def _torques(machine: Machine, samples: MotionSamples) -> Array | None:
-    """Return the joint torques of a motion by inverse dynamics, shape (M, n); None without accelerations or masses."""
+    """Return the joint torques of a motion by inverse dynamics, (M, n); None if accelerations or masses are unknown."""
     robot = machine.robot
     if samples.accelerations is None or robot.total_mass == 0:
         return None
@@ -127,7 +127,7 @@ def _torques(machine: Machine, samples: MotionSamples) -> Array | None:
 
 
 def machine_curves(machine: Machine, samples: MotionSamples) -> list[Curve]:
-    """Return curves of manipulability, tip speed and, of a floating machine whose base velocity is known, momentum."""
+    """Return curves of manipulability, of tip speed and, for a floating machine with known base rates, of momentum."""
     robot, curves = machine.robot, []
     base, joints, rates, base_rates = samples.base, samples.joints, samples.rates, samples.base_rates
     b, q, v = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", robot.dof), ca.SX.sym("v", robot.dof)
@@ -175,7 +175,7 @@ def ground_contact(
         rows = np.column_stack([normals, -np.ones(len(normals))])
         edge_distances = np.column_stack([one.values for one in inside]) - edges
         solution, *_ = np.linalg.lstsq(rows, edge_distances.T, rcond=None)
-        if np.abs(rows @ solution - edge_distances.T).max() < 1e-8:  # m, rounding: they belong to one point
+        if np.abs(rows @ solution - edge_distances.T).max() < 1e-8:  # m, rounding: the distances belong to one point
             points = np.ascontiguousarray(solution[:2].T)
             distances = edges + points @ normals.T
             margin = Curve("Standing", "zero moment point from the edge of the foot", "m", distances.min(axis=1), 0.0)
@@ -190,7 +190,7 @@ def ground_contact(
 
 
 def cumulative_integral(t: Array, values: Array) -> Array:
-    """Return the integral of samples (M,) up to each time, by the trapezoidal rule. Shape (M,)."""
+    """Integrate samples (M,) from the first time to each time, by the trapezoidal rule. Shape (M,)."""
     return np.concatenate([[0.0], np.cumsum(np.diff(t) * (values[1:] + values[:-1]) / 2)])
 
 
@@ -242,7 +242,7 @@ class ClosestPairs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """A sampled motion with everything that is displayed of it.
+    """A sampled motion with all data about the motion that a page displays.
 
     Attributes:
         name: Name of the motion.
@@ -278,7 +278,7 @@ class Animation:
 
 
 def animate_plan(plan: Plan, name: str = "plan", **settings: Any) -> Animation:
-    """Sample a plan for display, with its audit; `settings` are those of the audit."""
+    """Sample a plan for display, and audit the plan; `settings` are those of the audit."""
     times = _times(plan.horizon)
     sample = plan.sampled(times)
     base = plan.at(times)["base"] if plan.machine.base_size else np.zeros((len(times), 0))
@@ -352,7 +352,7 @@ def animate_solution(
 
 
 def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> Animation:
-    """Sample a joint trajectory for display, interpolated as controllers do.
+    """Sample a joint trajectory for display, interpolated between its samples as robot controllers do.
 
     Raises:
         ProblemError: The trajectory lacks joints of the machine, or has no valid sample.
@@ -382,14 +382,14 @@ def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> 
 
 
 def _interpolate(times: Array, t: Array, values: Array) -> Array:
-    """Return `values`, given at times `t`, interpolated linearly at other times. Shape (K, n)."""
+    """Interpolate `values`, given at times `t`, linearly at other times (K,). Shape (K, n)."""
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def _animation(
     name: str, machine: Machine, samples: MotionSamples, own_curves: Sequence[Curve], **details: Any
 ) -> Animation:
-    """Return the animation of a motion, with the curves of its problem, if any, and those that every motion has."""
+    """Combine the samples of a motion, the curves of its problem (if any) and the curves that every motion has."""
     t, relative = samples.t, PAGE_SETTINGS.same_cost
     effort = cumulative_integral(t, (samples.rates**2).sum(axis=1) / 2)
     curves = [Curve("Cost", "integral of half the squared joint velocities", "", effort)]
@@ -455,7 +455,9 @@ def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[
 
 
 def _margins(rows: Sequence[Curve]) -> list[Curve]:
-    """Return curves of the least margin of each inequality constraint and the largest error of each equation."""
+    """Return curves of the least margin of each inequality constraint and the largest error of each equality
+    constraint.
+    """
     curves = []
     for name in dict.fromkeys(one.group for one in rows):
         group = [one for one in rows if one.group == name]
@@ -470,7 +472,7 @@ def _margins(rows: Sequence[Curve]) -> list[Curve]:
 
 
 def _closest_pairs(parts: Sequence[tuple[Solution, str, Array]], horizon: float) -> ClosestPairs | None:
-    """Return the closest pair of bodies at uniform times of a motion, or None if it is unknown.
+    """Return the closest pair of bodies at uniform times of a motion, or None if the pairs are unknown.
 
     Args:
         parts: Solutions, suffixes and times as returned by `Plan.solved_parts` for these times.

@@ -57,7 +57,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class SurfaceStyle:
-    """Colours and resolution of surfaces.
+    """Colours and resolution of the displayed surfaces.
 
     Attributes:
         grey, rod: Colours of links without a colour, and of links without a shape: red, green, blue, opacity.
@@ -106,7 +106,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """Surfaces of a robot.
+    """Surfaces with which a robot is displayed, and the meshes that are missing.
 
     Attributes:
         parts: Surfaces of all links.
@@ -120,7 +120,7 @@ class Appearance:
 def appearance_of(
     robot: Robot, folders: Sequence[Any] = (), *, meshes: bool = True, most: int = SURFACE_STYLE.max_faces
 ) -> Appearance:
-    """Return the surfaces of a robot's links.
+    """Return the surfaces with which the links of a robot are displayed.
 
     Args:
         robot: The robot, modified or not: shapes move with the links into which theirs were merged.
@@ -133,7 +133,7 @@ def appearance_of(
     surfaces: list[tuple[str, Triangles]] = []
     for link in robot.links:
         triangles_of_link = _triangulate(link.visuals, folders, meshes, missing)
-        if not triangles_of_link:  # among links with visuals, a link without is a zone to keep out of
+        if not triangles_of_link:  # if other links have visual shapes, this is a keep-out zone
             color = SURFACE_STYLE.zone if has_visuals and not link.visuals else SURFACE_STYLE.grey
             triangles_of_link = _triangulate(link.collisions, folders, meshes, missing, color)
         surfaces += [(link.name, triangles) for triangles in triangles_of_link]
@@ -149,7 +149,7 @@ def _triangulate(
     missing: dict[str, str],
     default: tuple[float, ...] = SURFACE_STYLE.grey,
 ) -> list[Triangles]:
-    """Return the shapes of a link as triangles in its frame."""
+    """Convert the shapes of a link to triangles in the frame of the link."""
     triangles = []
     for shape in shapes:
         if shape.kind == "mesh" and not meshes:
@@ -167,7 +167,7 @@ def _triangulate(
 
 
 def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
-    """Return a shape as triangles in its own axes; raise ModelError if its mesh is not found or invalid."""
+    """Convert a shape to triangles in its own frame; raise ModelError if its mesh is not found or invalid."""
     size = np.asarray(shape.size, dtype=float)
     if shape.kind == "mesh":
         path = find_mesh(shape.file, shape.folder or None, folders)
@@ -192,7 +192,7 @@ def _triangles(shape: CollisionShape, folders: Sequence[Any]) -> Triangles:
 
 
 def _revolution_surface(profile: Array) -> Triangles:
-    """Return the surface of revolution about z of a profile of points (radius, z). Shape (k, 2)."""
+    """Return the surface that a profile of points (radius, z), shape (k, 2), generates by rotation about z."""
     sides = SURFACE_STYLE.sides
     angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -237,7 +237,7 @@ def _rods(robot: Robot, shown: set[str]) -> list[tuple[str, Triangles]]:
 
 
 def _few(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
-    """Return the surfaces, coarsened until they have at most `most` faces in total."""
+    """Merge nearby vertices of surfaces until the surfaces have at most `most` faces in total."""
     size = SURFACE_STYLE.min_cell
     coarse = surfaces
     while sum(len(mesh.faces) for _, mesh in coarse) > most and size < 1.0:
@@ -247,7 +247,7 @@ def _few(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Tr
 
 
 def _coarser(mesh: Triangles, size: float) -> Triangles:
-    """Return a mesh in which the vertices in each grid cell are merged to their mean, without degenerate faces."""
+    """Merge the vertices of a mesh that lie in one grid cell into their mean, and remove degenerate faces."""
     cells = np.floor(mesh.vertices / size).astype(np.int64)
     _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     cell = cell.ravel()
@@ -260,7 +260,7 @@ def _coarser(mesh: Triangles, size: float) -> Triangles:
 
 
 def _parts(surfaces: list[tuple[str, Triangles]]) -> list[Part]:
-    """Return surfaces grouped by link and colour, one Part for each group."""
+    """Group surfaces by link and colour, and return one Part (a surface of one colour) for each group."""
     parts = []
     for link in dict.fromkeys(name for name, _ in surfaces):
         mesh = join_meshes([triangles for name, triangles in surfaces if name == link])
@@ -316,12 +316,12 @@ TIP = "#009E73"
 SCENE = "#6E6E6E"
 """Colour of obstacles."""
 TIP_FRAME = "the tip frame"
-"""Key of the tip among the frames; no drawn link can have this name."""
+"""Key of the tip frame in `Frames`; no drawn link can have this name."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames in world along a motion, by link name and TIP_FRAME.
+    """Frames of the links and of the tip in world along a motion, keyed by link name or TIP_FRAME.
 
     Attributes:
         rotations: Axes as columns. Shape (M, 3, 3) each.
@@ -338,7 +338,7 @@ class Frames:
 
 
 def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
-    """Return the frames in world of all links, and of the tip if the robot has one, along a motion.
+    """Return the frames of all links, and of the tip if the robot has one, in world along a motion.
 
     Args:
         machine: The robot on its base.
@@ -418,7 +418,7 @@ def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
 
 
 def obstacles_of(parts: Sequence[tuple[Solution, str, Array]]) -> list[Obstacle]:
-    """Return the obstacles that the problems of a motion's solutions declare, for display.
+    """Return, for display, the obstacles that the optimal control problems of a motion declare.
 
     A moving obstacle is attached to a frame that depends on time but on no state.
 
@@ -457,7 +457,7 @@ def obstacles_of(parts: Sequence[tuple[Solution, str, Array]]) -> list[Obstacle]
 
 
 def obstacles_of_plan(plan: Plan, times: Array) -> list[Obstacle]:
-    """Return the obstacles of a plan for display, moving ones with their poses at increasing times (M,), s."""
+    """Return the obstacles of a plan for display; moving obstacles get their poses at increasing times (M,), s."""
     if isinstance(plan, PathPlan):
         obstacles = () if plan.constraints is None else plan.constraints.scene.obstacles
         return obstacles_of_shapes(shape for shape in obstacles if not isinstance(shape, MovingObstacle))

@@ -1,4 +1,4 @@
-"""Create a page that plays motions, with robots, paths, curves with limits and the audit, and serve it on this machine.
+"""Create a web page that plays motions and shows their curves and audits, and serve the page on this machine.
 
 The page contains its geometry and scripts, and its policy forbids requests to any host, so that it plays from a file
 without a server. `selfmotion view` serves the same page until Ctrl-C. A request must name this machine as its host,
@@ -40,7 +40,7 @@ SCRIPTS = ("scene.js", "curves.js", "player.js")
 
 
 class Buffers:
-    """Numerical data of a page: arrays in one block of bytes, each referred to by its offset."""
+    """Numerical data of a page: arrays in one block of bytes, in which an array is identified by its offset."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -136,7 +136,9 @@ def _alike(a: Robot, b: Robot) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
-    """Return for each link the moving link, or root, to which it is fixed, and its pose in the frame of that link."""
+    """Return, for each link, the moving link (or root) that carries the link, and the link's pose relative to the
+    carrier.
+    """
     carriers = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
     for joint in robot.joints:
         if joint.moves:
@@ -148,7 +150,7 @@ def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
 
 
 def _movers(robot: Robot) -> list[str]:
-    """Return the root and the links that move, whose frames the page animates."""
+    """Return the names of the root and of the moving links, whose frames the page animates."""
     return [robot.root, *(joint.child for joint in robot.joints if joint.moves)]
 
 
@@ -170,7 +172,7 @@ def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, 
 
 
 def _surface(vertices: Array, normals: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[str, Any]:
-    """Return the description of a surface for the page: vertices quantised to 1/65535 of its box, normals to 1/127."""
+    """Return the description of a surface for the page, with vertices rounded to 1/65535 of its bounding box."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     step = np.maximum(high - low, 1e-9) / 65535
     padded = np.zeros((len(vertices), 4))
@@ -187,7 +189,7 @@ def _surface(vertices: Array, normals: Array, faces: NDArray[np.intp], buffers: 
 
 
 def _poses(frames: Frames, names: Sequence[str]) -> Array:
-    """Return the poses of k frames: positions, and quaternions with signs continuous over time. Shape (M, k, 7)."""
+    """Return the poses of k frames as positions and quaternions, with signs continuous in time. Shape (M, k, 7)."""
     poses = []
     for name in names:
         quaternions = quaternion_from_rotation(frames.rotations[name])
@@ -275,12 +277,12 @@ def _solid(vertices: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[s
 
 
 def _plain(value: float | None) -> float | None:
-    """Return a number for JSON, or None if it is not finite."""
+    """Return a number for JSON, or None if the number is not finite."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
 PORT_ATTEMPTS = 20
-"""Number of ports to try from the requested one."""
+"""Number of ports that are tried, beginning with the requested port."""
 HOST = "127.0.0.1"
 
 
@@ -292,7 +294,7 @@ class PageServer:
     """
 
     def __init__(self, text: str, port: int = 0) -> None:
-        """Listen on the given port or the next free one; port 0 selects any.
+        """Listen on the given port or the next free port; port 0 selects any free port.
 
         Raises:
             ProblemError: No port is free, or the number is invalid.
@@ -312,7 +314,7 @@ class PageServer:
         self._server.server_close()
 
     def wait(self) -> None:
-        """Wait until Ctrl-C, and catch its KeyboardInterrupt."""
+        """Wait until the user presses Ctrl-C, and catch the KeyboardInterrupt."""
         try:
             Event().wait()
         except KeyboardInterrupt:
@@ -320,7 +322,7 @@ class PageServer:
 
 
 def _start_server(page: bytes, port: int) -> ThreadingHTTPServer:
-    """Return a server for a page on the first free port, which must be started by its caller."""
+    """Return a server for a page on the first free port; the caller must start the server."""
 
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self) -> None:

@@ -53,7 +53,7 @@ DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 def draw_curves(
     motion: Motion, bounds: JointBounds, *, names: Sequence[str], units: Sequence[str], faults: Sequence[Any] = ()
 ) -> str:
-    """Return an SVG with the position, velocity and acceleration of every joint over time, its limits and faults."""
+    """Return an SVG with position, velocity and acceleration of every joint over time, with their limits and faults."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(PICTURE_STYLE.width, 0.4 + 1.15 * len(names)), layout="constrained")
@@ -135,12 +135,12 @@ def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
 
 
 def line_style(number: int) -> dict[str, Any]:
-    """Return the line style of a plan (number 0), or of a motion that it is compared with."""
+    """Return the line style of a plan (number 0), or of a motion compared with the plan (number 1, 2, ...)."""
     return {"color": PLAN, "lw": 1.4} if number == 0 else {"color": COMPARED, "lw": 1.1, "ls": DASHES[number % 3]}
 
 
 def add_legend(figure: Any, names: Sequence[str]) -> None:
-    """Add a legend below a figure: the name of the plan, and those of the motions compared with it."""
+    """Add a legend below a figure, with the names of the plan and of the motions compared with the plan."""
     from matplotlib.lines import Line2D
 
     lines = [Line2D([], [], **line_style(number)) for number in range(len(names))]
@@ -193,7 +193,7 @@ def plot_plan(plan: Plan, against: Any = None, figure: Any = None) -> Any:
 
 
 def html_of_plan(plan: Plan) -> str:
-    """Return a plan as HTML for a notebook: its cost, its audit if it was computed, and its curves."""
+    """Return a plan as HTML for a notebook, with its cost, its audit (if it has been computed) and its curves."""
     lines = str(plan).splitlines()
     parts = [f"<p><b>{escape(lines[0])}</b></p>"]
     if plan.audits:
@@ -212,7 +212,7 @@ def _motion_of(plan: Plan) -> Motion:
 
 
 def _comparison(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
-    """Return a motion that is compared with a plan, and its cost if it is known."""
+    """Convert a motion that is compared with a plan to a Motion; return it with its cost (None if unknown)."""
     cost: float | None = None
     if isinstance(other, Plan):
         joints, motion, cost = other.names, _motion_of(other), other.cost
@@ -241,7 +241,7 @@ def _comparison(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, 
 
 
 def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -> Any:
-    """Plot states and controls over time, each entry with its bounds if the solution has its problem.
+    """Plot states and controls of a solution over time, with their bounds if the solution contains its problem.
 
     Args:
         solution: Solution, drawn in blue.
@@ -307,12 +307,12 @@ def html_of_solution(solution: Solution) -> str:
 
 
 def _widths(solution: Solution) -> dict[str, int]:
-    """Return the number of entries of each state and control by name."""
+    """Return the number of entries of each state and control of a solution by name."""
     return {name: values.shape[1] for name, values in {**solution.states, **solution.controls}.items()}
 
 
 def _local_widths(name: str, other: Any) -> dict[str, int]:
-    """Return the sizes of the states and controls of a result of `resolve`, named as in `minimum_velocity_problem`."""
+    """Return the number of entries of base, joints and rates in a result of `resolve`, by name."""
     if not isinstance(other, LocalSolution):
         words = (
             f"plot: {name!r} is a {type(other).__name__}; a solution can be compared with a solution or a result of "
@@ -323,13 +323,13 @@ def _local_widths(name: str, other: Any) -> dict[str, int]:
 
 
 def _local(other: LocalSolution) -> dict[str, Array]:
-    """Return a result of `resolve` as states and controls, named as in `minimum_velocity_problem`."""
+    """Return base, joints and rates of a result of `resolve`, named as the states and controls of a solution."""
     samples = {"base": other.base, "joints": other.joints, "rates": other.joint_rates}
     return {name: values for name, values in samples.items() if values.shape[1]}
 
 
 def _along(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times (s) and values of states and controls by name; at a node both one-sided values are listed.
+    """Return times (s) and values of a motion's states and controls by name, with both one-sided values at a node.
 
     States and controls of a phase are given over the interval of that phase.
     """
@@ -347,7 +347,7 @@ def _along(motion: Any) -> dict[str, tuple[Array, Array]]:
 
 
 def _bounds(solution: Solution) -> tuple[dict[str, Array], dict[str, str]]:
-    """Return lower and upper bounds (2, n) and units of states and controls by name; empty without the problem."""
+    """Return lower and upper bounds (2, n) and units of states and controls by name; {} if there is no problem."""
     if solution.problem is None:
         return {}, {}
     form = Formulation.of(solution.problem)

@@ -23,7 +23,7 @@ __all__ = ["PICTURE_STYLE", "Camera", "Floor", "Layer", "PictureStyle", "parts_i
 
 @dataclass(frozen=True)
 class PictureStyle:
-    """Style of pictures and curves.
+    """Style of rendered pictures and of plotted curves.
 
     Attributes:
         size: Size of a rendered picture, pixels.
@@ -97,7 +97,7 @@ class Camera(NamedTuple):
     def around(
         cls, points: Any, size: tuple[int, int], elevation: float = 22.0, azimuth: float = -58.0, *, room: float = 0.04
     ) -> Camera:
-        """Return the closest camera with a given direction of view that sees all points (k, 3), m; angles in degrees.
+        """Return the camera nearest to points (k, 3), m, that sees them all in a given direction (angles in degrees).
 
         Each edge of the picture is a plane through the eye with all points on its inner side, which gives the position
         in closed form. `room` is the margin at every edge, relative to the picture.
@@ -119,7 +119,7 @@ class Camera(NamedTuple):
         return cls(eye @ axes, axes, size)
 
     def seen(self, points: Any) -> tuple[Array, Array]:
-        """Project points (..., 3): return their pixels, (..., 2), from the upper left corner, and their depths, m."""
+        """Project points (..., 3); return their pixels (..., 2), from the upper left corner, and their depths, m."""
         x, y, z = np.moveaxis((np.asarray(points, dtype=float) - self.eye) @ self.axes.T, -1, 0)
         depth = np.maximum(-z, 1e-9)
         width, height = self.size
@@ -127,7 +127,7 @@ class Camera(NamedTuple):
         return np.stack([width / 2 + scale * x, height / 2 - scale * y], axis=-1), depth
 
     def rays(self, cells: NDArray[np.intp]) -> Array:
-        """Return the rays from the eye, to 1 m depth, through pixels that are numbered row by row. Shape (k, 3), m."""
+        """Return vectors from the eye to a depth of 1 m through pixels numbered row by row. Shape (k, 3), m."""
         width, height = self.size
         row, column = np.divmod(cells, width)
         step = 2 / (PICTURE_STYLE.lens * height)
@@ -136,7 +136,7 @@ class Camera(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """Surfaces that are rendered together, in world.
+    """Surfaces in the world frame that are rendered together.
 
     Attributes:
         parts: Surfaces to render.
@@ -167,7 +167,7 @@ class Floor(NamedTuple):
 
 
 def parts_in_world(appearance: Appearance, frames: Frames, k: int) -> list[Part]:
-    """Return the surfaces of a robot at sample k of a motion, in world."""
+    """Return the surfaces of a robot in the world frame at sample k of a motion."""
     parts = []
     for part in appearance.parts:
         rotation, position = frames.rotations[part.link][k], frames.positions[part.link][k]
@@ -176,7 +176,7 @@ def parts_in_world(appearance: Appearance, frames: Frames, k: int) -> list[Part]
 
 
 def tube(points: Any, radius: float, color: tuple[float, float, float]) -> Part:
-    """Return the surface of a round tube along a line through points, with which paths are drawn.
+    """Return the surface of a round tube along a line through points, to draw a path.
 
     Args:
         points: Points of the centre line. Shape (k, 3), m.
@@ -247,7 +247,7 @@ def render(
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
-    """Triangles in world: corners and normals (n, 3) each, faces as indices of corners (f, 3), their colours (f, 3)."""
+    """Triangles in world: corners and normals (n, 3), corner indices of the faces (f, 3), and face colours (f, 3)."""
 
     corners: Array
     normals: Array
@@ -267,13 +267,13 @@ class _Mesh:
 
 
 def _project(camera: Camera, mesh: _Mesh) -> tuple[Array, Array]:
-    """Project the corners of all triangles: return their picture positions (f, 3, 2) and inverse depths (f, 3)."""
+    """Project the corners of all triangles; return their picture positions (f, 3, 2) and inverse depths (f, 3)."""
     positions, depths = camera.seen(mesh.corners)
     return positions[mesh.faces], (1.0 / depths)[mesh.faces]
 
 
 def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, NDArray[np.intp]]:
-    """Return the inverse depth and index of the nearest triangle at each pixel centre; -inf and -1 if there is none.
+    """Return inverse depth and index of the nearest triangle at each pixel centre; -inf and -1 where there is none.
 
     Args:
         places: Corners of the triangles (f, 3, 2), in pixels from the upper left.
@@ -317,13 +317,13 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
 
 
 def _repeat_numbers(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Return the numbers 0, 1, ..., number i repeated counts[i] times, and the index of each repetition."""
+    """Repeat each number i = 0, 1, ... `counts[i]` times; return the numbers and the index of each repetition."""
     which = np.repeat(np.arange(len(counts)), counts)
     return which, np.arange(len(which)) - (np.cumsum(counts) - counts)[which]
 
 
 def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Yield ranges of consecutive items whose counts sum to about `batch_size`."""
+    """Yield ranges of consecutive items whose counts sum to about `batch_size`, to limit memory."""
     ends = np.cumsum(counts)
     begin = 0
     while begin < len(counts):
@@ -334,7 +334,7 @@ def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class _Sun:
-    """Directional light (the sun): the direction to it (3,), and the depth map of the first surfaces that it meets."""
+    """Directional light of a scene (the sun), with a depth map of the surfaces that its light meets first."""
 
     to_sun: Array
     axes: Array
@@ -390,7 +390,7 @@ def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun |
 
 
 def _shade(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun: _Sun | None) -> Array:
-    """Return the colours of triangles (k,) where rays (k, 3) from the camera hit them. Shape (k, 3)."""
+    """Return the colours at the points where rays (k, 3) from the camera hit given triangles (k,). Shape (k, 3)."""
     a, b, c = (mesh.corners[mesh.faces[:, k]] for k in range(3))
     one, two, to = b - a, c - a, camera.eye - a
     # barycentric coordinates of the second and third corners (Moeller, Trumbore 1997)

@@ -1,4 +1,4 @@
-"""Write an HTML report: the verdict in a sentence, pictures, curves with limits, and tables of all checked quantities.
+"""Write an HTML report with a verdict, pictures, curves with limits, and tables of all checked quantities.
 
 The page loads nothing from another host.
 """
@@ -39,7 +39,7 @@ from ocp.motion.tasks.limits import JointBounds, Limits
 __all__ = ["Report", "draw_scene", "report_of_check", "report_of_plan"]
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-"""Content security policy of the page: no script runs, and nothing is loaded."""
+"""Content security policy of a report, under which no script runs and nothing is loaded."""
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --soft: #f3f5f7; --line: #d5dae0;
   --good: #00734f; --bad: #b23b00 }
@@ -139,7 +139,7 @@ def _table(rows: Sequence[Row]) -> str:
 
 
 def report_of_check(check: Check, machine: Machine, limits: Limits, scene: Scene) -> Report:
-    """Return the report of a check, with the limits and the scene that it used."""
+    """Return the report of a trajectory check, with the limits and the scene that the check used."""
     motion, robot = check.cleaned.motion, machine.robot
     complete = len(check.joints) == robot.dof
     base_path = check.cleaned.base if machine.base_size else None
@@ -196,7 +196,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
 def draw_scene(
     machine: Machine, motion: Motion, bases: Array | None, obstacles: Sequence[Obstacle], *, folders: Sequence[Any] = ()
 ) -> bytes:
-    """Return a PNG picture of the robot at several times, the last one solid, with its tip path and obstacles.
+    """Return a PNG picture of the robot at several times (solid at the last), of its tip path and of the obstacles.
 
     Moving obstacles are drawn at the final time; `obstacles` has them at uniform times of the motion.
     """

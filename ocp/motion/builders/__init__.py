@@ -1,1 +1,1 @@
-"""Builders of optimal control problems, a module for each family of machines and tasks, and planners for them."""
+"""Functions that declare and solve optimal control problems of motions, by family of machines and tasks."""

@@ -45,13 +45,13 @@ __all__ = [
 ]  # fmt: skip
 
 CLEARANCE, APART = "clearance", "apart"
-"""Prefixes of the names under which proven clearances and separation constraints are declared."""
+"""Name prefixes of the clearances that the audit proves (CLEARANCE) and of separation constraints (APART)."""
 ROUNDING = 3e-3
-"""Smoothing width of the distances in separation constraints, m."""
+"""Width of the smoothing of distances in separation constraints, m; see `rounding` of `models.shapes.distance`."""
 LOOKS = 6
-"""Largest number of solves of one motion; after each, colliding bodies are separated by further constraints."""
+"""Largest number of solves of one motion; after each solve, the bodies that collide get separation constraints."""
 MARGIN = 5e-5
-"""Initial separation margin of a pair of bodies beyond its clearance, and least increase of a margin, m."""
+"""First margin by which separated bodies must exceed the clearance, and least increase of such a margin, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +85,11 @@ class ClearanceConstraints:
                 raise ProblemError(words, name="margins", value=pair, limit=len(self.scene.pairs))
 
     def with_pairs(self, pairs: Sequence[int]) -> ClearanceConstraints:
-        """Return a copy that also separates further pairs of bodies, given by index."""
+        """Return a copy of the constraints that also separates the pairs of bodies with the given indices."""
         return replace(self, margins={**{int(pair): MARGIN for pair in pairs}, **self.margins})
 
     def with_collisions(self, collisions: Sequence[Collision]) -> ClearanceConstraints:
-        """Return a copy that also separates the pairs of bodies of the given collisions.
+        """Return a copy of the constraints that also separates the pairs of bodies in the given collisions.
 
         Two hulls of meshes are separated by their covers, which protrude and may overlap in every configuration. The
         covers have to gain as much distance as the hulls lack where these are closest.
@@ -98,7 +98,7 @@ class ClearanceConstraints:
         return replace(self, margins={**margins, **self.margins})
 
     def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
-        """Return a copy with larger separation margins for pairs that violate their clearance, see `widen_margins`."""
+        """Return a copy of the constraints with larger margins for the pairs of bodies that violate their clearance."""
         return replace(self, margins=widen_margins(self.margins, self.scene.labels, proofs))
 
     def declare(
@@ -112,7 +112,7 @@ class ClearanceConstraints:
         pace: float = 1.0,
         horizon: float | None = None,
     ) -> None:
-        """Declare in a problem the clearances that the audit shall prove, and the separation constraints.
+        """Add to a problem the clearances that the audit shall prove, and the separation constraints.
 
         Args:
             problem: Problem with the states below.
@@ -159,21 +159,21 @@ class ClearanceConstraints:
             problem.path(f"{APART}{suffix}", distances, lower=least, unit="m")
 
     def find_collisions(self, base: Array, joints: Array, times: Array) -> list[Collision]:
-        """Return the pairs of bodies closer than the clearance at samples of a motion; see `local.collisions`."""
+        """Return the pairs of bodies that come closer than the clearance at samples of a motion."""
         return find_collisions(self.scene, base, joints, times)
 
 
 class Separating(Protocol):
-    """Interface of constraints that separate pairs of bodies by margins."""
+    """Interface of constraints that keep pairs of bodies apart and whose margins can be increased."""
 
     def widened(self, proofs: Sequence[Clearance]) -> Self:
-        """Return constraints of the same kind with larger margins for the pairs that violate their clearance."""
+        """Return a copy of the constraints with larger margins for the pairs of bodies that violate their clearance."""
 
 
 def widen_margins(
     margins: Mapping[int, float], labels: Sequence[tuple[str, str]], proofs: Sequence[Clearance]
 ) -> dict[int, float]:
-    """Return the separation margins of pairs of bodies, m, increased where the clearance of a pair is violated.
+    """Return the separation margins of pairs of bodies, m, increased for pairs that violate their clearance.
 
     Args:
         margins: Margins by the index of the pair among the labels.
@@ -230,7 +230,7 @@ def clearance_of(
 
 
 def _check_limits(scene: CollisionScene, joints: Variable) -> None:
-    """Raise ProblemError if joints may leave the limits that the scene assumes when it excludes pairs of bodies."""
+    """Raise ProblemError if a problem lets joints leave the position limits that the collision scene assumes."""
     robot = scene.machine.robot
     inside = (constant(joints.lower) >= robot.lower) & (constant(joints.upper) <= robot.upper)
     if scene.limits and not inside.all():
@@ -243,11 +243,11 @@ def _check_limits(scene: CollisionScene, joints: Variable) -> None:
 
 
 Constraints = TypeVar("Constraints", bound=Separating | None)
-"""Type variable of the clearance constraints of a planner, which may be None."""
+"""Type variable for the clearance constraints of a planner, or None if the planner ignores collisions."""
 
 
 def solve_with_clearance(clearance_constraints: Constraints, run: Callable[[Constraints], Solution]) -> Solution:
-    """Solve repeatedly; after each solve, add separation constraints for the pairs that collide in the solution.
+    """Solve a problem repeatedly; after each solve, add separation constraints for the bodies that collide.
 
     Args:
         clearance_constraints: Clearance constraints of the first solve; None for no collision avoidance.
@@ -274,7 +274,7 @@ def solve_with_clearance(clearance_constraints: Constraints, run: Callable[[Cons
 
 
 def is_clearance(name: Any) -> bool:
-    """Return whether a constraint name denotes a clearance, whether or not the name of a phase precedes it."""
+    """Return whether a constraint name, with or without the name of a phase in front, denotes a clearance."""
     return str(name).rpartition(".")[2].startswith(CLEARANCE)
 
 
@@ -289,7 +289,7 @@ def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
 
 
 def _evaluate(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
-    """Evaluate a function of base, joint positions and time; with MX arguments, return the call of an SX function."""
+    """Evaluate a function that builds an SX expression of base, joints and time, also for MX arguments."""
     arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
     if not any(isinstance(value, ca.MX) for value in arguments):
         return ca.SX(expression(*arguments))

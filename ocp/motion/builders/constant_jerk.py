@@ -1,4 +1,4 @@
-"""Rest-to-rest motions of joints in phases of constant jerk, in closed form and within torque limits.
+"""Rest-to-rest joint motions with phases of constant jerk, in closed form and slowed down to the torque limits.
 
 A joint that moves by d from rest to rest within limits V, A and J of velocity, acceleration and jerk is fastest if it
 builds up its acceleration for t_j, keeps it for t_a, and releases it for t_j; then it cruises for t_v, and brakes as it
@@ -45,12 +45,12 @@ __all__ = [
 ]  # fmt: skip
 
 NODES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
-"""Interpolation nodes of a phase, as fractions of its duration: joint positions are cubic in time."""
+"""Interpolation nodes of a phase, as fractions of its duration; four suffice because positions are cubic in time."""
 
 
 @dataclass(frozen=True)
 class ConstantJerkSettings:
-    """Settings of motions in phases of constant jerk.
+    """Settings of motions that consist of phases of constant jerk.
 
     Attributes:
         still: Duration of a motion that stays where it is, s, since the horizon of a problem must be positive.
@@ -72,7 +72,7 @@ SETTINGS = ConstantJerkSettings()
 
 
 class _Ramps(NamedTuple):
-    """Fastest rest-to-rest velocity profiles: durations of the phases, s, and peak velocities. Shape (..., n) each."""
+    """Fastest rest-to-rest velocity profiles of n joints: phase durations, s, and peak velocities. Shape (..., n)."""
 
     build_up: Array
     steady: Array
@@ -81,12 +81,12 @@ class _Ramps(NamedTuple):
 
     @property
     def duration(self) -> Array:
-        """Duration of the whole profile, s."""
+        """Duration of each velocity profile from rest to rest, s."""
         return 4 * self.build_up + 2 * self.steady + self.cruise
 
 
 def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) -> _Ramps:
-    """Return the fastest rest-to-rest profiles over distances (..., n) of the joints; distance 0 means no motion.
+    """Return the fastest rest-to-rest velocity profiles of joints that move by given distances. Shape (..., n).
 
     At peak velocity V and limits a and j, each ramp lasts r = V / a + a / j, or 2 sqrt(V / j) if it does not reach a.
     Both ramps together cover V r. The rest of the distance is covered at V.
@@ -108,11 +108,11 @@ def _ramps(distances: Array, velocity: Array, acceleration: Array, jerk: Array) 
 
 
 def least_durations(distances: Array, bounds: JointBounds) -> Array:
-    """Return the least duration of each joint alone, from rest to rest within velocity, acceleration and jerk limits.
+    """Return the least time in which each joint by itself moves by a given distance from rest to rest within limits.
 
     Args:
         distances: Absolute distances, rad or m. Shape (..., n).
-        bounds: Limits of the joints.
+        bounds: Limits of the joints; those of velocity, acceleration and jerk apply.
 
     Returns:
         Durations, s; 0 for a joint without limits. Shape (..., n).
@@ -146,7 +146,10 @@ class ConstantJerkMotion:
         return ConstantJerkMotion(self.durations * factor, self.joints, *derivatives)
 
     def sampled(self, places: Array) -> tuple[Array, Array, Array]:
-        """Return joint positions, rates and accelerations at fractions (M,) of each phase. Shape (K, M, n) each."""
+        """Return joint positions, rates and accelerations at fractions (M,) of the duration of each phase.
+
+        Shape (K, M, n) each.
+        """
         t = (self.durations[:, None] * places)[:, :, None]
         joints, rates, accelerations, jerks = (
             each[:, None] for each in (self.joints, self.rates, self.accelerations, self.jerks)
@@ -158,10 +161,10 @@ class ConstantJerkMotion:
         )
 
     def solution(self, problem: Problem, method: str) -> Solution:
-        """Return the motion as a solution of a `dynamics_problem` without the control "power"; it has no multipliers.
+        """Return the motion in the form of a solution of a `dynamics_problem`, but without multipliers.
 
         Args:
-            problem: The problem.
+            problem: The problem, which must not have the control "power".
             method: Phrase for what the motion does, such as "stops at the corners of a path".
         """
         form, horizon = Formulation.of(problem), self.duration
@@ -222,13 +225,13 @@ class TorqueLimits:
         self._samplers: dict[bool, Sampler] = {}
 
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> Array:
-        """Return the torques of the joints with a torque limit at M samples of a motion. Shape (M, L)."""
+        """Return the torques of the joints that have a torque limit at M samples of a motion. Shape (M, L)."""
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
     def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
-        """Return the torques (M, L) and their Jacobians with respect to the joint positions, rates and accelerations.
+        """Return torques at M samples, and their Jacobians with respect to joint positions, rates and accelerations.
 
-        Shape (M, L, n) each.
+        Torques of joints without a torque limit are left out. Shapes (M, L), and (M, L, n) for each Jacobian.
         """
         torques, *slopes = self._sampler(True)(joints, rates, accelerations)
         size = joints.shape[1]
@@ -266,7 +269,7 @@ class TorqueLimits:
 
 
 def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> ConstantJerkMotion:
-    """Return a time-optimal motion from rest to rest within velocity, acceleration and jerk limits.
+    """Return a time-optimal joint motion from rest to rest within velocity, acceleration and jerk limits.
 
     It is straight if a straight motion attains the least time.
 
@@ -284,7 +287,7 @@ def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> Const
 
 
 def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> ConstantJerkMotion:
-    """Return a motion along a joint path (M, n) that stops at each corner and satisfies the joint and torque limits.
+    """Return a motion within joint and torque limits that follows a joint path (M, n) and stops at each corner.
 
     Each segment is the fastest without torque limits, slowed down to them.
 
@@ -298,7 +301,7 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:
-    """Return the least durations of straight rest-to-rest joint motions, s, without torque limits.
+    """Return the least durations of straight rest-to-rest joint motions if torques are not limited, s.
 
     Shape (K,) for changes of the joint positions of shape (K, n).
     """
@@ -310,7 +313,7 @@ def _columns(motion: ConstantJerkMotion) -> Sequence[Array]:
 
 
 def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
-    """Return the limits of velocity, acceleration and jerk; infinite ones are replaced if profiles need finite ones."""
+    """Return the limits of velocity, acceleration and jerk, with finite values wherever a profile needs a limit."""
     velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
     jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
     velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
@@ -320,12 +323,15 @@ def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Arr
 
 
 def _profiles(distances: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest rest-to-rest profile of each joint by itself over absolute distances (..., n)."""
+    """Return the fastest rest-to-rest velocity profile of each joint by itself for absolute distances (..., n)."""
     return _ramps(distances, *_effective(distances, bounds))
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest profiles of the covered fraction of straight motions by displacements (K, n). Shape (K,)."""
+    """Return the fastest velocity profiles of K straight joint motions with displacements (K, n).
+
+    The distance of a profile is the covered fraction of the displacement. Shape (K,).
+    """
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [
@@ -335,7 +341,7 @@ def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
 
 
 def _straight(start: Array, change: Array, bounds: JointBounds) -> ConstantJerkMotion:
-    """Return the fastest straight joint motion by a displacement (n,); a short rest if the displacement is 0."""
+    """Return the fastest straight joint motion over a displacement (n,), or a short rest if this displacement is 0."""
     profile = _straight_profile(change[None], bounds)
     duration = float(profile.duration[0])
     if duration == 0:
@@ -347,7 +353,7 @@ def _straight(start: Array, change: Array, bounds: JointBounds) -> ConstantJerkM
 
 
 def _joint_phases(start: Array, signs: Array, profiles: _Ramps, duration: float) -> ConstantJerkMotion:
-    """Return the motion in which each joint follows its own profile, slowed down to a common duration.
+    """Return the motion in which each joint follows its own velocity profile, slowed down to a common duration.
 
     Args:
         start: Start configuration. Shape (n,).

@@ -1,4 +1,4 @@
-"""Optimal roll, the redundant angle of the captive trajectory rig, along a whole trajectory with limited roll rate.
+"""Optimal control of the roll, the redundant angle of the captive trajectory rig, along a whole tool trajectory.
 
 The paper, Lee, Lee 2017, resolves each target by itself, with the change of roll since the last target in the index
 (38); its roll lags behind the targets. Here the integral of the index I1, see `models.cts.roll`, and of the squared
@@ -37,12 +37,12 @@ from ocp.problem.problem import Problem
 __all__ = ["RollObstacles", "RollSettings", "least_cost_roll", "roll_problem", "spline_targets"]
 
 Targets = Callable[[Any], Any]
-LARGEST_SINE = 1 - 1e-9  # of the sine of q4 and the cosine of q2, just inside the reach
+LARGEST_SINE = 1 - 1e-9  # largest magnitude of the sine of q4 and the cosine of q2: the rig is just within reach
 
 
 @dataclass(frozen=True)
 class RollGuessSettings:
-    """Settings of the first guess: a lowest-cost path through a grid of times and rolls, then through finer grids.
+    """Settings of the initial guess of the roll, a lowest-cost path through finer and finer grids of times and rolls.
 
     Attributes:
         times: Number of times of the grid.
@@ -99,7 +99,7 @@ def spline_targets(times: Any, targets: Any) -> Targets:
 
 @dataclass(frozen=True, eq=False)
 class RollSettings:
-    """Cost weights, limits and branch of inverse kinematics of `roll_problem`.
+    """Settings of `roll_problem`: cost weights, limits, and the branch of the inverse kinematics of the rig.
 
     Attributes:
         rate_weight, acceleration_weight: Weights w, s^2, and v, s^4, of the cost; v keeps the control smooth.
@@ -132,7 +132,7 @@ class RollSettings:
 
 @dataclass(frozen=True, eq=False)
 class RollObstacles:
-    """Obstacles of `roll_problem`, with the settings by which the rig avoids them.
+    """Obstacles that the rig must avoid in `roll_problem`, and the settings of this avoidance.
 
     Attributes:
         scene: Obstacles.
@@ -166,7 +166,7 @@ class RollObstacles:
 
 
 def _check_nonnegative(name: str, value: Any, *, finite: bool) -> None:
-    """Raise ProblemError if a weight or limit is negative, or infinite where it must be finite."""
+    """Raise ProblemError if a weight or limit is negative, or if a number that must be finite is infinite."""
     number = real(value)
     if not number >= 0 or (finite and np.isinf(number)):
         message = f"roll_problem: {name} must be a number that is not negative, not {value!r}"
@@ -185,7 +185,7 @@ def roll_problem(
     settings: RollSettings | None = None,
     obstacles: RollObstacles | None = None,
 ) -> Problem:
-    """Declare the optimal control problem of the rig's roll along a trajectory of tool targets.
+    """Declare the optimal control problem of the rig's redundant angle (roll) along a trajectory of tool targets.
 
     The cost is the integral of I1 + w rate^2 + v acceleration^2, with the index I1 and the weights w and v.
     The states are "roll" (rad) and "rate" (rad/s), the control is "acceleration" (rad/s^2). The path constraints
@@ -266,7 +266,7 @@ def roll_problem(
     target = _column(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Insert the target at the problem's time and the roll state into an expression."""
+        """Substitute the tool target at the time of the problem, and the roll, into an expression."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
@@ -284,7 +284,7 @@ def roll_problem(
 
 
 def _column(targets: Targets, time: Any) -> Any:
-    """Return the target at a symbolic time, shape (5, 1); raise ProblemError if the user's function is invalid."""
+    """Return the tool target (5, 1) at a symbolic time; raise ProblemError if the user's function is invalid."""
     try:
         target = expression(targets(time))
     except RuntimeError:  # interpolants do not take SX symbols
@@ -301,13 +301,13 @@ def _column(targets: Targets, time: Any) -> Any:
 
 
 def _curve(targets: Targets, symbols: Any) -> Any:
-    """Return the user's function of targets as a casadi Function of time."""
+    """Convert the user's function that returns tool targets to a casadi Function of time."""
     time = symbols.sym("time")
     return ca.Function("target", [time], [_column(targets, time)])
 
 
 def _violation(value: Any, lower: Any, upper: Any) -> Any:
-    """Return the sum of the amounts by which values exceed their lower and upper bounds."""
+    """Return the sum of the amounts by which values are below their lower or above their upper bounds."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
 
 
@@ -322,9 +322,9 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll over time with the least integral of cost and weighted squared rate, by dynamic programming.
+    """Return the roll of the rig that minimises the integral of a cost and of the weighted squared roll rate.
 
-    Shape (samples,), rad.
+    The roll is found by dynamic programming. Shape (samples,), rad.
 
     Args:
         cost: Function (indices of times, rolls), both of shape (n,), that returns finite costs of shape (n,).
@@ -376,7 +376,10 @@ def least_cost_roll(
 
 
 def _lowest_cost_path(stage: Array, away: Any, spans: Array, rate_weight: float, rate_limit: float, step: float) -> Any:
-    """Return the index of the roll at each time on the lowest-cost path; rates beyond the limit are penalised."""
+    """Return the lowest-cost path through a grid of times and rolls, as the index of the roll at each time.
+
+    Roll rates beyond the limit are penalised.
+    """
     weights = np.convolve(np.append(spans, 0), [0.5, 0.5])[: len(stage)]
     weights[[0, -1]] = np.maximum(weights[[0, -1]], spans[[0, -1]] / 2)
     penalty = 1e3 * (np.ptp(stage[np.isfinite(stage)]) + rate_weight + 1e-9)

@@ -1,4 +1,4 @@
-"""Optimal control problems of fixed and free-floating arms with actuator limits; accelerations or jerks are controls.
+"""Optimal control problems of fixed and free-floating arms within actuator limits, controlled by acceleration or jerk.
 
 The joint torques follow from inverse dynamics (see `torques`). No mass matrix is inverted, and torque limits are
 ordinary path constraints (Featherstone 2008, chapter 5; Betts 2010, section 4.10).
@@ -162,7 +162,7 @@ def dynamics_problem(
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Boundary conditions of a motion, checked against the limits; entries that are free are nan.
+    """Boundary conditions of a motion, checked against the limits; values that are free are nan.
 
     Attributes:
         first, last: Joint positions at the start and at the end. Shape (n,).
@@ -204,18 +204,18 @@ class _Ends:
 
     @property
     def end(self) -> Array:
-        """Joint positions at the end of the guess; those with a free end keep their start value. Shape (n,)."""
+        """Joint positions at the end of the initial guess; joints with a free end stay at their start. Shape (n,)."""
         return np.where(np.isnan(self.last), self.start, self.last)
 
     def quintic(self, duration: float, order: int) -> Any:
-        """Return the quintic rest-to-rest motion of the joints, or a derivative of it, as a function of time."""
+        """Return the quintic rest-to-rest joint motion of the guess, or a derivative of it, as a function of time."""
         shape = QUINTIC.deriv(order) if order else QUINTIC
         begin = self.start if order == 0 else np.zeros(len(self.start))
         return lambda t: begin + (self.end - self.start) * shape(t / duration) / duration**order
 
 
 class _Motion(NamedTuple):
-    """Symbols of a problem's states and controls, and the expression of the rate of the base."""
+    """Symbols of the states and controls of a problem, and the expression of the time derivative of the base."""
 
     base: Any
     joints: Any
@@ -228,7 +228,7 @@ class _Motion(NamedTuple):
 def _declare_motion(
     problem: Problem, machine: Motors, ends: _Ends, bounds: JointBounds, duration: float, control: str
 ) -> _Motion:
-    """Declare the states and controls of joints and base, with dynamics, limits and boundary conditions."""
+    """Declare the states and controls of joints and base, with their dynamics, limits and boundary conditions."""
     robot, n = machine.robot, machine.joint_size
     scales = _wheel_scales(robot, bounds, duration)
     joints = problem.state(
@@ -267,7 +267,7 @@ def _declare_motion(
 def _declare_actuators(
     problem: Problem, machine: Motors, motion: _Motion, torques: Any, bounds: JointBounds, cost: Cost
 ) -> Any:
-    """Declare the limits of torque and power, and return the running cost."""
+    """Declare the torque and power limits of a problem, and return its running cost."""
     limit_torques(problem, machine.robot, torques, bounds.torque)
     running = running_cost(machine, cost, motion[:4], jerks=motion.jerks, torques=torques)
     if cost.energy or np.isfinite(bounds.power).any():
@@ -276,7 +276,7 @@ def _declare_actuators(
 
 
 def _checked_end(name: str, value: Any, n: int) -> Array:
-    """Return checked positions or velocities at the start or end of a motion; free entries are nan. Shape (n,).
+    """Return the user's positions or velocities at one end of a motion as numbers, nan where free. Shape (n,).
 
     Raises:
         ProblemError: The value has another size, or is infinite.
@@ -291,7 +291,7 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return scaling factors for angles, speeds, accelerations and jerks of reaction wheels; nan for other joints.
+    """Return scales of angles, speeds, accelerations and jerks of reaction wheels for the solver; nan for other joints.
 
     Rotors are light and turn fast. Their scales are a quarter of the saturation speed and of the motor torque, or what
     1 N m s and 1 N m cause where these are unlimited. Shape (4, n).
@@ -307,7 +307,7 @@ def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
 
 
 def end_velocities(name: str, value: Any, n: int) -> Array:
-    """Return joint velocities (n,) at the start or end from numbers, "rest" or "free"; free entries are nan."""
+    """Convert numbers, "rest" or "free" to joint velocities (n,) at one end of a motion; free velocities are nan."""
     if isinstance(value, str):
         return np.full(n, 0.0 if require.choice(name, value, ("rest", "free")) == "rest" else np.nan)
     if value is None:
@@ -316,7 +316,7 @@ def end_velocities(name: str, value: Any, n: int) -> Array:
 
 
 def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: Any) -> None:
-    """Constrain the configuration of the base at the end of a motion; three equations constrain its attitude."""
+    """Constrain the base configuration at the end of a motion; three equations constrain a spatial attitude."""
     if not machine.base_size:
         raise ProblemError("a fixed base has no end_base", name="end_base", value=end_base)
     goal = _checked_end("end_base", end_base, machine.base_size)

@@ -1,4 +1,4 @@
-"""Planners that solve and audit motions within actuator limits to one or several goals.
+"""Planners that solve and audit motions to one or several goals within actuator limits.
 
 A plan must satisfy its limits between the nodes of the mesh, too. A smooth plan of least effort needs few intervals. A
 plan of least time switches from limit to limit and gets nodes at its switches. Where a limit is still exceeded
@@ -66,7 +66,7 @@ def dynamics_phases(
     cost: Cost | None = None,
     setup: DynamicsSetup | None = None,
 ) -> Phases:
-    """Declare the motions to consecutive goals as phases of one optimal control problem with the least total cost.
+    """Declare the optimal control problem of motions to consecutive goals, one phase each, at the least total cost.
 
     Args:
         machine: Machine during the motion to the first goal, unless the goal has its own.
@@ -123,7 +123,7 @@ def dynamics_phases(
 
 
 def checked_goals(goals: Any) -> tuple[Goal, ...]:
-    """Return the goals of consecutive phases as a tuple, after checks.
+    """Check that goals can be the ends of consecutive phases of one problem, and return these goals as a tuple.
 
     Raises:
         ProblemError: There are none; one is no Goal, is a pose, or has no duration; two have the same name.
@@ -145,12 +145,12 @@ def checked_goals(goals: Any) -> tuple[Goal, ...]:
 
 
 def phase_names(goals: Sequence[Goal]) -> tuple[str, ...]:
-    """Return the name of the phase that leads to each goal: that of the goal, or "leg" and a number."""
+    """Return the names of the phases that lead to goals: the name of each goal or, without one, "leg" and a number."""
     return tuple(goal.name or f"leg {k + 1}" for k, goal in enumerate(goals))
 
 
 def machines_of(machine: Motors, goals: Sequence[Goal]) -> tuple[Motors, ...]:
-    """Return the machine of each phase of a motion to consecutive goals, which may pick up or put down loads.
+    """Return the machine of each phase of a motion to consecutive goals, where loads may be picked up or put down.
 
     Raises:
         ProblemError: The machine changes its joints or its kind of base, or while it moves or has momentum.
@@ -176,12 +176,12 @@ def machines_of(machine: Motors, goals: Sequence[Goal]) -> tuple[Motors, ...]:
 
 
 def _rests(goal: Goal) -> bool:
-    """Return whether the machine is at rest at a goal."""
+    """Return whether the machine must be at rest at a goal."""
     return isinstance(goal.velocity, str) and goal.velocity == "rest"
 
 
 def _join(phases: Phases, before: str, after: str, goal: Goal) -> None:
-    """Make the states continuous between two phases, except those that the goal between them fixes in both."""
+    """Make the states continuous between two phases, except states that the goal between the phases fixes anyway."""
     fixed: dict[str, Any] = {}
     if goal.joints is not None and not np.isnan(np.asarray(goal.joints, dtype=float)).any():
         fixed["joints"] = None
@@ -258,13 +258,13 @@ def solve_dynamics(
     setup: DynamicsSetup | None = None,
     settings: SolveSettings | None = None,
 ) -> Solution:
-    """Solve `dynamics_problem`, or the phases of `dynamics_phases`, and audit the plan.
+    """Plan a motion within actuator limits along tip tasks or to one or several goals, and audit the plan.
 
-    The plan satisfies its limits between the nodes, too, to 1e-5 of their units. The first plan that passes its audit
-    is returned. If none passes, the feasible plan of least cost is returned; its optimality is then undetermined, or it
-    costs too much, by about its `tightening_cost`. Least time alone, `Cost(velocity=0, time=1)`, leaves the motion of
-    joints that need not hurry undetermined, so that the optimality is undetermined, too. Add a small weight of
-    accelerations or torques.
+    The problem is `dynamics_problem`, or the phases of `dynamics_phases`. The plan satisfies its limits between the
+    nodes, too, to 1e-5 of their units. The first plan that passes its audit is returned. If none passes, the feasible
+    plan of least cost is returned; its optimality is then undetermined, or it costs too much, by about its
+    `tightening_cost`. Least time alone, `Cost(velocity=0, time=1)`, leaves the motion of joints that need not hurry
+    undetermined, so that the optimality is undetermined, too. Add a small weight of accelerations or torques.
 
     Args:
         machine, start, limits, cost, setup: As for `dynamics_problem`.
@@ -314,21 +314,21 @@ def solve_dynamics(
 
 
 def _check_end_velocity(setup: DynamicsSetup) -> None:
-    """Raise ProblemError if the setup prescribes an end velocity, because every goal has its own."""
+    """Raise ProblemError if the setup prescribes an end velocity, because every goal states its own velocity."""
     if setup.end_velocity != "rest":
         words = "end_velocity: every goal has its own; set Goal(velocity=...)"
         raise ProblemError(words, name="end_velocity", value=setup.end_velocity)
 
 
 def breaks_of(tasks: TipTask | Sequence[TipTask], horizon: float) -> Sequence[float]:
-    """Return the fractions of a horizon at which tasks have kinks or jumps."""
+    """Return the times at which tasks have kinks or jumps, as fractions of the horizon."""
     tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     times = np.unique(np.concatenate([np.zeros(0), *(task.begin + np.asarray(task.breaks) for task in tasks)]))
     return [float(at) for at in times / horizon if 0 < at < 1]
 
 
 def audit_error(audit: Audit, solution: Solution) -> SolveError:
-    """Return an error about that failure of an audit which exceeds its tolerance by the largest factor."""
+    """Return an error about the failed check of an audit whose value exceeds its tolerance by the largest factor."""
     worst = max(audit.failures, key=lambda row: row.value / row.limit if row.limit else np.inf)
     words = f"the audit fails: {worst.name} {worst.value:.2g}"
     return SolveError(words, solution, name=worst.name, value=worst.value, limit=worst.limit, time=worst.time)
@@ -343,7 +343,9 @@ def within_limits(
     settings: SolveSettings | None = None,
     guess: Guess = None,
 ) -> Solution:
-    """Solve until a plan satisfies its limits between the mesh nodes, too, and passes its audit; see `solve_dynamics`.
+    """Solve a problem on finer and finer meshes until a plan passes its audit and satisfies its limits everywhere.
+
+    Limits are satisfied between the mesh nodes, too; see `solve_dynamics`.
 
     Args:
         declare: Declares the problem under clearance constraints.
@@ -383,7 +385,7 @@ def _first_within_limits(
     tolerances: Mapping[str, float] | None,
     begin: Guess,
 ) -> Solution:
-    """Solve on finer and finer meshes from a guess, and return the first plan that `within_limits` accepts.
+    """Solve a problem on finer and finer meshes; return the first plan within its limits that passes its audit.
 
     Raises:
         SolveError: As `within_limits`; at once if collisions are all that is wrong with a plan.
@@ -437,7 +439,7 @@ def _first_within_limits(
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Yield attempts on one mesh: a label, and a plan that satisfies its limits or else an error.
+    """Yield the results of up to two attempts on one mesh: a label, and a plan that satisfies its limits or an error.
 
     The second attempt has nodes at the switches of the first. The caller stops at the first plan that it accepts.
     """
@@ -456,7 +458,7 @@ def _attempts(
 def _tighten_limits(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
-    """Tighten limits until a plan satisfies them between the nodes; return it, or an error if it costs too much."""
+    """Tighten limits until a plan satisfies the original ones between the nodes; return this plan, or an error."""
     if largest_excess(problem, plan) <= HOLDING.excess:
         return plan
     own, largest = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.cost_increase * abs(plan.cost)
@@ -471,7 +473,7 @@ def _tighten_limits(
 
 
 def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocation:
-    """Return a finer mesh: split where tightened limits cost too much, or else with all intervals halved."""
+    """Return a finer mesh: intervals whose tightened limits cost too much are split, or else all are halved."""
     if plan.bound_tightening is None or failure.solution is not plan or failure.name != "cost":
         return mesh.halve()
     nodes, amounts = plan.control_interpolant.breaks, plan.bound_tightening.max(axis=(0, 2))

@@ -1,4 +1,4 @@
-"""Optimal control problems of least joint velocity, controlled by joint rates: between configurations, and along tasks.
+"""Optimal control problems of least joint velocity between configurations or along tasks; joint rates are controls.
 
 A path of straight motions in joint space at constant speed is a motion of `joint_motion_problem`, with rates that jump
 at its corners. `motion_along` returns it as a solution that can be audited and saved like one of a solver.
@@ -50,7 +50,7 @@ def joint_motion_problem(
     length: bool = False,
     clearance_constraints: ClearanceConstraints | None = None,
 ) -> Problem:
-    """Declare the optimal control problem of least squared joint rates, or of least length, between two configurations.
+    """Declare the optimal control problem of least squared joint rates or least path length between two configurations.
 
     The state is "joints", the control "rates". With weights w and rates u the cost is the integral of sum(w u^2) / 2,
     or the length in joint space, the integral of sqrt(sum(w u^2)).
@@ -92,7 +92,7 @@ def joint_motion_problem(
 
 
 def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *, length: bool) -> Solution:
-    """Return the motion along a joint path at constant speed as a solution of a `joint_motion_problem`.
+    """Return the motion at constant speed along a joint path in the form of a solution of a `joint_motion_problem`.
 
     A straight path is optimal. One with corners has no multipliers: the audit proves only whether it is feasible.
 
@@ -147,7 +147,7 @@ def motion_along(problem: Problem, path: Array, scale: Array, horizon: float, *,
 
 
 GUESS_STEPS = 64
-"""Number of steps of the resolved-rate motion that serves as the guess, besides those at breaks of the tasks."""
+"""Number of time steps of the resolved-rate motion that is the initial guess; breaks of tasks add further steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +189,7 @@ def minimum_velocity_problem(
     limits: Limits | None = None,
     setup: VelocitySetup | None = None,
 ) -> Problem:
-    """Declare the optimal control problem of the least integral of half the squared joint rates along tasks.
+    """Declare the optimal control problem of tracking tasks with the least integral of half the squared joint rates.
 
     This is problem (27) of Kim and Kim 2011. The states are "joints", x2, and, on a floating base, "base"; the control
     is "rates". The path equality is "task", G x2' = v with the Jacobian G of the tasks, where v contains the drift of a
@@ -254,7 +254,7 @@ def minimum_velocity_problem(
 def _attach_guess(
     motion: ToolMotion, base: Array, joints: Array, weights: Array, bounds: JointBounds, damping: float
 ) -> None:
-    """Set the damped resolved-rate motion along the tasks as the guess of a problem's states and controls."""
+    """Use the damped resolved-rate motion along the tasks as the initial guess of a problem's states and controls."""
     motions: list[LocalMotion] = []
     place, at = base[None], joints[None]
     for stretch in motion.stretches:

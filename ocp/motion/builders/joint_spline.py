@@ -1,4 +1,4 @@
-"""Joint positions and torques of a plan as functions of the distance along a path, for scheduling the path speed.
+"""Joint positions and torques of a plan as functions of the distance along a path, for planning the path speed.
 
 The positions are a spline of degree 5, so that its third derivative, which joint jerks need, is continuous. The torques
 are linear in the acceleration a along the path and in the squared speed v^2. With joint positions q(s) at distance s,
@@ -41,7 +41,10 @@ ROW_OPERATIONS = {
     ca.OP_COS: np.cos,
     ca.OP_TWICE: lambda operand, out: np.add(operand, operand, out),
 }
-"""NumPy functions for the casadi operations of inverse dynamics, called with the operands and the output array."""
+"""NumPy functions that execute the casadi operations of inverse dynamics on arrays, by casadi operation code.
+
+They are called with the operands and the output array.
+"""
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ class _Along(NamedTuple):
 
 
 class _Torques(NamedTuple):
-    """Coefficients of joint torques along a path, inertia a + drag v^2 + rest, at path speed v and acceleration a."""
+    """Coefficients of joint torques in the acceleration a and speed v along a path: inertia a + drag v^2 + rest."""
 
     inertia: Array
     drag: Array
@@ -78,7 +81,7 @@ class _Torques(NamedTuple):
 
 
 class PlanLike(Protocol):
-    """Interface of a plan of tasks that `joint_path` uses, such as `ocp.Plan`."""
+    """Interface of the plans, such as `ocp.Plan`, whose joint positions `joint_path` can sample."""
 
     @property
     def horizon(self) -> float: ...
@@ -108,7 +111,7 @@ class PlannedJoints:
     forces: _BatchedFunction | None
 
     def at(self, distance: Any) -> _Along:
-        """Return the joint positions and their derivatives at distances along the path. Shape (M,), m.
+        """Return the joint positions and their derivatives at distances (M,) along the path, m.
 
         Raises:
             ProblemError: A distance is nan, or off the path by more than rounding.
@@ -116,7 +119,7 @@ class PlannedJoints:
         return _Along(*self.curves(self._check_distance(distance)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Return the coefficients of the joint torques at distances along the path. Shape (M,), m.
+        """Return the coefficients of the joint torques at distances (M,) along the path, m; see `_Torques`.
 
         Raises:
             ProblemError: The base of the machine moves, or distances are invalid, see `at`.
@@ -128,7 +131,7 @@ class PlannedJoints:
         return _Torques(*self.forces(along.position, along.first, along.second))
 
     def _check_distance(self, distance: Any) -> Array:
-        """Return distances clipped to the path; raise ProblemError if they exceed it by more than rounding."""
+        """Clip distances to the path; raise ProblemError if a distance is off the path by more than rounding errors."""
         try:
             s = np.atleast_1d(floats(distance))
         except NOT_NUMBERS as error:
@@ -149,7 +152,7 @@ def joint_path(
     samples: int = 400,
     names: Sequence[str] | None = None,
 ) -> PlannedJoints:
-    """Return joint positions along a path as a spline of the distance, from a plan at constant speed or from samples.
+    """Return a spline of joint positions over the distance along a path, from a plan at constant speed or samples.
 
     Args:
         machine: Machine of the joints.
@@ -210,7 +213,7 @@ def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple
 
 
 def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, Array]:
-    """Return checked distances along the path (M,) and joint positions (M, n) of a solution or of given samples."""
+    """Sample a solution along a path, or check given samples; return path distances (M,) and joint positions (M, n)."""
     if isinstance(plan, tuple):
         try:
             s, joints = (floats(part) for part in plan)
@@ -266,7 +269,7 @@ class _PiecewisePolynomial:
 
 
 class _BatchedFunction:
-    """Evaluator of a casadi SX Function for many inputs at once, with each instruction applied to arrays."""
+    """Evaluator of a casadi SX Function that applies each instruction to arrays of many inputs at once."""
 
     def __init__(self, function: Any) -> None:
         self.sizes = [function.size1_out(k) for k in range(function.n_out())]
@@ -315,7 +318,7 @@ class _BatchedFunction:
         return [part.T for part in np.split(results, np.cumsum(self.sizes)[:-1])]
 
     def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Return an array with a row for each intermediate value of the function, and instructions on these rows."""
+        """Return a work array with a row for each intermediate value, and the function's instructions on these rows."""
         table = np.zeros((self.rows + len(self.constants), SPLINE.batch))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)
@@ -323,7 +326,7 @@ class _BatchedFunction:
 
 
 def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
-    """Return the interpolating spline of joint positions (M, n) at distances (M,)."""
+    """Return the spline that interpolates joint positions (M, n) at distances (M,) along a path, m."""
     # in units of the length, which keeps the derivatives of the fit in range
     unit = float(s[-1])
     fit = ca.interpolant("fit", "bspline", [(s / unit).tolist()], joints.ravel().tolist(), {"degree": [DEGREE]})
@@ -336,7 +339,7 @@ def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
 
 
 def _forces(machine: Machine) -> _BatchedFunction | None:
-    """Return the function that computes the coefficients of joint torques along a path; None for a moving base.
+    """Return the function that computes the coefficients of joint torques along a path; None if the base moves.
 
     Its inputs are joint positions and their first two derivatives with respect to distance, its outputs `_Torques`.
     """

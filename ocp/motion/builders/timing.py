@@ -1,4 +1,4 @@
-"""Minimum time along a given path under all limits, as an optimal control problem over the path parameter.
+"""Minimum-time motion along a given path under all limits, as an optimal control problem over a path parameter.
 
 This is the reference for `schedule`, which plans by construction. The independent variable is a path parameter theta:
 the time (s) at which a reference motion, usually a schedule of the same path, passes a place. The distance, speed
@@ -66,7 +66,7 @@ REFINEMENT = RefinementSettings()
 
 @dataclass(frozen=True, eq=False)
 class TimingProblem:
-    """Minimum-time problem along a path, with its mesh and reference motion.
+    """Minimum-time problem along a path, with its mesh and the reference motion that defines the path parameter.
 
     Attributes:
         problem: Problem with states "speed" and "acceleration" and control "jerk" in `units`. Its time is theta less
@@ -86,7 +86,7 @@ class TimingProblem:
 
     @property
     def method(self) -> Collocation:
-        """Collocation with constant jerk in each interval, so that quantities do not overshoot between its points."""
+        """Collocation with constant jerk in each interval, which prevents overshoot between the collocation points."""
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:
@@ -120,7 +120,7 @@ class TimingProblem:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Lengths of the first and last parts of the path, over which the jerk is constant, m."""
+        """Lengths of the parts of the path, m, in which the motion starts and stops with constant jerk."""
         return _ends(self.reference, self.span)
 
 
@@ -200,7 +200,7 @@ def minimum_time_problem(
     guess: Schedule | None = None,
     intervals: int = 200,
 ) -> TimingProblem:
-    """Declare the minimum-time problem along a path that `solve_minimum_time` solves, for solution by any method.
+    """Declare the optimal control problem of the fastest motion along a path from rest to rest under all limits.
 
     The path constraints are "asked speed" (the line speed's limit), "centripetal acceleration", "joint velocity",
     "joint acceleration" and "joint jerk", each over its limit and only if limited. The boundary constraints are "start
@@ -295,7 +295,7 @@ def _declare(
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Return the ratios of centripetal acceleration and joint rates, accelerations and jerks to their limits, by name.
+    """Return the centripetal acceleration and joint velocities, accelerations and jerks divided by their limits.
 
     `values` are the reference speed and the values of `path_columns`; v, a, j are path speed, acceleration and jerk.
     """
@@ -319,7 +319,10 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 
 
 def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
-    """Return into how many parts each interval is to be split, since its error decreases with its length squared."""
+    """Return the number of parts into which to split each mesh interval, from its limit excess and integration error.
+
+    Both decrease with the square of the length of the interval.
+    """
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)
     distance_error, speed_error = distance / np.diff(profile.distance) - 1, (speed - v[1:]) / v.max()
@@ -331,7 +334,7 @@ def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
-    """Return the distances that the reference motion covers before and after a given span of its time, m."""
+    """Return the distances that the reference motion covers before and after a given interval of its time, m."""
     # the jerk is constant there; the cube is accurate near the end, a difference of distances is not
     left = reference.duration - span[1]
     return float(reference.jerk[0] * span[0] ** 3 / 6), float(reference.jerk[-1] * left**3 / 6)

@@ -44,12 +44,12 @@ __all__ = [
 ]
 
 Columns = Callable[[Array], Array]
-"""Type of a function of times (M,) that returns C path quantities at these times. Shape (M, C)."""
+"""Type of a function that returns C quantities of a path, shape (M, C), at times (M,) of the reference motion."""
 
 
 @dataclass(frozen=True)
 class TableSettings:
-    """Settings of the tabulated path quantities and of the mesh.
+    """Settings of the tables of path quantities, and of the mesh of the minimum-time problem.
 
     Attributes:
         degree: Degree of the polynomials of a table.
@@ -155,9 +155,10 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 
 def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Return the ratios of limited quantities to their limits at unit speed along a path, and their exponents of speed.
+    """Return ratios of quantities to their limits at speed 1 m/s, and the power of speed that each is proportional to.
 
-    The rows are the centripetal acceleration, then velocity, acceleration and jerk of each joint. Shapes (C, M), (C,).
+    The speed along the path is constant. The rows are the centripetal acceleration, then velocity, acceleration and
+    jerk of each joint. Shapes (C, M), (C,).
     """
     count = 0 if rates is None else len(rates.first)
     rows = [np.zeros((1, count)) if curvature is None else curvature[None] / limits.centripetal]
@@ -201,7 +202,7 @@ def _bernstein(x: Array) -> Array:
 
 
 def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
-    """Return the speed profile of a schedule along a path or, if it fails, a slower one that satisfies all limits."""
+    """Return a speed profile within all limits along a path: that of `schedule` or, if it fails, a slower one."""
     try:
         return schedule(path, limits, joints=joints).profile
     except ProblemError:
@@ -222,7 +223,7 @@ def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | Non
 
 
 def distinct(values: Array, tolerance: float) -> Array:
-    """Return values in increasing order without those within a tolerance of the previous one; the last one is kept."""
+    """Sort values and drop each value that exceeds the one before by at most a tolerance; the largest one is kept."""
     ordered = np.sort(values)
     ordered = ordered[np.concatenate([[True], np.diff(ordered) > tolerance])]
     ordered[-1] = values.max()
@@ -230,12 +231,12 @@ def distinct(values: Array, tolerance: float) -> Array:
 
 
 def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, float], intervals: int) -> Array:
-    """Return the mesh nodes of the minimum-time problem as fractions of its span of reference time.
+    """Return the mesh nodes of the minimum-time problem as fractions of its horizon.
 
     Args:
         reference: Reference motion; the changes of its jerk become nodes.
         joins: Times at which the path's derivatives jump; nodes are placed on both sides. Shape (B,), s.
-        span: Span of the problem, s.
+        span: Start and end of the problem in the time of the reference motion, s.
         intervals: Least number of intervals over the whole time.
     """
     whole, (begin, end) = reference.duration, span
@@ -256,7 +257,7 @@ def reference_mesh(reference: SpeedProfile, joins: Array, span: tuple[float, flo
 
 
 def subdivide(nodes: Array, parts: NDArray[np.intp]) -> Array:
-    """Return the nodes of a mesh (N + 1,) whose intervals are divided into given numbers of equal parts (N,)."""
+    """Divide each of the N intervals of a mesh into a given number of equal parts; return the nodes of the new mesh."""
     first = np.cumsum(parts) - parts
     step = np.arange(parts.sum()) - np.repeat(first, parts)
     return np.append(np.repeat(nodes[:-1], parts) + np.repeat(np.diff(nodes) / parts, parts) * step, nodes[-1])

@@ -1,4 +1,4 @@
-"""Optimal control problems of least joint velocity along tool tasks, each in its own interval of time.
+"""Optimal control problems of least joint velocity along tool tasks, which may begin and end at different times.
 
 The cost is the integral of half the weighted squared joint rates, problem (27) of Kim and Kim 2011. The horizon is
 split into stretches, intervals in which the same tasks are active. Each stretch has its own states, scaled to the whole
@@ -36,14 +36,17 @@ from ocp.tolerances import ROUNDING_SHARE
 __all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "ToolMotionSetup", "stretches_of", "tool_motion_problem"]
 
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
-"""Names in a free-time problem: time as a state, and derivatives of joint positions and time in the tasks' time."""
+"""Names of variables of a problem with free time: the time, and derivatives of joint positions and of the time.
+
+The derivatives are with respect to the time of the tasks.
+"""
 ERRORS, START_ERRORS = "task errors", "start errors"
-"""Names of the scaled velocity errors of a relaxed task and of its pose errors at a free start configuration."""
+"""Names of the variables for velocity errors of a relaxed task, and for its pose errors at a free start."""
 
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """Settings of the feedback of pose errors and of relaxed tasks.
+    """Settings of the feedback of pose errors, and of relaxed tasks, from which a motion may deviate at a cost.
 
     Attributes:
         decay: Largest decay of a pose error over an interval of the mesh, as a power of e. Faster feedback would need a
@@ -109,7 +112,10 @@ class ToolMotion:
     breaks: Array
 
     def guess(self, motions: Sequence[LocalMotion], number: int) -> dict[str, Any]:
-        """Return an initial guess of the problem from resolved-rate motions, that of index `number` in each stretch."""
+        """Return an initial guess of states and controls, by name, from the resolved-rate motions in each stretch.
+
+        `number` is the index of the resolved-rate motion that is used.
+        """
         guess: dict[str, Any] = {}
         for stretch, part in zip(self.stretches, motions, strict=True):
             t = (part.t - stretch.begin) * (self.horizon / stretch.duration)
@@ -122,7 +128,7 @@ class ToolMotion:
 
 
 def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> tuple[Stretch, ...]:
-    """Divide the horizon into stretches with the same active tasks, and limit the pose feedback to suit their meshes.
+    """Divide the horizon into intervals (stretches) with the same active tasks, and limit the gains of pose feedback.
 
     Raises:
         ProblemError: A task begins or ends outside the horizon.
@@ -199,12 +205,12 @@ class ToolMotionSetup:
 
     @property
     def free(self) -> bool:
-        """Whether a joint position at the start is not prescribed, so that only the tasks constrain it there."""
+        """Whether the start position of at least one joint is not prescribed and only the tasks constrain it."""
         return self.start is None or bool(np.isnan(self.start).any())
 
 
 def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: ToolMotionSetup) -> ToolMotion:
-    """Declare the optimal control problem of a motion along tasks with least weighted squared joint rates.
+    """Declare the optimal control problem of performing tasks with the least integral of weighted squared joint rates.
 
     Args:
         machine: Machine on a fixed or floating base.
@@ -259,11 +265,11 @@ class _Motion:
         return self.stretches[-1].end
 
     def pace(self, stretch: Stretch) -> float:
-        """Return the time of a stretch that passes per unit of the problem's time, by which its dynamics are scaled."""
+        """Return the ratio of a stretch's duration to the horizon, by which the dynamics of the stretch are scaled."""
         return stretch.duration / self.horizon
 
     def states(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare the joint positions of a stretch as states, and its base configuration if the base moves."""
+        """Declare the base configuration, if the base moves, and the joint positions of a stretch as states."""
         machine, begins, ends = self.machine, stretch is self.stretches[0], stretch is self.stretches[-1]
         place: Any = np.zeros(0)
         if machine.base_size:
@@ -287,7 +293,7 @@ class _Motion:
         return declare_actuators(self.problem, self.machine, self.horizon, (place, joints), **options)
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare the velocities by which relaxed tasks may deviate; return them and their cost, 0 if none may."""
+        """Declare the velocity errors of relaxed tasks as controls; return errors and cost, 0 if no task is relaxed."""
         assert stretch.equations is not None
         if not self.setup.relaxed or not stretch.equations.size:
             return 0, 0
@@ -305,10 +311,11 @@ class _Motion:
 
 
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
-    """Declare the states, controls and constraints of one stretch, an interval with the same tasks, in fixed time.
+    """Declare the states, controls and constraints of one stretch (interval with the same tasks) in fixed time.
 
-    `known` has the Jacobian of the positions that the stretch before fixes at its end, see `_slopes`, or None. Return
-    the states that continue in the next stretch, the running cost, and the Jacobian of the positions fixed here.
+    `known` is the Jacobian of the task coordinates that the stretch before fixes at its end, see `_slopes`, or None.
+    Return the states that continue in the next stretch, the running cost, and the Jacobian of the coordinates that
+    this stretch fixes.
     """
     problem, machine, bounds, pace = motion.problem, motion.machine, motion.setup.bounds, motion.pace(stretch)
     begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]
@@ -347,11 +354,12 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
 
 
 def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
-    """Declare the problem of a tool motion whose tasks may be executed more slowly, with the time t as a state.
+    """Declare the problem of a tool motion whose tasks may be executed more slowly than in their own time.
 
-    The independent variable is the tasks' own time s. With q' = dq/ds, z = dt/ds, rates u = q'/z and weights W the cost
-    is the integral of (time_cost + u W u/2) dt = (time_cost z + q' W q'/(2 z)) ds, which is convex in q' and z. Tasks,
-    J q' = v(s), and rate limits V, |q'| <= V z, are linear. With accelerations as controls, z is a state.
+    The independent variable is the tasks' own time s, and the time t is a state. With q' = dq/ds, z = dt/ds, rates
+    u = q'/z and weights W the cost is the integral of (time_cost + u W u/2) dt = (time_cost z + q' W q'/(2 z)) ds,
+    which is convex in q' and z. Tasks, J q' = v(s), and rate limits V, |q'| <= V z, are linear. With accelerations as
+    controls, z is a state.
     """
     machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.setup.bounds
     if len(stretches) > 1 or stretches[0].equations is None:
@@ -395,7 +403,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
 
 def _closure(motion: _Motion) -> Any:
-    """Declare and return a constant velocity by which a closed task may deviate so that the joint path can close.
+    """Declare and return a small constant velocity error of a closed task that lets the joint path close exactly.
 
     If the joints return, a closed task returns by itself. Both conditions would contradict each other by the error of
     the discretisation; so the task may deviate by a velocity of that size.
@@ -482,7 +490,7 @@ def _declare_tasks(
 
 
 def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
-    """Return the Jacobian of task coordinates with respect to base and joints at a random configuration.
+    """Return the Jacobian of a stretch's task coordinates with respect to base and joints at a random configuration.
 
     A rank found there applies everywhere but on a set of measure zero. Shape (size, base_size + joint_size).
     """

@@ -32,8 +32,10 @@ __all__ = [
 ]  # fmt: skip
 
 LENGTH_RATE = 1e-2
-"""Joint rate below which the length of a path is smoothed, rad/s: sqrt(|q'|^2 + LENGTH_RATE^2) exceeds |q'| by 0.02 %
-at 0.5 rad/s, and by LENGTH_RATE at rest."""
+"""Joint rate below which the integrand |q'| of the path length in a cost is smoothed, rad/s.
+
+sqrt(|q'|^2 + LENGTH_RATE^2) exceeds |q'| by 0.02 % at 0.5 rad/s, and by LENGTH_RATE at rest.
+"""
 
 Motors = FixedBase | FreeFloating
 """Type of the machines whose motion the joint torques alone determine."""
@@ -141,7 +143,7 @@ def declare_actuators(
     pace: Any,
     suffix: str = "",
 ) -> tuple[Any, Any, Any]:
-    """Declare joint velocities and accelerations within actuator limits; return them and the running cost per second.
+    """Declare joint velocities and accelerations within actuator limits; return both and the running cost per second.
 
     The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
     "power" where these are limited or weighted.
@@ -222,7 +224,7 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
 
 
 def positive_power(problem: Problem, powers: Any, bounds: JointBounds, suffix: str = "") -> Any:
-    """Declare each actuator's positive power as a control within its limit, W; return the sum."""
+    """Declare the positive power of each actuator as a limited control, W; return the sum over the actuators."""
     power = problem.control(f"power{suffix}", powers.numel(), lower=0.0, upper=bounds.power, unit="W")
     problem.path(f"power{suffix}", power - powers, lower=0.0, unit="W")
     return ca.sum1(power)

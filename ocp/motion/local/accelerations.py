@@ -40,7 +40,7 @@ Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilise
 
 @dataclass(frozen=True)
 class Layer:
-    """Secondary objective: a configuration index to be improved by the freedom that tasks and zero moment point leave.
+    """Secondary objective: a configuration index to improve with the freedom that tasks and zero moment point leave.
 
     Attributes:
         index: ``joint_limits``, p1 of equation (23) of Yoo et al. 2004, to be decreased; ``manipulability`` of the rows
@@ -135,7 +135,7 @@ class AccelerationOptions:
             require.count(name, getattr(self, name), least=1)
 
     def zmp_target(self, machine: Standing) -> Callable[[Any], Any]:
-        """Return the target of a machine's zero moment point as a checked function of time."""
+        """Return the desired zero moment point of a machine as a checked function of time."""
         zmp = machine.most_stable_point if self.zmp is None else self.zmp
         if callable(zmp):
             return lambda time: checked_point(zmp(time), "zmp")
@@ -144,26 +144,26 @@ class AccelerationOptions:
 
 
 class _TaskHierarchy:
-    """Joint accelerations for tasks of decreasing priority, each in the null space of those before."""
+    """Joint accelerations that perform tasks of decreasing priority, each in the null space of the tasks before."""
 
     def __init__(self, size: int) -> None:
         self.accelerations: Any = ca.DM.zeros(size)
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add a task, rows q'' = target for joint accelerations q'', with the least change of those so far."""
+        """Add a task `rows` q'' = `target` that the joint accelerations q'' shall satisfy with the least change."""
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
         self.projector = self.projector - ca.mtimes(inverse, projected)
 
     def add_free(self, direction: Any) -> None:
-        """Add joint accelerations, projected onto the null space of all tasks so far."""
+        """Add joint accelerations that are projected onto the null space of all tasks added before."""
         self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
 def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
-    """Raise ProblemError if a law is unknown, or needs more joints than the machine has.
+    """Raise ProblemError if a redundancy resolution law is unknown, or needs more joints than the machine has.
 
     Args:
         machine: The machine.
@@ -237,7 +237,7 @@ def accelerations(
 
 
 def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
-    """Return matrix and right side of a task of the joint accelerations that stabilises the centre of mass.
+    """Return matrix and right side of linear equations of joint accelerations that stabilise the centre of mass.
 
     `right` is C of equation (18), minus the moment of weight and wrenches about `place`, y*: it vanishes for a centre
     of mass at y*, and -C / (M g) is the distance of the centre of mass beyond y*.
@@ -256,12 +256,12 @@ def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, pla
 
 
 TIP_TOLERANCE = 1e-3
-"""Largest pose error of a motion that succeeds, m and rad."""
+"""Largest pose error up to which a motion counts as successful, m and rad."""
 
 
 @dataclass(frozen=True)
 class Stop:
-    """Reason why a motion ends before its horizon, with the time.
+    """Reason why a simulated motion ends before its horizon, and the time at which it ends.
 
     Attributes:
         reason: ``lift_off``: the vertical ground force is not positive. ``divergence``: a joint exceeds the speed
@@ -295,7 +295,7 @@ class AccelerationSolution:
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Names of the failures of the motion; () if there are none.
+        """Names of the requirements that the motion fails; empty if the motion succeeds.
 
         ``lift_off``, ``divergence``, ``breakdown`` as for Stop; ``leaves_foot``: the zero moment point leaves the
         support; ``joint_limits``; ``leaves_path``: a tip leaves its pose by more than 1e-3 (m or rad).
@@ -312,7 +312,7 @@ class AccelerationSolution:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the motion reaches the horizon on the ground, in the foot, within joint limits and on its path."""
+        """Whether the motion reaches its horizon and none of the `failures` occurs."""
         return not self.failures
 
     def __repr__(self) -> str:
@@ -336,7 +336,7 @@ def resolve_accelerations(
     step: float = 1e-3,
     options: AccelerationOptions | None = None,
 ) -> AccelerationSolution:
-    """Simulate a resolved-acceleration law from the start to the horizon, or until it fails.
+    """Simulate a standing machine under a resolved-acceleration law up to the horizon, or until the motion fails.
 
     Args:
         machine: A Standing machine.
@@ -392,7 +392,7 @@ def resolve_accelerations(
 
 
 class _Simulation:
-    """Integrator of joint positions and velocities under a law, with fixed steps, many of them in one call."""
+    """Integrator of joint positions and velocities under a control law that makes many fixed steps in one call."""
 
     def __init__(self, law: Any, n: int, step: float, options: AccelerationOptions) -> None:
         self.step, self._law, self._n = step, law, n
@@ -415,7 +415,7 @@ class _Simulation:
         self._many: dict[int, Any] = {}
 
     def advance(self, time: float, state: Array, count: int) -> Array:
-        """Return the states after each of `count` steps, nan after the integration fails. Shape (count, 2 n)."""
+        """Return joint positions and velocities (count, 2 n) after each of `count` steps; nan after a failure."""
         times = time + self.step * np.arange(count)
         if count not in self._many:
             self._many[count] = self._once.mapaccum("steps", count)
@@ -471,7 +471,7 @@ class _Recorder:
         return Stop("divergence", at, words)
 
     def results(self) -> tuple[StandingMotion, Array]:
-        """Return the recorded motion and its pose errors, shape (M,)."""
+        """Return the recorded motion, and the norm of its pose errors at each sample. Shape (M,)."""
         joined = {name: np.concatenate([record[name] for record in self._records]) for name in self._records[0]}
         gap = joined.pop("gap")
         return StandingMotion(**joined), gap

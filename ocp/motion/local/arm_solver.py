@@ -1,4 +1,4 @@
-"""All inverse kinematics solutions of an arm within its limits: joints to solve for, sampled joints and full turns.
+"""All inverse kinematics solutions of an arm within its limits; redundant joints are sampled.
 
 Six joints are solved for at once, in closed form or by elimination. Tasks that leave the orientation of the tip open
 and arms of fewer joints are brought to that form by revolute joints that the arm does not have, between its last joint
@@ -24,7 +24,7 @@ from ocp.motion.local.elimination import elimination_of
 __all__ = ["ArmSolver", "arm_solver", "sample_shares"]
 
 STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
-"""Steps of the sampled parameters between samples, as fractions of their ranges; irrational, so that none repeats."""
+"""Increments of the sampled parameters, as fractions of their ranges; irrational, so that no sample repeats."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class ArmSolver:
     upper: Array
 
     def redundant_positions(self, solver: PoseSolver, shares: Array) -> Array:
-        """Convert fractions of the ranges of a solver's redundant joints to joint positions. Shapes (M, k)."""
+        """Convert fractions of the joint ranges to positions of the redundant joints of a solver. Shapes (M, k)."""
         joints = list(solver.redundant)
         if not joints:
             return shares[:, :0]
@@ -114,7 +114,7 @@ class ArmSolver:
         return self._within_limits(solutions._replace(joints=solutions.joints[:, :n]), turns), doubtful
 
     def _within_limits(self, solutions: Solutions, turns: bool) -> Solutions:
-        """Return the IK solutions within the limits, repeated for all full turns of joints that stay within them."""
+        """Return the IK solutions within the limits and, with `turns`, all whole-turn shifts that keep the limits."""
         windows, order = self._windows, list(self.chain.order)
         start, shiftable = windows.low if turns else windows.middle, windows.shiftable
         joints = solutions.joints.copy()
@@ -147,7 +147,7 @@ class ArmSolver:
 
 @lru_cache(maxsize=256)
 def _whole_turns(counts: tuple[int, ...]) -> Array:
-    """Return all combinations of 0, 1, ..., count - 1 whole turns of some joints, rad. Shape (product, joints)."""
+    """Return all combinations of 0 to count - 1 whole turns of several joints, rad. Shape (combinations, joints)."""
     return np.asarray(TURN * np.indices(counts).reshape(len(counts), -1).T)
 
 
@@ -173,7 +173,7 @@ class _Windows(NamedTuple):
 
 
 def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = None) -> ArmSolver | None:
-    """Return the inverse kinematics solver of an arm; None if there is no choice of joints that can be solved for.
+    """Return the inverse kinematics solver of an arm; None if no choice of joints can be solved for.
 
     Args:
         chain: Chain of the arm.

@@ -1,4 +1,4 @@
-"""Serial chain from the world to a tip: its joint axes, and Newton's method for its inverse kinematics.
+"""Serial chain of joints from the world to a tip, with Newton's method for inverse kinematics.
 
 At the zero configuration each joint k has an axis in the world, a unit screw xi_k. The pose of the tip is the product
 of exponentials e_1 .. e_n H with e_k = exp(xi_k q_k) and the pose H at zero (Brockett 1984). A revolute screw satisfies
@@ -24,7 +24,7 @@ from ocp.problem.values import Sampler
 __all__ = ["TURN", "Chain", "Motion", "Solutions", "SymbolicAxis", "compose", "inverse"]
 
 TURN = 2 * np.pi
-"""Full turn, rad."""
+"""Angle of a full turn, rad."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ NEWTON = NewtonSettings()
 
 
 class Motion(NamedTuple):
-    """Rigid motions of M samples: rotation matrices `turn` (M, 3, 3) and translations `shift` (M, 3)."""
+    """M rigid motions, given by rotation matrices `turn` (M, 3, 3) and translations `shift` (M, 3)."""
 
     turn: Array
     shift: Array
@@ -73,7 +73,7 @@ class Motion(NamedTuple):
         return Motion(self.turn[chosen], self.shift[chosen])
 
     def after(self, first: Motion) -> Motion:
-        """Return the composition of motions: first the given ones, then these."""
+        """Return the motions that result if the motions `first` are applied before these motions."""
         return Motion(self.turn @ first.turn, self.at(first.shift))
 
     def rotate(self, vectors: Array) -> Array:
@@ -86,7 +86,7 @@ class Motion(NamedTuple):
 
     @property
     def inverse(self) -> Motion:
-        """The inverse motions."""
+        """Inverses of the rigid motions."""
         turn = self.turn.transpose(0, 2, 1)
         return Motion(turn, -(turn @ self.shift[:, :, None])[:, :, 0])
 
@@ -100,7 +100,7 @@ class SymbolicAxis(NamedTuple):
 
     @classmethod
     def of(cls, direction: Array, point: Array, revolute: bool) -> SymbolicAxis:
-        """Return a joint axis as constant CasADi expressions, which symbolic motions can then transform."""
+        """Convert a numeric joint axis to constant CasADi expressions, which symbolic rigid motions can transform."""
         return cls(expression(direction), expression(point), revolute)
 
     def moved(self, motion: Frame) -> SymbolicAxis:
@@ -108,19 +108,19 @@ class SymbolicAxis(NamedTuple):
         return self._replace(direction=ca.mtimes(motion.rotation, self.direction), point=motion.point(self.point))
 
     def frame(self, position: Any) -> Frame:
-        """Return the rigid motion about or along the axis that a joint position causes."""
+        """Return the rigid motion, about a revolute axis or along a prismatic one, that a joint position causes."""
         if not self.revolute:
             return Frame(ca.DM.eye(3), self.direction * position)
         turn = rotation(self.direction, position)
         return Frame(turn, self.point - ca.mtimes(turn, self.point))
 
     def angle(self, start: Any, end: Any) -> Any:
-        """Return the angle about the axis that turns a vector towards another, rad."""
+        """Return the angle of the rotation about the axis that turns one vector towards another, rad."""
         across = start - ca.dot(start, self.direction) * self.direction
         return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
 
     def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
-        """Return the coefficients of 1, cosine and sine in the scalar product of a fixed and a rotated vector.
+        """Return the scalar product of a fixed and a rotated vector as coefficients of 1, cos(angle) and sin(angle).
 
         The product is fixed . R(sign angle) vector, with the rotation R about the axis. Shape (1, 3).
         """
@@ -160,7 +160,7 @@ class Solutions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Joint axes of an arm at the zero configuration, in the world.
+    """Serial chain of an arm: its joint axes at the zero configuration, in world coordinates.
 
     Attributes:
         axes, points: Directions of the axes of all joints, and points on them. Shapes (n, 3), m.
@@ -180,7 +180,7 @@ class Chain:
 
     @classmethod
     def of(cls, machine: Machine) -> Chain | None:
-        """Return the chain from world to tip of a machine; None if its base moves, or a joint in it mimics another."""
+        """Return the serial chain from world to tip of a machine; None if the base moves or a joint mimics another."""
         robot = machine.robot
         path = () if robot.tip is None else [joint for joint in robot.path_to(robot.tip_link) if joint.moves]
         if machine.base_size or any(joint.mimic is not None for joint in path):
@@ -197,7 +197,7 @@ class Chain:
         return cls(axes, points, revolute, position, np.array(ca.DM(pose.rotation)), order, size)
 
     def extend(self, axes: Array, points: Array) -> Chain:
-        """Return the chain with added revolute joints between the last joint and the tip. Shapes (k, 3), (k, 3)."""
+        """Return the chain with k revolute joints, given by axes and points (k, 3), added before the tip."""
         n, count = len(self.axes), len(axes)
         return replace(
             self,
@@ -283,7 +283,7 @@ class Chain:
         return self.distinct(Solutions(pose[good], joints[good], _are_singular(jacobians[good])), free, goal)
 
     def union(self, first: Solutions, second: Solutions, free: Sequence[int], goal: Motion) -> Solutions:
-        """Return the union of two sets of IK solutions, without repetitions."""
+        """Return the union of two sets of IK solutions, in which no solution occurs twice."""
         if not len(first.pose):
             return second
         parts = (np.concatenate(pair) for pair in zip(first, second, strict=True))
@@ -318,7 +318,7 @@ class Chain:
 
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the index pairs of solutions, sorted by pose, that belong to the same pose. Shapes (P,)."""
+    """Return the index pairs of solutions that belong to the same pose; solutions are sorted by pose. Shapes (P,)."""
     if not len(pose) or pose[0] == pose[-1]:
         return _pairs(len(pose))
     first = np.arange(len(pose))[:, None]
@@ -331,12 +331,12 @@ def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArra
 
 @lru_cache(maxsize=64)
 def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return all pairs of the indices 0, ..., count - 1. Shapes (P,)."""
+    """Return the first and the second elements of all pairs of the numbers 0 to count - 1. Shapes (P,)."""
     return np.triu_indices(count, 1)
 
 
 def _damped_steps(jacobian: Array, missed: Array) -> Array:
-    """Return the joint steps of Newton's method, damped at singularities. Shapes (K, 6, m), (K, 6) to (K, m)."""
+    """Return the joint steps (K, m) of Newton's method for pose errors (K, 6), damped at singularities."""
     transposed, error = jacobian.transpose(0, 2, 1), missed[:, :, None]
     if jacobian.shape[2] < 6:
         normal = transposed @ jacobian + NEWTON.damping * np.eye(jacobian.shape[2])
@@ -346,9 +346,10 @@ def _damped_steps(jacobian: Array, missed: Array) -> Array:
 
 
 def _are_singular(jacobians: Array) -> NDArray[np.bool_]:
-    """Return which of the Jacobians (K, 6, m) have a singular value below that of regular solutions.
+    """Return which of the Jacobians (K, 6, m) are singular or nearly so, by their least singular value.
 
-    The product of the five others is at most (|J|^2 / 5)^(5 / 2), so that the determinant tells most regular ones.
+    The product of the five other singular values is at most (|J|^2 / 5)^(5 / 2). Hence the determinant suffices to
+    recognise most regular Jacobians.
     """
     singular = np.ones(len(jacobians), dtype=bool)
     if jacobians.shape[2] == 6:

@@ -1,4 +1,4 @@
-"""Solvers of the inverse kinematics of six joints, and the closed forms of arms whose geometry has one.
+"""Inverse kinematics of six joints: interface of the solvers, and closed forms for arms with a suitable geometry.
 
 A `PoseSolver` solves for six joints of a chain; further joints are redundant, and their positions are given.
 
@@ -39,12 +39,12 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class NearbySettings:
-    """Settings of the search for missing solutions at poses near those for which some may be missing.
+    """Settings of the search for missing IK solutions of a pose by solving poses near this pose.
 
     Attributes:
-        pairs: Number of pairs of poses near each.
-        distance: Their typical distance, rad and share of the size of the arm.
-        seed: Seed of their directions.
+        pairs: Number of pairs of nearby poses for each pose.
+        distance: Typical distance of nearby poses, rad and share of the size of the arm.
+        seed: Seed of the directions of nearby poses.
     """
 
     pairs: int = 2
@@ -57,7 +57,7 @@ NEARBY = NearbySettings()
 
 @dataclass(frozen=True, eq=False)
 class PoseSolver(ABC):
-    """Inverse kinematics of a chain for given positions of its redundant joints (base class).
+    """Base class of solvers of the inverse kinematics of a chain for given positions of its redundant joints.
 
     Attributes:
         chain: The chain.
@@ -74,7 +74,7 @@ class PoseSolver(ABC):
 
     @abstractmethod
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return IK solutions at M poses of the tip, all of them at regular poses.
+        """Return the IK solutions at M poses of the tip; at singular poses some solutions may be missing.
 
         Args:
             tips: Poses of the tip in the world.
@@ -109,7 +109,7 @@ class PoseSolver(ABC):
         return solutions, doubtful
 
     def _nearby(self, tips: Motion) -> Iterator[Motion]:
-        """Yield poses near the given ones, in pairs on opposite sides, at which missing solutions may be found."""
+        """Yield poses near the given poses, in pairs on opposite sides, at which missing solutions may be found."""
         rng = np.random.default_rng(NEARBY.seed)
         for _ in range(NEARBY.pairs):
             turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
@@ -124,9 +124,9 @@ class PoseSolver(ABC):
 
 
 TINY = 1e-300
-"""Number that is added to divisors, so that a zero causes no exception."""
+"""Small number that is added to divisors to avoid divisions by zero."""
 SIX, SCARA = 6, 4
-"""Numbers of non-redundant joints of the arms that have closed forms."""
+"""Numbers of non-redundant joints of arms with closed forms: six in general, four for a SCARA."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ FORMS = FormSettings()
 
 @dataclass(frozen=True, eq=False)
 class ClosedForm(PoseSolver):
-    """Closed-form solution of the inverse kinematics of an arm.
+    """Solver of the inverse kinematics of an arm in closed form.
 
     Attributes:
         kind: "meeting" or "parallel", by the axes of three of its joints, or "scara".
@@ -162,7 +162,7 @@ class ClosedForm(PoseSolver):
     triple: tuple[int, ...]
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return IK solutions at M poses; families of solutions may be incomplete. See `PoseSolver.solve_regular`."""
+        """Return IK solutions at M poses of the tip; continuous families of solutions may be incomplete."""
         arguments = np.concatenate([redundant, tips.turn.reshape(-1, 9), tips.shift], axis=1)
         count, families = len(arguments), np.zeros(len(arguments), dtype=bool)
         if self.kind == "scara":
@@ -183,7 +183,7 @@ class ClosedForm(PoseSolver):
         return self.chain.refine(pose, joints, self.free, tips), np.zeros_like(families), families
 
     def _loop(self) -> _SymbolicLoop:
-        """Return the loop closure equation of the free joints, opened so that its meeting or parallel axes are last."""
+        """Return the loop closure equation of the free joints; the meeting or parallel axes are the last ones."""
         chain = self.chain
         symbols, fixed = ca.SX.sym("pose", len(self.redundant) + 12), Frame(ca.DM.eye(3), ca.DM(3, 1))
         points, axes = chain.points.copy(), list[SymbolicAxis]()
@@ -202,12 +202,12 @@ class ClosedForm(PoseSolver):
         return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
 
     def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
-        """Return the solutions, lists of joint positions in `order`, as one column in the order of the free joints."""
+        """Convert solutions, lists of joint positions in `order`, to one column in the order of the free joints."""
         return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
 
     @cached_property
     def _planar_function(self) -> Sampler:
-        """Function from a pose to two solutions of a SCARA, and the distance by which the pose is out of reach."""
+        """Function of a tip pose that returns two IK solutions of a SCARA and the relative excess over its reach."""
         symbols, axes, order, goal = self._loop()
         triple = [axes[order.index(j)] for j in self.triple]
         slide = next(axis for axis in axes if not axis.revolute)
@@ -218,9 +218,9 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function of a tip pose that returns angle pairs of the first and third joint, residuals and conditioning.
+        """Function of a tip pose that returns candidate angles of two joints, their residuals and their conditioning.
 
-        The joints are x and z of the loop in the order of `_loop`.
+        The two joints are the first and the third of `_loop`, x and z.
         """
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
@@ -246,7 +246,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function that completes a tip pose and an angle pair of `_pair_function` to two solutions of all free joints.
+        """Function of a tip pose and angles of `_pair_function` that returns two IK solutions of all free joints.
 
         Further outputs are the excess over the reach and the lever arm of joint y, which is between x and z.
         """
@@ -281,7 +281,7 @@ class _SymbolicLoop(NamedTuple):
 
 
 def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[ClosedForm, ...]:
-    """Return the closed-form solvers of a chain, one for each choice of redundant joints that admits one.
+    """Return the closed-form solvers of a chain, one for each choice of redundant joints that has a closed form.
 
     Args:
         chain: The chain.
@@ -308,7 +308,7 @@ def is_scara(chain: Chain) -> bool:
 
 
 def _six_joint_forms(chain: Chain, lockable: tuple[int, ...]) -> tuple[ClosedForm, ...]:
-    """Return closed-form solvers with six free revolute joints, one for each choice of redundant joints."""
+    """Return the closed-form solvers with six free revolute joints, one for each suitable set of redundant joints."""
     n, forms = len(chain.order), list[ClosedForm]()
     for redundant in combinations(lockable, n - SIX) if n >= SIX else ():
         if not chain.revolute[[j for j in chain.order if j not in redundant]].all():
@@ -344,7 +344,7 @@ def _meeting_point(chain: Chain, triple: tuple[int, ...]) -> tuple[Array, float]
 
 @cache
 def _pair_solver() -> Any:
-    """Return the CasADi function that solves two equations for two angles, with residuals and conditioning.
+    """Return the CasADi function that solves two trigonometric equations for two angles, with residuals.
 
     The equations are a [cos, sin](first) + b [cos, sin](second) = c. The singular value decomposition b = L diag(s) R,
     in closed form, separates them: with a' = L' a and c' = L' c the remainders w = c' - a' [cos, sin](first) satisfy
@@ -414,7 +414,7 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Return the mean of the two roots of a linear equation in cosine and sine, and half their difference.
+    """Return the mean and half the difference of the two roots of an equation linear in cosine and sine.
 
     The equation is cosine cos(q) + sine sin(q) = value. Without a root, return the angle nearest to a solution.
     """
@@ -423,7 +423,7 @@ def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
 
 
 def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
-    """Return two solutions of three joints with meeting axes (goal rotation) or parallel axes (goal planar motion).
+    """Return two solutions of three joints that produce a rotation (meeting axes) or a planar motion (parallel axes).
 
     The second result is the share by which the motion exceeds what the axes can do; the solutions are then the nearest.
     """

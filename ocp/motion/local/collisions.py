@@ -73,7 +73,7 @@ def distances_along(
     cutoff: float = np.inf,
     pairs: Sequence[int] | None = None,
 ) -> Array:
-    """Return the distances of all pairs of bodies at samples of a motion, exact up to a cutoff. Shape (M, n), m.
+    """Return the distances of all pairs of bodies at samples of a motion, m. Shape (M, pairs).
 
     The penetration depth of a pair with a mesh or a cylinder is an estimate.
 
@@ -94,7 +94,7 @@ def distances_along(
 
 
 def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:
-    """Return the pairs of bodies closer than the clearance, each at its closest sample, the closest pair first.
+    """Return the pairs of bodies that come closer than the clearance, at their closest samples, sorted by distance.
 
     The arguments are those of `distances_along`.
     """
@@ -113,16 +113,16 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
 
 
 def _cover_distance(scene: CollisionScene, pair: int, base: Array, joints: Array, time: float) -> float:
-    """Return the smallest distance between the shapes that cover the two bodies of a pair, m."""
+    """Return the smallest distance between the convex shapes that cover the two bodies of a pair, m."""
     frames = frames_of(prepared_pairs(scene)[0](base[None], joints[None], np.full((1, 1), time))[0])
     rows = np.array([(*covers, scene.pairs[pair, 2]) for covers in scene.cover_pairs[pair]])
     return float(BodyPairs([*scene_hulls(scene).values()], rows, {}).distances(frames).min())
 
 
 def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
-    """Return the function for the body frames of a scene and the evaluator of its pair distances, both cached.
+    """Return the cached evaluators of the body frames and of the pair distances of a collision scene.
 
-    The arguments of the function are base, joints and time.
+    The arguments of the evaluator of body frames are base, joints and time.
     """
     cached: tuple[Sampler, BodyPairs] | None = scene.__dict__.get("_prepared")
     if cached is None:
@@ -150,7 +150,7 @@ def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -
 
 @dataclass(frozen=True)
 class SlidingSettings:
-    """Settings of `slide_apart`.
+    """Settings of `slide_apart`, which moves configurations out of collision along self-motions.
 
     Attributes:
         steps: Largest number of steps.
@@ -199,7 +199,7 @@ def slide_apart(
     target = scene.clearance + SLIDING.spare
 
     def distances(configurations: Array) -> Array:
-        """Return the distances of all pairs; above the target they may be lower bounds. Shape (K, P)."""
+        """Return the distances (K, P) of all pairs of bodies; beyond the distance `target`, lower bounds suffice."""
         return distances_along(scene, base, configurations, np.full(len(configurations), time), cutoff=target)
 
     best, current, clearance = joints.copy(), joints.copy(), np.full(count, -np.inf)

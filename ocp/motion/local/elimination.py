@@ -41,9 +41,9 @@ COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPL
 
 
 def _half_angle_products() -> Array:
-    """Return the products of full-angle and half-angle terms as coefficients of half-angle terms. Shape (3, 2, 4).
+    """Return the coefficients that express products of full-angle and half-angle functions by half-angle functions.
 
-    The terms are 1, cos h, sin h; cos h/2, sin h/2; and the latter two with cos 3h/2, sin 3h/2.
+    The functions are 1, cos h, sin h; cos h/2, sin h/2; and the latter two with cos 3h/2, sin 3h/2. Shape (3, 2, 4).
     """
     products = np.zeros((3, 2, 4))
     products[0] = np.eye(2, 4)
@@ -101,7 +101,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def axial(turn: Array) -> Array:
-    """Return the axial vectors of rotations, 2 sin(angle) times the axis. Shapes (M, 3, 3) to (M, 3)."""
+    """Return the axial vectors (M, 3) of rotation matrices (M, 3, 3), which are 2 sin(angle) times the axis."""
     return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
 
 
@@ -148,7 +148,7 @@ class LoopOpening(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """Loop closure equations of six joints at M poses, opened at a joint: the product of their motions is the goal."""
+    """Loop closure equations of six joints at M poses: the product of the joint motions is the goal motion."""
 
     joints: list[Axis]
     goal: Motion
@@ -156,7 +156,7 @@ class _Loop(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Candidate solutions that result from one opening of the loop.
+    """Candidate IK solutions that result from one opening of the kinematic loop.
 
     Attributes:
         pose: Index of the pose of each candidate. Shape (K,).
@@ -184,7 +184,7 @@ class Elimination(PoseSolver):
     openings: tuple[LoopOpening, ...]
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return IK solutions at M poses, all of them at regular poses; see `PoseSolver.solve_regular`.
+        """Return the IK solutions at M poses of the tip; some may be missing. See `PoseSolver.solve_regular`.
 
         Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
         number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
@@ -207,19 +207,19 @@ class Elimination(PoseSolver):
         return solutions, mixed, doubtful
 
     def prescribe(self, redundant: Array) -> Array:
-        """Return configurations with given positions of the redundant joints (M, k), others at 0. Shape (M, n)."""
+        """Return configurations (M, n) with given positions (M, k) of the redundant joints and the others at 0."""
         joints = np.zeros((len(redundant), len(self.chain.axes)))
         joints[:, list(self.redundant)] = redundant
         return joints
 
     def refine(self, pose: NDArray[np.intp], free: Array, prescribed: Array, goal: Motion) -> Solutions:
-        """Refine rough positions of the free joints (K, m) at poses (K,) by Newton's method; return the solutions."""
+        """Refine rough positions (K, m) of the free joints by Newton's method; return the IK solutions."""
         joints = prescribed[pose]
         joints[:, self.free] = free
         return self.chain.refine(pose, joints, self.free, goal)
 
     def loop(self, prescribed: Array, goal: Motion) -> tuple[list[Axis], Motion]:
-        """Return the axes of the free joints, and the motion that they must produce at given redundant positions."""
+        """Return the axes of the free joints and the rigid motion that these joints must produce to reach a goal."""
         chain, fixed, axes = self.chain, Motion(np.eye(3)[None], np.zeros((1, 3))), list[Axis]()
         for j in chain.order:
             axis = Axis(chain.axes[[j]], chain.points[[j]], bool(chain.revolute[j])).moved(fixed)
@@ -232,7 +232,7 @@ class Elimination(PoseSolver):
 
 
 def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | None:
-    """Return the elimination solver of six joints of a chain; None if all its eigenvalue problems are singular.
+    """Return the elimination solver of six joints of a chain; None if all eigenvalue problems are singular.
 
     At random configurations the openings are sorted by the condition of their problems. The first ones are taken that
     find the most of these configurations again, and the most solutions.
@@ -272,16 +272,17 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
 
 
 def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
-    """Open the loop at a joint: joints before it move to the end of the loop, transformed by the goal pose."""
+    """Open the kinematic loop at a joint: transform the joints before that joint by the goal and append them."""
     back = goal.inverse
     joints = [axes[(first + i) % SIX] for i in range(SIX)]
     return _Loop([axis.moved(back) if i >= SIX - first else axis for i, axis in enumerate(joints)], goal, size)
 
 
 def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
-    """Separate the first two joints of a loop: return singular vectors and ranks of their terms, and the other terms.
+    """Separate the terms of the first two joints of a loop, which are eliminated, from the terms of the other joints.
 
-    Shapes (M, 15, 15), (M,), (M, 15, 3, 3, 3), the last (1, ...) if it is the same for all poses.
+    Return singular vectors (M, 15, 15) and ranks (M,) of the terms to eliminate, and coefficients (M, 15, 3, 3, 3) of
+    the other terms, or (1, ...) if these are the same for all poses.
     """
     goal, size, c = loop.goal, loop.size, loop.joints[5]
     center = sum(axis.point for axis in loop.joints) / SIX
@@ -299,7 +300,7 @@ def _reverse_axis(axis: Axis) -> Axis:
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return the coordinates of a line after joint motions, as coefficients of products of cosines and sines.
+    """Return the conformal coordinates of a moved line element as coefficients of products of cosines and sines.
 
     Args:
         axes: Axes of the joints, the one that moves the line element first in front.
@@ -355,7 +356,7 @@ def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]
 
 
 def _companions(matrices: Array) -> tuple[Array, Array, Array]:
-    """Return companion matrices of polynomial eigenvalue problems, their poles, and reciprocal condition numbers.
+    """Return companion matrices and poles of polynomial eigenvalue problems, and reciprocal condition numbers.
 
     The eigenvalues are tan((h - pole) / 2) of an angle h. Shapes (M, 24, 24), (M,), (M,).
     """
@@ -388,7 +389,7 @@ def _inverses(matrices: Array) -> Array:
 
 
 def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpening) -> _Candidates:
-    """Return candidate IK solutions from the real eigenvalues, single or double, of one opening of the loop."""
+    """Return candidate IK solutions from the real eigenvalues of one opening of the kinematic loop."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)
     matrices = _matrices(singular_vectors[:, :, opening.rank :], remaining, opening.roles)
@@ -415,9 +416,10 @@ def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpen
 
 
 def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
-    """Return the two angles of eigenvectors (K, 4, 3), whose entries are products of functions of each angle.
+    """Recover two joint angles from each of K eigenvectors (4, 3), whose entries are products of two functions.
 
-    The third result is the largest deviation from such products, of which the largest is 1.
+    One function is of half the first angle, the other of the second angle. The third result is the largest deviation
+    of an entry from such products, relative to the largest entry.
     """
     flat, rows = vectors.reshape(-1, 12), np.arange(len(vectors))
     largest = flat[rows, np.abs(flat).argmax(axis=1)]
@@ -438,7 +440,7 @@ def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
 
 
 def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
-    """Return the positions (K, 6) of all joints of a loop from those of its third, fourth and fifth joint (K, 3).
+    """Complete positions (K, 3) of the third, fourth and fifth joint of a loop to positions (K, 6) of all its joints.
 
     The motions of x and y are found from e_x^-1 (G p, G l) = e_y (p', l'), which is linear in their cosines and sines.
     """

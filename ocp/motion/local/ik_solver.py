@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 ROTATION_TOLERANCE = 1e-6
-"""Largest deviation of a rotation matrix from an orthonormal one."""
+"""Largest accepted entry of R R^T - 1 for a rotation matrix R."""
 
 
 class ToolFreedom(Enum):
@@ -47,7 +47,7 @@ class ToolFreedom(Enum):
 
 
 class Incompleteness(Flag):
-    """Reasons why IK configurations of a pose may be missing; without a flag, all are found.
+    """Reasons why IK configurations of a pose may be missing; no flag means that all configurations are found.
 
     Attributes:
         SAMPLED: The arm is redundant. Its configurations form families, of which those at samples are listed.
@@ -62,7 +62,7 @@ class Incompleteness(Flag):
 
 @dataclass(frozen=True, eq=False)
 class IkConfigurations:
-    """IK configurations of an arm at N poses of its tip; each reaches its pose up to rounding.
+    """Configurations in which the tip of an arm reaches N given poses, up to rounding errors.
 
     Attributes:
         joints: Configurations of all poses. Shape (K, n), rad or m.
@@ -91,7 +91,7 @@ class IkConfigurations:
 
 
 def idle_positions(lower: Array, upper: Array) -> Array:
-    """Return positions for joints that move no tip: the middle of the range, or the allowed value nearest to 0."""
+    """Return positions for joints that move no tip: the middle of a finite range, else the value nearest to 0."""
     with np.errstate(invalid="ignore"):
         middle = (lower + upper) / 2
     return np.asarray(np.where(np.isfinite(middle), middle, np.clip(0.0, lower, upper)))
@@ -117,7 +117,7 @@ class IkSolver:
         limits: bool = True,
         samples: int = 36,
     ) -> None:
-        """Prepare the solver of an arm.
+        """Prepare the inverse kinematics of one arm for poses of one kind.
 
         Args:
             machine: Machine on a fixed base.
@@ -203,7 +203,7 @@ class PreparedArm:
     def of(
         cls, tip: Machine, lower: Array, upper: Array, *, free: ToolFreedom, tool_axis: Array, within: float = 0.0
     ) -> PreparedArm | None:
-        """Return the prepared arm; None if its base moves, or if no six joints determine the pose of its tip."""
+        """Prepare an arm for inverse kinematics; return None if its base moves or no six joints determine its tip."""
         chain = Chain.of(tip)
         if chain is None or (free is ToolFreedom.CONE and len(chain.order) < SIX):
             return None
@@ -231,7 +231,7 @@ class PreparedArm:
     def solve(
         self, solver: PoseSolver, positions: Array, rotations: Array, shares: Array, *, turns: bool = True
     ) -> tuple[Array, NDArray[np.intp], tuple[Incompleteness, ...]]:
-        """Return IK configurations (K, n), indices of their poses (K,), and why some may be missing at each of N poses.
+        """Return IK configurations (K, n), the indices (K,) of their poses, and why some may be missing at each pose.
 
         Args:
             solver: One of the solvers of the arm.
@@ -275,7 +275,7 @@ class PreparedArm:
         return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
 
     def _rotations(self, shares: Array) -> Array:
-        """Return sampled rotations of the tip in its own frame that the task leaves free. Shape (S, 3, 3).
+        """Return samples of those rotations of the tip, in the tip frame, that the task leaves free. Shape (S, 3, 3).
 
         `shares` (S, 1) or (S, 3) are fractions of full turns of roll and azimuth, and of the area of the cone's cap.
         """
@@ -323,7 +323,9 @@ class IkBranches:
     def configurations(
         self, targets: Array, count: int, number: int = 0, *, turns: bool = True, choices: int | None = None
     ) -> IkConfigurations:
-        """Return IK configurations of all branches within the limits; unlimited joints are between -pi and pi.
+        """Return IK configurations of all branches within the joint limits, at samples of the free parameters.
+
+        Joints without limits are between -pi and pi.
 
         Args:
             targets: Targets of the equations. Shape (size,).
@@ -363,7 +365,7 @@ class IkBranches:
 
 
 def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranches | None:
-    """Return the solver of all IK branches of a pose task; None if there is none for this task or machine.
+    """Return the solver of all IK branches of a pose task; None if no such solver exists for the task or machine.
 
     Args:
         equations: Equations of one pose of the tip of an arm in the world: the whole pose, a position and a direction
@@ -397,7 +399,7 @@ def ik_branches(equations: TaskEquations, lower: Array, upper: Array) -> IkBranc
 def ik_configurations(
     machine: Machine, task: TipTask, *, time: float = 0.0, limits: bool = True, samples: int = 36
 ) -> IkConfigurations:
-    """Return IK configurations of an arm on all branches of a pose task, and whether they are complete.
+    """Return IK configurations of an arm on all branches of a pose task, and whether the list is complete.
 
     For many poses of one arm, prepare an `IkSolver`.
 

@@ -140,7 +140,7 @@ class Unreachable(ProblemError):
         self.distance, self.angle = distance, angle
 
     def __reduce__(self) -> Any:
-        """Pickle the arguments together with the fields."""
+        """Return what pickle needs to rebuild the error with its arguments and fields."""
         return type(self), (*self.args, self.joints, self.pose_error), self.__dict__
 
 
@@ -156,7 +156,7 @@ def inverse_kinematics(
     scene: CollisionScene | None = None,
     options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
-    """Return distinct joint vectors at which the machine satisfies its pose tasks, in order of preference.
+    """Return distinct configurations in which the machine satisfies its pose tasks, sorted by decreasing quality.
 
     If the task is one pose of the tip of an arm on a fixed base, its solutions are listed on all branches, see
     `ik_configurations`. With more joints than rows they form families, of which members at samples of the free
@@ -242,9 +242,9 @@ def inverse_kinematics_at(
     near: Array | None = None,
     options: IkOptions = IK_OPTIONS,
 ) -> list[IkSolution]:
-    """Return IK solutions of a fixed-base machine by iterations from initial guesses, without listing branches.
+    """Return IK solutions of a fixed-base machine for numerical task targets, by iterations from initial guesses.
 
-    `targets` are the numerical targets of the equations; see also `inverse_kinematics`.
+    Unlike `inverse_kinematics`, this function does not list all branches first.
 
     Raises:
         Unreachable: No start leads to the pose.
@@ -256,7 +256,7 @@ def inverse_kinematics_at(
 
 @dataclass(frozen=True)
 class _MultiStart:
-    """Iterative solver of pose tasks at one time, from many initial guesses at once."""
+    """Iterative solver of the pose tasks of one sample time that starts from many initial guesses at once."""
 
     equations: TaskEquations
     base: Array
@@ -266,9 +266,9 @@ class _MultiStart:
     options: IkOptions = IK_OPTIONS
 
     def solve(self, first: Array, random: int) -> list[IkSolution]:
-        """Return the distinct solutions to which initial guesses (K, n) lead, best first.
+        """Return the distinct IK solutions to which initial guesses (K, n) lead, sorted by decreasing quality.
 
-        Unlimited angles of the last `random` ones are wrapped.
+        Unlimited angles that result from the last `random` guesses are wrapped to -pi .. pi.
 
         Raises:
             Unreachable: There is no solution.
@@ -286,7 +286,10 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return solutions (K, n) on all branches if a solver exists, and the number of random guesses still needed."""
+        """List IK solutions (K, n) on all branches; return the list and the number of random guesses to complete it.
+
+        The list is empty if no solver of all branches exists.
+        """
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
             return np.zeros((0, len(self.lower))), count
@@ -299,14 +302,14 @@ class _MultiStart:
         return joints, count - len(joints)
 
     def iterate(self, joints: Array) -> tuple[Array, Array]:
-        """Iterate from configurations (K, n); return the final ones and their largest pose errors (K,)."""
+        """Run Gauss-Newton iterations from configurations (K, n); return final configurations and pose errors (K,)."""
         fixed = ca.DM(self.base), ca.DM(self.targets)
         function = self.equations.pose_residual_function
         options: Any = {"tolerance": self.options.tolerance, "iterations": int(self.options.iterations), "fixed": fixed}
         return gauss_newton(function, joints, self.lower, self.upper, **options)
 
     def rank(self, joints: Array, errors: Array) -> list[IkSolution]:
-        """Return the distinct solutions among configurations, by decreasing quality."""
+        """Return the distinct IK solutions among configurations, sorted by decreasing quality."""
         solved, lower, upper = np.flatnonzero(errors <= self.options.tolerance), self.lower, self.upper
         if not solved.size:
             return []
@@ -329,7 +332,7 @@ class _MultiStart:
 
 
 def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, *, near: Any = None, seed: int) -> Array:
-    """Return initial guesses: those of `near`, then `count` random ones within the joint limits. Shape (K, n)."""
+    """Return initial guesses: the configurations `near`, then `count` random ones within limits. Shape (K, n)."""
     size, rng = machine.joint_size, np.random.default_rng(seed)
     prismatic = np.array([joint.kind == "prismatic" for joint in machine.robot.moving_joints])
     span = np.where(prismatic, IK_SETTINGS.slide_spread, np.pi)
@@ -358,7 +361,7 @@ def gauss_newton(
     iterations: int,
     fixed: Sequence[Any] = (),
 ) -> tuple[Array, Array]:
-    """Run damped Gauss-Newton iterations from several starts; return joint positions (K, n) and residuals (K,).
+    """Run damped Gauss-Newton iterations from K starts; return joint positions (K, n) and largest residuals (K,).
 
     Args:
         function: CasADi Function of the joint positions and `fixed` that returns a residual and its Jacobian.
@@ -403,7 +406,7 @@ def gauss_newton(
 def distinct_solutions(
     solutions: list[IkSolution], revolute: NDArray[np.bool_], apart: float = IK_OPTIONS.apart
 ) -> list[IkSolution]:
-    """Return IK solutions that differ by at least `apart` in a joint; angles are compared modulo full turns."""
+    """Drop IK solutions whose joints all differ by less than `apart`, modulo full turns, from an earlier solution."""
     distinct: list[IkSolution] = []
     kept = np.zeros((len(solutions), len(revolute)))
     for solution in solutions:
@@ -416,7 +419,7 @@ def distinct_solutions(
 
 
 def spread_points(points: Array, count: int) -> NDArray[np.intp]:
-    """Return the indices of `count` mutually distant points of (K, n): each is the farthest from those before."""
+    """Select `count` of K points, each the farthest from the points selected before; return their indices."""
     chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
     while len(chosen) < count:
@@ -428,7 +431,7 @@ def spread_points(points: Array, count: int) -> NDArray[np.intp]:
 def _closest_collisions(
     solutions: list[IkSolution], scene: CollisionScene, base: Array, time: float
 ) -> list[Collision | None]:
-    """Return for each IK solution its closest pair of bodies if that violates the clearance, else None."""
+    """Return for each IK solution the closest pair of bodies if the pair violates the clearance, else None."""
     collisions = (find_collisions(scene, base[None], solution.joints[None], np.array([time])) for solution in solutions)
     return [next(iter(each), None) for each in collisions]
 
@@ -467,7 +470,7 @@ def unreachable_error(
     upper: Array,
     misses: tuple[float, float],
 ) -> Unreachable:
-    """Return the error that inverse kinematics found no solution, with the smallest pose error that was reached.
+    """Return an error that inverse kinematics found no solution; it states the smallest pose error reached.
 
     Args:
         misses: Distance, m, and angle, rad, of the nearest configuration from the target.
@@ -490,6 +493,6 @@ def unreachable_error(
 
 
 def describe_miss(distance: float, angle: float) -> str:
-    """Describe a pose error by its distance, m, and angle, rad; leave out one that is only rounding."""
+    """Describe a pose error by its distance, m, and angle, rad; a part that is only rounding error is left out."""
     parts = [(distance, "m"), (angle, "rad")]
     return " and ".join(f"{value:.3g} {unit}" for value, unit in parts if value > 1e-9 * (distance + angle)) or "0 m"

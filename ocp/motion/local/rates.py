@@ -77,7 +77,10 @@ class LocalSolution:
         return f"<LocalSolution of {self.t[-1]:.6g} s, {self.joints.shape[1]} joints: cost {self.cost[-1]:.6g}{end}>"
 
     def at(self, time: float) -> dict[str, Array]:
-        """Interpolate the motion at a time: "base" and "joints" cubically, "joint_rates" linearly, constant outside."""
+        """Interpolate the motion at a time: "base" and "joints" by cubic polynomials, "joint_rates" linearly.
+
+        Times outside the motion are clipped to its ends.
+        """
         time = float(np.clip(time, self.t[0], self.t[-1]))
         rates = np.array([np.interp(time, self.t, column) for column in self.joint_rates.T])
         if len(self.t) == 1:
@@ -97,7 +100,7 @@ class LocalSolution:
 
 @dataclass(frozen=True, eq=False)
 class RateOptions:
-    """Options of the computation of least joint rates, and of their integration.
+    """Options of resolved-rate control: weights and damping of the joint rates, and accuracy of the integration.
 
     Attributes:
         weights: Positive weights of the squared joint rates that are minimised. Shape (joint_size,); all 1 if None.
@@ -238,7 +241,7 @@ class _Model:
         return _cvodes(problem, start, times, tolerance)
 
     def one_interval(self, tolerance: float) -> Any:
-        """Return an integrator for any interval between samples, which starts at time p[0] and lasts p[1] seconds."""
+        """Return an integrator over any one interval between samples; its parameters are start time and duration, s."""
         span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
         rates = ca.Function("at", [self.time, self.state], [self.ode, self.running])
         ode, running = rates(span[0] + fraction * span[1], self.state)
@@ -311,7 +314,7 @@ def _manipulabilities(jacobians: Array) -> Array:
 
 
 CORRECTIONS = 2
-"""Number of pose corrections after each step; the second one leaves about the fourth power of the error."""
+"""Number of Newton corrections of the pose after each step; each correction about squares the remaining error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,7 +367,7 @@ class LocalMotion:
         return cls(motions[0].t, *(np.concatenate([getattr(motion, name) for motion in motions]) for name in names))
 
     def straight_to(self, joints: Array) -> LocalMotion:
-        """Return straight motions in joint space from where these motions start to configurations (K, joint_size)."""
+        """Return motions straight in joint space from the starts of these motions to configurations (K, joint_size)."""
         share = ((self.t - self.t[0]) / (self.t[-1] - self.t[0]))[:, None]
         displacement = (joints - self.joints[:, 0])[:, None]
         rates = np.repeat(displacement / (self.t[-1] - self.t[0]), len(self.t), axis=1)
@@ -412,7 +415,7 @@ def track_tasks(
     bases, configurations, errors = [base_now], [joints_now], list[Array]()
 
     def linearise(k: int) -> tuple[Array, Array, Array, Array]:
-        """Return Jacobians (K, m, n), task velocities (K, m), pose errors (K, m) and largest residuals (K,)."""
+        """Return Jacobians (K, m, n), task velocities (K, m), pose errors (K, m) and largest residuals at times[k]."""
         jacobian, right, error, residual, *leaning = task(base_now, joints_now, targets[:, k])
         matrix = jacobian.reshape(count, machine.joint_size, equations.size).transpose(0, 2, 1)
         errors_along = np.abs(residual).max(axis=1, initial=0.0)
@@ -426,7 +429,7 @@ def track_tasks(
         return matrix, right, error, np.where(np.isfinite(errors_along), errors_along, np.inf)
 
     def move_base(step: Array, duration: float) -> Array:
-        """Return the base configurations (K, base_size) after steps of the joints and a duration of drift."""
+        """Return the base configurations (K, base_size) after the joints make a step and the base drifts for a time."""
         if motion is None:
             return base_now
         drift = np.array(motion(base_now.T, joints_now.T, np.zeros_like(joints_now).T)).T
@@ -467,7 +470,10 @@ def track_tasks(
 
 
 def _cone_function(equations: TaskEquations) -> Any:
-    """Return the CasADi function (base, joints, targets) of the cosines that cone tasks limit, and their gradients."""
+    """Return the CasADi function that computes the cosines of tool-axis tilts, which cone tasks limit, and gradients.
+
+    A cone task keeps a tool axis within a cone. The inputs are base, joints and targets.
+    """
     machine = equations.machine
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
     targets = ca.SX.sym("targets", equations.target_function().numel_out())
@@ -481,7 +487,7 @@ def _cone_function(equations: TaskEquations) -> Any:
 def _damped_rates(
     matrix: Array, velocities: Array, weights: Array, damping: float, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the least joint rates (K, n) for task velocities (K, m); joints that would leave their limits stop."""
+    """Return the least joint rates (K, n) for task velocities (K, m); joints stop rather than leave their limits."""
     finite: Any = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(velocities).all(axis=1)
     matrix, velocities = np.where(finite[:, None, None], matrix, 0.0), np.where(finite[:, None], velocities, 0.0)
     size = np.sqrt((matrix**2).sum(axis=(1, 2)) / max(matrix.shape[1], 1))

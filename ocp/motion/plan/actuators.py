@@ -56,12 +56,12 @@ def weights_actuators(cost: Cost) -> bool:
 
 
 def without_actuators(limits: Limits) -> Limits:
-    """Return limits of positions and rates alone, without those of acceleration, jerk, torque and power."""
+    """Return the limits after removing those of acceleration, jerk, torque and power."""
     return replace(limits, acceleration=None, jerk=None, torque=None, power=None)
 
 
 def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
-    """Return the cost of a plan's motion by the trapezoidal rule, not counting joints that it keeps at rest."""
+    """Integrate the cost of a plan's motion by the trapezoidal rule; joints that are held at rest do not count."""
     machine = hold_joints(plan.machine, plan.held) if plan.held else plan.machine
     sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
     free = [name not in plan.held for name in plan.names]
@@ -82,12 +82,12 @@ def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
 
 @dataclass(frozen=True)
 class ActuatorDemand:
-    """Actuator demand of a motion that is largest relative to its limit: quantity, joint, time and values.
+    """Largest actuator demand of a motion relative to the limit: the quantity, joint, time and values.
 
     Attributes:
         quantity: "torque", "power" or "acceleration".
         joint: Name of the joint.
-        time: s.
+        time: Time, s.
         required, allowed: Values in `unit`.
     """
 
@@ -106,7 +106,7 @@ class ActuatorDemand:
 
     @classmethod
     def of(cls, plan: SolvedPlan, limits: Limits) -> ActuatorDemand | None:
-        """Return the actuator demand of a plan that is largest relative to its limit; None if no actuator is limited.
+        """Return the largest actuator demand of a plan relative to the limit; None if no actuator is limited.
 
         The limits are those of the joints that the plan does not keep at rest.
         """
@@ -139,7 +139,7 @@ class ActuatorDemand:
 
 
 def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
-    """Solve a request again within its actuator limits; the guess is a motion that ignores these limits.
+    """Solve a request within its actuator limits; the initial guess is a motion that ignores these limits.
 
     Args:
         request: The request. If many starts are equally good, that of the first solution is fixed.
@@ -185,7 +185,7 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
 
 
 def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError:
-    """Return an error whose text also states the actuator demand of the motion that ignores the limits."""
+    """Return the error with the actuator demand of the motion that ignores the limits added to its text."""
     details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
     words = "no motion within the actuator limits was found"
     if demand is not None:
@@ -196,7 +196,7 @@ def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError
 
 
 def _set_guess(motion: ToolMotion, unlimited: SolvedPlan) -> None:
-    """Set the guess of the states and controls of a problem to a motion that ignores actuator limits."""
+    """Set the initial guess of the states and controls of a problem to a motion that ignores actuator limits."""
     fractions = np.linspace(0.0, 1.0, CHECKED_TIMES)
     sample = unlimited.solution.at_fraction(fractions)
     pace = sample[PACE] if unlimited.rate_name == SLOPES else 1.0

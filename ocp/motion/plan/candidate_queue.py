@@ -1,4 +1,4 @@
-"""Best-first search over candidate motions: the one of least cost is advanced by one solution stage at a time.
+"""Best-first search over candidate motions: the candidate of least cost is advanced by one stage at a time.
 
 The cost on the coarse mesh is an estimate, and separation constraints or actuator limits can only increase it. Apart
 from the error of the coarse mesh, the cost of a candidate is therefore a lower bound of its final cost, and candidates
@@ -42,7 +42,7 @@ class Solver:
     error: SolveError | None = None
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """Advance a candidate by one solution stage or reject it; return it and any candidates derived from it."""
+        """Advance a candidate by one solution stage or reject it; return this candidate and any derived from it."""
         raise NotImplementedError
 
     def collision(self, candidate: Candidate) -> Reason | None:
@@ -54,11 +54,11 @@ class Solver:
         return False
 
     def reaches_limits(self, solution: Solution) -> bool:
-        """Return whether joints of a solution reach their limits, so that full turns of joints may change its cost."""
+        """Return whether joints of a solution reach their limits, where full turns of joints may change the cost."""
         return True
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error raised if no candidate passes its audit; it lists the reasons, the most frequent first."""
+        """Return the error that no candidate passes its audit, with the rejection reasons, the most frequent first."""
         reasons = Counter(str(candidate.reason) for candidate in candidates).most_common()
         listed = "\n".join(f"  {count} of {len(candidates)} candidates: {reason}" for reason, count in reasons)
         last = next((candidate.solution for candidate in candidates if candidate.solution is not None), None)
@@ -72,13 +72,13 @@ class Solver:
         return SolveError(f"{words}\n{cause}", cause.solution or last, cause.conflicts, candidates, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the first candidate as the plan, which also lists the other candidates."""
+        """Return the plan of the first candidate, in which the other candidates are listed as well."""
         raise NotImplementedError
 
 
 @dataclass
 class _Motion:
-    """Motion to which several candidates converge: the first one, and duplicates that wait for its result."""
+    """Motion to which several candidates converge: the first candidate, and duplicates that wait for its result."""
 
     first: Candidate
     waiting: list[Candidate] = field(default_factory=list)
@@ -92,7 +92,7 @@ class CandidateQueue:
     """
 
     def __init__(self, solver: Solver, settings: PlannerSettings, *, include_costlier: bool = False) -> None:
-        """Create an empty queue for a solver.
+        """Create an empty queue of candidates for the solver that advances them.
 
         Args:
             solver: Solver of the candidates.
@@ -106,7 +106,7 @@ class CandidateQueue:
 
     @property
     def cost(self) -> float:
-        """Cost of the best candidate that passed its audit; inf if none did."""
+        """Cost of the best candidate that passed its audit; inf if no candidate passed."""
         return min((candidate.cost for candidate in self.candidates if candidate.passed), default=np.inf)
 
     @property
@@ -126,7 +126,7 @@ class CandidateQueue:
         return seconds > self.settings.refusal_time and bool(self.candidates) and not (self.passed or self.collided)
 
     def run(self, seeds: Iterable[Candidate], include_costlier: bool = False) -> None:
-        """Advance the candidates of a batch until none of them can cost less than the best one that passed.
+        """Advance the candidates of a batch until none of them can cost less than the best candidate that passed.
 
         Initial guesses that differ by full turns of joints lead to motions that differ by the same turns, unless joint
         limits intervene: only the first of them is solved then.
@@ -167,7 +167,7 @@ class CandidateQueue:
         self.candidates += [each.with_rejection(Reason(Rejection.DUPLICATE)) for batch in waiting for each in batch]
 
     def plan(self) -> SolvedPlan:
-        """Return the plan of the best candidate that passed; it also lists the rejected ones with their reasons.
+        """Return the plan of the best candidate that passed, which also lists the rejected candidates with the reasons.
 
         Raises:
             SolveError: No candidate passed.
@@ -209,7 +209,7 @@ class CandidateQueue:
         return None
 
     def _prune(self, candidate: Candidate) -> Reason | None:
-        """Return the reason why a candidate need not be advanced; None if it must be advanced."""
+        """Return the reason why a candidate need not be advanced; None if the candidate must be advanced."""
         settings, stage, best = self.settings, candidate.stage, self.cost
         if stage is Stage.SEED:
             if not candidate.seed.tracked and np.isfinite(self._least):
@@ -231,7 +231,7 @@ class CandidateQueue:
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, candidate: Candidate) -> bool:
-        """Return whether a candidate of equal cost (if costlier ones are needed, also of equal path) has passed."""
+        """Return whether a candidate of equal cost (if costlier ones are kept, also of equal path) has passed."""
         passed = [c for c in self.candidates if c.passed]
         same = [c for c in passed if abs(candidate.cost - c.cost) <= self.settings.same_cost * c.cost]
         if not self._always_costlier or candidate.solution is None:
@@ -259,7 +259,7 @@ class CandidateQueue:
             self._push(advanced)
 
     def _replace(self, rejected: Candidate) -> None:
-        """Resume the duplicates that waited for a candidate which was rejected."""
+        """Resume the duplicates that waited for the result of a rejected candidate."""
         self._push_turned(rejected)
         for motion in [motion for motion in self._motions if motion.first.seed is rejected.seed]:
             self._motions.remove(motion)
@@ -267,7 +267,7 @@ class CandidateQueue:
                 self._push(candidate)
 
     def _push_turned(self, candidate: Candidate) -> None:
-        """Push the candidates whose initial guesses differ from that of a candidate by full turns of joints."""
+        """Queue the candidates whose initial guesses differ from a given candidate's guess by full turns of joints."""
         for turned in self._turned.pop(id(candidate.seed), []):
             self._push(turned)
 

@@ -75,7 +75,7 @@ class CandidateSolver(Solver):
         self._collisions: tuple[Solution | None, list[Collision]] = None, []
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """Advance a candidate by one solution stage or reject it; return it and any candidates derived from it."""
+        """Advance a candidate by one solution stage or reject it; return this candidate and any derived from it."""
         steps = {
             Stage.SEED: self._solve_seed,
             Stage.COARSE: self._separate,
@@ -103,18 +103,18 @@ class CandidateSolver(Solver):
         return [advanced, *self._free_start(advanced)]
 
     def with_own_cost(self) -> CandidateSolver:
-        """Return the solver with an additional last stage, which minimises the cost that the request defines."""
+        """Return the solver with an additional last stage, which minimises the cost function of the request."""
         solver = copy(self)
         solver.last = Stage.ACTUATED
         return solver
 
     def own_cost(self, candidate: Candidate) -> float:
-        """Return the cost of an audited candidate's motion, as the request defines it."""
+        """Return the value of the request's own cost function for the motion of an audited candidate."""
         assert self.request.cost is not None
         return cost_of_motion(self.plan([candidate]), self.request.cost)
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
-        """Return whether the task Jacobian is nearly singular along a local motion, so that the tasks are relaxed."""
+        """Return whether to relax the tasks, because the task Jacobian is nearly singular along a local motion."""
         return self._can_relax and is_nearly_singular(self.motion.stretches, local)
 
     @property
@@ -122,14 +122,14 @@ class CandidateSolver(Solver):
         return self.request.time_cost is None
 
     def _may_relax(self, candidate: Candidate) -> bool:
-        """Return whether to solve a rejected candidate again with relaxed tasks; in collisions that would not help."""
+        """Return whether relaxed tasks may save a rejected candidate; they cannot resolve collisions."""
         seed, reason = candidate.seed, candidate.reason
         if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or _is_separated(candidate):
             return False
         return self._can_relax and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
-        """Return why no motion was found: what the initial guess or, for relaxed tasks, the last iterate violates."""
+        """Return the rejection reason: what the initial guess or, if tasks are relaxed, the last iterate violates."""
         samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
         if not samples:
             return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
@@ -171,7 +171,7 @@ class CandidateSolver(Solver):
         return self._solve(candidate, Stage.SEPARATED if separated else Stage.COARSE, seed.guess)
 
     def _separate(self, candidate: Candidate) -> Candidate:
-        """Solve a candidate again with its colliding bodies separated; without collisions, solve on the fine mesh."""
+        """Solve a candidate again, with colliding bodies separated or, if no bodies collide, on the fine mesh."""
         collisions = self.collisions(candidate)
         if not collisions:
             return self._solve(candidate, Stage.FINE, candidate.solution)
@@ -181,7 +181,7 @@ class CandidateSolver(Solver):
         return self._separate_pairs(candidate, Stage.SEPARATED, collisions)
 
     def _refine(self, candidate: Candidate) -> Candidate:
-        """Solve again with colliding bodies separated; without collisions, refine the mesh for tips and limits."""
+        """Separate colliding bodies or, if no bodies collide, refine the mesh to reduce the errors of the motion."""
         if collisions := self.collisions(candidate):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
@@ -198,7 +198,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.REFINED, cost=solution.cost, solution=solution)
 
     def _audit(self, candidate: Candidate) -> Candidate:
-        """Audit a candidate; if it fails, refine its mesh or increase separation margins where that may help.
+        """Audit a candidate; if the audit fails, refine the mesh or increase separation margins where that may help.
 
         If many starts are equally good, the optimality of one of them is undetermined. The motion is then solved and
         audited with its start fixed.
@@ -244,7 +244,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return a new candidate with a free start configuration for a candidate that passed with a fixed one."""
+        """Return a new candidate with a free start, derived from a candidate that passed with a fixed start."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints
@@ -265,7 +265,7 @@ class CandidateSolver(Solver):
         return replace(candidate, cost=np.nan, solution=None).with_rejection(reason)
 
     def _separate_pairs(self, candidate: Candidate, stage: Stage, collisions: list[Collision]) -> Candidate:
-        """Solve a candidate again, with separation constraints for the pairs that collide."""
+        """Solve a candidate again, with separation constraints for the body pairs that collide."""
         assert candidate.constraints is not None
         separated = replace(candidate, constraints=candidate.constraints.with_collisions(collisions))
         return self._solve_again(separated, stage, self._collision_reason(collisions[0]))
@@ -279,7 +279,7 @@ class CandidateSolver(Solver):
     def prepared(
         self, candidate: Candidate, fine: bool, cost: float = np.inf
     ) -> tuple[ToolMotion, Collocation, Prepared]:
-        """Return the problem of a candidate, its first mesh, and its solver, prepared for guesses of similar cost."""
+        """Return the problem of a candidate, the first mesh, and the solver prepared for guesses of a similar cost."""
         settings, separated = self.settings, _is_separated(candidate)
         margins: tuple[Any, ...] = ()
         if candidate.constraints is not None and separated:
@@ -304,7 +304,7 @@ class CandidateSolver(Solver):
         return declared_motion(self.request, **options, relaxed=candidate.seed.relaxed)
 
     def _start(self, candidate: Candidate) -> Array:
-        """Return the start configuration, nan for free joints; joints that move separated bodies stay free."""
+        """Return the start configuration, nan for free joints; joints that move separated bodies are free too."""
         if candidate.seed.fixed:
             return candidate.start
         constraints = candidate.constraints
@@ -315,7 +315,7 @@ class CandidateSolver(Solver):
     def _options(
         self, motion: ToolMotion, mesh: Collocation, cost: float, options: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return solver options; for separated bodies, the cost of the guess limits the initial barrier parameter.
+        """Return solver options; if bodies are separated, the cost of the guess limits the initial barrier parameter.
 
         An interior-point method with barrier parameter mu leads to a point whose cost exceeds the least one by mu for
         each limit (Boyd, Vandenberghe 2004, section 11.2.2). If that is more than the cost of the guess, the barrier
@@ -339,7 +339,7 @@ class CandidateSolver(Solver):
     def _audit_and_refine(
         self, motion: ToolMotion, mesh: Collocation, solution: Solution, check: bool
     ) -> tuple[Solution, Audit]:
-        """Audit a motion, and solve it on finer meshes if the audit requires that; return motion and audit.
+        """Audit a solution and, if the audit requires it, solve on finer meshes; return the last solution and audit.
 
         With `check`, a solve that fails on a finer mesh is repeated from other guesses and diagnosed.
         """
@@ -414,14 +414,14 @@ class CandidateSolver(Solver):
         return bool(np.minimum(joints - bounds.lower, bounds.upper - joints).min() <= self.settings.same_path)
 
     def _joints_along(self, solution: Solution) -> Array:
-        """Return joint positions at M equally spaced times of each of S stretches of time. Shape (S, M, n)."""
+        """Return joint positions at M equally spaced times in each of S time intervals. Shape (S, M, n)."""
         values = solution.at_fraction(np.linspace(0.0, 1.0, self.settings.compared_samples))
         return np.array([values[f"joints{stretch.suffix}"] for stretch in self.motion.stretches])
 
     # ---- collisions --------------------------------------------------------------------------------------------------
 
     def collisions(self, candidate: Candidate) -> list[Collision]:
-        """Return the closest approaches of colliding pairs without separation constraints, in order of severity."""
+        """Return the collisions of a candidate between bodies that are not yet separated, in order of severity."""
         constraints, solution = candidate.constraints, candidate.solution
         if constraints is None or solution is None:
             return []
@@ -436,7 +436,7 @@ class CandidateSolver(Solver):
         return [collision for collision in self._collisions[1] if collision.pair not in constraints.margins]
 
     def collision(self, candidate: Candidate) -> Reason | None:
-        """Return the rejection reason for the worst collision of a candidate; None if it is collision-free."""
+        """Return the rejection reason for the worst collision of a candidate; None if no bodies collide."""
         collisions = self.collisions(candidate)
         return self._collision_reason(collisions[0]) if collisions else None
 
@@ -450,11 +450,11 @@ class CandidateSolver(Solver):
 
     @property
     def no_clear_configuration(self) -> bool:
-        """Whether all configurations that satisfy the tasks at some checked time are in collision."""
+        """Whether there is a checked time at which all configurations that satisfy the tasks are in collision."""
         return any(isinstance(value, Unreachable) for value in self._clear_counts.values())
 
     def _count_clear_at(self, time: float) -> int | Unreachable | None:
-        """Return the number of collision-free configurations at a time or why there are none, from a cache if known."""
+        """Return the number of collision-free configurations at a time, or an error if there are none (cached)."""
         if time not in self._clear_counts:
             self._clear_counts[time] = count_clear_configurations(self.request, time)
         return self._clear_counts[time]
@@ -466,7 +466,7 @@ class CandidateSolver(Solver):
     # ---- results -----------------------------------------------------------------------------------------------------
 
     def failure(self, candidates: Sequence[Candidate]) -> SolveError:
-        """Return the error raised if no candidate passes; it describes the lowest-cost candidate that collides."""
+        """Return the error that no candidate passes, with details of the lowest-cost candidate that collides."""
         error = super().failure(candidates)
         colliding = [c for c in candidates if c.reason is not None and c.reason.kind is Rejection.COLLISION]
         if not colliding:
@@ -479,7 +479,7 @@ class CandidateSolver(Solver):
         return SolveError(words, error.solution, error.conflicts, candidates, **details)
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the first candidate as the plan, which also lists the other candidates."""
+        """Return the plan of the first candidate, in which the other candidates are listed as well."""
         best, parts = candidates[0], parts_of(self.motion.stretches)
         assert best.solution is not None
         if self.request.time_cost is not None:

@@ -52,7 +52,7 @@ __all__ = [
 ]  # fmt: skip
 
 PHASE_INTERVALS = 40
-"""Number of intervals of the first mesh, over all phases; one phase gets no more than a motion of its own."""
+"""Number of intervals of the first mesh, summed over all phases; a phase gets no more than a single motion would."""
 REGION_SAMPLES = 8
 """Number of random tip positions in the region of a goal, besides its centre."""
 
@@ -115,7 +115,7 @@ def plan_sequence(
 def plan_goal(
     machine: Machine, goal: Goal, horizon: Any, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> SolvedPlan:
-    """Plan the motion to one goal: around obstacles or, if it has its own tasks or machine, as a one-phase problem.
+    """Plan the motion to one goal: around obstacles or, if the goal has its own tasks or machine, as a single phase.
 
     Args:
         machine: Arm on a fixed or floating base.
@@ -133,7 +133,7 @@ def plan_goal(
 
 
 def _has_only_target(goal: Goal) -> bool:
-    """Return whether a goal states only a target: no tasks on the way, and no change of machine or base."""
+    """Return whether a goal states only where the motion ends, and neither tasks on the way nor a machine or base."""
     has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
     return not has_tasks and goal.machine is None and goal.base is None
 
@@ -216,7 +216,7 @@ def plan_capture(
 
 
 def with_joints(goal: Goal, joints: Array) -> Goal:
-    """Return a goal with a joint configuration in place of its pose."""
+    """Return the goal with its pose replaced by a joint configuration."""
     no_pose: dict[str, Any] = dict.fromkeys(("tip", "position", "orientation", "direction", "within", "region"))
     return replace(goal, joints=joints, **no_pose)
 
@@ -228,7 +228,7 @@ def _plan_of_phases(machine: Machine, solution: Solution, start: Array) -> Phase
 
 
 def nearest_configuration(machine: Machine, goal: Goal, near: Array, *, limits: Limits, seed: int) -> Array:
-    """Return the configuration at the pose of a goal that is nearest to the configuration `near`. Shape (n,).
+    """Return the configuration nearest to the configuration `near` that reaches the pose of a goal. Shape (n,).
 
     Raises:
         Unreachable, ProblemError: As `inverse_kinematics`.
@@ -282,7 +282,7 @@ def goal_configurations(
 
 
 def _points_inside(region: Box | Sphere | None, seed: int) -> Array:
-    """Return random points in the region of a goal, in world; none without a region. Shape (K, 3), m."""
+    """Return random points inside the region of a goal in the world frame. Shape (K, 3), m; K = 0 without a region."""
     if region is None:
         return np.zeros((0, 3))
     center: Array = np.array(region.position, dtype=float)
@@ -304,7 +304,7 @@ def plan_to_stand(
     constraints: ClearanceConstraints | None,
     wrenches: External | None,
 ) -> SolvedPlan:
-    """Plan a motion that satisfies the tasks while the zero moment point stays inside the foot.
+    """Plan a motion of a standing machine that satisfies the tasks and keeps the zero moment point inside the foot.
 
     The joints start and end at rest if their tasks do; else they may move there. Candidates start from every
     configuration that inverse kinematics finds and that stands; with search "start", from the best conditioned one that
@@ -356,7 +356,7 @@ def plan_to_stand(
 
 @dataclass
 class _StandingSolver(Solver):
-    """Solver of the candidate motions of a standing machine, in one stage: `solve_standing` solves and audits them."""
+    """Solver of the candidate motions of a standing machine; `solve_standing` solves and audits each in one stage."""
 
     machine: Standing
     tasks: list[TipTask]
@@ -365,7 +365,7 @@ class _StandingSolver(Solver):
     start_is_fixed: bool
 
     def advance(self, candidate: Candidate) -> list[Candidate]:
-        """Solve a candidate; return it as audited or rejected.
+        """Solve and audit a candidate; return the candidate as audited or rejected.
 
         Raises:
             ProblemError, SolveError: The only start is given, and no motion was found from it.
@@ -379,7 +379,7 @@ class _StandingSolver(Solver):
         return [replace(candidate, stage=Stage.AUDITED, cost=solution.cost, solution=solution)]
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
-        """Return the first candidate as the plan, which also lists the others."""
+        """Return the plan of the first candidate, in which the other candidates are listed as well."""
         best = candidates[0].solution
         assert best is not None
         parts = (Part(0.0, self.duration, ""),)
@@ -407,7 +407,7 @@ def _takes_scalars(equations: TaskEquations) -> bool:
 def _start_configurations(
     machine: Standing, tasks: list[TipTask], start: Any, limits: Limits | None, seed: int
 ) -> list[Array]:
-    """Return start configurations, in order of their conditioning; only the given one if there is one."""
+    """Return the given start configuration or, without one, inverse kinematics solutions sorted by conditioning."""
     if start is not None:
         return [start]
     poses = [task for task in tasks if task.is_pose]

@@ -130,7 +130,7 @@ def _plan(
     search: Search,
     seed: int,
 ) -> Plan:
-    """Select the planner for the tasks, and call it with the arguments of `plan`."""
+    """Select the planner for the tasks, and call this planner with the arguments of `plan`."""
     options: dict[str, Any] = {"cost": cost, "limits": limits, "seed": seed}
     wrenches = scene.wrenches if isinstance(scene, Scene) else None
     if wrenches is not None and (not isinstance(machine, Standing) or isinstance(tasks, Steps)):
@@ -200,7 +200,7 @@ def _is_sequence(tasks: Any) -> bool:
 
 
 def _check_unused(reason: str, **arguments: Any) -> None:
-    """Raise ProblemError about the first argument that is not None, because this planner does not use it."""
+    """Raise ProblemError if an argument that the selected planner does not use is not None."""
     for name, value in arguments.items():
         if value is not None:
             raise ProblemError(f"{reason} takes no {name}; leave it out", name=name, value=value)
@@ -302,7 +302,7 @@ def _goal_problem(
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """Read the file of a plan of any kind; see `Plan.load`."""
+    """Read a plan of any kind from a file; see `Plan.load`."""
     arrays = read_arrays(path)
     if "path" in arrays:
         return PathPlan.of_arrays(path, arrays)

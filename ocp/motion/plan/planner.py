@@ -70,7 +70,7 @@ __all__ = [
 def plan_from_configurations(
     request: PlanRequest, configurations: Array, solver: CandidateSolver
 ) -> tuple[SolvedPlan, float | None]:
-    """Return the lowest-cost plan from any of the start configurations, and a lower bound of its cost or None.
+    """Return the lowest-cost plan from any of the start configurations, and a lower cost bound (None if unknown).
 
     Args:
         request: The request.
@@ -112,7 +112,7 @@ def plan_from_configurations(
 
 
 def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
-    """Return the plan of the candidate whose cost, as the request defines it, is lowest.
+    """Return the plan of the candidate that costs least by the cost function of the request.
 
     If the request has another cost than the squared rates, all motions that passed are solved again for this cost,
     in the order of the value that it has for them before.
@@ -130,7 +130,7 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates whose initial guesses are local motions: those that satisfy their tasks first, then by cost.
+    """Return candidates with local motions as initial guesses, by rising cost; motions that satisfy tasks come first.
 
     Args:
         motions: K local motions through each stretch.
@@ -185,7 +185,7 @@ def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configuratio
 
 
 def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch) -> None:
-    """Solve candidates from the motions of a global search that may lead to the optimum; if these fail, from all.
+    """Solve candidates from the promising motions of a global search; if none passes, from all of its motions.
 
     A free start and a coarse mesh may lead away from a nearly optimal motion. Motions of the search that promise a
     lower cost than the plan are therefore also solved with their start fixed, until the plan is close to its bound.
@@ -219,7 +219,7 @@ def _check_dead_end(search: TaskSearch) -> None:
 def _search_cells(
     queue: CandidateQueue, solver: CandidateSolver, motions: Sequence[LocalMotion], configurations: Array
 ) -> None:
-    """Solve candidates of a floating machine from motions of a `CellSearch` and from local (resolved-rate) motions.
+    """Solve candidates of a floating-base machine from motions of a `CellSearch` and from local motions.
 
     Raises:
         Unreachable, DeadEnd: As in `CellSearch`, if no local motion leads to a plan either.
@@ -352,7 +352,7 @@ def clearance_for(
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """Options of `plan` for tasks of tips, before they are checked.
+    """Unchecked options of `plan` for tip tasks.
 
     Attributes:
         start, cyclic, cost, limits, search, seed: As in `plan`.
@@ -412,7 +412,7 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
-    """Check the weights of the cost of tip tasks, and return the cost.
+    """Check the cost weights of a motion along tip tasks, and return the cost.
 
     Args:
         free: Whether the horizon is free.

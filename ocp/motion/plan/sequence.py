@@ -1,4 +1,4 @@
-"""Motions one after the other: to goals and along tasks in sequence, and along tasks in the fewest segments.
+"""Consecutive motions: to goals and along tasks in sequence, or along tasks in the fewest segments.
 
 In a sequence, each motion starts where the one before ends. The start of a task is searched as for a task alone, and a
 motion of its own leads there, unless the goal before is there. A task is therefore planned before the goal that leads
@@ -45,7 +45,7 @@ from ocp.motion.tasks.tip_task import TipTask, retime_task
 __all__ = ["SequenceRequest", "plan_consecutive", "plan_in_segments"]
 
 AT_START = 1e-6
-"""Largest pose error of a configuration that counts as the start of a task or as being at a goal, m and rad."""
+"""Largest pose error, m and rad, with which a configuration counts as being at the start of a task or at a goal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class SequenceRequest:
 
 
 class _State(NamedTuple):
-    """Configuration and joint velocities at the junction of two motions; None if not yet known."""
+    """Configuration and joint velocities at the junction of two motions; unknown joint positions are None."""
 
     joints: Array | None
     base: Array
@@ -84,7 +84,7 @@ class _State(NamedTuple):
 
     @classmethod
     def end_of(cls, plan: SolvedPlan, smooth: bool) -> _State:
-        """Return the state at the end of a motion; its rates are zero if rates may jump."""
+        """Return the configuration and rates at the end of a motion; the rates count as zero if they may jump."""
         at = plan.at(plan.horizon)
         return cls(at["joints"], at.get("base", np.zeros(0)), _velocity(at["rates"], smooth))
 
@@ -110,7 +110,7 @@ def plan_consecutive(request: SequenceRequest, parts: Sequence[Goal | TipTask | 
 
 @dataclass(eq=False)
 class _Sequence:
-    """Planner of a sequence of motions: the motions planned so far, and the state at their end."""
+    """Planner of a sequence of motions, with the plans so far and the configuration and rates at their end."""
 
     request: SequenceRequest
     parts: tuple[Any, ...]
@@ -163,7 +163,7 @@ class _Sequence:
         return np.where(np.isnan(joints), self.state.joints, joints)
 
     def _plan_goal(self, goal: Goal) -> SolvedPlan:
-        """Return the motion from the current state to a goal."""
+        """Plan the motion from the end of the previous motion to a goal."""
         request = self.request
         own = self.machine if goal.machine is None else checked_motors("goal: machine", goal.machine)
         if own.robot.joint_names != self.machine.robot.joint_names:
@@ -178,7 +178,7 @@ class _Sequence:
         return plan_goal(own, replace(goal, machine=None), horizon, options, constraints=self._constraints())
 
     def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
-        """Return the motion along tasks from the configuration `near` or, if they do not start there, from any."""
+        """Plan the motion along tasks from configuration `near` or, if the tasks do not start there, from any other."""
         request, machine = self.request, self.machine
         options: dict[str, Any] = {"cost": request.cost, "limits": request.limits, "seed": request.seed}
         options |= {"search": request.search, "start": None}
@@ -195,7 +195,7 @@ class _Sequence:
         return plan_request(checked)
 
     def _approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
-        """Append the motion to the start of a task, if one is needed, and return the motion along the task."""
+        """Append an approach motion to the start of a task, if one is needed, and return the plan along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
@@ -235,14 +235,14 @@ def _is_at_start(machine: Machine, tasks: Any, joints: Array) -> bool:
 
 
 def _misses(equations: TaskEquations, joints: Array) -> float:
-    """Return the largest pose error of joint positions at time 0, m or rad; tool axes may be anywhere in a cone."""
+    """Return the largest pose error of a configuration at time 0, m or rad; a tool axis inside its cone has none."""
     at: tuple[Any, ...] = np.zeros(1), None, joints[None]
     errors = equations.errors(*at), equations.cone_violations(*at)
     return max(float(np.abs(each).max(initial=0.0)) for each in errors)
 
 
 def _led_to(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return a goal with the configuration and velocity at the start of a task, if that start satisfies the goal."""
+    """Return a goal moved to the start of the next task or, if this start does not satisfy the goal, unchanged."""
     first = plan.at(0.0)
     if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
         return goal
@@ -370,7 +370,7 @@ def _plan_segment(request: PlanRequest, begin: float, end: float) -> SolvedPlan:
 
 
 def _task_between(task: TipTask, begin: float, end: float) -> TipTask | None:
-    """Return the part of a task between two times, with `begin` as the new time 0; None if it is empty."""
+    """Return the part of a task between two times, with `begin` as the new time 0; None if this part is empty."""
     first, last = max(task.begin, begin), min(task.end, end)
     if last <= first:
         return None

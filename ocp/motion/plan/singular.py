@@ -58,7 +58,7 @@ class MotionSample:
     Attributes:
         stretch: The stretch.
         t: Times, s. Shape (M,).
-        base, joints, rates: Shapes (M, base_size), (M, n), (M, n).
+        base, joints, rates: Base and joint positions, and joint rates. Shapes (M, base_size), (M, n), (M, n).
     """
 
     stretch: Stretch

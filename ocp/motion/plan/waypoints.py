@@ -45,7 +45,7 @@ Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 
 WAYPOINT = "waypoint {:g}"
 TOO_MANY_CHARTS = "configurations"
-"""Field `name` of the error of a search that needs too many charts of the self-motion manifold."""
+"""Value of the field `name` in the error of a search that needs too many charts of the self-motion manifold."""
 NO_PATH = "no path through the waypoints keeps all limits"
 
 
@@ -205,7 +205,7 @@ class _WaypointPlanner:
         self._section_joint = robot.joint_names.index(names[0]) if self.manifolds.size > 1 else None
 
     def plan(self, counted: bool) -> PathPlan:
-        """Return the lowest-cost path through all waypoints; with `counted`, in the fewest segments.
+        """Plan the lowest-cost path through all waypoints, in one segment or, if `counted`, in the fewest segments.
 
         Some waypoints are searched, and the paths found are extended to all waypoints. If that fails, the waypoints
         where it fails, or more closely spaced ones, are searched as well.
@@ -250,7 +250,7 @@ class _WaypointPlanner:
         return [[Segment(0, len(path) - 1, path, search.path_cost(path), bound)] for path in paths], bound
 
     def _best_plan(self, paths: list[_Path], bound: float) -> PathPlan:
-        """Return the plan whose path is the lowest-cost valid one.
+        """Return the plan of the valid path of lowest cost.
 
         Raises:
             SolveError: No path is valid.
@@ -274,14 +274,14 @@ class _WaypointPlanner:
         )
 
     def _candidate(self, path: _Path, is_best: bool) -> Candidate:
-        """Return a path as a candidate of the plan, valid or rejected."""
+        """Return the path as a candidate of the plan, accepted or rejected with a reason."""
         reason = Reason(Rejection.INFEASIBLE, path.failure) if path.failure else Reason(Rejection.COSTLIER)
         return Candidate(path.joints[0], path.cost, None if is_best else reason, Stage.FINE)
 
     # ---- searched waypoints ------------------------------------------------------------------------------------------
 
     def _strides(self) -> tuple[list[int], int]:
-        """Return the strides between waypoints of the successive searches, and the number of searches always made."""
+        """Return the waypoint spacing of each successive search, and the number of searches that are always made."""
         settings, count = self.settings, len(self.positions)
         if self._section_joint is None:
             halves = int(np.log2(settings.stride)) + 1
@@ -323,7 +323,7 @@ class _WaypointPlanner:
             return None
 
     def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
-        """Return the search over some waypoints: of all configurations or, with two redundant joints, on sections."""
+        """Return the search over some waypoints; with two redundant joints, it is over sections with a fixed joint."""
         manifolds = SelfMotionManifolds(self.space, self.manifolds.equations, self.manifolds.targets[chosen])
         distances = np.diff(chosen)[:, None]
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
@@ -341,7 +341,7 @@ class _WaypointPlanner:
         return SectionSearch(*arguments, **options, **sections, joint=joint)
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
-        """Return the error that says where all paths end, located among the waypoints that the search skipped."""
+        """Return the error that says at which waypoint all paths end, including waypoints that the search skipped."""
         error, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
         if error is None:
             return SolveError("no path goes through the waypoints", name="waypoints")
@@ -350,7 +350,7 @@ class _WaypointPlanner:
         return (None if len(refined) == len(chosen) else dead_end(self._search(refined), WAYPOINT)) or error
 
     def _negligibly_relaxed_paths(self, search: AtlasSearch) -> list[_Path]:
-        """Return paths that a relaxation of the poses by no more than the pose tolerance makes possible.
+        """Return paths that become possible if the poses are relaxed by no more than the pose tolerance.
 
         Raises:
             SolveError: There is no such path.
@@ -372,9 +372,9 @@ class _WaypointPlanner:
     # ---- paths through all waypoints ---------------------------------------------------------------------------------
 
     def _extend(self, search: AtlasSearch, chain: list[Segment]) -> _Path:
-        """Return a path through all waypoints from segments through some of them.
+        """Extend path segments through some waypoints to a path through all waypoints.
 
-        It is invalid if it reconfigures between two waypoints that are not consecutive.
+        The path is invalid if it reconfigures between two waypoints that are not consecutive.
         """
         chosen = search.times.astype(int)
         breaks = [(int(chosen[segment.last]), int(chosen[segment.last + 1])) for segment in chain[:-1]]
@@ -421,7 +421,7 @@ class _WaypointPlanner:
         return joints
 
     def _check_path(self, joints: Array, breaks: tuple[int, ...]) -> tuple[str, NDArray[np.intp]]:
-        """Describe a requirement that a path violates ("" if none); also return the waypoints where it is invalid."""
+        """Describe a requirement that a path violates ("" if none); also return the waypoints of the violations."""
         names, indices = self.machine.robot.joint_names, np.arange(len(joints))
         errors = np.abs(self.manifolds.linearize(indices, joints)[0]).max(axis=1)
         excess = np.maximum(joints - self.upper, self.lower - joints)
@@ -452,7 +452,7 @@ class _WaypointPlanner:
 
 
 def _path_weights(weights: Any, size: int) -> Array:
-    """Return the weights of the joints in a path length; 0 for joints that do not count. Shape (size,)."""
+    """Check the weights of the joints in the path length, and return the weight of each joint. Shape (size,)."""
     if weights is None:
         return np.ones(size)
     array = require.array("weights", weights, (size,), meaning="one for each joint")
@@ -463,7 +463,7 @@ def _path_weights(weights: Any, size: int) -> Array:
 
 
 def _step(step: Any, size: int) -> Array:
-    """Check the largest displacement between waypoints, and return it for each joint. Shape (n,)."""
+    """Check the largest step between waypoints, and return the largest displacement of each joint. Shape (n,)."""
     try:
         steps = floats(step)
         if steps.shape in ((), (1,), (size,)) and (steps > 0).all():

@@ -1,1 +1,1 @@
-"""What planning returns: plans of all kinds, their candidates, and the requests from which files declare them again."""
+"""Results of planning: plans of all kinds, candidate motions, and requests from which problems are declared again."""

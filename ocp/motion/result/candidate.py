@@ -1,4 +1,4 @@
-"""Candidate of a plan: how far its motion has been solved, its cost, and the reason for its rejection."""
+"""Candidate motions of a plan: how far each motion is solved, the cost, and the reason for a rejection."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Reason:
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> Reason:
-        """Return the rejection reason from data of a file; they are checked because files are not trusted.
+        """Rebuild a rejection reason from the data of a file, which are checked because files are not trusted.
 
         Raises:
             KeyError, TypeError, ValueError: The record is damaged.
@@ -86,7 +86,7 @@ class Reason:
 
     @classmethod
     def of_error(cls, kind: Rejection, error: Exception) -> Reason:
-        """Return a reason from an exception: its first line, and its value, limit and time if they are numbers."""
+        """Return a rejection reason that takes its text, name, value, limit and time from an exception."""
         numbers = {name: getattr(error, name, None) for name in ("value", "limit", "time")}
         details: dict[str, Any] = {name: float(x) for name, x in numbers.items() if isinstance(x, int | float)}
         name = getattr(error, "name", None)
@@ -100,7 +100,7 @@ def collision_reason(pair: Collision | ClosestPair, limit: float, remedy: str = 
 
 @dataclass(frozen=True, eq=False)
 class Seed:
-    """Initial guess from which a candidate motion is solved, and how it is solved.
+    """Initial guess of a candidate motion, and options for solving the optimal control problem from this guess.
 
     Attributes:
         guess: Guess of the first solve.
@@ -123,7 +123,7 @@ class Seed:
     relaxed: bool = False
 
     def is_turned(self, other: Seed, turning: Sequence[int] | NDArray[np.intp]) -> bool:
-        """Return whether another initial guess is the same motion apart from full turns of the joints `turning`."""
+        """Return whether another initial guess differs from this one only by full turns of the joints `turning`."""
         pairs = list(zip(self.local, other.local, strict=False))
         if not pairs or (self.direct, self.fixed, self.relaxed) != (other.direct, other.fixed, other.relaxed):
             return False
@@ -138,7 +138,7 @@ class Seed:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Motion that may become the plan, with the state of its solution process.
+    """Motion that may become the plan, with its cost and the stage that its solution has reached.
 
     Attributes:
         start: Start configuration of the search, rad or m. Shape (n,).
@@ -171,7 +171,7 @@ class Candidate:
 
     @classmethod
     def of_record(cls, record: Sequence[Any], solution: Solution | None) -> Candidate:
-        """Return a candidate from the data of a plan file; `solution` is its motion unless it was rejected.
+        """Rebuild a candidate from the data of a plan file; `solution` is its motion unless the candidate was rejected.
 
         Args:
             record: As `record` returns it; it is not trusted.
@@ -195,12 +195,12 @@ class Candidate:
         return self.reason is None
 
     def with_rejection(self, reason: Reason) -> Candidate:
-        """Return the candidate as rejected, for `reason` or for the collision after which bodies were separated."""
+        """Return the candidate as rejected for `reason` or, if bodies had been separated, for their collision."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
 
     def finished(self) -> Candidate:
-        """Return the candidate without intermediate data, as a plan lists it."""
+        """Return the candidate as a plan lists it, without the data of intermediate solution stages."""
         solution = self.solution if self.stage >= Stage.FINE else None
         return Candidate(self.start, self.cost, self.reason, self.stage, solution, audit=self.audit)

@@ -1,4 +1,4 @@
-"""Plan that is a joint path of straight motions, through tool poses or to a goal."""
+"""Plan that consists of straight motions in joint space, through tool poses or to a goal."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ POSE_TOLERANCE = 1e-6
 STEP_TOLERANCE = 1e-6
 """Largest excess over a joint limit or over the largest step between waypoints, rad or m."""
 UNLIMITED_RATE = 1.0
-"""Rate at which joints without velocity limits pass a path, rad/s or m/s."""
+"""Rate that is assumed for joints without velocity limits when a path is timed, rad/s or m/s."""
 UNDECIDED = "a path through waypoints is compared with its lower bound, not with its neighbours"
 
 
 class PathPoses(NamedTuple):
-    """Tool poses that a path through waypoints must reach, and the largest joint step between them.
+    """Tool poses that a path must reach at its waypoints, and the largest joint displacement between waypoints.
 
     Attributes:
         positions, rotations: Poses of the tip at the waypoints, in world. Shapes (N, 3), m, and (N, 3, 3).
@@ -53,7 +53,7 @@ class PathPoses(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PathPlan(Plan):
-    """Joint path of straight motions between configurations, through tool poses or to a goal.
+    """Plan that consists of straight motions in joint space, through tool poses or to a goal.
 
     A path has no times of its own. The plan passes it in the least time at constant joint rates between waypoints
     within the velocity limits; `ocp.joint_path` and `schedule` time it under further limits.
@@ -119,7 +119,7 @@ class PathPlan(Plan):
 
     @property
     def steps(self) -> Array:
-        """Largest displacement of each joint between waypoints; reconfigurations do not count. Shape (n,), rad or m."""
+        """Largest displacement of each joint between waypoints, without reconfigurations. Shape (n,), rad or m."""
         steps = np.delete(np.abs(np.diff(self.joints, axis=0)), list(self.reconfigurations), axis=0)
         return np.asarray(steps.max(axis=0, initial=0.0))
 
@@ -142,7 +142,7 @@ class PathPlan(Plan):
     # ---- audit -------------------------------------------------------------------------------------------------------
 
     def clearance(self) -> Clearance | None:
-        """Return the proven clearance between waypoints, except in reconfigurations; None if it is not checked."""
+        """Return the proven clearance between waypoints, except in reconfigurations; None if clearance is unchecked."""
         if self.constraints is None:
             return None
         t, horizon = self.t, self.horizon
@@ -180,7 +180,7 @@ class PathPlan(Plan):
         return f"the best of {len(self.candidates)} paths"
 
     def _pose_findings(self, poses: PathPoses) -> list[Finding]:
-        """Return the audit findings about the largest pose errors and the largest excess of a joint step."""
+        """Return the audit findings about the largest pose errors and the joint step that exceeds its limit most."""
         t, tips = self.t, tip_poses(self.machine, np.zeros((len(self.joints), 0)), self.joints)
         misses = np.abs(tips[:, :3] - poses.positions)
         turns = scipy.spatial.transform.Rotation.from_quat(
@@ -223,7 +223,7 @@ class PathPlan(Plan):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> PathPlan:
-        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
+        """Build the plan from the arrays of a file, which are checked because files are not trusted."""
         try:
             numbers = {name: arrays[f"path.{name}"] for name in ARRAY_NAMES}
             head = unpack_record(read_head(path, arrays["path"]), numbers)
@@ -254,7 +254,7 @@ class PathPlan(Plan):
 
 
 def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
-    """Return joints and poses read from a file; raise ValueError if they do not fit the number of joints."""
+    """Return the joint positions and poses from a file; raise ValueError if their shapes do not fit the machine."""
     count = len(head["joints"])
     shapes: dict[str, tuple[int, ...]] = {"joints": (count, size)}
     written = {"joints": head["joints"]}
@@ -270,7 +270,7 @@ def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
 
 
 def _check_constraints(constraints: Any) -> None:
-    """Raise TypeError or ValueError unless these are the clearance constraints of a path, or None."""
+    """Raise TypeError or ValueError unless `constraints` are clearance constraints with static obstacles, or None."""
     if constraints is not None and not isinstance(constraints, ClearanceConstraints):
         raise TypeError(f"its collision scene is a {type(constraints).__name__}")
     if constraints is not None and constraints.scene.has_moving_obstacles:
@@ -280,7 +280,7 @@ def _check_constraints(constraints: Any) -> None:
 def _largest(
     name: str, values: Array, limit: float, times: Array, names: tuple[str, ...] = (), unit: str = ""
 ) -> Finding:
-    """Return the audit finding about the largest positive entry of `values`, which has one row per time."""
+    """Return the audit finding about the largest entry of `values` (one row per time); negative entries count as 0."""
     if not values.size:
         return Finding(name, 0.0, limit, unit=unit)
     row, column = np.unravel_index(int(np.argmax(values)), values.shape)

@@ -34,16 +34,16 @@ __all__ = ["CHECKED_TIMES", "Plan", "PlanSample"]
 CHECKED_TIMES = 2001
 """Number of samples at which joint limits are checked, besides the times of the plan."""
 TIME_TOLERANCE = 1e-9
-"""Share of the horizon by which a time may lie outside it."""
+"""Largest amount by which a time may lie outside a plan, as a fraction of the horizon."""
 
 
 class PlanSample(NamedTuple):
     """Samples of a plan at M times.
 
     Attributes:
-        t: s. Shape (M,).
-        joints: rad or m. Shape (M, n).
-        rates, accelerations: First and second derivatives of the joints. Shape (M, n).
+        t: Times, s. Shape (M,).
+        joints: Joint positions, rad or m. Shape (M, n).
+        rates, accelerations: First and second time derivatives of the joint positions. Shape (M, n).
         tip: Pose of the machine's tip in world: position (m) and quaternion [w, x, y, z]. Shape (M, 7).
     """
 
@@ -60,7 +60,7 @@ class PlanSample(NamedTuple):
 
 
 class Plan(ABC):
-    """Lowest-cost motion that was found and passes its audit (base class of all plans).
+    """Lowest-cost motion that planning found and that passes its audit (base class of all plans).
 
     Attributes:
         machine: The machine.
@@ -86,11 +86,11 @@ class Plan(ABC):
     @property
     @abstractmethod
     def cost(self) -> float:
-        """Cost of the motion."""
+        """Value of the cost function for the motion."""
 
     @property
     def gap(self) -> float | None:
-        """Relative amount by which the cost may exceed the lower bound of all motions; None without a bound."""
+        """Difference between the cost and its lower bound, relative to the cost; None if there is no bound."""
         if self.bound is None:
             return None
         return (self.cost - self.bound) / self.cost if self.cost > 0 else 0.0
@@ -98,17 +98,17 @@ class Plan(ABC):
     @property
     @abstractmethod
     def horizon(self) -> float:
-        """Final time, s."""
+        """Final time of the motion, s."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the moving joints."""
+        """Names of the joints, in the order of their values in the plan."""
         return tuple(self.machine.robot.joint_names)
 
     @property
     @abstractmethod
     def t(self) -> Array:
-        """Times of the plan's own grid, s; a time at which the motion changes abruptly occurs twice. Shape (M,)."""
+        """Times of the samples that the plan stores, s; a time of an abrupt change occurs twice. Shape (M,)."""
 
     @abstractmethod
     def _values(self, name: str) -> Array:
@@ -119,13 +119,15 @@ class Plan(ABC):
         """Return values of "joints", "rates", "accelerations" or "base" at checked times (M,). Shape (M, n)."""
 
     def __getitem__(self, name: str) -> Array:
-        """Return the values of "joints", "rates" or "base" at the times `t` of the plan. Shape (M, n)."""
+        """Return joint positions ("joints"), joint rates ("rates") or base configurations ("base") at the times `t`."""
         if name not in self._names():
             raise require.unknown("name in a plan", name, self._names())
         return self._values(name)
 
     def at(self, time: Any) -> dict[str, Array]:
-        """Return the values of "joints", "rates" and "base" at a time, (n,) each, or at times (M,), (M, n) each.
+        """Return joint positions, joint rates and base configurations at one time or at times (M,), by name.
+
+        The names are "joints", "rates" and, if the base moves, "base". Shapes (n,) for one time, (M, n) for several.
 
         Raises:
             ProblemError: A time is not finite or outside 0 to the horizon.
@@ -135,7 +137,7 @@ class Plan(ABC):
         return {name: values[0] if times.ndim == 0 else values for name, values in values_by_name.items()}
 
     def sample(self, period: float) -> PlanSample:
-        """Return samples of the motion every `period` s from 0; the last one is at the horizon.
+        """Return samples of the motion every `period` s from 0; the last sample is at the horizon.
 
         Rates may jump where the tasks do, such as where a path begins at full speed. Accelerations there are those
         after the jump.
@@ -154,7 +156,7 @@ class Plan(ABC):
         return PlanSample(t, at["joints"], at["rates"], accelerations, tips)
 
     def task_share(self, times: Any) -> Array:
-        """Return the fraction of the task time that has passed at times (M,), s. Shape (M,).
+        """Return the fraction of the duration of the tasks that has passed at times (M,), s. Shape (M,).
 
         It equals the share of the horizon unless the pace of the tasks is planned, or the tasks wait.
 
@@ -165,7 +167,7 @@ class Plan(ABC):
 
     @abstractmethod
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the solutions that make up the plan at increasing times (M,), s, in order.
+        """Return the solutions of the optimal control problems that form the plan, at rising times (M,), s.
 
         Each comes with the suffix of the names of its states, and with the times in it, shape (K,), s; all K add up to
         M. The list is empty for a plan that solves no optimal control problem.
@@ -184,7 +186,7 @@ class Plan(ABC):
 
     @abstractmethod
     def _audit(self, **settings: Any) -> Audit:
-        """Check the motion without using the cache."""
+        """Audit the motion without using the cache of earlier audits."""
 
     @property
     def audits(self) -> tuple[Audit, ...]:
@@ -275,11 +277,11 @@ class Plan(ABC):
 
     @abstractmethod
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays that are written to the file of the plan, by name; raises the errors of `save`."""
+        """Return the arrays of the file of the plan, by name; raise the same errors as `save`."""
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
-        """Read a file that `save` has written; only the plan itself has its solution, other candidates have none.
+        """Read a plan from a file that `save` has written; candidates other than the plan have no solutions.
 
         The problem is declared again from the request by the planner's own code, so that the audit checks the motion
         against the machine, limits, tasks and obstacles of the request. The bound and the other candidates are read as
@@ -299,8 +301,8 @@ class Plan(ABC):
     def table(self, period: float = 0.01) -> dict[str, Array]:
         """Return the motion as a table of named columns, with a row every `period` s, for pandas, polars or pyarrow.
 
-        They are `time` (s), the joints (rad or m), and `NAME.velocity` and `NAME.acceleration` of each. Shape (M,)
-        each.
+        The columns are `time` (s), the joints (rad or m), and `NAME.velocity` and `NAME.acceleration` of each. Each
+        column has the shape (M,).
         """
         sample = self.sample(period)
         columns = {"time": sample.t}
@@ -309,7 +311,7 @@ class Plan(ABC):
         return columns
 
     def write_csv(self, path: str | os.PathLike[str], period: float = 0.01) -> None:
-        """Write the `table` of times and joints, sampled every `period` s, in full precision, with a header."""
+        """Write the `table` of the motion, with a row every `period` s, to a CSV file in full precision."""
         columns = self.table(period)
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
@@ -344,5 +346,5 @@ class Plan(ABC):
 
 
 def audit_key(**settings: Any) -> str:
-    """Return the key under which a plan caches its audit with these settings."""
+    """Return the key under which a plan caches its audit with the given settings."""
     return repr(sorted(settings.items()))

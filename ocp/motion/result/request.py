@@ -88,7 +88,7 @@ def _machine_of(arguments: Mapping[str, Any]) -> Machine:
 
 @dataclass(frozen=True, eq=False)
 class MotionRequest:
-    """Name of the builder that declared a problem, and its arguments, so that it can be declared again.
+    """Name and arguments of the builder function with which an optimal control problem can be declared again.
 
     Attributes:
         builder: Name of the builder in BUILDERS.
@@ -139,7 +139,7 @@ def declared_motion(
     actuation: Actuation | None = None,
     relaxed: bool = False,
 ) -> ToolMotion:
-    """Declare the optimal control problem of a request, and note in it how a plan file can declare it again.
+    """Declare the optimal control problem of a request, and store in the problem how to declare it again.
 
     Args:
         request: The request.
@@ -189,7 +189,7 @@ MACHINE_NAMES = ("machine", "chaser")
 
 
 def machines_of_phases(request: MotionRequest | None) -> tuple[Machine, ...]:
-    """Return the machine of each phase of a problem; empty if it has no phases or is unknown."""
+    """Return the machine of each phase of a problem; empty if the problem has no phases or its request is unknown."""
     if request is None:
         return ()
     arguments = request.arguments
@@ -202,7 +202,7 @@ def machines_of_phases(request: MotionRequest | None) -> tuple[Machine, ...]:
 
 
 def request_of(problem: Problem | None) -> MotionRequest | None:
-    """Return the builder and arguments from which a problem was declared, or None if unknown."""
+    """Return the builder and arguments from which a problem was declared; None if they are unknown."""
     origin = None if problem is None else problem.origin
     if isinstance(origin, tuple):  # name and arguments of a builder that does not import this module
         origin = MotionRequest(*origin)
@@ -267,7 +267,7 @@ def stored_request(builder: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _scene_fields(scene: CollisionScene) -> dict[str, Any]:
-    """Return the arguments of a collision scene, with the bodies that enclose meshes instead of mesh files."""
+    """Return the constructor arguments of a collision scene; bodies that enclose meshes replace the mesh files."""
     return {
         "obstacles": scene.obstacles,
         "clearance": scene.clearance,
@@ -284,13 +284,13 @@ def _scene_fields(scene: CollisionScene) -> dict[str, Any]:
 
 
 def _put_track(name: str, track: Callable[[Any], Any], writer: FunctionWriter) -> dict[str, Any]:
-    """Return the record of a function of time and, if it has one, of its rate."""
+    """Return the file record of a function of time and, if the function has a rate, of this rate."""
     parts = {"track": track, "rate": getattr(track, "rate", None)}
     return {role: writer.write(_trace(name, part)) for role, part in parts.items() if part is not None}
 
 
 def _trace(name: str, track: Callable[[Any], Any]) -> Any:
-    """Convert a function of time to a CasADi function by calling it with a symbol."""
+    """Convert a Python function of time to a CasADi function by calling the function with a symbol."""
     for symbols in (ca.SX, ca.MX):
         time = symbols.sym("time")
         try:
@@ -304,7 +304,7 @@ def _trace(name: str, track: Callable[[Any], Any]) -> Any:
 
 
 def restored_request(record: Any) -> MotionRequest:
-    """Rebuild a request from a record of `stored_request`, after checks because files are not trusted.
+    """Rebuild a request from a record of `stored_request`, which is checked because files are not trusted.
 
     Raises:
         ProblemError: The record is damaged.
@@ -331,7 +331,7 @@ def restored_request(record: Any) -> MotionRequest:
 
 
 def _read(value: Any, functions: list[Any], machines: tuple[Machine, Machine] | None) -> Any:
-    """Rebuild a value from a record; `machines` are the machine without and with its held joints locked."""
+    """Rebuild an argument of a request from its record; `machines` are the machine without and with locked joints."""
 
     def read(part: Any) -> Any:
         return _read(part, functions, machines)

@@ -1,4 +1,4 @@
-"""Several plans one after the other as one plan: goals and tasks in sequence, or segments with reconfigurations."""
+"""Plans that consist of consecutive plans: goals and tasks in sequence, or segments with reconfigurations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = ["JUMP_TOLERANCE", "ConsecutivePlans", "Piece", "Reconfiguration", "Se
 
 NO_MOTION = "reconfigurations without a motion"
 JUMP_TOLERANCE = 1e-6
-"""Largest difference of a joint between the end of a motion and the start of the next one, rad or m."""
+"""Largest difference of a joint position between the end of a motion and the start of the next motion, rad or m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +96,12 @@ class ConsecutivePlans(Plan):
 
     @property
     def cost(self) -> float:
-        """Sum of the costs of the consecutive plans; reconfigurations do not count."""
+        """Total cost of the consecutive plans, without the reconfigurations between them."""
         return float(sum(plan.cost for plan in self._plans))
 
     @property
     def bound(self) -> float | None:  # type: ignore[override]
-        """Sum of the lower bounds of the consecutive plans, each between fixed ends; None if one is unknown."""
+        """Sum of the lower bounds of the consecutive plans, whose ends count as fixed; None if a bound is unknown."""
         bounds = [plan.bound for plan in self._plans]
         return None if None in bounds else float(sum(bounds))  # type: ignore[arg-type]
 
@@ -137,7 +137,7 @@ class ConsecutivePlans(Plan):
 
     @property
     def t(self) -> Array:
-        """Times of the grids of the consecutive plans, s; a time between two plans occurs twice. Shape (M,)."""
+        """Times of the grids of the consecutive plans, s; the time at a junction occurs twice. Shape (M,)."""
         return np.concatenate([piece.begin + piece.plan.t for piece in self.pieces])
 
     def _values(self, name: str) -> Array:
@@ -166,7 +166,7 @@ class ConsecutivePlans(Plan):
     # ---- audit -------------------------------------------------------------------------------------------------------
 
     def _audit(self, **settings: Any) -> Audit:
-        """Audit all segments and their junctions, and add up the suboptimality of the segments."""
+        """Audit all consecutive plans and the junctions between them, and combine the suboptimality of the plans."""
         findings: list[Finding] = []
         undecided, clearances, losses = "", dict[str, Clearance](), list[float]()
         for piece in self.pieces:
@@ -237,7 +237,7 @@ class SequencePlan(ConsecutivePlans):
         return poses
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the audit findings about jumps of joints, base, and rates that must be continuous, between motions."""
+        """Return the audit findings about jumps of joints, base and, if they must be continuous, rates at junctions."""
         rates = [self._jump_finding("rates")] if self.smooth and len(self.parts) > 1 else []
         return super()._junction_findings() + rates
 
@@ -251,7 +251,7 @@ class SequencePlan(ConsecutivePlans):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays that are written to the file of the plan; names start with the motion they belong to."""
+        """Return the arrays of the file of the plan, by name; a prefix of each name states the motion."""
         head = {"phases": list(self.phases), "smooth": self.smooth}
         arrays = {self.kind: np.frombuffer(json.dumps(head).encode(), np.uint8)}
         for number, plan in enumerate(self.parts):
@@ -260,7 +260,7 @@ class SequencePlan(ConsecutivePlans):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SequencePlan:
-        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
+        """Build the plan from the arrays of a file, which are checked because files are not trusted."""
         try:
             head = read_head(path, arrays[cls.kind])
             phases = tuple(str(name) for name in head["phases"])
@@ -275,14 +275,14 @@ class SequencePlan(ConsecutivePlans):
 
 
 def _plan_of(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], prefix: str) -> SolvedPlan:
-    """Return the plan from those arrays of a file whose names begin with a prefix."""
+    """Build one of the plans in a file from the arrays whose names begin with a prefix."""
     own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
     return (PhasedPlan if PHASED in own else SolvedPlan).of_arrays(path, own)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SegmentedPlan(ConsecutivePlans):
-    """Motions along consecutive segments of tasks, and reconfigurations between them, during which tasks pause.
+    """Motions along consecutive segments of tasks; the arm reconfigures between segments while the tasks pause.
 
     Attributes:
         machine: The arm.
@@ -327,7 +327,7 @@ class SegmentedPlan(ConsecutivePlans):
         return tuple(map(Piece, begins, plans, names))
 
     def task_share(self, times: Any) -> Array:
-        """Return the fraction of the task time that has passed; it is constant during reconfigurations."""
+        """Return the fraction of the duration of the tasks that has passed; reconfigurations do not count."""
         pieces = self.pieces
         waits = [piece.plan.horizon * all(piece.plan is not segment for segment in self.segments) for piece in pieces]
         ends, lost = [piece.begin + piece.plan.horizon for piece in pieces], np.cumsum(waits)
@@ -336,7 +336,7 @@ class SegmentedPlan(ConsecutivePlans):
         return np.asarray(np.minimum(task_times / self.task_horizon, 1.0))
 
     def _junction_findings(self) -> list[Finding]:
-        """Return the audit findings about reconfigurations without a motion, and about jumps of joints."""
+        """Return the audit findings about reconfigurations for which no motion was found, and about jumps of joints."""
         if not self.reconfigurations:
             return []
         missing = [each for each in self.reconfigurations if each.motion is None]
@@ -359,7 +359,7 @@ class SegmentedPlan(ConsecutivePlans):
     # ---- files -------------------------------------------------------------------------------------------------------
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays that are written to the file of the plan; names start with the motion they belong to."""
+        """Return the arrays of the file of the plan, by name; a prefix of each name states the motion."""
         head, numbers = pack_record(
             {
                 "start_times": list(self.start_times),
@@ -381,7 +381,7 @@ class SegmentedPlan(ConsecutivePlans):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SegmentedPlan:
-        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
+        """Build the plan from the arrays of a file, which are checked because files are not trusted."""
         try:
             numbers = {name: arrays[f"segments.{name}"] for name in ARRAY_NAMES}
             head = unpack_record(read_head(path, arrays["segments"]), numbers)

@@ -32,7 +32,7 @@ __all__ = ["PHASED", "Part", "PhasedPlan", "SolvedPlan", "parts_of", "parts_of_p
 
 RATES = ("rates", SLOPES, "velocities")
 PHASED = "plan.phased"
-"""Name of the array that marks the file of a plan of several phases."""
+"""Name of the array whose presence marks the file of a plan with several phases."""
 PHASED_RATES = "velocities"
 """Name of the joint rates in the solution of a problem of several phases."""
 TARGET_TIMES = 401
@@ -40,7 +40,7 @@ TARGET_TIMES = 401
 
 
 class Part(NamedTuple):
-    """Time interval of a plan, s, and the suffix of the names of its states and controls in the solution."""
+    """Time interval of a plan, s, and the suffix of the state and control names for this interval in the solution."""
 
     begin: float
     end: float
@@ -70,17 +70,17 @@ class SolvedPlan(Plan):
 
     @property
     def cost(self) -> float:
-        """Cost of the motion."""
+        """Value of the cost function for the motion."""
         return self.solution.cost
 
     @property
     def horizon(self) -> float:
-        """Final time, s."""
+        """Final time of the motion, s."""
         return self.parts[-1].end
 
     @property
     def t(self) -> Array:
-        """Times of the plan's grid, s; a time between two parts occurs twice. Shape (M,)."""
+        """Times of the plan's grid, s; the time at a junction of two parts occurs twice. Shape (M,)."""
         if CLOCK in self.solution.states:
             return np.asarray(self.solution[CLOCK][:, 0])
         share = self.solution.t / self.solution.horizon
@@ -93,7 +93,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, np.concatenate([self.solution[own + part.suffix] for part in self.parts]))
 
     def _of_all_joints(self, name: str, values: Array) -> Array:
-        """Return joint values of the solution (M, m), extended by the joints that stay at rest."""
+        """Extend joint values (M, m) of the solution by the values of the joints that stay at rest."""
         return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
 
     def _values_at(self, name: str, times: Array) -> Array:
@@ -118,11 +118,11 @@ class SolvedPlan(Plan):
 
     @property
     def request(self) -> MotionRequest | None:
-        """Builder and arguments of the problem; None for a problem that the user declared."""
+        """Builder and arguments from which the problem was declared; None if the user declared the problem."""
         return request_of(self.solution.problem)
 
     def task_share(self, times: Any) -> Array:
-        """Return the fraction of the tasks' own time that has passed; see `Plan.task_share`."""
+        """Return the fraction of the duration of the tasks that has passed; see `Plan.task_share`."""
         if CLOCK not in self.solution.states:
             return super().task_share(times)
         return self._fractions(self.parts[0], np.atleast_1d(self._checked_times(times)))
@@ -190,7 +190,7 @@ class SolvedPlan(Plan):
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SolvedPlan:
-        """Build the plan from the arrays of a file; they are checked, since files are not trusted."""
+        """Build the plan from the arrays of a file, which are checked because files are not trusted."""
         solution = Solution.of_arrays(path, arrays)
         if "plan" not in arrays:
             words = f"{path} holds a solution and no plan; read it with Solution.load"
@@ -218,7 +218,7 @@ class SolvedPlan(Plan):
     # ---- time of the motion and time of the solution -----------------------------------------------------------------
 
     def _check_parts(self) -> None:
-        """Raise ValueError unless the time intervals of the plan and its machine match the solution."""
+        """Raise ValueError if the time intervals, the joints or the base of the plan do not fit the solution."""
         ends = [0.0, *(part.end for part in self.parts)]
         contiguous = all(part.begin == end < part.end for part, end in zip(self.parts, ends, strict=False))
         clock = self.solution.states.get(CLOCK)
@@ -262,7 +262,7 @@ class SolvedPlan(Plan):
         return np.asarray(interpolant.derivative()(fraction)[:, offset : offset + pool[name].shape[1]])
 
     def _fractions(self, part: Part, times: Array) -> Array:
-        """Return the fractions of the solution's horizon that belong to times (M,) in a time interval of the plan."""
+        """Convert times (M,) in a time interval (part) of the plan to fractions of the solution's horizon."""
         if CLOCK not in self.solution.states:
             return np.asarray(np.clip((times - part.begin) / (part.end - part.begin), 0.0, 1.0))
         low, high = np.zeros(len(times)), np.ones(len(times))
@@ -273,7 +273,7 @@ class SolvedPlan(Plan):
         return np.asarray((low + high) / 2)
 
     def _over(self, times: Array, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate a quantity at times (M,), each in the time interval (part) of the plan that contains it.
+        """Evaluate a quantity at times (M,), using for each time the part (time interval) that contains the time.
 
         `evaluate` takes a part and fractions of the solution's horizon. A junction belongs to the later part.
         """
@@ -289,7 +289,7 @@ class SolvedPlan(Plan):
 
 
 def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
-    """Return the time interval and the name suffix of each part of a plan, one for each stretch of time."""
+    """Return the parts of a plan (time interval and name suffix), one for each stretch of time with the same tasks."""
     return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)
 
 
@@ -311,7 +311,7 @@ class PhasedPlan(SolvedPlan):
 
     @cached_property
     def machines(self) -> tuple[Machine, ...]:
-        """Machine of each phase; the first machine for all if the user declared the problem."""
+        """Machine of each phase; the first phase's machine for all phases if the user declared the problem."""
         machines = machines_of_phases(self.request)
         return machines if len(machines) == len(self.parts) else (self.machine,) * len(self.parts)
 
@@ -321,7 +321,7 @@ class PhasedPlan(SolvedPlan):
 
     @cached_property
     def _joint_indices(self) -> dict[str, NDArray[np.intp]]:
-        """For each phase, the indices of the first machine's joints in the phase's joint vector. Shape (n,)."""
+        """Indices of the first machine's joints in the joint vector of each phase, by phase name. Shape (n,) each."""
         orders = {}
         for name, machine in zip(self.phases, self.machines, strict=True):
             joints = list(machine.robot.joint_names)
@@ -330,7 +330,7 @@ class PhasedPlan(SolvedPlan):
 
     @property
     def t(self) -> Array:
-        """Times of the grids of all phases, s; a time between two phases occurs twice. Shape (M,)."""
+        """Times of the grids of all phases, s; the time at a junction of two phases occurs twice. Shape (M,)."""
         return np.concatenate([part.begin + self._solutions[part.suffix].t for part in self.parts])
 
     def _values(self, name: str) -> Array:
@@ -382,5 +382,5 @@ class PhasedPlan(SolvedPlan):
 
 
 def parts_of_phases(solution: Solution) -> tuple[Part, ...]:
-    """Return the time interval and the name of each part of a plan, one for each phase."""
+    """Return the parts of a plan with phases: the time interval and the name of each phase."""
     return tuple(Part(begin, end, name) for name, (begin, end) in solution.phases.items())

@@ -1,1 +1,1 @@
-"""Sampling-based planning: collision-free joint paths of several homotopy classes, proven clear and shortened."""
+"""Sampling-based planning of joint paths in several homotopy classes, which are proven collision-free."""

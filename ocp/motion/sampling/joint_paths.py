@@ -92,14 +92,14 @@ class StraightMotions:
             self._levers, self._turns = self.scene.levers.joints, self.scene.levers.joint_turns
 
     def collisions(self, joints: Array) -> list[Collision]:
-        """Return the pairs of bodies closer than the clearance in a configuration (n,), the closest first."""
+        """Return the pairs of bodies closer than the clearance in a configuration (n,), sorted by distance."""
         if self.scene is None:
             return []
         collisions = find_collisions(self.scene, np.zeros(0), joints[None], np.zeros(1))
         return [collision for collision in collisions if collision.distance < self._required]
 
     def near_pairs(self, joints: Array, reach: float) -> tuple[Indices, Indices, Array, Array]:
-        """Return the pairs of bodies closer than clearance plus `reach`, m, in configurations (M, n).
+        """Return the pairs of bodies whose distance in configurations (M, n) is below the clearance plus `reach`, m.
 
         Returns:
             Configuration and pair of each, their distance beyond the clearance, m, shape (K,) each, and its gradient,
@@ -147,7 +147,7 @@ class StraightMotions:
         clear: NDArray[np.bool_],
         intervals: tuple[Indices, Array, Array],
     ) -> None:
-        """Bound distances of bodies on ever shorter intervals, and unset `clear` for motions that may collide.
+        """Bound the distances of bodies on shorter and shorter intervals; unset `clear` for motions that may collide.
 
         Args:
             lines: Starts and ends of the motions.
@@ -225,7 +225,7 @@ class ShorteningSettings:
 
 
 def path_length(path: Array, scale: Array) -> float:
-    """Return the length of a joint path (M, n) if displacements dq have the length |scale * dq|."""
+    """Return the length of a joint path (M, n) in the metric in which a displacement dq has length |scale * dq|."""
     return float(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1).sum())
 
 
@@ -243,7 +243,7 @@ def shorten(
     random: np.random.Generator,
     settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
-    """Shorten a path; the result consists of straight motions that are proven collision-free.
+    """Shorten a joint path by random shortcuts; all its straight motions remain proven collision-free.
 
     Args:
         motions: Proofs of clearance.
@@ -271,10 +271,10 @@ def shorten(
 
 
 def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, *, rungs: int = 32) -> bool:
-    """Return whether two paths are homotopic, as shown by collision-free straight motions at equal fractions.
+    """Return whether collision-free straight motions at equal fractions of two paths prove the paths homotopic.
 
-    Paths of one homotopy class need not satisfy this; paths that do can replace each other as guesses. They are
-    compared at as many places as there are `rungs`.
+    Paths of one homotopy class need not pass this test; paths that pass can replace each other as guesses. The paths
+    are compared at as many places as there are `rungs`.
     """
     shares = np.linspace(0.0, 1.0, rungs + 2)[1:-1]
     return bool(motions.are_clear(*(points_along(path, scale, shares) for path in (first, second))).all())
@@ -286,7 +286,7 @@ def _places(path: Array, scale: Array) -> Array:
 
 
 def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Callable[[Array], Array]) -> Array:
-    """Return the lowest-cost collision-free path from the first to the last corner through some of the others.
+    """Return the lowest-cost collision-free path through the ends and any subset of the other corners of a path.
 
     Args:
         motions: Proofs of clearance.
@@ -312,7 +312,7 @@ def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Ca
 
 
 def _cut(motions: StraightMotions, path: Array, scale: Array, random: np.random.Generator, batch: int) -> Array:
-    """Replace parts of the path by straight shortcuts between random points, those with the largest savings first."""
+    """Replace parts of a path by straight shortcuts between random points; the best shortcuts are applied first."""
     places = _places(path, scale)
     ends = np.sort(random.random((batch, 2)) * places[-1], axis=1)
     begins, stops = (points_along(path, scale, ends[:, side] / places[-1]) for side in (0, 1))
@@ -408,9 +408,9 @@ def optimise_length(
 
 
 def _resample(motions: StraightMotions, path: Array, scale: Array, count: int) -> Array:
-    """Divide a path into straight motions of similar length, proven collision-free; keep corners if necessary.
+    """Divide a path into collision-free straight motions of similar length; keep corners where necessary.
 
-    It is the old path if the motions cannot be proven, since halves of a proven motion need not be.
+    The result is the old path if the motions cannot be proven, since halves of a proven motion need not be.
     """
     shares = np.linspace(0.0, 1.0, count + 1)
     chain = points_along(path, scale, shares)
@@ -433,7 +433,10 @@ def _step(
     inertia: float,
     settings: LengthSettings,
 ) -> Array:
-    """Return the step of a path (m + 1, n) that minimises a bound of its length under linearised constraints."""
+    """Return the displacements of a path's corners that minimise a bound of its length under linear constraints.
+
+    The clearance constraints are linearised. Shape (m + 1, n).
+    """
     inner, n = len(chain) - 2, chain.shape[1]
     places = np.empty((2 * len(chain) - 1, n))
     places[::2], places[1::2] = chain, (chain[:-1] + chain[1:]) / 2
@@ -464,7 +467,7 @@ def _step(
 
 
 def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
-    """Return the point nearest to a target in the polyhedron of points z with rows z >= least, which contains 0."""
+    """Return the point z nearest to a target in the polyhedron `rows` z >= `least`, which contains the origin."""
     needed = least - rows @ target
     active = np.flatnonzero(needed > -np.inf)
     if not len(active) or needed.max() <= 0:
@@ -480,7 +483,10 @@ def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
 
 
 def _clear_step(motions: StraightMotions, chain: Array, moved: Array, smallest: float) -> tuple[Array, Array]:
-    """Shorten the steps of a path until its straight motions are collision-free; return path and step fractions."""
+    """Shorten the displacements of a path's corners until the moved path is collision-free.
+
+    Return the moved path, and the fractions of the displacements by which its corners are moved.
+    """
     shares = np.ones(len(chain))
     while True:
         trial = chain + shares[:, None] * (moved - chain)

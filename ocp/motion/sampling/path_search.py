@@ -134,7 +134,7 @@ def connect(
 
 
 def _step_towards(starts: Array, targets: Array, step: float, scale: Array) -> Array:
-    """Move configurations (K, n) towards their targets by at most one step, as random trees grow."""
+    """Return configurations (K, n) moved towards their targets by at most the step length of a random tree."""
     length = np.linalg.norm((targets - starts) * scale, axis=1, keepdims=True)
     return np.where(length <= step, targets, starts + (targets - starts) * (step / np.maximum(length, step)))
 
@@ -250,7 +250,7 @@ def _path_of(joints: Array, goals: Array, scale: Array) -> JointPath:
 
 
 def _with_path(search: TreeSearch, paths: list[JointPath], path: JointPath) -> list[JointPath]:
-    """Add a path to paths sorted by length, and keep only the shortest path of each homotopy class."""
+    """Add a path to a list sorted by length, and keep only the shortest path of each homotopy class."""
     others = []
     for other in paths:
         if other.goal == path.goal and same_class(search.motions, other.joints, path.joints, search.scale):

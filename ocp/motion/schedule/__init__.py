@@ -1,4 +1,4 @@
-"""Time schedules of paths: jerk-limited speed along a path, as requested wherever the limits allow it."""
+"""Time parametrisation of paths: jerk-limited motions at the requested speed wherever the limits allow it."""
 
 from ocp.motion.schedule.limits import JointLimits, JointPath, JointRates, LineLimits, PathLike, ToolLimits, TorqueRates
 from ocp.motion.schedule.planner import Dip, Schedule, schedule

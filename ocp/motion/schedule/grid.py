@@ -1,4 +1,4 @@
-"""Grids of nodes along a path, fine enough to resolve how its limits vary with distance.
+"""Grids of nodes along a path that are fine enough to resolve how the limits vary along the path.
 
 The bounds between the segments of the path are nodes. Intervals are halved until every limit row at the fastest steady
 speed varies almost linearly between nodes. They also last only a fraction of the time in which the acceleration builds
@@ -34,7 +34,7 @@ __all__ = ["Grid", "coarse_grid", "make_grid", "reachable_bounds"]
 
 @dataclass(frozen=True)
 class GridSettings:
-    """Settings of the grids of nodes along a path, at which limits are evaluated.
+    """Settings for placing the nodes along a path at which the limits are evaluated.
 
     Attributes:
         halvings: Largest number of halvings of an interval of the first grid.
@@ -96,7 +96,8 @@ class Grid:
     sharp: bool = True
 
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
-        """Return the limit rows at start and end of each interval between two nodes. Shape (N,) each.
+        """Return the coefficients of all limits at both ends of each interval from node `first` to `last`. Shape (N,)
+        each.
 
         The rows are evaluated on request: all those of a long path would fill the memory.
         """
@@ -109,13 +110,13 @@ class Grid:
         return rows.take(slice(count)), rows.take(right)
 
     def parts(self) -> list[tuple[int, int]]:
-        """Divide the nodes into blocks of bounded size; return the first and last node of each block."""
+        """Divide the grid into consecutive blocks of bounded size; return the first and last node of each block."""
         ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]
         return list(pairwise(ends))
 
 
 class _Cells(NamedTuple):
-    """N intervals of a path that are short enough to resolve its limits, with bounds of the motion in each interval.
+    """N intervals of a path that are short enough to resolve the limits, with bounds of the motion in each interval.
 
     Attributes:
         begin: Distances at which the intervals begin. Shape (N,), m, as of the others.
@@ -132,7 +133,7 @@ class _Cells(NamedTuple):
 
 
 def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> Grid:
-    """Return a grid of nodes along a path that is fine enough to resolve its limits.
+    """Return a grid of nodes along a path that is fine enough to resolve how the limits vary along the path.
 
     Args:
         path, limits: As of the schedule.
@@ -165,7 +166,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
 def _halve_intervals(
     path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, requested: tuple[Array, Array]
 ) -> _Cells:
-    """Halve the intervals between positions on the path until their limit rows vary almost linearly.
+    """Halve the intervals of a path until the coefficients of all limits vary almost linearly in each interval.
 
     Args:
         path, limits, joints: As for `make_grid`.
@@ -214,14 +215,14 @@ def _check_rest(rows: Rows, s: Array, names: tuple[str, ...]) -> None:
 
 
 def _separate(places: Array, nodes: Array) -> Array:
-    """Return positions on a path in order, without those that are too close to a node or to each other."""
+    """Sort positions on a path and remove those too close to another position; positions in `nodes` are kept."""
     s = np.unique(places)
     for _ in range(3):
         gap = np.diff(s)
         longer_gap = np.maximum(np.append(gap, 0.0), np.insert(gap, 0, 0.0))
         close = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf)) < SETTINGS.closest * longer_gap
         close &= ~np.isin(s, nodes)
-        close[1:] &= ~close[:-1]  # of two close positions one stays
+        close[1:] &= ~close[:-1]  # of two close positions, keep one
         if not close.any():
             break
         s = s[~close]
@@ -229,14 +230,14 @@ def _separate(places: Array, nodes: Array) -> Array:
 
 
 def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Array:
-    """Return the fastest constant speed that limits and requested speed permit in each interval. Shape (N,), m/s."""
+    """Return the fastest constant speed that the limits and the request permit in each interval. Shape (N,), m/s."""
     steady = rows.steady()[0]
     here = requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)]
     return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), here))
 
 
 def _uneven_intervals(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
-    """Return in which intervals limits vary too nonlinearly with distance at the fastest steady speed. Shape (N,)."""
+    """Return in which intervals limits vary too nonlinearly with distance at the highest steady speed. Shape (N,)."""
     sides = left, middle, right
     kinds = (
         # by the squared speed, as the rows of speed are in the program
@@ -254,7 +255,7 @@ def _uneven_intervals(left: Rows, middle: Rows, right: Rows, top: Array) -> NDAr
 def reachable_bounds(
     distance: Array, caps: Array, *, left: Rows, right: Rows, at_rest: tuple[bool, bool]
 ) -> tuple[Array, Array]:
-    """Return upper bounds of the squared speeds at nodes (N + 1,) and of the accelerations in intervals (N,).
+    """Return upper bounds, for any motion, of squared speeds at nodes (N + 1,) and accelerations in intervals (N,).
 
     Args:
         distance: Distances of the nodes. Shape (N + 1,), m.
@@ -267,7 +268,7 @@ def reachable_bounds(
 
 
 def _acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> Array:
-    """Return upper bounds of the accelerations in intervals from squared speeds at their ends. Shape (N,) each."""
+    """Return upper bounds of the acceleration in each interval from the squared speeds at both ends. Shape (N,)."""
     rates = np.full(len(first), np.inf)
     for side, most in ((left, first), (right, last)):
         rows = np.abs(side.acceleration)
@@ -288,7 +289,7 @@ def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tupl
 
 
 def _time_nodes(cells: _Cells, length: float) -> Array:
-    """Return the nodes of a grid whose intervals the motion passes in a short time, refined towards both ends."""
+    """Return grid nodes such that the motion passes every interval in a short time, refined towards the path's ends."""
     _, top, rates, acceleration, jerk = cells
     s = np.append(cells.begin, length)
     caps = np.minimum(np.append(top, np.inf), np.insert(top, 0, np.inf)) ** 2
@@ -323,5 +324,5 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
 
 
 def _group_indices(sizes: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the numbers 0, 1, ... within each group of the given sizes."""
+    """Return the index of each element within its group, for consecutive groups of the given sizes."""
     return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)

@@ -1,4 +1,4 @@
-"""Limits of a schedule, as inequalities in the speed v, acceleration a and jerk j along a path at points of the path.
+"""Limits of a motion along a path, as inequalities in its speed v, acceleration a and jerk j at points of the path.
 
     speed          k v <= 1
     acceleration   -1 <= p a + q v^2 + r <= 1
@@ -35,7 +35,7 @@ BLOCK_SIZE = 20_000
 
 
 class PathLike(Protocol):
-    """Interface that a schedule needs of a path; models.paths.SmoothPath provides it."""
+    """Interface of a path for which a motion can be timed; models.paths.SmoothPath provides this interface."""
 
     @property
     def length(self) -> float: ...
@@ -107,7 +107,7 @@ class JointLimits:
 
 @dataclass(frozen=True, eq=False)
 class ToolLimits:
-    """Limits of acceleration (m/s^2) and jerk (m/s^3) of the tool along each world axis, and of its turn rate.
+    """Limits of the tool: acceleration (m/s^2) and jerk (m/s^3) along each world axis, and angular speed.
 
     Attributes:
         acceleration, jerk: Symmetric limits. Shape (3,), or one number for all axes.
@@ -133,7 +133,7 @@ class ToolLimits:
 
 @dataclass(frozen=True, eq=False)
 class LineLimits:
-    """Limits of a schedule: of speed, acceleration and jerk along the path, of the tool and of the joints.
+    """Limits of a motion along a path: of its speed, acceleration and jerk, of the tool and of the joints.
 
     Attributes:
         speed: Requested speed along the path, m/s: one number, or one for each segment of the task.
@@ -162,7 +162,8 @@ class LineLimits:
                 require.instance("joint limits" if name == "joints" else "tool limits", getattr(self, name), kind)
 
     def of_joints(self, count: int) -> Array:
-        """Return velocity, acceleration and jerk limits of `count` joints, where 0 becomes infinite. Shape (3, count).
+        """Return velocity, acceleration and jerk limits of `count` joints, with 0 replaced by infinity. Shape (3,
+        count).
 
         Joints with a limit of 0 do not move, see `check_line`.
         """
@@ -174,7 +175,7 @@ class LineLimits:
         return np.asarray(self._of_joints(count, ("torque",))[0])
 
     def _of_joints(self, count: int, names: tuple[str, ...]) -> Array:
-        """Return the joint limits of the kinds `names` for `count` joints, after checks. Shape (len(names), count)."""
+        """Return the joint limits named by `names`, such as "jerk", for `count` joints. Shape (len(names), count)."""
         joints = self.joints or JointLimits()
         rows = []
         for name in names:
@@ -187,7 +188,8 @@ class LineLimits:
 
 
 def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, zero: bool = False) -> None:
-    """Raise ProblemError unless a limit is positive, of at most `dimensions` array dimensions, and finite if required.
+    """Raise ProblemError unless a limit is positive, has at most `dimensions` array dimensions, and is finite if
+    required.
 
     With `zero` it may also be 0.
     """
@@ -204,7 +206,7 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, ze
         message = f"{name} limit {value_at_fault:g} must be positive{' and finite' if finite else ''}"
         raise ProblemError(message, name=name, value=value_at_fault, limit=0.0)
     numbers = np.finfo(float)
-    low, high = (float(end) ** 0.2 for end in (numbers.tiny, numbers.max))  # products of five are numbers
+    low, high = (float(end) ** 0.2 for end in (numbers.tiny, numbers.max))  # products of five do not overflow
     extreme = array[np.isfinite(array) & (array != 0) & ~((low < array) & (array < high))]
     if extreme.size:
         message = f"{name} limit {extreme[0]:g} is outside the range of sizes {low:.0e} to {high:.0e}: check its unit"
@@ -212,7 +214,7 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, ze
 
 
 def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> JointPath | None:
-    """Check the arguments of a schedule; return the joints along the path if they are limited, else None.
+    """Check the arguments of `schedule`; return `joints` if the limits include joint limits, else None.
 
     Raises:
         ProblemError: Path, limits or joints have the wrong type, or there are joint limits without joints.
@@ -253,14 +255,14 @@ def _check_still(path: PathLike, limits: LineLimits, joints: JointPath) -> None:
 
 
 def check_joints(joints: JointPath) -> None:
-    """Raise ProblemError unless an object has the names and positions of joints along a path."""
+    """Raise ProblemError unless an object provides the names and positions of joints along a path."""
     if isinstance(joints, type) or not hasattr(joints, "names") or not callable(getattr(joints, "at", None)):
         message = f"joints must be a function of the distance, as models.scara_along makes it, not {joints!r}"
         raise ProblemError(message, name="joints", value=joints)
 
 
 def rates_along(joints: JointPath, distance: Array) -> JointRates:
-    """Return joint positions and their derivatives with respect to distance at distances (M,), after checks.
+    """Return joint positions and their derivatives with respect to distance at points (M,) of a path, after checks.
 
     Raises:
         ProblemError: A shape is not (M, n), or a value is not finite.
@@ -289,7 +291,7 @@ def rates_along(joints: JointPath, distance: Array) -> JointRates:
 
 
 def curvature_along(path: PathLike, distance: Array) -> Array:
-    """Return a path's curvature at distances (M,), 1/m; raise ProblemError if it has a wrong shape or is not finite."""
+    """Return a path's curvature at distances (M,), 1/m; raise ProblemError for a wrong shape or non-finite values."""
     value = np.asarray(path.curvature(distance), dtype=float)
     if value.shape != np.shape(distance):
         message = f"the path's curvature has shape {value.shape}, expected {np.shape(distance)}"
@@ -321,7 +323,9 @@ def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
 
 
 def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Array]:
-    """Return tangent, curvature vector, its derivative, and rotation of the tool per distance. Shape (M, 3) each."""
+    """Return the tangent, the curvature vector and its derivative, and the tool's rotation per metre. Shape (M, 3)
+    each.
+    """
     missing = [name for name in ("at", "turn") if not callable(getattr(path, name, None))]
     if missing:
         message = f"tool limits need a path with places and turns, as models.smooth makes it; it has no {missing[0]}"
@@ -365,7 +369,9 @@ class Rows(NamedTuple):
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
     def steady(self) -> tuple[Array, NDArray[np.intp]]:
-        """Return the greatest constant speed at each point, m/s, and the index of its active limit. Shape (S,) each."""
+        """Return the greatest permitted constant speed at each point, m/s, and the index of its active limit. Shape
+        (S,).
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             available = 1 - np.sign(self.acceleration[:, :, 1]) * self.acceleration[:, :, 2]
             speeds = np.concatenate(
@@ -425,7 +431,7 @@ def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[s
 
 
 def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
-    """Return the number of limits of torques, which are the last of the acceleration limits in `Rows`."""
+    """Return the number of torque limits, which are the last of the acceleration limits in `Rows`."""
     if joints is None or not np.isfinite(limits.torques(len(joints.names))).any():
         return 0
     return len(joints.names)
@@ -434,7 +440,7 @@ def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
 def limit_rows(
     path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array, *, torques: bool = True
 ) -> Rows:
-    """Return the coefficients of all limits at distances (S,) along a path, zero for those of torques unless `torques`.
+    """Return the coefficients of all limits at distances (S,) along a path; torques count only if `torques` is true.
 
     Raises:
         ProblemError: Curvature or joints are not finite, as at a singular arm, or have a wrong shape.

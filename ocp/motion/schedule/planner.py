@@ -1,4 +1,4 @@
-"""Time schedules of paths: the requested speed along a path wherever limits permit it, smooth reductions elsewhere.
+"""Time parametrisation of paths: at the requested speed wherever the limits permit it, and smoothly reduced elsewhere.
 
 On long paths where centripetal acceleration alone reduces the speed, the schedule consists of stretches of constant
 speed joined by ramps. The maximum velocity curve, sqrt(limit / curvature), is sampled on a grid that is refined where
@@ -39,7 +39,7 @@ __all__ = ["Dip", "Schedule", "plan_below_velocity_curve", "schedule"]
 
 @dataclass(frozen=True)
 class ScheduleSettings:
-    """Settings of the planning of schedules, and of the maximum velocity curve.
+    """Settings for planning the time parametrisation of a path and for sampling its maximum velocity curve.
 
     Attributes:
         curve_halvings: Largest number of halvings of an interval of the velocity curve, whose minima are sharp.
@@ -71,7 +71,7 @@ SETTINGS = ScheduleSettings()
 
 
 def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
-    """Return a motion from rest to rest below the maximum velocity curve and within the limits along the path.
+    """Return a motion from rest to rest below a path's maximum velocity curve and within the limits along the path.
 
     Raises:
         ProblemError: The curvature is not finite, or no plan below the curve is found.
@@ -87,7 +87,7 @@ def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfil
 
 
 def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
-    """Return distances, the maximum velocity curve at them (G,), and requested speeds between them (G - 1,)."""
+    """Sample the maximum velocity curve; return distances and speeds (G,), and requested speeds between (G - 1,)."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
@@ -108,7 +108,7 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
 def _refine_distances(
     path: PathLike, limits: LineLimits, s: Array, bounds: Array, of_pieces: Array
 ) -> tuple[Array, Array, Array]:
-    """Refine sample distances on given segments of a path until they resolve the maximum velocity curve."""
+    """Refine sample distances on given segments of a path until the samples resolve the maximum velocity curve."""
 
     def permitted_at(places: Array) -> Array:
         with np.errstate(divide="ignore"):
@@ -132,7 +132,7 @@ def _refine_distances(
 def _unresolved_intervals(
     length: float, s: Array, permitted: Array, requested: Array, acceleration: float
 ) -> NDArray[np.bool_]:
-    """Return which intervals are too coarse to resolve the permitted speed where it limits the motion.
+    """Return which intervals are too coarse to resolve the permitted speed where this speed limits the motion.
 
     It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.
     """
@@ -159,7 +159,7 @@ def _constant_zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
 
 
 def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, everywhere: bool) -> bool:
-    """Lower the speeds of intervals, in place, where a profile is too fast; return whether a speed was lowered."""
+    """Lower, in place, the speeds of intervals in which a profile is too fast; return whether a speed was lowered."""
     speeds = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // BLOCK_SIZE + 1)])
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
@@ -187,7 +187,7 @@ def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfil
 
 @dataclass(frozen=True)
 class Dip:
-    """Part of a path on which the schedule is slower than requested, and the limit that causes it.
+    """Part of a path on which the motion is slower than requested, and the limit that causes the reduction.
 
     Attributes:
         start, end: Distances along the path, m.
@@ -218,7 +218,7 @@ class Dip:
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """Motion along a path over time, as planned by `schedule`.
+    """Motion along a path as a function of time, planned by `schedule`.
 
     Attributes:
         path: The path.
@@ -260,7 +260,7 @@ class Schedule:
         return self.at(sample_times("sample period", period, self.duration))
 
     def function(self) -> Any:
-        """Return the motion as a CasADi function of time, see SpeedProfile.function."""
+        """Return the motion as a CasADi Function from time (s) to distance, speed, acceleration and jerk."""
         return self.profile.function()
 
 
@@ -307,7 +307,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
 
 def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
-    """Return `line_profile`, or the fastest motion under all limits where it violates one or if it is None."""
+    """Return `line_profile`, planned again under all limits where it violates a limit, or everywhere if it is None."""
     count = len(grid.requested)
     if line_profile is None:
         return fastest_profile(Stretch(grid, 0, count))
@@ -345,7 +345,7 @@ def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> Speed
 
 
 def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
-    """Return which intervals of the grid contain a violation of a limit. Shape (N,)."""
+    """Return in which intervals of the grid a speed profile violates a limit. Shape (N,)."""
     violated = np.zeros(len(grid.requested), dtype=bool)
     # inside an interval the jerk may change and the speed may have its maximum
     peaks = profile.at(
@@ -364,7 +364,7 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
 
 
 def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float) -> list[tuple[int, int]]:
-    """Return the first and last nodes of the stretches of a path that must be planned again.
+    """Return first and last node of each stretch of a path that must be planned again because a limit is violated.
 
     They end at steady speeds or path ends, beyond the violated intervals by `extent` times the length of a ramp to
     rest.
@@ -392,7 +392,7 @@ def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], e
 
 
 def _reaches_speed_at_ends(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
-    """Return whether a motion has the requested speed near the ends of its stretch; path ends are excepted."""
+    """Return whether a motion has the requested speed near both ends of its stretch, except at the path's ends."""
     length = motion.distance[-1] - motion.distance[0]
     for node, inside in ((first, first), (last, last - 1)):
         if node in (0, len(grid.requested)):
@@ -418,7 +418,7 @@ def _cut_profile(profile: SpeedProfile, begin: float, end: float) -> SpeedProfil
 
 
 def _find_dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Dip, ...]:
-    """Return the parts of a path on which a limit other than those of the line reduces the requested speed."""
+    """Return the parts of a path on which a limit other than those along the path reduces the requested speed."""
     middle = profile.at_distance((grid.distance[:-1] + grid.distance[1:]) / 2)
     line_rows = [k for k, name in enumerate(names) if name.startswith("line ")]
     cause, steady = np.zeros(len(grid.requested), dtype=np.intp), np.zeros(len(grid.requested))

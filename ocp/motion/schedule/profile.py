@@ -1,4 +1,4 @@
-"""Distance and speed along a path over time, in segments of constant jerk."""
+"""Distance and speed along a path as functions of time, in segments of constant jerk."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class LineMotion(NamedTuple):
 
 
 def integrate_jerk(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple[Any, Any, Any]:
-    """Return distance, speed and acceleration after a time at constant jerk, for numbers, arrays or CasADi."""
+    """Return distance, speed and acceleration after a time at constant jerk; works for numbers, arrays and CasADi."""
     s = time * (speed + time * (acceleration / 2 + time * jerk / 6))
     return s, speed + time * (acceleration + time * jerk / 2), acceleration + time * jerk
 
@@ -49,7 +49,7 @@ def segment_index(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "r
 
 
 def _checked_values(value: ArrayLike, upper: float, name: str, problem: str) -> Array:
-    """Return numbers, clipped to [0, upper]; raise ProblemError if one lies outside by more than rounding."""
+    """Return numbers clipped to [0, upper]; raise ProblemError if a number is outside by more than rounding."""
     try:
         # a contiguous array occupies its memory; a broadcast view could claim any size
         plain = isinstance(value, np.ndarray) and value.dtype == float and value.flags.c_contiguous
@@ -109,7 +109,7 @@ class SpeedProfile:
         return float(self.t[-1])
 
     def at(self, time: ArrayLike) -> LineMotion:
-        """Return the motion at times (M,) in [0, duration], s; where the jerk jumps, it has the later value.
+        """Return the motion at times (M,) in [0, duration], s; where the jerk jumps, the value after the jump counts.
 
         Raises:
             ProblemError: A time is nan, or outside by more than rounding.
@@ -123,7 +123,7 @@ class SpeedProfile:
         return motion
 
     def at_distance(self, distance: ArrayLike) -> LineMotion:
-        """Return the motion at distances (M,) from the start, m; where it rests, at the time of arrival.
+        """Return the motion at distances (M,) from the start, m; where the motion rests, at the time of arrival.
 
         Raises:
             ProblemError: A distance is nan, or off the path by more than rounding.
@@ -136,14 +136,14 @@ class SpeedProfile:
         return self._motion(segment, np.where(s == length, np.diff(self.t)[-1], inside))
 
     def peaks(self) -> LineMotion:
-        """Return the motion at all times where the speed may be largest: segment ends and zero acceleration."""
+        """Return the motion at all times of possible speed maxima: at segment ends and at zero acceleration."""
         with np.errstate(divide="ignore", invalid="ignore"):
             zero = -self.acceleration[:-1] / self.jerk
         inside = np.flatnonzero((zero > 0) & (zero < np.diff(self.t)))
         return self.at(np.concatenate([self.t, self.t[:-1][inside] + zero[inside]]))
 
     def function(self) -> Any:
-        """Return the CasADi Function of distance, speed, acceleration and jerk over time (s).
+        """Return the motion as a CasADi Function from time (s) to distance, speed, acceleration and jerk.
 
         Its tables are MX constants. Times outside are clipped to the ends.
         """

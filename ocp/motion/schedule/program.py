@@ -1,4 +1,5 @@
-"""Minimum time over a stretch of a path: convex programming in the squared speed by one interior-point iteration.
+"""Minimum-time motion along a stretch of a path: a convex program in the squared speed, solved by an interior-point
+method.
 
 With x = v^2 as a function of the distance s, a = x'/2 and j = v x''/2, so that
 
@@ -40,7 +41,7 @@ __all__ = ["INTERIOR", "Program", "ProgramSettings", "Spline", "SplineRows", "le
 
 @dataclass(frozen=True)
 class ProgramSettings:
-    """Settings of the interior-point method for the fastest motion; complementarity is relative to the travel time.
+    """Settings of the interior-point method for the fastest motion. Complementarity is relative to the travel time.
 
     Attributes:
         steps: Largest number of steps.
@@ -76,7 +77,7 @@ INTERIOR = ProgramSettings()
 
 
 class SplineRows(NamedTuple):
-    """Constraints on the squared speed x and its first two derivatives with respect to distance, M rows.
+    """M constraints on the squared speed x along a path and its derivatives x' and x'' with respect to distance.
 
     Attributes:
         interval: Interval in which each row holds. Shape (M,).
@@ -96,7 +97,7 @@ class SplineRows(NamedTuple):
 
 
 class Spline:
-    """Quadratic spline of the squared speed x along a path, with N + 2 coefficients for N + 1 nodes (m)."""
+    """Quadratic spline for the squared speed along a path, with N + 2 coefficients for nodes at N + 1 distances (m)."""
 
     def __init__(self, nodes: Array) -> None:
         self.nodes, self.h = nodes, np.diff(nodes)
@@ -105,7 +106,7 @@ class Spline:
         self.share = before / self.width
 
     def part(self, at: NDArray[np.intp]) -> Spline:
-        """Return the spline with a subset of the coefficients, treated as if they were neighbours."""
+        """Return a spline with a subset of the coefficients, as if these coefficients were neighbours."""
         part, last = copy(self), len(self.h)
         part.h = self.h[np.minimum(at[:-2], last - 1)]
         nodes = np.minimum(at[:-1], last)
@@ -122,7 +123,7 @@ class Spline:
         return np.append(x - self.share * self.width * slope / 2, x[-1])
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
-        """Return the matrices from spline coefficients of intervals to x, x', x'' at points there. Shape (3, 3, M)."""
+        """Return the matrices from coefficients of an interval to x, x', x'' at a point in it. Shape (3, 3, M)."""
         h, share = self.h[interval], self.share[interval]
         inside = fraction * h
         first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
@@ -154,7 +155,9 @@ class Program(NamedTuple):
     fixed: NDArray[np.intp]
 
     def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
-        """Return the program of given intervals (B,), with fixed motion elsewhere, and its coefficients' indices."""
+        """Return the program for given intervals (B,), with fixed motion elsewhere, and the indices of its
+        coefficients.
+        """
         count = len(self.spline.h)  # stretches are concatenated, with two intervals without rows between them
         cuts = np.flatnonzero(np.diff(free) > 1)
         first, last = free[np.append(0, cuts + 1)], free[np.append(cuts, len(free) - 1)] + 1
@@ -181,7 +184,7 @@ class Program(NamedTuple):
 
 
 class _EndConditions:
-    """End conditions of the motion: fixed spline coefficients, and at rest a coefficient that follows its neighbour."""
+    """End conditions of the motion: fixed coefficients or, at rest, an outer coefficient proportional to the next."""
 
     def __init__(self, program: Program) -> None:
         n, h, (first, last) = len(program.upper), program.spline.h, program.rest
@@ -190,20 +193,20 @@ class _EndConditions:
         self.fixed = np.union1d(program.fixed, np.array([outer for outer, *_ in self.sides], dtype=np.intp))
 
     def start(self, b: Array) -> Array:
-        """Return the coefficients ``b`` changed so that they satisfy the end conditions."""
+        """Return a copy of the spline coefficients ``b`` that satisfies the end conditions."""
         b = b.copy()
         for outer, inner, ratio in self.sides:
             b[outer] = ratio * b[inner]
         return b
 
     def follow(self, change: Array) -> None:
-        """Adjust a change of the coefficients to the end conditions, in place."""
+        """Modify a change of the coefficients, in place, so that the end conditions stay satisfied."""
         change[self.fixed] = 0.0
         for outer, inner, ratio in self.sides:
             change[outer] = ratio * change[inner]
 
     def reduce(self, slope: Array) -> None:
-        """Reduce a gradient to that of the free coefficients, in place."""
+        """Replace a gradient, in place, by the gradient with respect to the free coefficients."""
         for outer, inner, ratio in self.sides:
             slope[inner] += ratio * slope[outer]
         slope[self.fixed] = 0.0
@@ -230,7 +233,8 @@ class _EndConditions:
 
 
 class _BandSolver:
-    """Solver of linear systems with a symmetric positive definite matrix of five diagonals, given as three (3, n).
+    """Solver of linear systems with a symmetric positive definite pentadiagonal matrix, given by three diagonals (3,
+    n).
 
     Raises:
         LinAlgError: The equations are not positive definite, for example when only rounding errors remain.
@@ -251,7 +255,7 @@ class _BandSolver:
 
 
 class _Constraints:
-    """Constraints of a program: positive coefficients, bounded coefficients, then limit rows with jerk limits last.
+    """Constraints of a program: positive coefficients, bounds of coefficients, then limit rows with jerk limits last.
 
     Values of constraints, shape (M,), are in this order.
 
@@ -290,7 +294,7 @@ class _Constraints:
         self.middles = INTERIOR.block * np.arange(self.blocks.max() + 1) + (INTERIOR.block - 1) / 2
 
     def evaluate(self, b: Array) -> tuple[Array, Array]:
-        """Return violations and scales of the constraints at coefficients b, and linearise jerk limits there."""
+        """Return violations and scales of the constraints at spline coefficients b, and linearise jerk limits at b."""
         coefficients, sharp = self._coefficients(b), self.alone + self.jerk
         at = _weighted_sum(self.square, [each[self.jerk :] for each in coefficients])
         root = self.sharp / np.sqrt(at)
@@ -306,7 +310,7 @@ class _Constraints:
         return gap, size
 
     def change_of(self, change: Array) -> Array:
-        """Return the changes of all constraints for a change of the coefficients. Shape (M,)."""
+        """Return the linearised changes of all constraint values for a change of the coefficients. Shape (M,)."""
         return self._all_values(change, _weighted_sum(self.gradients, self._coefficients(change)))
 
     def weighted_gradients(self, values: Array) -> Array:
@@ -317,7 +321,9 @@ class _Constraints:
         return out
 
     def squares(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return the diagonals of the weighted sum of outer products of gradients. Shapes (N + 2,), (N + 1,), (N,)."""
+        """Return diagonals of the weighted sum of g g' over all constraint gradients g. Shapes (N + 2,), (N + 1,),
+        (N,).
+        """
         g = self.gradients
         pulled = g * values[self.alone :]
         main = self._spread(g * pulled)
@@ -326,15 +332,15 @@ class _Constraints:
         return main, self._spread([g[0] * pulled[1], g[1] * pulled[2]]), self._spread([g[0] * pulled[2]])
 
     def _coefficients(self, b: Array) -> list[Array]:
-        """Return the three spline coefficients of the interval of each limit row."""
+        """Return, for each limit row, the three spline coefficients of the interval to which the row belongs."""
         return [b[k : self.count + k].take(self.row_interval) for k in range(3)]
 
     def _all_values(self, b: Array, rows: Array) -> Array:
-        """Return the values of all constraints from spline coefficients ``b`` and the values of the limit rows."""
+        """Return the values of all constraints, given spline coefficients ``b`` and the values of the limit rows."""
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
     def _spread(self, values: Iterable[Array]) -> Array:
-        """Sum values over the limit rows of each interval, and add the k-th sums to its k-th spline coefficient.
+        """Sum values over the limit rows of each interval; add the k-th sum to the interval's k-th spline coefficient.
 
         Shapes (M - `alone`,) each to (N + number of values - 1,).
         """
@@ -345,7 +351,7 @@ class _Constraints:
         return out
 
     def longest(self, rates: Array, share: float, of_positive: float) -> Array:
-        """Return step lengths of at most 1 for the intervals, which vary slowly along the path. Shape (N,).
+        """Return a step length of at most 1 for each interval; the lengths vary slowly along the path. Shape (N,).
 
         Args:
             rates: Relative rates of change of values that stay positive. Shape (M,).
@@ -476,14 +482,15 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
 
 def _violations(gap: Array, slack: Array, size: Array, count: int) -> Array:
-    """Return the relative violations of constraints that slacks leave; zero for the first `count`, always satisfied."""
+    """Return the relative residuals of constraints with slacks; zero for the first `count`, which always hold."""
     violation = (gap + slack) / size
     violation[:count] = 0.0
     return np.asarray(violation)
 
 
 def _travel_time(share: Array, weights: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
-    """Return the travel time, its gradient, and its Hessian as main and two upper diagonals.
+    """Return the travel time, its gradient in the spline coefficients, and the main and two upper diagonals of its
+    Hessian.
 
     `weights` are the path lengths that the quadrature points represent.
     """

@@ -1,4 +1,4 @@
-"""Jerk-limited ramps of the speed along a path, and time-optimal passes where no jerk is limited.
+"""Jerk-limited changes of the speed along a path, and time-optimal passes for motions without jerk limits.
 
 A ramp changes the speed with zero acceleration at both ends. This module has its time and distance, its inverse (the
 speed within reach), and the fastest motion between two speeds over a distance. A zone is a stretch with constant limits
@@ -33,10 +33,10 @@ __all__ = [
 Phases = tuple[tuple[float, float], ...]
 """Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
 Memory = MutableMapping[tuple[float, ...], Phases]
-"""Cache of computed motions, by distance, end speeds and limits."""
+"""Cache of computed motions, keyed by distance, end speeds and limits."""
 
 REACH_MARGIN = 1e-6
-"""Share of the length of a zone reserved when the speeds at its ends are chosen, so that it has a feasible motion."""
+"""Fraction of a zone (stretch with constant limits) kept in reserve, so that a motion through the zone is feasible."""
 
 
 class Zones(NamedTuple):
@@ -68,7 +68,7 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
 
 
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
-    """Return the distance (m) of the shortest change between two speeds; raises the errors of `ramp_time`."""
+    """Return the distance (m) covered by the shortest change between two speeds; raises the errors of `ramp_time`."""
     for name, value in (("first", first), ("last", last)):
         require.nonnegative(f"ramp: {name}", value)
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
@@ -145,7 +145,7 @@ def fastest_motion(distance: float, first: float, last: float, limits: tuple[flo
 
 
 def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
-    """Return whether phases of constant jerk reach the given distance and final speed at admissible speeds."""
+    """Return whether phases of constant jerk end at the given distance and speed, and keep to permitted speeds."""
     s, v, a = 0.0, first, 0.0
     error = ROUNDING_SHARE * top
     for t, j in phases:
@@ -157,7 +157,7 @@ def _closes(phases: Phases, distance: float, first: float, last: float, top: flo
 
 
 def _two_ramps(distance: float, first: float, last: float, top: float, acceleration: float, jerk: float) -> Phases:
-    """Return a motion that accelerates to the highest possible speed, keeps it, and decelerates."""
+    """Return a motion that accelerates to the highest possible speed, continues at that speed, and decelerates."""
 
     def needed(peak: float) -> float:
         return ramp_distance(first, peak, acceleration, jerk) + ramp_distance(peak, last, acceleration, jerk)
@@ -241,7 +241,7 @@ def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
 
 
 def _limit_speed(speed: float, other_end: float, length: float, limits: tuple[float, float, float]) -> float:
-    """Return the speed at one end of a zone (a stretch with constant limits), lowered to what the other end permits."""
+    """Lower the speed at one end of a zone (stretch with constant limits) to what is reachable from the other end."""
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
@@ -290,7 +290,7 @@ def reachability_passes(distance: Array, caps: Array, *, p: Array, q: Array, low
 
 
 def _feasible_squares(p: Array, q: Array, low: Array, high: Array, caps: Array) -> tuple[Array, Array]:
-    """Return the bounds (N,) of the squared speed between which each interval permits some acceleration."""
+    """Return lower and upper bounds (N,) of the squared speeds at which the limits permit some acceleration."""
     floor, ceiling = np.zeros(len(p)), caps.copy()
     count = p.shape[1]
     with np.errstate(divide="ignore", invalid="ignore"):

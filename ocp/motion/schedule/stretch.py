@@ -39,12 +39,12 @@ from ocp.tolerances import ROUNDING_SHARE
 __all__ = ["ACTIVE_SHARE", "fastest_profile"]
 
 ACTIVE_SHARE = 0.98
-"""Share of a limit above which it counts as active; limits that stay below it in every motion are left out at first."""
+"""Fraction of a limit above which it counts as active; limits that no motion can activate are left out at first."""
 
 
 @dataclass(frozen=True)
 class StretchSettings:
-    """Settings of the search for the fastest motion over a stretch of a path; shares are relative.
+    """Settings of the search for the fastest motion over a stretch of a path.
 
     Attributes:
         rounds: Largest number of rounds of tightening the limits.
@@ -81,7 +81,7 @@ SETTINGS = StretchSettings()
 
 
 def fastest_profile(stretch: Stretch) -> SpeedProfile:
-    """Return the fastest motion over a stretch of a path, with distances from the start of the path.
+    """Return the fastest motion over a stretch of a path; its distances count from the start of the path.
 
     Raises:
         ProblemError: No motion keeps the limits, with the distance at fault.
@@ -106,7 +106,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
 def _solve_window(
     window: Window, seam: int, before: EnforcedRows | None
 ) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
-    """Return the fastest motion over a window (intervals that are solved at once) up to the start of the next one.
+    """Return the fastest motion over a window (intervals solved at once), up to the start of the next window.
 
     Args:
         window: The window.
@@ -130,7 +130,8 @@ def _solve_window(
 
 
 def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> tuple[Array, Array | None]:
-    """Tighten limits until a motion satisfies the original ones; return its squared speeds and, if needed, slopes.
+    """Tighten limits until the motion satisfies the original limits; return squared speeds and, with jerk limits,
+    slopes.
 
     If few intervals still violate limits, these are planned again with their neighbours, between fixed motions.
 
@@ -189,7 +190,7 @@ def _seam_shares(window: Window, seam: int) -> Array:
 
 
 def _without_jerk(window: Window, margins: Margins) -> Array:
-    """Return the highest squared speeds at nodes if jerks are unlimited, by a forward and a backward pass."""
+    """Return the highest squared speeds at a window's nodes without jerk limits, by a forward and a backward pass."""
     grid = window.grid
     left, right = window.rows[0], window.rows[-1]
     h = np.diff(window.nodes)[:, None]
@@ -217,7 +218,7 @@ def _node_minimum(of_intervals: Array) -> Array:
 def _with_jerk(
     window: Window, enforced: EnforcedRows, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
 ) -> Motion:
-    """Return the squared speeds and their slopes at the nodes of a window if jerks are limited, by a convex program."""
+    """Return squared speeds and their slopes at the nodes of a window under jerk limits, by a convex program."""
     begin, end, ends, grid, nodes = window.first, window.last, window.ends, window.grid, window.nodes
     left, middle, right = (window.rows[k] for k in (0, 2, 4))
     at_rest = ends[0][0] == 0, ends[1][0] == 0
@@ -288,7 +289,7 @@ def _with_jerk(
 
 
 def _resolve(program: Program, known: Array, accuracy: float) -> Array:
-    """Solve a program from the solution of a similar one; if that fails, from a guess farther inside."""
+    """Solve a program from the scaled solution of a similar program; if that fails, scale the solution further down."""
     free = np.ones(len(known), dtype=bool)
     free[program.fixed] = False
     start = np.where(free, SETTINGS.again, 1.0) * known
@@ -300,7 +301,7 @@ def _resolve(program: Program, known: Array, accuracy: float) -> Array:
 
 
 def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: Ends) -> Array:
-    """Return an initial guess of the squared speeds at nodes (N + 1,) that approximately keeps the jerk limits.
+    """Return an initial guess of the squared speeds at nodes (N + 1,) that approximately satisfies the jerk limits.
 
     From rest, squared speed to the power 3/4 grows by the square root of 9/2 of the jerk times the distance; a known
     motion may slow down likewise.
@@ -338,7 +339,7 @@ def _spline_rows(
     speeds: Array,
     in_motion: tuple[bool, bool],
 ) -> SplineRows:
-    """Return the enforced limits as constraint rows on a spline, with speed limits at nodes and where tightened.
+    """Return the enforced limits as constraints on a spline, with speed limits at nodes and where they are tightened.
 
     Args:
         places: Limit rows where intervals begin, inside them, and where they end. Shape (N,) each.
@@ -377,7 +378,7 @@ def _spline_rows(
 
 
 def _jerk_place(inside: float) -> float:
-    """Return where in an interval the spline's jerk equals the constant jerk of the final motion in the same half.
+    """Return the fraction of an interval where the spline's jerk equals the final motion's jerk in the same half.
 
     With squared speed x, the spline's jerk is x''/2 v. With a = a0 + x''/2 (s - s0), two jerks over half the time T
     each lead to the speed and acceleration at its end if they are x''/2 (v0 + a0 T / 6) and x''/2 (v0 + a0 5 T / 6),
@@ -387,7 +388,7 @@ def _jerk_place(inside: float) -> float:
 
 
 def _speed_ratios(spline: Spline, b: Array) -> Array:
-    """Return the ratios of a spline's speeds at the `HELD` positions to those at their `_jerk_place`. Shape (4, N)."""
+    """Return speeds where limits are enforced, divided by the speeds at the associated `_jerk_place`. Shape (4, N)."""
     x, slope = spline.at_nodes(b)
     second = np.diff(slope) / spline.h
 
@@ -400,13 +401,13 @@ def _speed_ratios(spline: Spline, b: Array) -> Array:
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
-    """Return the constraint rows by which squared speeds in intervals, multiplied by `of`, are at most one."""
+    """Return constraints that keep `of` times the squared speed at most 1 at given fractions of given intervals."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
     return SplineRows(interval, fraction, fraction, coefficients, np.ones(len(of)), none)
 
 
 def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -> NDArray[np.bool_]:
-    """Return which acceleration and jerk limits any motion may reach in each interval. Shape (N, K + L + P).
+    """Return which acceleration and jerk limits a motion may reach in each interval. Shape (N, K + L + P).
 
     Args:
         rows: Limit rows in N intervals.

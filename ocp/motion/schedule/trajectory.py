@@ -1,4 +1,4 @@
-"""Joint trajectories sampled from a schedule, and their exchange as CSV and as ROS 2 JointTrajectory messages."""
+"""Joint trajectories sampled along a timed path, and their exchange as CSV and as ROS 2 JointTrajectory messages."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class JointTrajectory:
 
     @classmethod
     def read_csv(cls, path: str | FilePath[str]) -> JointTrajectory:
-        """Read a file written by write_csv without loss of precision; raise ProblemError for any other file."""
+        """Read a CSV file that `write_csv` has written, in full precision; raise ProblemError for any other file."""
         try:
             text = read_regular(checked_path(path), MAX_FILE_BYTES).decode()
         except (OSError, ValueError) as error:
@@ -115,7 +115,7 @@ class JointTrajectory:
 
     @classmethod
     def from_ros(cls, message: Mapping[str, Any]) -> JointTrajectory:
-        """Read a message that to_ros has returned; raise ProblemError if a field is missing."""
+        """Convert a message, as returned by `to_ros`, to a trajectory; raise ProblemError if a field is missing."""
         try:
             points = message["points"]
             stamps = [p["time_from_start"] for p in points]
@@ -150,7 +150,7 @@ def joint_motion(joints: JointPath, motion: LineMotion) -> tuple[Array, Array, A
 
 
 def joint_trajectory(schedule: Schedule, joints: JointPath, period: float) -> JointTrajectory:
-    """Return the joint trajectory of a whole schedule, sampled every `period` s; raise ProblemError for a bad period.
+    """Return the joint trajectory of a schedule, sampled every `period` s; raise ProblemError for an invalid period.
 
     Times are whole nanoseconds, those of the ROS message, and the joint positions are those at these times. The last
     time is the first one at or after the end, at rest.

@@ -1,4 +1,4 @@
-"""Windows (parts of a path grid that are solved at once): limit rows, enforced rows, and how much of limits is used."""
+"""Windows (parts of a path grid that are solved at once), the limits enforced in a window, and the usage of limits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """Settings by which limits are enforced and checked in a window of a path grid; shares are relative to the limits.
+    """Settings for enforcing and checking limits in a window of a path grid. Shares are fractions of the limits.
 
     Attributes:
         room: Share of the limits reserved for what happens between the positions where they are enforced: half of the
@@ -45,9 +45,10 @@ class WindowSettings:
 SETTINGS = WindowSettings()
 
 INSIDE = (0.25, 0.5, 0.75)
-"""Positions inside each interval at which limits are evaluated, as fractions of its length."""
+"""Positions inside each interval at which limits are evaluated, as fractions of the length of the interval."""
 HELD = (0, 1, 3, 4)
-"""Indices of the positions (0, *INSIDE, 1) at which limits are enforced: not the middle, where the jerk may change."""
+"""Indices in (0, *INSIDE, 1) of the positions where limits are enforced: all but the middle, where the jerk may jump.
+"""
 
 Ends: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 """Squared speed and its derivative with respect to distance, at the beginning and at the end of a stretch."""
@@ -88,7 +89,7 @@ class Window(Stretch):
 
     @classmethod
     def build(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
-        """Return the window of a stretch between two nodes, with its limit rows evaluated."""
+        """Return the window of a stretch between two nodes, with the coefficients of all limits evaluated."""
         grid = stretch.grid
         begin, h = grid.distance[first:last], np.diff(grid.distance[first : last + 1])
         left, right = grid.ends(first, last)
@@ -103,7 +104,7 @@ class Window(Stretch):
         return cls(grid, first, last, ends, every, bends)
 
     def fine_rows(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
-        """Return the limit rows at the inner points that divide intervals into `fine` parts, in order of the points.
+        """Return the limit rows at the points that divide intervals into `fine` parts, ordered by point, then interval.
 
         Shape ((SETTINGS.fine - 1) B,); with torques, which take longest, on request.
         """
@@ -120,7 +121,7 @@ class Window(Stretch):
 
     @property
     def torques(self) -> slice:
-        """Slice of the torque limits in `limit_names`."""
+        """Slice that selects the torque limits among all limits, in the order of `limit_names`."""
         speed, acceleration, _ = (kind.shape[1] for kind in self.rows[0])
         count = torque_rows(self.grid.limits, self.grid.joints)
         return slice(speed + acceleration - count, speed + acceleration)
@@ -152,7 +153,7 @@ class Margins(NamedTuple):
 
 @dataclass(eq=False)
 class EnforcedRows:
-    """Limit rows that are enforced in a window, and the margins of the limits.
+    """Limit rows (inequalities) that are enforced in a window, and the fractions of the limits that may be used.
 
     Attributes:
         margins: Usable shares of the limits, lowered where limits are violated although they are enforced there.
@@ -184,7 +185,8 @@ class EnforcedRows:
         return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
 
     def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
-        """Enforce limits that a motion nearly reaches, also in neighbouring intervals, and one jerk limit per interval.
+        """Enforce the limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in every
+        interval.
 
         Args:
             used, values: Usage of the limits, see `limit_usage`.
@@ -213,7 +215,9 @@ class EnforcedRows:
         self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce given limit rows (2, N, K + L + P) where they are used most; return which already were enforced."""
+        """Enforce the limit rows of a mask (2, N, K + L + P) where they are used most; return which already were
+        enforced.
+        """
         already = np.zeros(rows.shape, dtype=bool)
         sign, at, row = np.nonzero(rows)
         place = (values[:, at, row] * (1 - 2 * sign)).argmax(axis=0)
@@ -245,7 +249,7 @@ class EnforcedRows:
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
-    """Return the speed profile with given squared speeds and, with jerk limits, slopes at a stretch's first nodes."""
+    """Return the speed profile with given squared speeds (and slopes, under jerk limits) at a stretch's first nodes."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     v = np.sqrt(x)
     if slope is not None:
@@ -257,7 +261,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProf
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return the share of each limit that a motion uses in given intervals (B,): the largest, and at `HELD` positions.
+    """Return the fractions of limits that a motion uses in given intervals (B,): largest values, and values at `HELD`.
 
     Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 
@@ -329,14 +333,16 @@ def limit_usage(
 
 
 def _parabola_errors(rows: list[Array]) -> Array:
-    """Return the largest errors of parabolas through three of five equidistant row coefficients. Shape (N, L, 3)."""
+    """Return the largest error of a parabola through three of five equidistant samples of a coefficient. Shape (N, L,
+    3).
+    """
     a, b, c, d, e = rows
     # the third difference gives the cubic term; a parabola misses at most 1/(9 sqrt 3) of it
     return np.asarray(np.maximum(np.abs(d - a + 3 * (b - c)), np.abs(e - b + 3 * (c - d))) / (9 * np.sqrt(3)))
 
 
 def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
-    """Return which limits may be exceeded by interpolation error between evaluated positions. Shape (N, K + L + P)."""
+    """Return which limits a motion may exceed, given the interpolation errors. Shape (N, K + L + P)."""
     v, a, j = (
         np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
         for kind in ("speed", "acceleration", "jerk")
@@ -354,7 +360,7 @@ def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[Lin
 def _fine_usage(
     window: Window, profile: SpeedProfile, intervals: NDArray[np.intp], f: Array, known: Array, torques: bool
 ) -> Array:
-    """Return the largest usage of each limit in both directions, from dense samples of intervals. Shape (2, B, R).
+    """Return the largest usage of each limit in both directions, from dense samples in intervals. Shape (2, B, R).
 
     Args:
         window, profile: As for `limit_usage`.
@@ -383,7 +389,9 @@ def _fine_usage(
 
 
 def _vertex(values: Array, places: list[Array]) -> Array:
-    """Return the extreme value of the parabola through three values if it lies between them, else the first value."""
+    """Return the vertex value of the parabola through three values if its vertex lies between them, else the first
+    value.
+    """
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Forward search for low-cost motions of machines with a moving base, pruned by a grid over joints and base attitude.
+"""Forward search for low-cost motions of machines with a moving base, pruned on a grid of joint positions and attitude.
 
 The configurations that such a machine can reach at a time do not form a manifold, since the attitude of the base
 depends on the path. The search therefore keeps states that were reached by exact integration of the tasks. Of the
@@ -37,12 +37,12 @@ __all__ = ["CellSearch", "tracks_tasks"]
 Indices = NDArray[np.intp]
 
 MAX_VELOCITY_ERROR = 0.1
-"""Accepted integral of the tip's velocity error under velocity tasks, relative to that of the prescribed speed."""
+"""Largest accepted time integral of the tip's velocity error, relative to the integral of the prescribed speed."""
 
 
 @dataclass(frozen=True)
 class CellSettings:
-    """Settings of the cell search, such as the numbers of states and of time steps.
+    """Settings of the forward search over grid cells, such as the numbers of states and of time steps.
 
     Attributes:
         states: Largest number of states kept at each time, of 1 kB each.
@@ -77,7 +77,7 @@ class CellSettings:
 
 
 def tracks_tasks(request: PlanRequest, motions: Sequence[LocalMotion]) -> NDArray[np.bool_]:
-    """Return which of K local (resolved-rate) motions reach their poses and track their prescribed velocities."""
+    """Return which of K local (resolved-rate) motions reach all task poses and track all prescribed velocities."""
     count = len(motions[0].cost)
     missing, prescribed = np.zeros(count), np.zeros(count)
     for stretch, motion in zip(request.stretches, motions, strict=True):
@@ -95,7 +95,7 @@ class _Layer:
     """States (base and joint positions) that the search reaches at one time.
 
     Attributes:
-        time: s.
+        time: Time, s.
         base, joints: Positions of base and joints. Shapes (K, b), (K, n).
         cost: Cost of the motion up to this time. Shape (K,).
         parent: Index of the preceding state in the layer before. Shape (K,).
@@ -112,10 +112,10 @@ class _Layer:
 
 
 class CellSearch:
-    """Forward search, pruned by grid cells, for motions of a floating machine that perform all tasks of a request."""
+    """Forward search, pruned by grid cells, for motions of a floating-base machine that perform all requested tasks."""
 
     def __init__(self, request: PlanRequest, configurations: Array, settings: CellSettings = CellSettings()) -> None:
-        """Run the search several times, first with few states and at last with many.
+        """Run the search several times, first with few states at each time and finally with many.
 
         Args:
             request: The request.
@@ -152,7 +152,7 @@ class CellSearch:
             max_cost, full = wanted, wanted >= max_cost / 2
 
     def _check_reach(self, error: DeadEnd) -> None:
-        """Raise Unreachable if the search ends because a pose is out of reach."""
+        """Raise Unreachable if the search ends because a required pose is out of reach."""
         request, machine, bounds = self.request, self.request.machine, self.request.bounds
         if request.start is None or not isinstance(machine, FreeFloating):
             return  # the path of the centre of mass depends on the start
@@ -164,7 +164,7 @@ class CellSearch:
             raise locate_error(request, unreachable, unreachable.time) from error
 
     def _cost_estimate(self, configurations: Array) -> float:
-        """Estimate the cost of the tasks from the joint rates that they require at the best start configuration."""
+        """Estimate the cost of the tasks from the least joint rates that they require at any start configuration."""
         request, total, count = self.request, 0.0, self._settings.seats
         base = np.tile(request.base, (len(configurations), 1))
         for stretch, kinematics in zip(request.stretches, self._kinematics, strict=True):
@@ -174,12 +174,12 @@ class CellSearch:
         return total
 
     def local_motions(self) -> list[list[LocalMotion]]:
-        """Return the locally lowest-cost motions that each run of the search found, the last run first."""
+        """Return the motions of locally least cost that each run of the search found; the last run comes first."""
         return [search.local_motions() for search in reversed(self._searches)]
 
 
 class _CellPass:
-    """One run of the cell search, over motions of limited cost and with a limited number of states at each time.
+    """One run of the cell search, which limits the cost of the motions and the number of states at each time.
 
     Attributes:
         cost: Cost of the best path.
@@ -197,7 +197,7 @@ class _CellPass:
         seed: int,
         settings: CellSettings,
     ) -> None:
-        """Prepare a run over motions of limited cost; with `full`, it keeps the full number of states at each time."""
+        """Prepare a run, which keeps the full number of states at each time if `full`, otherwise a smaller number."""
         self.request, self.kinematics, self.max_cost, self._settings = request, kinematics, max_cost, settings
         self.states = settings.states if full else int(settings.few * settings.states)
         self.root, self._rng = np.sqrt(request.weights), np.random.default_rng(seed)
@@ -207,7 +207,7 @@ class _CellPass:
         self.cost = np.inf
 
     def search(self, configurations: Array) -> None:
-        """Search from start configurations (K, n) to the end of the requested tasks.
+        """Search for motions from start configurations (K, n) to the end of the requested tasks.
 
         Raises:
             DeadEnd: No state reaches the end.
@@ -283,7 +283,7 @@ class _CellPass:
         return expanded.select(best), limit_counts
 
     def _sample_self_motions(self, count: int, r: int) -> Array:
-        """Return self-motion rates to try from each state, as null-space coordinates. Shape (count, C, r)."""
+        """Return the self-motion rates to be tried from each state, in null-space coordinates. Shape (count, C, r)."""
         levels = self._settings.levels
         share = np.linspace(-1.0, 1.0, levels)
         rates = self._max_rate * np.sign(share) * share**2  # finer near zero, where most motions are
@@ -296,7 +296,7 @@ class _CellPass:
         return np.asarray(samples)
 
     def _best_of_cells(self, base: Array, joints: Array, cost: Array, resize: bool) -> Indices:
-        """Return the indices of the lowest-cost states in the grid cells, whose size adapts to the number of states.
+        """Return the index of the lowest-cost state in each grid cell; the cell size adapts to the number of states.
 
         The cells grow if there are more states than may be kept. Only with `resize`, they also shrink if there are few.
         """
@@ -337,7 +337,7 @@ class _CellPass:
         return np.asarray(valid)
 
     def _states_at_new_poses(self, layer: _Layer, kinematics: ReducedKinematics) -> _Layer:
-        """Return the states of one time, corrected to the poses of the tasks that begin then."""
+        """Return the states of one time after moving them to the poses of the tasks that begin at this time."""
         states, max_steps = (layer.base, layer.joints, layer.time), self._settings.corrections
         corrected = kinematics.correct_poses(*states, REACH_TOLERANCE / 10, max_steps=max_steps)
         base, joints, pose_error = corrected
@@ -348,7 +348,7 @@ class _CellPass:
         return _Layer(layer.time, base, joints, cost, np.arange(len(cost))).select(reached)
 
     def _dead_end_error(self, layer: _Layer, limit_counts: Counter[tuple[int, int]]) -> DeadEnd:
-        """Return the error that says that no state can be continued, and which joint limit stops most of them."""
+        """Return an error which says that no state can be continued, and which joint limit stops most states."""
         bounds, names = self.request.bounds, self.request.machine.robot.joint_names
         details: dict[str, Any] = {"time": layer.time, "name": "task"}
         words = "the joint rates would diverge: the tasks lead beyond the workspace or through a singularity"
@@ -366,7 +366,7 @@ class _CellPass:
     # ---- results -----------------------------------------------------------------------------------------------------
 
     def local_motions(self) -> list[LocalMotion]:
-        """Return the locally lowest-cost motions, one result for each time interval (stretch) with the same tasks."""
+        """Return the motions of locally least cost, as one `LocalMotion` for each time interval with the same tasks."""
         layers, request = self.layers, self.request
         final, states = layers[-1], np.arange(len(layers[-1].cost))
         paths = np.empty((len(layers), len(states)), dtype=np.intp)
@@ -392,7 +392,7 @@ class _CellPass:
         return motions
 
     def _local_motion(self, layers: Sequence[_Layer], paths: Indices) -> LocalMotion:
-        """Return the motions through given states; row `paths[k]` (K,) holds their indices at the k-th of L times."""
+        """Return K motions through given states of L times; `paths` (L, K) holds the indices of the states."""
         times = np.array([layer.time for layer in layers])
         base = np.stack([layer.base[row] for layer, row in zip(layers, paths, strict=True)], axis=1)
         joints = np.stack([layer.joints[row] for layer, row in zip(layers, paths, strict=True)], axis=1)

@@ -1,4 +1,4 @@
-"""Atlas of the self-motion manifold: charts that cover all configurations that perform a task at some time samples.
+"""Atlas of the self-motion manifold: charts that cover all configurations which satisfy a task at given time samples.
 
 If a task leaves r of n degrees of freedom undetermined, the configurations that satisfy it at one time form curves
 (r = 1), surfaces (r = 2) or isolated points (r = 0). A chart consists of a configuration (its centre), an orthonormal
@@ -60,7 +60,7 @@ class ChartSettings:
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """Charts of the self-motion manifolds at some time samples, each a box in a tangent space.
+    """Charts of the self-motion manifolds at given time samples; each chart is a box in a tangent space.
 
     Attributes:
         layer: Index of the time sample. Shape (N,).
@@ -94,15 +94,15 @@ class Charts:
 
     @property
     def max_deviation(self) -> Array:
-        """Largest deviation of the manifold from each tangent box, for each joint. Shape (N, n)."""
+        """Largest deviation of the manifold from the tangent box of each chart, for each joint. Shape (N, n)."""
         return np.asarray(np.abs(self.deviations).max(axis=1, initial=0.0))
 
     def points(self, places: Array) -> Array:
-        """Return the points of the tangent spaces, (N, n), that have given chart coordinates, (N, r)."""
+        """Return the points (N, n) of the tangent spaces that have given chart coordinates (N, r)."""
         return np.asarray(self.centers + np.einsum("knr,kr->kn", self.tangents, places))
 
     def curvature(self) -> tuple[Array, Array]:
-        """Fit quadratic forms in the chart coordinates to the manifold's deviations from its charts (least squares).
+        """Fit quadratic forms in chart coordinates to the deviations of the manifold from its charts by least squares.
 
         Returns:
             The forms, (N, n, r, r), and their residuals at the points of `_rim`, (N, c, n).
@@ -120,7 +120,7 @@ class Charts:
 
 
 def point_chart(joints: Array) -> Charts:
-    """Return a chart of dimension 0, which contains a single configuration (n,)."""
+    """Return a chart of dimension 0, which contains only the configuration `joints` of shape (n,)."""
     n, empty = len(joints), np.zeros((1, 0))
     deviations = np.zeros((1, 0, n))
     return Charts(np.zeros(1, dtype=np.intp), joints[None], np.zeros((1, n, 0)), np.zeros(1), empty, empty, deviations)
@@ -132,7 +132,7 @@ def concatenate(parts: list[Charts]) -> Charts:
 
 
 class SplitCharts(NamedTuple):
-    """Manifold charts of half the radius that replace larger charts.
+    """Manifold charts of half the radius, which replace the charts that were split.
 
     Attributes:
         charts, owners: N charts, and the indices of the charts that they replace, (N,).
@@ -166,7 +166,7 @@ class _Edges(NamedTuple):
 
 
 class SelfMotionManifolds:
-    """Self-motion manifolds of a task at some time samples.
+    """Self-motion manifolds of a task, one at each of the given time samples.
 
     Attributes:
         space: Joint space.
@@ -177,7 +177,7 @@ class SelfMotionManifolds:
     def __init__(
         self, space: JointSpace, equations: TaskEquations, targets: Array, settings: ChartSettings = ChartSettings()
     ) -> None:
-        """Prepare the equations of the manifolds at all time samples.
+        """Prepare the task equations that define the manifolds at all time samples.
 
         Args:
             space: Joint space of a machine on a fixed base.
@@ -224,13 +224,13 @@ class SelfMotionManifolds:
         return np.vstack([listed, *(solution.joints for solution in random)])
 
     def linearize(self, layer: Indices, joints: Array) -> tuple[Array, Array]:
-        """Return the task errors (M, m) and their Jacobians with respect to the scaled joint positions (M, m, n)."""
+        """Return the task errors (M, m), and their Jacobians (M, m, n) with respect to the scaled joint positions."""
         error, jacobian = self._sampler(joints, self.targets[layer])
         m, n = error.shape[1], joints.shape[1]
         return error, jacobian.reshape(-1, n, m).transpose(0, 2, 1) / self.space.scale
 
     def project(self, layer: Indices, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Project configurations (M, n) onto their manifolds by Newton steps; also return which converged, (M,)."""
+        """Project configurations (M, n) onto the manifolds by Newton steps; also return a mask of convergence (M,)."""
         projected, converged = joints.copy(), np.zeros(len(joints), dtype=bool)
         active = np.arange(len(joints))
         for _ in range(self.settings.corrections):
@@ -265,7 +265,7 @@ class SelfMotionManifolds:
     # ---- charts ------------------------------------------------------------------------------------------------------
 
     def charts_at(self, layer: Indices, joints: Array, radii: Array, like: Array | None = None) -> tuple[Charts, Array]:
-        """Return charts centred at configurations; their radii are halved until the manifold is nearly flat in them.
+        """Return charts with given centres; each radius is halved until the manifold is nearly flat in the chart.
 
         Returns:
             The charts, and the points of the manifold at their rims, nan where none was found. Shape (N, c, n).
@@ -288,7 +288,7 @@ class SelfMotionManifolds:
         return self._clip_boxes(layer, joints, tangents, radii, deviations), points
 
     def _clip_boxes(self, layer: Indices, joints: Array, tangents: Array, radii: Array, deviations: Array) -> Charts:
-        """Return charts with given centres and radii, whose tangent boxes are shrunk to end at the joint limits."""
+        """Return charts with given centres and radii; tangent boxes that extend beyond the joint limits are shrunk."""
         deviations = np.nan_to_num(deviations)
         max_deviation = np.abs(deviations).max(axis=1, initial=0.0)
         reach = np.abs(tangents) * radii[:, None, None]
@@ -305,7 +305,7 @@ class SelfMotionManifolds:
         return Charts(layer, joints, tangents, radii, -low, high, deviations)
 
     def _deviations(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
-        """Return manifold points near the rims of tangent boxes (nan if not found), and their offsets from the rims."""
+        """Project rim points of tangent boxes onto the manifold; return the projections (nan if failed) and shifts."""
         rim = _rim(tangents.shape[2])
         tangent_points = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
         projected, converged = self.project(np.repeat(layer, len(rim)), tangent_points.reshape(-1, joints.shape[1]))
@@ -319,7 +319,7 @@ class SelfMotionManifolds:
         return np.asarray(reached & (charts.low <= charts.high).all(axis=1))
 
     def cover(self, layer: Indices, joints: Array, radius: float, max_charts: int) -> Charts:
-        """Return charts that cover the manifold components of given configurations, also at neighbouring time samples.
+        """Return charts that cover the manifold components of given configurations, continued to other time samples.
 
         Args:
             layer, joints: Indices of time samples and configurations on their manifolds. Shapes (M,), (M, n).
@@ -379,7 +379,7 @@ class SelfMotionManifolds:
         return charts
 
     def split(self, charts: Charts) -> SplitCharts:
-        """Replace manifold charts by charts of half the radius; keep a chart whose halves cannot be projected."""
+        """Replace manifold charts by charts of half the radius; keep a chart if its halves cannot be projected."""
         r = charts.tangents.shape[2]
         signs = np.array(list(product((-0.5, 0.5), repeat=r))).reshape(2**r, r)
         offsets = charts.radii[:, None, None] * np.einsum("knr,cr->kcn", charts.tangents, signs)
@@ -406,7 +406,7 @@ class SelfMotionManifolds:
         return SplitCharts(concatenate([halves.select(within_limits), charts.select(unsplit)]), owners, low, high)
 
     def _split_radii(self, charts: Charts, signs: Array) -> Array:
-        """Return the radii that half-size charts need to cover the same part of the manifold as those they replace.
+        """Return the radii that half-size charts need to cover the same part of the manifold as the original charts.
 
         Shape (N c,). Their centres are `signs` (c, r) times the radii. At the centre of a half, let the manifold leave
         the chart with slope Ds. A shift u in the chart is then a shift (1 + Ds' Ds)^1/2 u in the half, whose axes are
@@ -424,7 +424,7 @@ class SelfMotionManifolds:
     def is_covered(
         self, charts: Charts, layer: Indices, joints: Array, excluded: Indices | None = None
     ) -> NDArray[np.bool_]:
-        """Return which configurations lie in a manifold chart, not counting the chart in `excluded`. Shape (M,)."""
+        """Return for each configuration whether a manifold chart other than `excluded` contains it. Shape (M,)."""
         if not len(layer) or not len(charts):
             return np.zeros(len(layer), dtype=bool)
         r = charts.tangents.shape[2]
@@ -448,7 +448,7 @@ class SelfMotionManifolds:
         return covered
 
     def _thin_out(self, layer: Indices, joints: Array, radii: Array) -> Indices:
-        """Return the indices of configurations that remain after removing those within the radius of an earlier one."""
+        """Select configurations that lie outside the chart radii of each other, and return their indices."""
         if not len(layer):
             return np.zeros(0, dtype=np.intp)
         pairs = self.space.tree(joints, layer).query_pairs(float(radii.max()), output_type="ndarray")
@@ -464,7 +464,7 @@ class SelfMotionManifolds:
     def _new_charts(
         self, layer: Indices, joints: Array, radii: Array, like: Array | None, first: int = 0
     ) -> tuple[Charts, _Edges]:
-        """Return new manifold charts, numbered from `first`, at configurations, and their edge points within limits."""
+        """Return new charts, numbered from `first`, at given configurations, and their edge points within limits."""
         if like is None:
             chosen = self._thin_out(layer, joints, radii)
             layer, joints, radii = layer[chosen], joints[chosen], radii[chosen]
@@ -477,14 +477,14 @@ class SelfMotionManifolds:
 
 
 class TimeSample(NamedTuple):
-    """Self-motion manifold at one time sample: the manifolds of its task, and its index among their time samples."""
+    """Self-motion manifold at one time sample, given by the manifolds of all samples and the index of this sample."""
 
     manifolds: SelfMotionManifolds
     row: int
 
 
 def _rim(r: int) -> Array:
-    """Return the points (c, r) of a box of half width 1 at which charts are checked: side midpoints and corners."""
+    """Return the corners and side midpoints (c, r) of the box [-1, 1]^r, where charts are checked."""
     middles = [side * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0)] if r > 1 else []
     corners = [np.array(signs) for signs in product((-1.0, 1.0), repeat=r)] if r else []
     return np.array([*middles, *corners]).reshape(-1 if r else 0, r)

@@ -39,7 +39,7 @@ __all__ = [
 
 SearchKind: TypeAlias = Literal["start", "configurations", "global"]
 REACH_TOLERANCE = 1e-4
-"""Largest error with which a pose counts as reached, m or rad."""
+"""Largest pose error at which a pose counts as reached, m or rad."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class PlanRequest:
     whole: Machine | None = None
 
     def with_held(self, positions: Mapping[str, float]) -> PlanRequest:
-        """Return the request for the machine with further joints held at rest at given positions, rad or m."""
+        """Return the request with further joints of the machine held at rest at given positions, rad or m."""
         if not positions:
             return self
         free = np.array([name not in positions for name in self.machine.robot.joint_names])
@@ -172,7 +172,7 @@ class PlanRequest:
 
     @property
     def ik_arguments(self) -> dict[str, Any]:
-        """Keyword arguments of `inverse_kinematics` for configurations at the start of the motion."""
+        """Keyword arguments with which `inverse_kinematics` searches for start configurations of the motion."""
         own = IkOptions(base=self.base, limits=self.limits.joints)
         return {"seed": self.seed, "starts": self.settings.ik_starts, "options": own}
 
@@ -183,14 +183,14 @@ class PlanRequest:
 
     @cached_property
     def turning_joints(self) -> NDArray[np.intp]:
-        """Indices of the joints whose start angles may differ by full turns; none if the start is given."""
+        """Indices of the joints whose start angle may be changed by full turns; empty if the start is given."""
         if self.start is not None:
             return np.zeros(0, dtype=np.intp)
         return turning_joints(self.machine.robot, self.bounds.lower, self.bounds.upper)
 
 
 def start_configurations(request: PlanRequest) -> Array:
-    """Return start configurations, sorted by their conditioning, but collision-free ones first. Shape (K, n)."""
+    """Return start configurations sorted by conditioning, with all collision-free ones first. Shape (K, n)."""
     if request.start is not None:
         return request.start[None]
     first = [request.tasks[i] for i in request.stretches[0].tasks if request.tasks[i].is_pose]
@@ -209,7 +209,7 @@ def start_configurations(request: PlanRequest) -> Array:
 def start_collisions(
     request: PlanRequest, configurations: Array, pairs: list[int] | None = None
 ) -> list[Collision | None]:
-    """Return the closest pair of bodies in each start configuration (K, n), or None if the clearance is kept.
+    """Return for each start configuration (K, n) the closest pair of bodies, or None if the clearance is kept.
 
     If given, `pairs` are the indices of the only pairs that are checked.
     """
@@ -235,7 +235,7 @@ def check_clear_start(request: PlanRequest, configurations: Array) -> None:
 
 
 def count_clear_configurations(request: PlanRequest, time: float) -> int | Unreachable | None:
-    """Count collision-free configurations that satisfy the tasks at a time (s), or return why there are none.
+    """Count the collision-free configurations that satisfy the tasks at a time, s; return an error if there are none.
 
     The result is None if it would prove nothing: no task gives a pose then, or the base may be elsewhere.
     """
@@ -250,7 +250,7 @@ def count_clear_configurations(request: PlanRequest, time: float) -> int | Unrea
 
 
 def describe_alternatives(count: int | Unreachable | None) -> list[str]:
-    """Describe for an error message how many other configurations are collision-free; an empty list if unknown."""
+    """Return text for an error message about the number of collision-free configurations; [] if it is unknown."""
     if count is None:
         return []
     if isinstance(count, Unreachable):
@@ -260,7 +260,7 @@ def describe_alternatives(count: int | Unreachable | None) -> list[str]:
 
 
 def local_motions_from(request: PlanRequest, configurations: Array) -> list[LocalMotion]:
-    """Track the tasks from K start configurations (K, n) by resolved-rate control; return a result per stretch of time.
+    """Track the tasks from start configurations (K, n) by resolved-rate control; return a result per time interval.
 
     Starts that differ by full turns lead to the same motion. Joints that can make a full turn within their limits are
     therefore tracked without limits, and the motion is shifted to mid-range. If it satisfies the tasks, but exceeds the
@@ -279,7 +279,7 @@ def local_motions_from(request: PlanRequest, configurations: Array) -> list[Loca
 
 
 def _track_within(request: PlanRequest, configurations: Array, lower: Array, upper: Array) -> list[LocalMotion]:
-    """Return resolved-rate motions within limits, with the least damping at which one of them reaches its poses."""
+    """Track the tasks by resolved-rate control within limits, with the least damping at which a motion succeeds."""
     settings, least_damped = request.settings, list[LocalMotion]()
     for damping in settings.dampings:
         motions: list[LocalMotion] = []
@@ -305,7 +305,7 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
 
 
 def _within_limits(request: PlanRequest, configurations: Array, motions: Sequence[LocalMotion]) -> list[LocalMotion]:
-    """Shift motions by full turns into the joint limits; track those again that no shift brings within them."""
+    """Shift motions by full turns into the joint limits; track a motion again, within limits, if no shift suffices."""
     turning, bounds = request.turning_joints, request.bounds
     limits = bounds.lower[turning], bounds.upper[turning]
     joints = np.concatenate([motion.joints for motion in motions], axis=1)[:, :, turning]
@@ -329,7 +329,7 @@ def _within_limits(request: PlanRequest, configurations: Array, motions: Sequenc
 def _joints_at_new_poses(
     request: PlanRequest, stretch: Stretch, base: Array, joints: Array, lower: Array, upper: Array
 ) -> Array:
-    """Return the nearest configurations (K, n) that satisfy the tasks so far and the poses that begin now."""
+    """Return the configurations nearest to `joints` (K, n) that satisfy the tasks of two adjoining time intervals."""
     before = request.stretches[request.stretches.index(stretch) - 1]
     if not any(request.tasks[i].is_pose and new for i, new in zip(stretch.tasks, stretch.new, strict=True)):
         return joints
@@ -354,7 +354,7 @@ def largest_pose_errors(motions: Sequence[LocalMotion]) -> list[float]:
 
 
 def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
-    """Raise Unreachable if a pose that all motions miss cannot be reached by a machine on a fixed base."""
+    """Raise Unreachable if a machine on a fixed base cannot reach a pose that its local motions miss."""
     if request.machine.base_size:
         return
     limits, starts, seed = request.limits.joints, request.settings.ik_starts, request.seed
@@ -369,7 +369,7 @@ def _check_reach(request: PlanRequest, motions: list[LocalMotion]) -> None:
 
 
 def locate_error(request: PlanRequest, error: Unreachable, time: float) -> Unreachable:
-    """Return an error with its time, and the task positions at that time, added to its message."""
+    """Return the error with a time, s, and the positions that the tasks require at this time, added to its message."""
     places = []
     for number, task in enumerate(request.tasks):
         if task.position is not None and task.begin <= time <= task.end:
@@ -401,7 +401,7 @@ REACH = ReachSettings()
 
 @dataclass
 class _Reach:
-    """Inverse kinematics of tasks at successive times, each started from the solutions at the previous time."""
+    """Inverse kinematics of tasks at successive times; each solve starts from the solutions at the previous time."""
 
     equations: TaskEquations
     options: dict[str, Any]
@@ -411,7 +411,7 @@ class _Reach:
         self._targets = self.equations.target_function()
 
     def unreachable_at(self, time: float, limits: bool) -> Unreachable | None:
-        """Solve inverse kinematics at a time and keep the solutions; return None, or the error if there are none."""
+        """Solve inverse kinematics at a time and store the solutions; return an error if there is no solution."""
         targets = np.array(self._targets(time)).ravel()
         options = {**self.options, "options": IkOptions(limits=limits, tolerance=REACH.tolerance)}
         for starts in (0, self.options["starts"]):
@@ -438,7 +438,7 @@ def end_of_reach(
     starts: int,
     seed: int,
 ) -> Unreachable | None:
-    """Return an error that says when tasks leave the workspace of a machine on a fixed base, and why.
+    """Return an error that says when and why the tasks leave the workspace of a machine on a fixed base.
 
     The end is the first time at which the tasks have no solution within the joint limits. A joint ends the reach if it
     is at its limit there and the pose would be within reach without limits. Otherwise the tasks' Jacobian is singular.
@@ -490,7 +490,7 @@ def end_of_reach(
 
 
 def _joint_at_limit(machine: Machine, joints: Array) -> tuple[str, dict[str, Any]]:
-    """Return text and error fields about the joint nearest to its limit, where joint limits end the reach."""
+    """Return the text and the fields of an error about the joint that is nearest to its limit and ends the reach."""
     moving = machine.robot.moving_joints
     limits = [min(joint.lower, joint.upper, key=lambda x: abs(x - q)) for joint, q in zip(moving, joints, strict=True)]
     nearest = int(np.abs(joints - limits).argmin())

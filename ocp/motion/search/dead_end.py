@@ -1,4 +1,4 @@
-"""Diagnosis of a task without a motion: where motions end, what obstructs them, and by how much to relax the task.
+"""Diagnosis of tasks that no motion satisfies: where motions end, what obstructs them, and how far to relax the tasks.
 
 From the first time sample on, configurations are propagated from chart to chart by all steps within the limits. Each
 chart keeps the configuration whose path has the largest clearance. Motions end at the last sample that is reached. The
@@ -30,9 +30,9 @@ __all__ = ["DeadEnd", "Obstruction", "Relaxation", "dead_end"]
 Indices = NDArray[np.intp]
 
 MAX_TRIALS = 3
-"""Largest number of configurations from which a step into a chart is tried, and of obstructions in a message."""
+"""Largest number of start configurations tried for a step into one chart, and of obstructions in a message."""
 NEGLIGIBLE = 1e-9
-"""Least amount by which relaxations of the tasks are scaled, to avoid division by zero, m or rad."""
+"""Lower bound of the divisors that scale relaxations of the tasks, m or rad, which avoids division by zero."""
 
 
 class ObstructionKind(StrEnum):
@@ -46,7 +46,7 @@ class ObstructionKind(StrEnum):
 
 
 class RelaxationKind(StrEnum):
-    """Kinds of requirements that can be relaxed: position of the tip, its orientation, clearance."""
+    """Kinds of requirements that can be relaxed: tip position, tip orientation and clearance."""
 
     DEVIATION = "deviation"
     ROTATION = "rotation"
@@ -74,7 +74,7 @@ class Obstruction(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """Amount by which the limit is exceeded, rad or m."""
+        """Amount by which the required value violates its limit, rad or m."""
         return abs(self.value - self.limit)
 
     def __str__(self) -> str:
@@ -111,7 +111,7 @@ class Relaxation(NamedTuple):
 
 
 class DeadEnd(SolveError):
-    """Error that no motion satisfies the tasks, or that the search over all motions found none.
+    """Error which states that no motion satisfies the tasks, or that the search found no such motion.
 
     Attributes:
         time: Time, s, or waypoint number, from which no motion can be continued.
@@ -149,7 +149,7 @@ class DeadEnd(SolveError):
 def dead_end(
     search: AtlasSearch, unit: str = "{:.4g} s", proven: bool = True, segments: int | None = None
 ) -> DeadEnd | None:
-    """Return an error that says why all motions of a search end before the last time sample; None if one reaches it.
+    """Return an error that says why all motions end before the last time sample; None if a motion reaches this sample.
 
     Args:
         unit: Format of the sample times in the message.
@@ -189,7 +189,7 @@ def dead_end(
 
 
 class _Propagation:
-    """Configurations propagated from one time sample to the next, one for each manifold chart that can be reached.
+    """Configurations that are propagated from one time sample to the next, one for each reachable manifold chart.
 
     Attributes:
         layers: Charts of each sample, no wider than steps, including those in collision.
@@ -217,11 +217,11 @@ class _Propagation:
 
     @property
     def last(self) -> int:
-        """Index of the last time sample that is reached with the required clearance; -1 if none is."""
+        """Index of the last time sample that is reached with the required clearance; -1 if no sample is reached."""
         return max((k for k, clearance in enumerate(self.clearance) if (clearance >= self.required).any()), default=-1)
 
     def path(self, k: int, chart: int) -> Array:
-        """Return the configurations from the first time sample to a manifold chart of sample k. Shape (k + 1, n)."""
+        """Return the path from the first time sample to a manifold chart of sample `k`. Shape (k + 1, n)."""
         path = []
         for sample in range(k, -1, -1):
             path.append(self.joints[sample][chart])
@@ -229,7 +229,7 @@ class _Propagation:
         return np.array(path[::-1])
 
     def _propagate(self, graph: ChartGraph, k: int) -> None:
-        """Propagate configurations from a time sample to the manifold charts of the next, largest clearance first."""
+        """Propagate configurations from time sample `k` to the charts of the next sample, by falling clearance."""
         space, limit, successor = self.search.space, self.search.limits[k], k + 1
         reached = np.isfinite(self.joints[k][:, 0])
         parts = [(i[reached[i]], j[reached[i]]) for i, j in graph.edges(k, successor)]
@@ -250,7 +250,7 @@ class _Propagation:
             self._record(successor, j[chosen], self.joints[k][i[chosen]] + displacement[chosen], i[chosen])
 
     def _record(self, k: int, charts: Indices, joints: Array, parents: Indices) -> None:
-        """Project configurations to the manifold; keep for each chart the one within limits with most clearance."""
+        """Project configurations to the manifold; keep for each chart the valid configuration of largest clearance."""
         search = self.search
         sample, required = search.samples[k], self.required
         if k == 0 and search.start is not None:
@@ -277,7 +277,7 @@ class _Propagation:
 
 
 def _fine_charts(search: AtlasSearch) -> list[Charts]:
-    """Return manifold charts of all configurations, split until none is wider than a step or there are too many."""
+    """Return all manifold charts, split until no chart is wider than a step or there would be too many charts."""
     layers = search.atlas
     reach = search.limits.max(axis=1) / 2
     max_radius = np.minimum(np.append(reach, np.inf), np.append(np.inf, reach))
@@ -290,7 +290,7 @@ def _fine_charts(search: AtlasSearch) -> list[Charts]:
 
 
 def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruction]:
-    """Return the constraints that stop motions at the last reached time sample, each once, the least violated first."""
+    """Return the different constraints that stop motions at the last reached time sample, by rising violation."""
     space, scene, last = search.space, search.scene, front.last
     names, n, next_sample = search.samples[0].manifolds.equations.machine.robot.joint_names, len(space.scale), last + 1
     before, targets, converged = _continuations(search, front)
@@ -310,7 +310,7 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
     largest = excess[np.arange(len(worst)), worst]
 
     def obstruction_of(row: int) -> Obstruction:
-        """Return the obstruction of one attempted step: its most violated constraint."""
+        """Return the obstruction of one attempted step, which is the most violated constraint of the step."""
         kind, joint = divmod(int(worst[row]) - 1, n)
         current, target = before[row], targets[row]
         if worst[row] == 0:
@@ -339,10 +339,10 @@ def _find_obstructions(search: AtlasSearch, front: _Propagation) -> list[Obstruc
 
 
 def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return attempted steps from configurations reached last (M, n) to targets at the next time sample (M, n).
+    """Return the starts (M, n) and ends (M, n) of attempted steps from the last reached time sample to the next.
 
-    Targets are the projection of each configuration to the next sample, and the configurations there which keep all
-    limits but are too far away. Also return which targets satisfy the task (M,).
+    The ends are the projection of each start to the next sample, and the configurations at this sample which keep all
+    limits but are too far away. Also return which ends satisfy the task (M,).
     """
     space, last = search.space, front.last
     sample, layer = search.samples[last + 1], max(last, 0)
@@ -365,7 +365,7 @@ def _continuations(search: AtlasSearch, front: _Propagation) -> tuple[Array, Arr
 
 
 def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Array:
-    """Return a path (K, n) beyond a dead end, as a guess: a path to the last reached sample, then a straight line.
+    """Return an initial guess of a path (K, n): it follows a path to the dead end, and continues on a straight line.
 
     The line leads to the nearest chart centre of the last time sample.
     """
@@ -379,7 +379,7 @@ def _extend_path(search: AtlasSearch, front: _Propagation, blocked: Array) -> Ar
 
 
 def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: RelaxationKind) -> Relaxation | None:
-    """Return the motion near a path (K, n) whose tips deviate or rotate least from the tasks; None if none is found."""
+    """Minimise the deviation or rotation of the tips from their tasks near a path (K, n); return None if that fails."""
     if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
     scene, pairs = search.scene, list[int]()
@@ -401,7 +401,7 @@ def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: Rela
 
 
 class _RelaxedProblem:
-    """Nonlinear program for the least deviation or rotation of the tips, with some bodies separated by constraints."""
+    """Nonlinear program that minimises the deviation or rotation of the tips and separates given pairs of bodies."""
 
     def __init__(self, search: AtlasSearch, turning: bool, pairs: list[int]) -> None:
         self.search, self.turning = search, turning
@@ -440,12 +440,12 @@ class _RelaxedProblem:
             self._separations = ca.vec(distances) - search.scene.clearance - MARGIN
 
     def amount(self, path: Array) -> float:
-        """Return the largest deviation, m, or rotation, rad, of the tips along a motion (K, n)."""
+        """Return the largest deviation (m) or rotation (rad) of the tips from their tasks along a path (K, n)."""
         largest = float(np.sqrt(float(self._largest_norm(path.T))))
         return float(np.arcsin(min(largest, 1.0))) if self.turning else largest
 
     def solve(self, path: Array, scale: float | None) -> Array | None:
-        """Return the optimal joint path (K, n) near a guess; None if the solver fails."""
+        """Solve the program from a guess, and return the joint path (K, n); None if the solver fails."""
         search, slack = self.search, ca.MX.sym("slack")
         if scale is None:
             relaxed_constraints, slack_guess = ca.vertcat(self._relaxed_rows - slack, -self._relaxed_rows - slack), 0.1

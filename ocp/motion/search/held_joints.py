@@ -1,4 +1,4 @@
-"""Joints that a plan keeps at rest: those that move no task frame, and those shared with other limbs.
+"""Joints that a plan keeps at rest: joints that move no task frame, and joints that also move other limbs.
 
 A gripper, a head or another arm adds joints that no task determines. They are locked at the present position, or at a
 free one near the middle of their limits, and the motion is planned for the machine that remains. Bodies that then
@@ -50,12 +50,12 @@ __all__ = [
 ]
 
 STIFFNESS = 1e6
-"""Factor on the rate weights of joints that also move other limbs, with which a local motion hardly moves them."""
+"""Factor on the rate weights of joints shared with other limbs, which makes local motions hardly move these joints."""
 Error = TypeVar("Error", bound=Exception)
 
 
 def all_joints(robot: Robot, held: Mapping[str, float], values: Array, *, rates: bool = False) -> Array:
-    """Return positions or rates of all joints (..., n) from those of the joints that are not held at rest (..., m).
+    """Return the positions or rates (..., n) of all joints from the values (..., m) of the joints not held at rest.
 
     Args:
         robot: Robot with all its joints.
@@ -72,7 +72,7 @@ def all_joints(robot: Robot, held: Mapping[str, float], values: Array, *, rates:
 
 
 def hold_idle_joints(request: PlanRequest) -> PlanRequest:
-    """Return a request that holds joints which move no task frame at rest, at their start or mid-range positions."""
+    """Return the request with joints that move no task frame held at rest at their start or mid-range positions."""
     idle = bind(request.machine, request.tasks).idle
     if idle.all():
         return request
@@ -105,7 +105,7 @@ def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanReq
 
 
 def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations: Array) -> PlanRequest:
-    """Hold joints that move no task frame at the nearest positions at which some start configuration is collision-free.
+    """Hold joints that move no task frame at the nearest positions that permit a collision-free start configuration.
 
     If held bodies of the machine collide with each other at all sampled positions, that is ignored. So are start
     configurations (K, m) whose collisions do not depend on the held joints, unless all have such collisions.
@@ -137,7 +137,7 @@ def _own_held(whole: PlanRequest, request: PlanRequest) -> dict[str, float]:
 
 
 def _still_pairs(whole: PlanRequest, request: PlanRequest) -> list[int]:
-    """Return the indices of the body pairs that the moving joints of a request cannot move relative to each other."""
+    """Return the indices of the body pairs whose relative pose the moving joints of a request cannot change."""
     assert whole.clearance_constraints is not None
     moving = [name not in request.held for name in whole.machine.robot.joint_names]
     levers = whole.clearance_constraints.scene.levers.joints[:, moving]
@@ -176,7 +176,7 @@ def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: 
 
 
 def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[Array, Array]:
-    """Fix joints that have no effect on the tasks; return their start positions (n,), nan for the other joints.
+    """Return start positions (n,) that fix the joints without effect on the tasks, and are nan for the other joints.
 
     Also return the configurations with these joints fixed. An example of such an ignorable (cyclic) coordinate is the
     last joint of an arm whose roll about the tool's axis is free. If it were free, each motion would belong to a family
@@ -204,7 +204,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
 
 
 def move_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return a request whose held joints are at other positions, so that they no longer cause a reported collision.
+    """Return a request whose held joints are at positions where they do not cause the collision of a given error.
 
     Args:
         whole: Request before joints were held.
@@ -236,7 +236,7 @@ def move_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> P
 
 
 def release_obstructing(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return a request that no longer holds the joints which move a colliding body; None if none of them is held.
+    """Return a request that releases the held joints which move a colliding body; None if there are no such joints.
 
     Args: As in `move_aside`.
     """
@@ -257,7 +257,7 @@ def _obstructing_joints(whole: PlanRequest, request: PlanRequest, error: SolveEr
 
 
 def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[dict[str, float]]:
-    """Return random positions within limits for joints held at rest, sorted by distance from the present ones."""
+    """Return random positions within limits for joints held at rest, sorted by distance from the present positions."""
     names, bounds = whole.machine.robot.joint_names, whole.bounds
     samples = sample_starts(whole.machine, bounds.lower, bounds.upper, whole.settings.ik_starts, seed=whole.seed)
     columns = [names.index(name) for name in held]
@@ -266,7 +266,7 @@ def _nearest_positions(whole: PlanRequest, held: Mapping[str, float]) -> list[di
 
 
 def _hold_shared_joints(request: PlanRequest, configurations: Array) -> PlanRequest:
-    """Hold as many joints at rest that also move other limbs as a global search with the remaining joints requires.
+    """Hold joints shared with other limbs at rest if the request has too many redundant joints for a global search.
 
     Only joints that carry a limb without a task are held, those nearest to the root first. They are held at the start
     of the motion if it is given, otherwise where the lowest-cost local motion begins that leaves them nearly still.
@@ -308,7 +308,7 @@ def _shared_joints(request: PlanRequest) -> list[int]:
 
 
 def restore_error(error: Error, request: PlanRequest) -> Error:
-    """Return an error after adding the joints that the request holds at rest to the configurations in it."""
+    """Return the error after adding the joints held at rest to the configurations that the error contains."""
     if request.whole is None:
         return error
     robot = request.whole.robot

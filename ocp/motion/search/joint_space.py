@@ -29,7 +29,7 @@ __all__ = [
 Indices = NDArray[np.intp]
 
 TOLERANCE = 1e-9
-"""Largest task error and largest excess over a joint limit of a valid configuration, m and rad."""
+"""Largest task error, and largest excess over a joint limit, that a valid configuration may have, m and rad."""
 FULL_TURN = 2 * np.pi
 MAX_STEP = 1e6
 """Upper bound of the length of a step between two time samples, rad or m.
@@ -58,7 +58,7 @@ class JointSpace:
         self.upper = np.where(self.periodic, np.inf, upper)
 
     def difference(self, to: Array, start: Array) -> Array:
-        """Return the joint displacements from `start` to `to`, (..., n); periodic joints take the shorter way round."""
+        """Return the joint displacements (..., n) from `start` to `to`; periodic joints turn by at most half a turn."""
         delta = to - start
         turns = delta[..., self.periodic]
         delta[..., self.periodic] = turns - FULL_TURN * np.round(turns / FULL_TURN)
@@ -74,7 +74,7 @@ class JointSpace:
             return np.asarray(((joints >= self.lower - TOLERANCE) & (joints <= self.upper + TOLERANCE)).all(axis=-1))
 
     def shift_turns(self, path: Array, lower: Array, upper: Array) -> Array:
-        """Return a joint path (K, n) with periodic joints shifted by full turns towards the middle of their limits."""
+        """Return a joint path (K, n) after shifting periodic joints by full turns towards the middle of their range."""
         limited = np.flatnonzero(self.periodic & np.isfinite(lower) & np.isfinite(upper))
         middle = (lower[limited] + upper[limited] - path[:, limited].min(axis=0) - path[:, limited].max(axis=0)) / 2
         shifted = path.copy()
@@ -82,7 +82,7 @@ class JointSpace:
         return shifted
 
     def tree(self, joints: Array, layer: Indices | None = None) -> Any:
-        """Return a k-d tree for nearest-neighbour queries among configurations (M, n); query it with `tree_points`."""
+        """Return a k-d tree of configurations (M, n) for nearest-neighbour queries with points from `tree_points`."""
         box = np.append(0.0, np.where(self.periodic, FULL_TURN * self.scale, 0.0))
         periods = box if self.periodic.any() else None  # None is faster
         return scipy.spatial.cKDTree(self.tree_points(joints, layer), boxsize=periods)
@@ -99,7 +99,7 @@ class JointSpace:
 
 @dataclass(frozen=True, eq=False)
 class TasksWithFixedJoints(TaskEquations):
-    """Task equations, and equations that fix some joints at positions which are appended to the targets.
+    """Task equations extended by equations that fix some joints; the fixed positions are appended to the targets.
 
     Attributes:
         fixed: Indices of the fixed joints.
@@ -149,13 +149,13 @@ def turning_joints(robot: Robot, lower: Array, upper: Array) -> NDArray[np.intp]
 
 
 def whole_turns_between(start: Array, end: Array, lower: Any = -np.inf, upper: Any = np.inf) -> Array:
-    """Return the multiples of 2 pi that bring the angles `start` closest to `end` without leaving the limits, rad."""
+    """Return the multiples of 2 pi that, added to the angles `start`, lead closest to `end` within the limits, rad."""
     least, greatest = np.ceil((lower - start) / FULL_TURN), np.floor((upper - start) / FULL_TURN)
     return np.asarray(FULL_TURN * np.clip(np.round((end - start) / FULL_TURN), least, greatest))
 
 
 def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the multiples of 2 pi that shift joint motions towards mid-range, and which joints then keep their limits.
+    """Return the multiples of 2 pi that shift joint motions towards mid-range, and which joints are then within limits.
 
     Args:
         joints: Motions of k joints. Shape (K, M, k), rad.
@@ -174,7 +174,7 @@ def whole_turns_into(joints: Array, lower: Array, upper: Array) -> tuple[Array, 
 
 
 def all_turns(joints: Array, known: Array, lower: Array, upper: Array) -> Array:
-    """Return all variants of a configuration that differ by full turns of its joints and keep the limits.
+    """Return all configurations within limits that differ from a given configuration by full turns of its joints.
 
     Args:
         joints: Angles. Shape (k,), rad.

@@ -1,4 +1,4 @@
-"""Paths in the fewest segments with reconfigurations between them, and paths found on sections of the manifold.
+"""Paths with the fewest reconfigurations, and paths on sections of the self-motion manifold with one joint fixed.
 
 Where a motion cannot be continued, the arm has to leave the task and come back to it in any configuration that does the
 task: at the next time sample, if the samples are all there is, or at the same one if they stand for a continuous time.
@@ -35,7 +35,7 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class SegmentSettings:
-    """Settings of the search for the lowest-cost division into segments.
+    """Settings of the search for the lowest-cost division of a path into segments.
 
     Attributes:
         max_iterations: Largest number of divisions that are evaluated; then the best known one is taken.
@@ -66,7 +66,7 @@ class Segment(NamedTuple):
 def fewest_segments(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
 ) -> tuple[list[Segment], float] | None:
-    """Divide a path into the fewest segments at the least cost; return them, and a lower bound of this cost.
+    """Cover all time samples by the fewest segments, at least cost; return the segments and a lower cost bound.
 
     Args:
         gap: Samples from the end of a segment to the start of the next one: 1, or 0 if the samples stand for a
@@ -86,7 +86,7 @@ def fewest_segments(
     segments = dict[Span, Segment | None]()
 
     def best_chain(bounded: bool, bounds: bool = False) -> tuple[list[Span], float]:
-        """Return the lowest-cost chain of adjoining segments; with `bounds`, solved ones count by lower bounds.
+        """Return the lowest-cost chain of adjoining segments; with `bounds`, lower bounds replace known costs.
 
         Segments not solved yet count with their lower bounds if `bounded`, and are left out otherwise.
         """
@@ -106,7 +106,7 @@ def fewest_segments(
 
 
 def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
-    """Return at which time samples each of the fewest segments may begin and end; None if no segments pass all samples.
+    """Return the ranges of start and end samples of each of the fewest segments; None if there is no division.
 
     Segments extended greedily forwards give the latest ends, those extended backwards the earliest starts.
     """
@@ -151,12 +151,12 @@ def segment_ends(
 
 
 def _is_barred(span: Span, gap: int, barred: Collection[Span]) -> bool:
-    """Return whether a span of samples is empty or contains an infeasible one, so that no segment can cover it."""
+    """Return whether no segment can cover a span of samples, because it is empty or contains an infeasible span."""
     return (span[0] == span[1] and not gap) or any(span[0] <= bar[0] and bar[1] <= span[1] for bar in barred)
 
 
 def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None:
-    """Return the lowest-cost segment between two time samples; None if none was found."""
+    """Return the lowest-cost segment between two time samples; None if no segment was found."""
     part = search.restrict(first, last)
     joints, bound = part.solve(np.inf)
     return None if joints is None else Segment(first, last, joints, part.path_cost(joints), bound)
@@ -165,7 +165,7 @@ def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None
 def _last_reachable(
     search: AtlasSearch, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
 ) -> int | None:
-    """Return the farthest time sample that one segment from `start` reaches (backwards with `back`), or None."""
+    """Return the farthest time sample that a segment from `start` can reach, or None; `back` searches backwards."""
 
     def reaches(sample: int) -> bool:
         span = min(start, sample), max(start, sample)
@@ -190,7 +190,7 @@ def _last_reachable(
 
 
 def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: list[range]) -> dict[Span, float]:
-    """Return lower bounds of the cost of segments, by first and last sample; those without a path may be absent."""
+    """Return lower bounds of the costs of segments, by first and last sample; segments without a path may be absent."""
     bounds = dict[Span, float]()
     for starts, ends in zip(start_ranges, end_ranges, strict=True):
         if len(ends) == 1:  # one backward sweep serves all starts
@@ -208,7 +208,7 @@ def _segment_bounds(search: AtlasSearch, start_ranges: list[range], end_ranges: 
 def _best_chain(
     start_ranges: list[range], end_ranges: list[range], gap: int, costs: dict[Span, float]
 ) -> tuple[list[Span], float]:
-    """Return the chain of adjoining segments of least total cost, and this cost; [] and inf if there is none."""
+    """Return the chain of adjoining segments of least total cost, and this cost; [] and inf if there is no chain."""
     best: dict[int, tuple[float, list[Span]]] = {start_ranges[0][0]: (0.0, [])}
     for starts, ends in zip(start_ranges, end_ranges, strict=True):
         after: dict[int, tuple[float, list[Span]]] = {}
@@ -258,7 +258,7 @@ def section_values(
 
 
 class SectionSearch(AtlasSearch):
-    """Search for paths on sections of self-motion manifolds, on each of which one joint has a constant value."""
+    """Search for paths on sections of the self-motion manifolds; on each section, one joint has a fixed position."""
 
     def __init__(self, *args: Any, joint: int, values: Array, radius: float, charts: int, **options: Any) -> None:
         """Build the charts of all sections of the self-motion manifolds at all time samples.
@@ -274,7 +274,7 @@ class SectionSearch(AtlasSearch):
         super().__init__(*args, **options)
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return charts of the curves on which the joint is fixed, for each time sample."""
+        """Return for each time sample the charts of all sections, which are curves on which the joint is fixed."""
         manifolds, count = self.samples[0].manifolds, len(self.samples)
         indices, value_count = [sample.row for sample in self.samples], len(self._values)
         targets = np.tile(manifolds.targets[indices], (value_count, 1))
@@ -294,7 +294,7 @@ class SectionSearch(AtlasSearch):
         return self._curves.split(charts)
 
     def paths(self) -> tuple[list[Array], float]:
-        """Return the best path and the best for each value of the fixed joint, by rising cost; the cost bound is 0."""
+        """Return the best path over all sections and the best on each section, by rising cost; the cost bound is 0."""
         count = len(self.samples)
         paths = [path for path in (self.find_path(np.inf)[1],) if path is not None]
         for value in range(len(self._values)):

@@ -1,4 +1,4 @@
-"""Vectorised kinematics of a machine with a moving base at many states, and a test of which poses it can reach.
+"""Vectorised kinematics of a moving-base machine at many states, and a test of whether the machine reaches poses.
 
 With the scaled rates p = sqrt(W) dq/dt, the running cost is |p|^2 / 2. The rates that do a task, A p = v, are the
 least-norm solution plus any rates in the null space of A, the self-motions. The base follows, since its momentum is
@@ -36,9 +36,9 @@ __all__ = ["LimitSide", "ReducedKinematics", "TaskKinematics", "check_floating_r
 
 
 START_GAP = 1e-4
-"""Largest pose error at the start of a pose task with which the tip counts as being at the pose, m or rad."""
+"""Largest pose error, m or rad, with which a tip counts as being at its pose when a task starts."""
 SIMPSON_STEPS = 400
-"""Number of steps of Simpson's rule that integrates a tip velocity to a position."""
+"""Number of steps of Simpson's rule, which integrates a tip velocity to a displacement."""
 
 
 class LimitSide(IntEnum):
@@ -72,16 +72,16 @@ class TaskKinematics(NamedTuple):
     null: Array
 
     def select(self, rows: Any) -> TaskKinematics:
-        """Return the kinematics of the given states."""
+        """Return the linearised tasks at the states with the given indices."""
         return TaskKinematics(*(part[rows] for part in self))
 
     def task_rates(self, rates: Array) -> Array:
-        """Return the tip velocities in the task equations (K, m) that scaled joint rates (K, n) cause."""
+        """Return the rates of the task coordinates (K, m) that scaled joint rates (K, n) cause."""
         rates_of_tasks: Array = self.lower @ (self.row_space.transpose(0, 2, 1) @ rates[:, :, None])
         return rates_of_tasks[:, :, 0]
 
     def least_rates(self, required: Array) -> Array:
-        """Return the least-norm scaled joint rates (K, n) that cause required tip velocities (K, m)."""
+        """Return the least-norm scaled joint rates (K, n) that cause required rates of the task coordinates (K, m)."""
         if not required.shape[1]:
             return np.zeros(self.null.shape[:2])
         solutions: Array = self.row_space @ np.linalg.solve(self.lower, required[:, :, None])
@@ -93,12 +93,12 @@ class TaskKinematics(NamedTuple):
         return np.asarray(rates - projected[:, :, 0])
 
     def base_rates(self, rates: Array) -> Array:
-        """Return the rates of the base (K, b) that scaled joint rates (K, n) cause; the drift is not added."""
+        """Return the base rates (K, b) that scaled joint rates (K, n) cause, without the drift at zero joint rates."""
         return np.asarray((self.base @ rates[:, :, None])[:, :, 0])
 
 
 class ReducedKinematics:
-    """Kinematics of a machine and of its tasks, if it has any, in scaled joint rates at many states.
+    """Kinematics of a machine, and of its tasks if there are any, at many states in terms of scaled joint rates.
 
     Attributes:
         rows: Number of task equations.
@@ -120,7 +120,7 @@ class ReducedKinematics:
         self._sampler = Sampler(symbols, parts)
 
     def at(self, base: Array, joints: Array, time: float) -> TaskKinematics:
-        """Linearise the tasks at states, which consist of base (K, b) and joint (K, n) coordinates."""
+        """Linearise the tasks at K states, given by base coordinates (K, b) and joint positions (K, n)."""
         count, n = joints.shape
         arguments = [base, joints]
         if self._targets is not None:
@@ -139,7 +139,7 @@ class ReducedKinematics:
         return TaskKinematics(right, error, base_jacobian, drift, row_space, lower, null)
 
     def speed(self, base: Array, joints: Array, time: float) -> Array:
-        """Estimate the squared norm (K,) of the scaled rates that tasks require at a time, far from singularities."""
+        """Estimate the squared norm (K,) of the scaled joint rates that the tasks require far from singularities."""
         if self.equations is None:
             return np.zeros(len(joints))
         tasks = [part.task for part in self.equations.bound]
@@ -149,7 +149,7 @@ class ReducedKinematics:
         return np.asarray(self.rows * rates_squared / (task.lower**2).sum(axis=(1, 2)))
 
     def velocity_errors(self, base: Array, joints: Array, rates: Array, time: float) -> tuple[Array, Array]:
-        """Return the tip speed errors of joint rates (K, n) in velocity tasks, and the required speeds. Shapes (K,)."""
+        """Return the norms (K,) of the velocity errors of joint rates (K, n), and of the required tip velocities."""
         zeros = np.zeros(len(joints))
         if self.equations is None or self.equations.pose_rows.all():
             return zeros, zeros
@@ -167,7 +167,7 @@ class ReducedKinematics:
         interval: tuple[float, float],
         tolerance: float,
     ) -> tuple[Array, Array, Array]:
-        """Advance states over a time step by the midpoint rule; keep the self-motion of given scaled rates (K, n).
+        """Advance states by one time step of the midpoint rule; scaled joint rates (K, n) prescribe the self-motion.
 
         Returns:
             Base (K, b), joints (K, n) and remaining pose errors (K,), which are corrected down to the tolerance.
@@ -183,7 +183,7 @@ class ReducedKinematics:
             return self.correct_poses(base, joints, end, tolerance)
 
         def remaining(at_end: TaskKinematics, joints: Array) -> Array:
-            """Return the tip displacement that velocity tasks still require in this step, by Simpson's rule."""
+            """Return, by Simpson's rule, the tip displacement that velocity tasks still require in this step."""
             straight = (joints - start_joints) * self.root
             parts = ((1, task), (4, middle), (1, at_end))
             return np.asarray(sum(k / 6 * (duration * each.right - each.task_rates(straight)) for k, each in parts))
@@ -200,7 +200,7 @@ class ReducedKinematics:
         max_steps: int = 3,
         remaining: Callable[[TaskKinematics, Array], Array] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Correct the pose errors of states by Newton steps; return the same quantities as `step`.
+        """Correct the pose errors of states by Newton steps; return base, joints and pose errors as `step` does.
 
         Args:
             tolerance: Pose error, m and rad, below which the iteration ends.
@@ -227,7 +227,7 @@ class ReducedKinematics:
 
 
 def _normalize(base: Array) -> Array:
-    """Return base configurations (K, b) with unit quaternions."""
+    """Return base configurations (K, b) after normalising their quaternions, if they contain any."""
     if base.shape[1] == 7:
         base[:, 3:] /= np.linalg.norm(base[:, 3:], axis=1, keepdims=True)
     return base
@@ -236,7 +236,7 @@ def _normalize(base: Array) -> Array:
 def limit_rates(
     rates: Array, null: Array, lower: Array, upper: Array, *, max_rates: Array
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Return scaled joint rates (K, n), changed by self-motions so that each joint keeps its limits.
+    """Add self-motions to scaled joint rates (K, n) to bring each joint within its limits, where this is possible.
 
     Args:
         null: Bases of the self-motions. Shape (K, n, r).
@@ -274,9 +274,9 @@ def limit_rates(
 STARTS = 64
 """Number of random joint positions and attitudes from which inverse kinematics starts at each time."""
 PLACE_TOLERANCE = 1e-4
-"""Largest error of a pose that counts as reached, m or rad."""
+"""Largest pose error at which a pose counts as reached, m or rad."""
 CHECKED_TIMES = 17
-"""Number of times at which poses are tested for reach before the bisection."""
+"""Number of times at which the reach of poses is tested before the first failure is located by bisection."""
 
 
 def check_floating_reach(
@@ -289,7 +289,7 @@ def check_floating_reach(
     bounds: JointBounds,
     seed: int = 0,
 ) -> None:
-    """Raise Unreachable if inverse kinematics from many starts finds a pose out of reach for any attitude of the base.
+    """Raise Unreachable if inverse kinematics from many starts cannot reach a pose with any attitude of the base.
 
     Velocities in world axes are integrated to positions; orientations from velocities are ignored.
 
@@ -315,7 +315,7 @@ def check_floating_reach(
     solutions = np.zeros((0, n + attitude_size))  # solutions at the preceding time
 
     def unreachable_at(time: float) -> Unreachable | None:
-        """Return the error that a pose is out of reach at a time; None if all poses can be reached."""
+        """Return an error if a pose is out of reach at a time; None if all poses can be reached."""
         nonlocal solutions
         poses = []
         for task in tasks:
@@ -359,7 +359,7 @@ def check_floating_reach(
 
 
 def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float, *, base: Any = ()) -> TipTask | None:
-    """Return the pose task to which a task is equivalent at a time; None if the pose depends on the path.
+    """Return the pose task that is equivalent to a task at a time; None if the pose depends on the path taken.
 
     Args:
         machine, task: The machine and its task.
@@ -384,7 +384,7 @@ def _equivalent_pose(machine: Machine, task: TipTask, start: Array, time: float,
 
 
 def _base_about_center_of_mass(machine: FreeFloating, base: Array, start: Array, z: Any, time: float) -> Any:
-    """Return the base configuration that places the centre of mass on its straight line at a time.
+    """Return the base configuration for which the centre of mass lies where conserved momentum has moved it.
 
     z holds the joint positions and the attitude of the base.
     """

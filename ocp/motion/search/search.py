@@ -1,4 +1,4 @@
-"""Global search over the self-motion manifolds: the lowest-cost motion, and a lower bound of any motion's cost.
+"""Global search over the self-motion manifolds: the lowest-cost motion, and a lower bound of the cost of all motions.
 
 An atlas of charts covers all configurations that satisfy the tasks at some time samples. Dynamic programming over the
 charts yields lower bounds of the cost-to-go and the cost-to-come, and paths of locally least cost, each of which is a
@@ -37,7 +37,7 @@ from ocp.tolerances import ROUNDING_SHARE
 __all__ = ["MAX_FREE_DIRECTIONS", "AtlasSearch", "SearchSettings", "checked_bound"]
 
 MAX_FREE_DIRECTIONS = 2
-"""Largest dimension of the self-motion manifold; an atlas of more dimensions is too large."""
+"""Largest dimension of a self-motion manifold that can be searched; an atlas of more dimensions is too large."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class SearchSettings:
 
 
 def checked_bound(bound: float, cost: float) -> float | None:
-    """Return a lower bound of the cost of all motions, or None if it is wrong, since a known motion costs less.
+    """Return a lower bound of the cost of all motions; warn and return None if a known motion costs less.
 
     Warns:
         BoundWarning: The cost of a motion lies below the bound.
@@ -124,7 +124,7 @@ class AtlasSearch:
         self.layers = [self.without_collisions(charts, k) for k, charts in enumerate(self.atlas)]
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return charts of the self-motion manifolds that cover all configurations for the tasks at each time sample.
+        """Return for each time sample the charts that cover all configurations in which the tasks are satisfied.
 
         Raises:
             Unreachable, ProblemError: As in the constructor.
@@ -153,7 +153,7 @@ class AtlasSearch:
         return atlas
 
     def without_collisions(self, charts: Charts, k: int) -> Charts:
-        """Return the manifold charts of a time sample except those on which all configurations are in collision."""
+        """Return the manifold charts of a time sample without those on which every configuration is in collision."""
         return charts.select(self._collision_free(charts, k))
 
     def _collision_free(self, charts: Charts, k: int) -> NDArray[np.bool_]:
@@ -165,7 +165,7 @@ class AtlasSearch:
         return np.asarray((distances + charts.spans @ scene.levers.joints.T >= scene.clearance).all(axis=1))
 
     def graph(self, layers: list[Charts], max_costs: Any = np.inf) -> ChartGraph:
-        """Return the graph of charts of the self-motion manifolds and of the steps of limited cost between them.
+        """Return the graph whose nodes are manifold charts and whose edges are steps of limited cost between charts.
 
         Each step costs at most `max_costs`: one value for all steps, or shape (K - 1,).
         """
@@ -243,7 +243,7 @@ class AtlasSearch:
         cost_to_come: list[QuadraticBounds],
         cost_to_go: list[QuadraticBounds],
     ) -> Array | None:
-        """Return the lowest-cost path through one manifold chart; None if it cannot be continued to both ends."""
+        """Return the lowest-cost path through one manifold chart; None if the path breaks off before either end."""
         slope = cost_to_go[k].slope[chart] + (cost_to_come[k].slope[chart] if k else 0.0)
         start_chart = graph.layers[k].select([chart])
         place = np.where(slope > 0, start_chart.low[0], np.where(slope < 0, start_chart.high[0], 0.0))
@@ -271,10 +271,10 @@ class AtlasSearch:
         return np.array([path[number] for number in range(last + 1)])
 
     def project_in_box(self, k: int, box: Charts, place: Array) -> Array | None:
-        """Return a valid configuration at coordinates (r,) of a manifold chart or nearer to its middle, else None.
+        """Return the valid configuration to which a point of a chart, given by coordinates (r,), is projected.
 
-        Points nearer to the middle are tried if the first is not valid: a box reaches beyond the joint limits by the
-        deviation of the manifold.
+        If the result is not valid, points nearer to the middle of the chart are tried: a box reaches beyond the joint
+        limits by the deviation of the manifold. Return None if no point leads to a valid configuration.
         """
         middle = (box.low[0] + box.high[0]) / 2
         shares = (0.0, 0.25, 0.5, 1.0)
@@ -283,7 +283,7 @@ class AtlasSearch:
         return next((configuration for configuration in projected if configuration is not None), None)
 
     def _project(self, k: int, joints: Array) -> Array | None:
-        """Project a configuration to the manifold of a time sample; return None if it violates limits or clearance."""
+        """Project a configuration to the manifold of a time sample; return None if the result is invalid."""
         if k == 0 and self.start is not None:
             return self.start
         projected, converged = self.samples[k].manifolds.project(np.array([self.samples[k].row]), joints[None])
@@ -319,7 +319,7 @@ class AtlasSearch:
         return 1 - self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
 
     def _solve(self, max_cost: float) -> tuple[Array | None, float]:
-        """Return what `solve` does (best path, lower bound) for paths whose steps each cost at most `max_cost`."""
+        """Return the best path without steps costlier than `max_cost`, and a lower cost bound of all such paths."""
         target = self._target_share
         layers, best_path = self.find_path(max_cost)
         if not layers:
@@ -361,7 +361,7 @@ class AtlasSearch:
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
-        """Find a path whose steps each cost at most `max_cost`; return the charts open to such paths, and the path.
+        """Find a path whose steps each cost at most `max_cost`; return the charts such paths may use, and the path.
 
         The list of charts is empty if no path exists. The path is None if the atlas would need too many charts.
         """
@@ -384,7 +384,7 @@ class AtlasSearch:
             layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
     def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
-        """Follow the least cost-to-go; return the shortened path, or None if the path breaks off or is too fast."""
+        """Follow the least cost-to-go and shorten the path; return None if it breaks off or exceeds step limits."""
         chart = int(graph.minima(cost_to_go[0], 0).argmin())
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 
@@ -430,7 +430,7 @@ class AtlasSearch:
         return valid
 
     def _shorten(self, path: Array | None, layers: list[Charts]) -> Array | None:
-        """Shorten a path on the manifolds if the result is valid; return None if the path is then too fast."""
+        """Shorten a path on the manifolds if the result is valid; return None if the path then exceeds step limits."""
         bounds = self.space.lower, self.space.upper
         if path is None:
             return None
@@ -443,7 +443,7 @@ class AtlasSearch:
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
 
     def split_charts(self, charts: Charts, k: int) -> Charts:
-        """Return charts of the self-motion manifold with half the radius, in place of those of a time sample."""
+        """Return manifold charts of half the radius that replace the given charts of a time sample."""
         return self._split(charts, k).charts
 
     def _split(self, charts: Charts, k: int) -> SplitCharts:
@@ -453,7 +453,7 @@ class AtlasSearch:
         return self.samples[k].manifolds.split(numbered)
 
     def _refine(self, charts: Charts, k: int, values: QuadraticBounds) -> tuple[Charts, QuadraticBounds]:
-        """Halve manifold charts; return the halves that are not in collision, and lower bounds of the cost on them."""
+        """Halve manifold charts; return the halves not entirely in collision, and lower cost bounds on these halves."""
         halves = self._split(charts, k)
         free = self._collision_free(halves.charts, k)
         values, low, high = values.select(halves.owners[free]), halves.low[free], halves.high[free]

@@ -1,4 +1,4 @@
-"""Lower bounds of the cost of straight steps between charts of the self-motion manifold, as functions of their start.
+"""Lower bounds of the cost of straight steps between charts of the self-motion manifold, as functions of the start.
 
 The integral of half the squared rates is no less than |dq|^2 / (2 dt), the length no less than |dq|_1. Charts are
 tangent to the manifold; its measured deviation is taken into account, and assumed to be no larger within a box than at
@@ -23,9 +23,9 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_CUTS = 8
-"""Number of tangents that bracket the minimum of a homogeneous cost, which has one linear piece per joint."""
+"""Number of tangents with which the minimum of a piecewise linear step cost is bracketed; each joint adds a kink."""
 MAX_CONCAVITY = 0.5
-"""Largest concavity of a cost bound relative to the curvature of a step's cost; the excess becomes a constant."""
+"""Largest concavity of a cost bound, relative to the curvature of a step's cost; a constant replaces the excess."""
 
 
 class QuadraticBounds(NamedTuple):
@@ -44,7 +44,7 @@ class QuadraticBounds(NamedTuple):
     curve: Array
 
     def select(self, rows: Any) -> QuadraticBounds:
-        """Return the bounds on the charts with the given indices."""
+        """Return the lower bounds on the charts with the given indices."""
         return QuadraticBounds(*(part[rows] for part in self))
 
     @classmethod
@@ -53,19 +53,19 @@ class QuadraticBounds(NamedTuple):
         return cls(least, np.zeros((len(least), free)), np.zeros((len(least), free, free)))
 
     def minimum(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """Return the minima of the bounds over the boxes of the charts (N, r), and the coordinates of the minima."""
+        """Return the minimum of each lower bound over the box (N, r) of its chart, and the minimiser (N, r)."""
         least, place = least_in_box(self.slope, self.curve, low, high)
         return self.least + least, place
 
     def at(self, places: Array) -> Array:
-        """Return the values of the bounds (N,) at chart coordinates (N, r)."""
+        """Return the values (N,) of the lower bounds at chart coordinates (N, r)."""
         products = np.einsum("nab,nb->na", self.curve, places)
         return np.asarray(self.least + (places * (self.slope + products / 2)).sum(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Steps between consecutive time samples: their limits, durations and cost.
+    """Limits, durations and cost of the steps between consecutive time samples.
 
     Attributes:
         times: Times of the samples, s. Shape (K,).
@@ -79,7 +79,7 @@ class Steps:
 
 
 class CurvedCharts(NamedTuple):
-    """Manifold charts, and the deviation of the manifold from them as a quadratic form with a residual.
+    """Manifold charts, and the deviations of the manifold from the charts as quadratic forms with residuals.
 
     Attributes:
         charts: N charts.
@@ -92,7 +92,7 @@ class CurvedCharts(NamedTuple):
     rest: Array
 
     def select(self, rows: Any) -> CurvedCharts:
-        """Return the charts with the given indices."""
+        """Return the curved charts with the given indices."""
         return CurvedCharts(self.charts.select(rows), self.bends[rows], self.rest[rows])
 
 
@@ -103,7 +103,7 @@ class StepCost(ABC):
     def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
     ) -> tuple[Array, Array]:
-        """Return the costs (P,) and end coordinates (P, r) of the lowest-cost steps into manifold charts.
+        """Return the costs (P,) and end coordinates (P, r) of the lowest-cost step into each of P manifold charts.
 
         The centres of the charts are `delta` (P, n) away. The costs include the remaining costs `after`.
         """
@@ -112,7 +112,7 @@ class StepCost(ABC):
     def lower_bounds(
         self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
     ) -> StepBounds:
-        """Return lower bounds of the costs of P steps between manifold charts, plus the costs `after` them.
+        """Return lower bounds of the costs of P steps between manifold charts, plus the costs `after` the steps.
 
         The centres of the charts are `delta` (P, n) apart.
         """
@@ -194,7 +194,7 @@ class SquaredRates(StepCost):
 
 
 def _rows_last(rows: Array) -> Array:
-    """Move the first axis, that of the steps, to the end, so that sums over joints are vectorised over all steps."""
+    """Move the first axis (the steps) to the end, which vectorises sums over joints over all steps."""
     return np.ascontiguousarray(np.moveaxis(rows, 0, -1))
 
 
@@ -218,7 +218,7 @@ def _dot(left: Array, right: Array) -> Array:
 
 
 def _support(points: Array, direction: Array) -> Array:
-    """Return the support function of each point set (c, n, P) and the origin in directions (n, P). Shape (P,)."""
+    """Return the largest component, but at least 0, of each point set (c, n, P) along directions (n, P). Shape (P,)."""
     support = np.zeros(direction.shape[1])
     for point in points:
         np.maximum(support, _dot(point, direction), out=support)
@@ -236,7 +236,7 @@ def _symmetric_support(points: Array, directions: Array) -> Array:
 def _nearest_places(
     projection: Array, rotation: Array, start_box: Array, end_box: Array, slope: Array, curve: Array, seconds: float
 ) -> tuple[Array, Array]:
-    """Return the start and end coordinates (r, P) of a low-cost step between the boxes of each of P pairs of charts."""
+    """Return start and end coordinates (r, P) of a low-cost step between the tangent boxes of each of P chart pairs."""
     square, middle = curve + np.eye(len(projection))[:, :, None] / seconds, (start_box[0] + start_box[1]) / 2
     end_place = _least_in_box((projection - _apply(rotation, middle)) / seconds + slope, square, *end_box)[1]
     slope, square = -_apply_transposed(rotation, projection + end_place), _multiply_transposed(rotation, rotation)
@@ -245,7 +245,7 @@ def _nearest_places(
 
 @dataclass(frozen=True, eq=False)
 class SquaredRateBounds:
-    """Lower bounds of the cost of steps plus the remaining cost, as functions of the start coordinates t of a step.
+    """Lower bounds of the cost of steps plus the remaining cost, as functions of the start coordinates t of the step.
 
     The bound is least + slope . t + t . level . t / 2, plus the minimum over t' in the box `end_box` of
     v . v / (2 dt) + after . t' + t' . after_curve . t' / 2. Here v = projection - rotation . t + t' is the step along
@@ -279,7 +279,7 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + _rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Minimise the bounds over the end of a step; return the step to end 0, the least cost added, the best end."""
+        """Minimise the bounds over the end of a step; return the step to the centre, the minimum, the best end."""
         start = self.projection - _apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
@@ -293,9 +293,9 @@ class SquaredRateBounds:
         return value + _dot(places, products / 2 + self.slope), _rows_first(slope)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Improve start coordinates (P, r) towards a minimum of the bounds minus a quadratic function of them.
+        """Improve start coordinates (P, r) towards a minimum of the bounds minus a quadratic function.
 
-        With start coordinates t, this function is slope . t + t . curve . t / 2.
+        With start coordinates t, the quadratic function is slope . t + t . curve . t / 2.
         """
         end_place = self._minimize_after(_rows_last(places))[2]
         gradient = -_apply_transposed(self.rotation, self.projection + end_place) / self.seconds
@@ -304,13 +304,13 @@ class SquaredRateBounds:
 
 
 def _rows_first(columns: Array) -> Array:
-    """Move the last axis, that of the steps, to the front: the inverse of `_rows_last`."""
+    """Move the last axis (the steps) to the front, which is the inverse of `_rows_last`."""
     return np.ascontiguousarray(np.moveaxis(columns, -1, 0))
 
 
 @dataclass(frozen=True, eq=False)
 class Homogeneous(StepCost):
-    """Cost proportional to the length of a step, with affine lower bounds on charts of dimension 0 or 1.
+    """Step cost proportional to the length of the step; its lower bounds on charts of dimension 0 or 1 are affine.
 
     Attributes:
         weights: Weights of the joint displacements, 0 to ignore a joint. Shape (n,).
@@ -320,10 +320,10 @@ class Homogeneous(StepCost):
 
     @abstractmethod
     def gradient(self, displacement: Array) -> Array:
-        """Return the gradients of the cost at joint displacements (P, n)."""
+        """Return the gradients (P, n) of the cost with respect to the joint displacements (P, n)."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return lower bounds (P,) of the costs of steps plus later costs, gradients (P, n), and end points (P, 1)."""
+        """Return lower bounds (P,) of step costs plus later costs, cost gradients (P, n), and step ends (P, 1)."""
         count = len(delta)
         if not target.tangents.shape[2]:
             return self.evaluate(delta, 1.0) + after.least, self.gradient(delta), np.zeros((count, 0))
@@ -331,7 +331,7 @@ class Homogeneous(StepCost):
         box = target.low[:, 0], target.high[:, 0]
 
         def linearize(place: Array) -> list[Array]:
-            """Return chart coordinates, the gradient there, the tangent's value at the origin, and the total slope."""
+            """Return the coordinates, the cost gradient, and the value at the origin and total slope of the tangent."""
             gradient = self.gradient(delta + along * place[:, None])
             return [place, gradient, (gradient * delta).sum(axis=1), (gradient * along).sum(axis=1) + slope]
 
@@ -384,7 +384,7 @@ class PathLength(Homogeneous):
 
 
 class LargestMotion(Homogeneous):
-    """Cost of a step: the largest weighted joint displacement, a duration if weights are inverse velocity limits."""
+    """Cost of a step: the largest weighted joint displacement (a duration for inverse velocity limits)."""
 
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).max(axis=-1))
@@ -401,7 +401,7 @@ class LargestMotion(Homogeneous):
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBounds:
-    """Lower bounds of a homogeneous cost of steps plus later costs, as built by `Homogeneous.lower_bounds`."""
+    """Lower bounds of step costs proportional to length plus later costs, from `Homogeneous.lower_bounds`."""
 
     cost: Homogeneous
     delta: Array
@@ -431,7 +431,7 @@ class HomogeneousBounds:
 
 
 StepBounds: TypeAlias = SquaredRateBounds | HomogeneousBounds
-"""Lower bounds of the costs of P steps plus the costs after them, as functions of the start coordinates."""
+"""Lower bounds of the costs of P steps plus the costs after the steps, as functions of the start coordinates."""
 
 
 def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
@@ -445,7 +445,7 @@ def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[
 
 
 def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Minimise P quadratic functions over boxes as `least_in_box` does, but with the functions along the last axis."""
+    """Minimise P quadratic functions over boxes; unlike in `least_in_box`, the last array axis counts the functions."""
     r, count = slope.shape
     if not r:
         return np.zeros(count), np.zeros(slope.shape)
@@ -485,7 +485,7 @@ def _lowest_eigenvalue(square: Array) -> Array:
 
 
 def _raise_eigenvalues(square: Array, floor: float) -> tuple[Array, Array]:
-    """Raise the eigenvalues of symmetric matrices (r, r, P) to at least `floor`; also return the increases (P,)."""
+    """Raise the eigenvalues of symmetric matrices (r, r, P) to at least `floor`; also return the largest increases."""
     excess = np.maximum(floor - _lowest_eigenvalue(np.moveaxis(square, -1, 0)), 0.0)
     rows = np.flatnonzero(excess > 0)
     if rows.size:

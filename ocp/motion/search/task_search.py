@@ -1,4 +1,4 @@
-"""Global search over all motions that perform the tasks at their times: choice of time samples, and bounds."""
+"""Global search over all motions that perform the tasks: choice of the time samples, and lower cost bounds."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class SampleSettings:
 
 
 class TaskSearch:
-    """Global search for the motions of a plan request.
+    """Global search for motions that perform the tasks of a plan request.
 
     Attributes:
         request: The request.
@@ -126,7 +126,7 @@ class TaskSearch:
         self._search_at(times)
 
     def _search_at(self, times: list[Array]) -> None:
-        """Search over the configurations at time samples, given for each interval (stretch) that has tasks."""
+        """Search over the configurations at given time samples; `times` has an entry for each interval with tasks."""
         self._build_search(times)
         self._path, bound = self._search.solve(self._known_cost)
         self.bound = max(self.bound, bound)  # the bound of fewer samples stays valid
@@ -134,7 +134,7 @@ class TaskSearch:
             self._known_cost = max(self._known_cost, self._search.path_cost(self._path))
 
     def _build_search(self, times: list[Array]) -> None:
-        """Build the atlas of the manifolds at time samples, given for each interval (stretch) that has tasks."""
+        """Build the atlas of the manifolds at given time samples; `times` has an entry for each interval with tasks."""
         request, samples = self.request, list[TimeSample]()
         for equations, stretch_times in zip(self._equations, times, strict=True):
             manifolds = self._manifolds(equations, stretch_times)
@@ -147,7 +147,7 @@ class TaskSearch:
         self._search = AtlasSearch(self.space, samples, steps, **options)
 
     def _manifolds(self, equations: TaskEquations, times: Array) -> SelfMotionManifolds:
-        """Return the self-motion manifolds of tasks at some times."""
+        """Return the self-motion manifolds of tasks at given times (M,), s."""
         targets = np.array(equations.target_function().map(len(times))(times[None, :])).T
         return SelfMotionManifolds(self.space, equations, targets)
 
@@ -156,7 +156,7 @@ class TaskSearch:
         return [stretch.equations for stretch in self.request.stretches if stretch.equations is not None]
 
     def dead_end(self) -> DeadEnd | None:
-        """Return an error that says where all motions end, and why; None if a motion reaches the end."""
+        """Return an error that says where all motions end, and why; None if a motion to the end was found."""
         if self._path is not None:
             return None
         ends = segment_ends(self._search, 0)
@@ -164,7 +164,7 @@ class TaskSearch:
         return dead_end(self._search, proven=not np.isfinite(self.bound), segments=len(ends) if through else None)
 
     def segments(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
-        """Divide the tasks into the fewest segments of lowest cost; return their times and a bound of their number.
+        """Divide the tasks into the fewest segments, at least cost; return their times and a bound of their number.
 
         Args:
             barred: Begin and end, s, of intervals that are known to be infeasible in one segment.
@@ -197,7 +197,7 @@ class TaskSearch:
         return np.asarray(np.diff(self.times) > self._settings.closest * self.request.horizon)
 
     def _with_samples(self, times: Array) -> list[Array]:
-        """Return the sample times of each interval (stretch) that has tasks, including additional times."""
+        """Return the sample times of each interval with tasks after inserting additional times."""
         return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._times_by_stretch]
 
     def refine_samples(self) -> bool:
@@ -223,7 +223,7 @@ class TaskSearch:
             raise locate_error(self.request, error, float(self.times[k])) from error
 
     def local_motions(self, include_costlier: bool = False) -> list[LocalMotion]:
-        """Return motions of locally least cost as guesses, one result for each time interval with the same tasks.
+        """Return motions of locally least cost, as one `LocalMotion` for each time interval with the same tasks.
 
         By default only motions near which the optimum may lie; with `include_costlier` all of them.
         """
@@ -253,7 +253,7 @@ class TaskSearch:
 def choose_samples(
     t: Array, joints: Array, weights: Array, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Choose a few times of a motion (M,) such that straight steps between them keep its cost to a given accuracy.
+    """Choose a few sample times of a motion; straight steps between them lose at most a given share of its cost.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.

@@ -106,7 +106,7 @@ class ChartGraph:
         return self._sweep(range(len(self.layers)), 1, cost_to_go, max_cost)
 
     def reachable(self) -> list[NDArray[np.bool_]]:
-        """Return which manifold charts lie on a path from the first to the last time sample. Shape (N,) for each."""
+        """Return which manifold charts lie on a path from the first to the last time sample. Shape (N,) each."""
         masks = [np.ones(len(charts), dtype=bool) for charts in self.layers]
         end = len(masks) - 1
         for order in (range(end), range(end, 0, -1)):
@@ -119,7 +119,7 @@ class ChartGraph:
         return masks
 
     def edges(self, k: int, neighbour: int) -> Iterator[tuple[Indices, Indices]]:
-        """Yield batches of pairs of manifold charts of consecutive time samples between which a step is possible."""
+        """Yield, in batches, the pairs of manifold charts at two neighbouring time samples that a step can connect."""
         source, target = self.layers[k], self.layers[neighbour]
         if not len(source) or not len(target):
             return
@@ -151,7 +151,7 @@ class ChartGraph:
     def successors(
         self, joints: Array, k: int, neighbour: int, after: QuadraticBounds
     ) -> Iterator[tuple[Charts, Array]]:
-        """Yield the manifold charts of a neighbouring time sample that a configuration (n,) can reach, by rising cost.
+        """Yield, by rising cost, the charts at a neighbouring time sample that one step from `joints` (n,) can reach.
 
         Yields:
             A single chart, shifted by full turns to the configuration, and the end of the step in chart coordinates
@@ -190,7 +190,7 @@ class ChartGraph:
     def _propagate(
         self, k: int, neighbour: int, after: QuadraticBounds, known_bounds: QuadraticBounds | None, max_cost: float
     ) -> QuadraticBounds:
-        """Return cost bounds on the manifold charts of sample k, from the bounds `after` on a neighbouring sample.
+        """Return lower cost bounds on the charts of time sample `k`, from the bounds `after` on a neighbouring sample.
 
         With `known_bounds` of the other part of the motions, those that cost `max_cost` or more are left out.
         """
@@ -233,7 +233,7 @@ class ChartGraph:
 
     @staticmethod
     def _raise_to_floor(values: QuadraticBounds, charts: Charts, floor: Array) -> QuadraticBounds:
-        """Replace a cost bound by the constant `floor` where this exceeds the mean of its middle value and minimum."""
+        """Replace a cost bound by the constant `floor` if the mean of its minimum and middle value is smaller."""
         least = values.minimum(charts.low, charts.high)[0]
         higher = values.at((charts.low + charts.high) / 2) + least < 2 * floor
         return QuadraticBounds(
@@ -243,7 +243,7 @@ class ChartGraph:
         )
 
     def minima(self, values: QuadraticBounds, k: int) -> Array:
-        """Return the minimum of the cost bound on each chart of a time sample's self-motion manifold. Shape (N,)."""
+        """Return the minimum of the cost bound on each manifold chart of a time sample. Shape (N,)."""
         return values.minimum(self.layers[k].low, self.layers[k].high)[0]
 
     def cost_through(self, cost_to_come: list[QuadraticBounds], cost_to_go: list[QuadraticBounds], k: int) -> Array:
@@ -253,7 +253,7 @@ class ChartGraph:
 
 
 def _bound_with_rest(steps: StepBounds, charts: Charts, known_bounds: QuadraticBounds) -> Array:
-    """Return lower bounds of the total cost of motions that contain given steps. Shape (P,)."""
+    """Return for each step a lower bound of the total cost of all motions that contain this step. Shape (P,)."""
     middle, curve = (charts.low + charts.high) / 2, steps.curve
     total = _tangent_bounds(middle, steps.at(middle), curve, -known_bounds.curve, -known_bounds.slope)
     return known_bounds.least + total.minimum(charts.low, charts.high)[0]
@@ -268,7 +268,7 @@ def _least_of_groups(values: Array, groups: Indices) -> Array:
 def _bound_charts(
     steps: StepBounds, charts: Charts, starts: Indices, max_costs: Array, settings: GraphSettings
 ) -> QuadraticBounds:
-    """Combine the cost bounds of all steps from a chart of the self-motion manifold into one bound for each chart.
+    """Combine the cost bounds of all steps that start in the same manifold chart into one bound for each chart.
 
     The steps of a chart are consecutive and begin at `starts`. Values above `max_costs` (M,) need not be resolved.
     """
@@ -310,9 +310,9 @@ def _bound_charts(
 def _best_combination(
     best: QuadraticBounds, best_least: Array, tangent: QuadraticBounds, charts: Charts
 ) -> tuple[QuadraticBounds, Array]:
-    """Return the convex combination of two cost bounds whose minimum is highest, and this minimum, for P steps.
+    """Return for each of P steps the convex combination of two cost bounds with the highest minimum, and its minimum.
 
-    Both have the same curvature. Combinations are tried that are level along an axis. `best_least` is
+    Both have the same curvature. The combinations that are level along an axis are tried. `best_least` is
     the minimum of the first. Shape (P,).
     """
     first = best
@@ -341,9 +341,9 @@ def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> 
 def _tangent_bounds(
     places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
 ) -> QuadraticBounds:
-    """Return lower bounds of functions by their tangents at given points, minus a common quadratic function.
+    """Return lower bounds of functions by tangents at given points, after subtracting a common quadratic function.
 
-    This function is tilt . t + t . common . t / 2.
+    The subtracted function is tilt . t + t . common . t / 2.
     """
     value, slope = values
     at_origin = value - (places * slope).sum(axis=1) + _quadratic(curve, places)
@@ -351,9 +351,9 @@ def _tangent_bounds(
 
 
 def _concavity(values: Array, half: Array, curve: Array) -> Array:
-    """Estimate the concavity of functions on charts from values in the middle and on each axis. Shape (M, r, r).
+    """Estimate the concavity of functions on charts from values in the middle and at the ends of each axis.
 
-    It does not make the total curvature negative.
+    The total curvature is kept non-negative. Shape (M, r, r).
     """
     second_differences = (values[1::2] + values[2::2] - 2 * values[0]).T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -363,7 +363,7 @@ def _concavity(values: Array, half: Array, curve: Array) -> Array:
 
 
 def _secant_slopes(values: list[Array], half: Array) -> Array:
-    """Return slopes of functions on charts, from values in the middle and at both ends of each axis. Shape (M, r).
+    """Estimate the slopes of functions on charts from values in the middle and at the ends of each axis. Shape (M, r).
 
     A concave function gets the slope from end to end, a convex one the flattest slope.
     """
@@ -378,12 +378,12 @@ def _secant_slopes(values: list[Array], half: Array) -> Array:
 
 
 PENALTY = 1e6
-"""Penalty per rad or m by which a limit is violated, larger than the cost of any path."""
+"""Penalty for each rad or m by which a limit is violated; the penalty exceeds the cost of any path."""
 
 
 @dataclass(frozen=True)
 class ShorteningSettings:
-    """Settings of `shorten_path`.
+    """Settings of `shorten_path`, such as the number of neighbouring configurations that are tried.
 
     Attributes:
         neighbours: Number of configurations on either side of the path, by the dimension of the manifold.
@@ -408,7 +408,7 @@ def shorten_path(
     widths: tuple[float, float],
     settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
-    """Return a path near the given one with a lower cost, or with smaller violations of limits. Shape (K, n).
+    """Return a path near the given path that has a lower cost or smaller violations of limits. Shape (K, n).
 
     Args:
         path: Configurations that do the tasks at the samples. Shape (K, n).
@@ -464,7 +464,7 @@ def shorten_path(
 def _violation(
     candidates: Array, times: Array, bounds: tuple[Array, Array], scene: CollisionScene | None, margin: float
 ) -> Array:
-    """Return by how much configurations (K, s, n) violate joint limits and clearance, rad and m. Shape (K, s)."""
+    """Return the amounts (K, s), rad and m, by which configurations (K, s, n) violate joint limits and clearance."""
     excess = np.maximum(np.maximum(candidates - bounds[1], bounds[0] - candidates), 0.0).sum(axis=2)
     if scene is None:
         return np.asarray(excess)

@@ -1,4 +1,4 @@
-"""Checks of tasks against a machine and a start configuration, before anything is solved."""
+"""Checks of tip tasks against a machine and a start configuration, before a motion is planned."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ CHECKS = CheckSettings()
 
 
 def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
-    """Return the horizon of a motion, s; if it is not given (None), the time at which the last task ends.
+    """Return the horizon (duration) of a motion, s; if `horizon` is None, this is the time at which the last task ends.
 
     Raises:
         ProblemError: The horizon is not positive, or it is None and no task has a duration.
@@ -92,7 +92,7 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
 
 
 def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
-    """Return joint values (n,) at an end of a motion, clipped to their limits if they exceed these by rounding only.
+    """Clip joint values (n,) at an end of a motion to their limits; raise ProblemError if the excess is not rounding.
 
     Args:
         joints, lower, upper: Joint positions, or velocities, nan where free, and their limits. Shape (n,).
@@ -116,7 +116,7 @@ def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, nam
 
 
 def checked_weights(weights: Any, size: int) -> Array:
-    """Return weights (size,) of the squared joint rates, ones if None; raise ProblemError if one is not positive."""
+    """Return weights (size,) of the squared joint rates, 1 if None; raise ProblemError if one is not positive."""
     if weights is None:
         return np.ones(size)
     array = require.array("weights", weights, (size,), meaning="one for each joint")
@@ -180,7 +180,7 @@ def checked_tasks(
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
-    """Return a name for the tasks if their rows are linearly dependent in a configuration up to rounding, else None."""
+    """Return a description of the tasks if their rows are linearly dependent in a configuration, else None."""
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
@@ -188,7 +188,7 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joint positions have no effect on the joint rates that tasks and base require. Shape (n,), bool.
+    """Return which joint positions affect neither the required joint rates nor the base motion. Shape (n,), bool.
 
     Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
     and the cones of tool axes do not depend on such a joint position.
@@ -215,7 +215,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return how errors number the rows of the tasks: by twist component for a single task, else by position."""
+    """Return the numbers of task rows in error messages: twist components for a single task, else indices."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -228,13 +228,13 @@ def _frame(part: BoundTask) -> str:
 
 
 def _sample_targets(equations: TaskEquations, horizon: float, count: int) -> tuple[Array, Array]:
-    """Return `count` equidistant times from 0 to the horizon, and the targets at these times, one column each."""
+    """Sample the targets of all tasks at `count` equidistant times from 0 to the horizon; return times and samples."""
     times = np.linspace(0.0, horizon, count)
     return times, np.array(equations.target_function().map(count)(times[None, :]))
 
 
 def _parts(equations: TaskEquations, values: Array) -> list[tuple[BoundTask, Array]]:
-    """Return each task with its own rows of the stacked targets of all tasks."""
+    """Split the stacked targets of all tasks, and return each task with the rows that belong to it."""
     ends = np.cumsum([target_size(part.task) for part in equations.bound])
     return list(zip(equations.bound, np.split(values, ends[:-1]), strict=True))
 
@@ -261,7 +261,7 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if a task of a cyclic motion does not return to its start, as far as its targets show that.
+    """Raise ProblemError if the targets show that a task of a cyclic motion does not return to its start.
 
     Poses are checked by their targets, velocities by their integrals.
     """
@@ -291,7 +291,7 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
-    """Raise ProblemError if a task moves at one of the times at which joints are to be at rest; None is skipped."""
+    """Raise ProblemError if a task prescribes motion when the joints must be at rest; times of None are skipped."""
     targets = equations.target_function()
     for time in times:
         if time is None:
@@ -326,7 +326,7 @@ def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
 
 
 def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end: float) -> None:
-    """Raise ProblemError if a task is faster than the tip can move in any configuration within joint rate limits.
+    """Raise ProblemError if a task is faster than the joint rate limits permit the tip to move in any configuration.
 
     A revolute joint moves the tip at most by its rate times the length of the links from its axis to the tip.
 
@@ -356,7 +356,7 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
 
 
 def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array) -> tuple[float, float]:
-    """Return the largest speed, m/s, and angular speed, rad/s, of the tip within joint rate limits (n,)."""
+    """Return upper bounds of the tip's speed, m/s, and angular speed, rad/s, under given joint rate limits (n,)."""
     linear, angular = 0.0, 0.0
     whole = machine.robot.path_to(machine.robot.tip_link)
     after = {joint.name: whole[i + 1 :] for i, joint in enumerate(whole)}
@@ -390,7 +390,9 @@ def _chain_length(machine: Machine, joints: Sequence[Joint]) -> float:
 
 
 def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
-    """Return the position of the first moving joint in the world, (3,), and the largest distance of the tip from it."""
+    """Return the position of the first moving joint in world, (3,), and the largest distance of the tip from this
+    joint.
+    """
     robot = machine.robot
     chain = robot.path_to(robot.tip_link)
     first = next((i for i, joint in enumerate(chain) if joint.moves), len(chain) - 1)
@@ -422,7 +424,7 @@ def _integral(values: Array, step: float) -> Array:
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:
-    """Return the angle of the net rotation, rad, from samples of an angular velocity in world axes, (3, samples)."""
+    """Return the angle, rad, of the total rotation that a sampled angular velocity (3, samples) in world causes."""
     rotation = np.eye(3)
     # fourth-order Magnus expansion over two steps at a time
     for k in range(0, CHECKS.closure_samples - 1, 2):
@@ -438,7 +440,8 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities to prescribe where a motion starts or ends at rest: 0, or nan if free. Shape (n,).
+    """Return the joint velocities to prescribe where a motion begins or ends at rest: 0, or nan for free joints. Shape
+    (n,).
 
     A tip whose velocity or acceleration is prescribed comes to rest by itself. As many joints as the tasks have such
     rows then follow from the others, and prescribing their rest too would be redundant. The joints that move the tip

@@ -1,4 +1,5 @@
-"""Equations of tip tasks, J u = b in the joint rates u with drift and feedback in b, or J u' = c in their derivatives.
+"""Equations of tip tasks: J u = b for the joint rates u, with drift and feedback in b, or J u' = c for accelerations
+u'.
 
 The latter are the former differentiated along the motion. Everything that depends on time alone is in the column of
 targets; everything else is a function of configuration and targets, written element by element on SX symbols.
@@ -71,7 +72,8 @@ class TaskEquations:
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Mask of joints that, by the kinematic tree, move no task or reference frame. Shape (joint_size,), bool.
+        """Mask of the joints that move neither the frame nor the reference frame of any task. Shape (joint_size,),
+        bool.
 
         On a floating base or a standing machine no joint is idle: each one moves the base or the balance.
         """
@@ -97,7 +99,7 @@ class TaskEquations:
         return ", ".join(units)
 
     def targets(self, time: Any, pace: Any = 1) -> Any:
-        """Return the targets of the tasks at a time as a column of expressions of the symbol `time`.
+        """Return the targets of all tasks (poses and velocities) as a column of expressions of the symbol `time`.
 
         For each task: the velocity in its rows; or, in its reference and as far as given, position and velocity (3, 3),
         rotation and angular velocity (9, 3), direction and angular velocity (3, 3).
@@ -169,7 +171,7 @@ class TaskEquations:
 
     @on_scalars
     def twist(self, base: Any, joints: Any, rates: Any) -> Any:
-        """Return the tip velocities in the rows of the tasks, rad/s and m/s. Shape (size, 1)."""
+        """Return the tip velocities in the components that the tasks prescribe, rad/s and m/s. Shape (size, 1)."""
         rows = []
         for part in self.bound:
             twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
@@ -177,7 +179,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
-        """Return the deviations of the tips from their tasks, by name, as arguments of `Problem.watch`.
+        """Return the deviations of the tips from their tasks, each as a dictionary of arguments of `Problem.watch`.
 
         For poses these are their errors, "task position" and "task orientation"; for velocities the integral of their
         residual, "task displacement" and "task rotation"; each is judged relative to the path of the tips. If a task is
@@ -256,7 +258,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Return pose minus target in the rows of poses, and `residual` in those of velocities. Shape (size, 1)."""
+        """Return pose minus target in the rows of pose tasks, and velocity residuals elsewhere. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         return ca.vertcat(*((-error if is_pose else residual)[i] for i, is_pose in enumerate(self.pose_rows)))
 
@@ -316,7 +318,9 @@ class TaskEquations:
 
     @on_scalars
     def cone_cosines(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return the cosine of the angle between tool axis and direction for each task with `within`. Shape (k, 1)."""
+        """Return the cosine of the angle between tool axis and target direction for each task with a cone. Shape (k,
+        1).
+        """
         rows: list[Any] = [ca.DM(0, 1)]
         for part, target in self._with_targets(targets):
             if part.task.within is not None:
@@ -325,18 +329,18 @@ class TaskEquations:
 
     @property
     def cone_angles(self) -> Array:
-        """Half-angles of the cones in which tool axes must stay, see `cone_cosines`, rad. Shape (k,)."""
+        """Half-angles, rad, of the cones in which tool axes must stay, one for each task with a cone. Shape (k,)."""
         return np.array([part.task.within for part in self.bound if part.task.within is not None], dtype=float)
 
     def _cosine(self, part: BoundTask, base: Any, joints: Any, target: Any) -> Any:
-        """Return the cosine of the angle between a task's tool axis and its direction."""
+        """Return the cosine of the angle between the tool axis of a task and the target direction of the task."""
         _, direction = split_targets(part.task, target)
         reference = reference_pose(part, base, joints)
         goal = direction[0] if reference is None else ca.mtimes(reference.rotation, direction[0])
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the pose errors of the tips of velocity tasks at a start, relative to a reference configuration.
+        """Return the errors of the tip poses of all velocity tasks, relative to the poses in a reference configuration.
 
         For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
         """
@@ -360,13 +364,13 @@ class TaskEquations:
             at += size
 
     def errors(self, t: Any, base: Any, joints: Any) -> Array:
-        """Return the pose errors along a motion, see `task_errors`. Shape (M, size)."""
+        """Return the pose errors of all tasks along a motion, m and rad; 0 in velocity rows. Shape (M, size)."""
         bases, positions, targets = self._along(t, base, joints)
         count = len(positions)
         return np.array(self.function.map(count)(bases.T, positions.T, targets)[2]).reshape(-1, count).T
 
     def _along(self, t: Any, base: Any, joints: Any) -> tuple[Array, Array, Any]:
-        """Return base (M, base_size) and joint positions (M, joint_size) along a motion, and targets as M columns."""
+        """Return base configurations (M, base_size), joint positions (M, joint_size) and targets as M columns."""
         times, positions = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
         bases = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
         return bases, positions, self.target_function().map(len(times))(times[None, :])
@@ -407,7 +411,7 @@ class TaskEquations:
 
     @property
     def _symbols(self) -> tuple[Any, ...]:
-        """Symbols of base configuration, joint positions and targets."""
+        """CasADi symbols for the base configuration, the joint positions and the targets."""
         targets = sum(target_size(part.task) for part in self.bound)
         sizes = {"base": self.machine.base_size, "joints": self.machine.joint_size, "targets": targets}
         return tuple(ca.SX.sym(name, size) for name, size in sizes.items())

@@ -35,7 +35,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Return a start, its checked joint positions (n,) or None if free, and its base configuration (base_size,).
+        """Convert a value to a Start; return it with its joint positions (n,), None if free, and its base (base_size,).
 
         Args:
             value: A start, joint positions, or None.
@@ -50,7 +50,8 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Return a start whose joint positions must be given, and these (n,) and its base (base_size,) after checks.
+        """Convert a value to a Start with given joint positions; return it, these positions (n,) and its base
+        (base_size,).
 
         Args:
             value: A start with joint positions, or joint positions.
@@ -138,7 +139,7 @@ class Goal:
 
     @property
     def task(self) -> TipTask:
-        """Tip task with the pose of the goal as constant target, or with the centre of its region."""
+        """Tip task whose constant target is the pose of the goal, or the centre of the goal's region."""
         center = self.position if self.region is None else self.region.position
         return TipTask(
             position=center,
@@ -232,7 +233,7 @@ class Cost:
         return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
-        """Return the weights of the squared joint rates, multiplied by `velocity`. Shape (size,).
+        """Return the joint weights multiplied by the weight `velocity` of the squared joint rates. Shape (size,).
 
         Raises:
             ProblemError: The number of weights is not the number of joints, or a weight is not positive.

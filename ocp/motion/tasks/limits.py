@@ -22,7 +22,8 @@ __all__ = [
 ]  # fmt: skip
 
 PARALLEL = 1e-12
-"""Cosine of the angle between the normal of a support edge and a direction below which the edge is parallel to it."""
+"""Cosine between a direction and the normal of a support edge below which the edge counts as parallel to the direction.
+"""
 
 ROUNDING_M = 1e-9
 REFERENCE_SAMPLES = 201  # number of times at which a reference is checked
@@ -56,9 +57,9 @@ class InFoot:
 
 @dataclass(frozen=True)
 class IndexAtLeast:
-    """Rule that the stability index, equations (5) and (6) of the paper, is at least `value` in x and y.
+    """Rule that the stability index of the zero moment point (Yoo et al. 2004) is at least `value` in x and y.
 
-    The zero moment point also stays inside the support polygon.
+    Equations (5) and (6) of that paper. The zero moment point also stays inside the support polygon.
     """
 
     value: float
@@ -100,7 +101,7 @@ class Following:
     reference: Callable[[Any], Any]
 
     def place(self, machine: Standing, time: Any) -> Any:
-        """Return the reference of the zero moment point at a time. Shape (2, 1), m."""
+        """Return the reference position of the zero moment point at a time. Shape (2, 1), m."""
         if not callable(self.reference):
             words = f"Following: a function of time is expected, not {self.reference!r}"
             raise ProblemError(words, name="Following", value=self.reference)
@@ -130,7 +131,8 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges, moved inwards by the margin, that a rule for the zero moment point does not guarantee.
+    """Return the support edges, moved inwards by the margin, that still need a constraint under a zero moment point
+    rule.
 
     Returns:
         Inward normals n and offsets o: n . point >= o. Shapes (k, 2) and (k,).
@@ -150,7 +152,7 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return those distances of the zero moment point from `foot_edges` that depend on the motion. Shape (k, 1), m.
+    """Return the motion-dependent distances of the zero moment point from the edges of `foot_edges`. Shape (k, 1), m.
 
     Args:
         machine, zmp: The machine and the rule for its zero moment point.
@@ -177,7 +179,7 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 
 
 def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the coordinates (0, 1) of the zero moment point that may violate the rule on the stability index.
+    """Return the coordinates (0: x, 1: y) in which the zero moment point may violate the rule on the stability index.
 
     Args:
         machine, zmp, point, external: As for foot_rows.
@@ -223,11 +225,11 @@ def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
 
 
 LIMITED = ("velocity", "acceleration", "jerk", "torque", "power")
-"""Names of the limits that are given as one number for each joint, or one for all."""
+"""Names of the limits that are given as one number for each joint, or as one number for all joints."""
 
 
 class JointBounds(NamedTuple):
-    """Limits of every joint, infinite where there is none, in rad or m, s, N m or N, W. Shape (n,) each.
+    """Limits of every joint, infinite for no limit, in rad or m, s, N m or N, and W. Shape (n,) each.
 
     Attributes:
         lower, upper: Position limits.

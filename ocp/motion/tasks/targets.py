@@ -1,4 +1,4 @@
-"""Targets of tasks over time: their poses in the world along a motion, and the nodes that a mesh needs for them."""
+"""Targets of tasks over time: target poses in world along a motion, and the mesh nodes needed to represent targets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["Target", "required_nodes", "targets_along", "tip_poses"]
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """Settings for `required_nodes`, the choice of mesh nodes for targets.
+    """Settings for choosing the mesh nodes that are needed to represent the targets of tasks.
 
     Attributes:
         points: Points of an interval of the mesh at which the targets determine the motion.
@@ -164,7 +164,7 @@ def _frames(machine: Machine, base: Array, joints: Array) -> tuple[Array, Array]
 
 
 def tip_poses(machine: Machine, bases: Array, joints: Array) -> Array:
-    """Return tip poses of a machine in world as position and quaternion; nan without a tip. Shape (M, 7).
+    """Return tip poses of a machine in world as position and quaternion; nan if the robot has no tip. Shape (M, 7).
 
     Args:
         bases, joints: Configurations. Shapes (M, base_size) and (M, n).

@@ -1,4 +1,4 @@
-"""Tasks of a frame of the machine: prescribed components (rows) of its twist, or a pose that it tracks over time.
+"""Tasks for a frame of the machine: prescribed components (rows) of the frame's twist, or a pose over time to track.
 
 Pose tasks are differentiated to velocities, with the pose error fed back so that it does not accumulate (Baumgarte
 1972): task twist = twist of the target + gain x pose error. The functions of a `BoundTask` are expressions of this
@@ -200,7 +200,7 @@ class TipTask:
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Indices 0..5 of the twist components that the task prescribes; those of a tool direction are not included."""
+        """Indices 0..5 of the prescribed twist components, without the two rows that prescribe a tool direction."""
         return tuple(self.rows or ())
 
     @property
@@ -210,17 +210,17 @@ class TipTask:
 
     @property
     def along_reference(self) -> bool:
-        """Whether the rows refer to the axes of the frame relative to which the pose is given."""
+        """Whether the rows of the task are taken along the axes of the reference frame of the pose."""
         return self.axes == "reference" or (self.axes == "world" and self.relative_to is None)
 
     @property
     def tilts(self) -> bool:
-        """Whether the task prescribes the direction of the tool axis, by two rows; not if a cone is permitted."""
+        """Whether two rows prescribe the direction of the tool axis; False if the axis may lie in a cone."""
         return self.direction is not None and self.within is None
 
     @property
     def size(self) -> int:
-        """Number of rows (scalar equations) of the task, including the two of a prescribed tool direction."""
+        """Number of rows (scalar equations) of the task, including the two rows of a prescribed tool direction."""
         return len(self.chosen) + (2 if self.tilts else 0)
 
     @property
@@ -230,7 +230,7 @@ class TipTask:
 
 
 def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
-    """Convert a task over a path parameter to a task over time.
+    """Convert a task whose tracks are functions of a path parameter to a task over time.
 
     Args:
         task: Task whose tracks are functions of the parameter and whose velocity is per unit of it.
@@ -250,7 +250,7 @@ def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
 
 
 class BoundTask(NamedTuple):
-    """A task with the machine whose tip is its frame, and the machine whose tip is its reference (None: world)."""
+    """A task, the machine whose tip is the task's frame, and the machine whose tip is the reference (None: world)."""
 
     task: TipTask
     tip: Machine
@@ -306,7 +306,7 @@ def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates
 
 
 def task_rows(part: BoundTask, base: Any, joints: Any, twist: Any) -> Any:
-    """Return the components that a task prescribes of a twist in world axes, or of columns of twists."""
+    """Return the components that a task prescribes, selected from a twist in world axes or from columns of twists."""
     task = part.task
     angular, linear = twist[0:3, :], twist[3:6, :]
     rotation = None
@@ -334,7 +334,7 @@ def _tool_normals(task: TipTask) -> Any:
 
 
 def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the pose error, target minus pose, in world axes: (sine of the angle about its axis, displacement)."""
+    """Return the pose error, target minus pose, in world axes: axis times sine of the angle, and displacement."""
     position_target, goal = split_targets(part.task, targets)
     pose, reference = part.tip.tip_pose(base, joints), reference_pose(part, base, joints)
     angular, linear = ca.DM(3, 1), ca.DM(3, 1)
@@ -350,7 +350,7 @@ def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
 
 
 def target_twist(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the target's twist relative to the reference plus pose feedback, in world axes. Shape (6, 1)."""
+    """Return the target's twist relative to the reference, plus pose feedback, in world axes. Shape (6, 1)."""
     position_target, rotation_target = split_targets(part.task, targets)
     reference = reference_pose(part, base, joints)
     angular = ca.DM(3, 1) if rotation_target is None else rotation_target[1]
@@ -419,7 +419,7 @@ def angular_velocity(rotation: Any, rate: Any) -> Any:
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return combinations of task rows that base motion with a fixed centre of mass does not change. Shape (m, k).
+    """Return the combinations of task rows that base motion with a fixed centre of mass leaves unchanged. Shape (m, k).
 
     Raises:
         ProblemError: The momentum moves the centre of mass, and the joints cannot return.
@@ -447,7 +447,7 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return orthonormal combinations (count, k) of a Jacobian's first `count` rows that depend on its other rows."""
+    """Return orthonormal combinations (count, k) of a Jacobian's first `count` rows that are spanned by the others."""
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)

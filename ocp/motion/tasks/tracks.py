@@ -27,16 +27,17 @@ __all__ = [
 ]  # fmt: skip
 
 Track: TypeAlias = Any
-"""A constant, or a function: casadi time (s) -> casadi vector or matrix, or a list of expressions."""
+"""Target over time: a constant, or a function of CasADi time (s) that returns a vector, matrix or list of expressions.
+"""
 
 _Result = TypeVar("_Result")
 
 MAX_ROTATION_RAD = np.pi - 1e-3
-"""Largest rotation between the two poses of a line, since the axis of half a turn is ambiguous."""
+"""Largest rotation between the two poses of a `pose_line`, because the sense of half a turn is ambiguous."""
 
 
 class PoseLine(NamedTuple):
-    """Position and orientation of a TipTask: `TipTask(position=line.position, orientation=line.orientation)`."""
+    """Position and orientation along a line between two poses, as functions of time to be used in a `TipTask`."""
 
     position: Callable[[Any], Any]
     orientation: Callable[[Any], Any]
@@ -211,7 +212,7 @@ def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]
 
 
 def on_symbols(build: Callable[[Any], _Result]) -> _Result:
-    """Call `build` with SX symbols or, if interpolants or external functions reject these, with MX symbols."""
+    """Call `build` with SX symbols or, if interpolants or external functions reject SX, with MX symbols."""
     try:
         return build(ca.SX)
     except (RuntimeError, NotImplementedError):
@@ -266,7 +267,7 @@ def track_expression(
 
 
 def _call_track(track: Callable[[Any], Any], time: Any, what: str) -> Any:
-    """Call a function of time; raise ProblemError if it fails, except for interpolants on SX symbols."""
+    """Call a function of time; raise ProblemError if it fails, but pass on the errors by which CasADi rejects SX."""
     try:
         return track(time)
     except (RuntimeError, NotImplementedError, ProblemError, ModelError):

@@ -64,7 +64,7 @@ POINTS = Collocation(8, degree=4, scheme="legendre")
 
 @dataclass(frozen=True)
 class Cone:
-    """Approach cone: region in which the chaser's tip stays near the grasp, in the grasped frame.
+    """Approach cone, fixed in the grasped frame, to which the chaser's tip is confined when it is near the grasp.
 
     Attributes:
         direction: Direction from the grasp to the approaching tip, in the grasped frame. Shape (3,).
@@ -174,7 +174,7 @@ def capture_problem(
     cost: Cost | None = None,
     clearance_constraints: ClearanceConstraints | None = None,
 ) -> Phases:
-    """Declare the optimal control problem of approach, grasp and detumbling with the least total cost.
+    """Declare the optimal control problem of the capture of a tumbling body at the least total cost of both phases.
 
     The phases "approach" and "detumble" have the states and controls of `dynamics_problem`. The configuration of the
     target is the state "target" of the first, and follows from that of the chaser in the second. Wheel angles count
@@ -223,7 +223,9 @@ def solve_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> Solution:
-    """Solve `capture_problem` and audit the solution, whose limits also hold between the nodes.
+    """Plan the capture of a tumbling body within limits at the least total cost, and audit the plan.
+
+    The problem is `capture_problem`. The plan satisfies its limits between the nodes of the mesh, too.
 
     Args:
         chaser, capture, start, limits, cost, clearance_constraints: As for `capture_problem`.
@@ -261,7 +263,7 @@ def chained_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> tuple[Solution, Solution]:
-    """Solve the approach by itself, then the detumbling from its end; this costs more than `solve_capture`.
+    """Plan the approach by itself, then the detumbling from its end state, at a higher cost than `solve_capture`.
 
     Args, Raises: As for `solve_capture`.
 
@@ -293,7 +295,7 @@ def chained_capture(
 
 
 def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:
-    """Return the machines of both phases: the chaser, and chaser and target as one machine after the grasp.
+    """Return the machines of both phases: the chaser alone, and the chaser that holds the target as one machine.
 
     Raises:
         ProblemError: As `capture_problem`.
@@ -303,7 +305,7 @@ def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFl
 
 @dataclass(frozen=True, eq=False)
 class _Capture:
-    """Checked arguments of a capture; `pair` is the machine of chaser and target, with their initial momentum."""
+    """Checked arguments of a capture; `pair` is the machine of chaser and target with the momentum of both."""
 
     chaser: FreeFloating
     capture: Capture
@@ -342,7 +344,10 @@ class _Capture:
 
     @property
     def arm_weights(self) -> Array:
-        """Factors of joint positions between the phases: 0 for wheels, whose angles restart at 0, else 1. (n,)"""
+        """Factors that carry joint positions into the second phase: 1, but 0 for wheels, whose angles start again at 0.
+
+        Shape (n,).
+        """
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
@@ -393,7 +398,7 @@ class _Capture:
             raise ProblemError(words, name="cone", value=inside, limit=0.0)
 
     def declare_second_phase(self, start: Mapping[str, Array] | None) -> Problem:
-        """Declare the problem of the detumbling, which starts in a given state or, without one, in a free state."""
+        """Declare the problem of the detumbling; its initial state is free if `start` is None."""
         pair, capture = self.pair, self.capture
         wheels, rest = find_wheels(pair.robot), capture.rest
         still = np.array([np.nan if name in wheels else 0.0 for name in pair.robot.joint_names])
@@ -416,7 +421,7 @@ class _Capture:
         return problem
 
     def grasp(self, problem: Problem, base: Any, joints: Any, rates: Any, goal: Any) -> None:
-        """Constrain the tip to the pose and twist of the grasped frame at the end of a problem."""
+        """Add the end condition that the chaser's tip has the pose and the twist of the grasped frame."""
         chaser, target, none = self.chaser, self.capture.target, ca.DM(0, 1)
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
         turned = ca.mtimes(grasped.rotation.T, tip.rotation)
@@ -429,10 +434,11 @@ class _Capture:
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base configuration at a time from its attitude, the joint positions and the moving centre of mass.
+        """Return the base configuration at a time; its position follows from the uniform motion of the centre of mass.
 
-        The position of the centre of mass and the norm of the quaternion are conserved by the dynamics. Continuity of
-        them would be a condition that no control influences, and would leave the second-order conditions undetermined.
+        The position of the centre of mass and the norm of the quaternion are conserved by the dynamics. Their
+        continuity would be a condition that no control influences, and would leave the second-order conditions
+        undetermined.
         """
         chaser, size = self.chaser, len(self.chaser.twist_rows) // 2 + (self.chaser.base == "planar")
         attitude = base[size:] if chaser.base == "planar" else base[size:] / ca.norm_2(base[size:])
@@ -443,7 +449,7 @@ class _Capture:
         return ca.vertcat(place, attitude)
 
     def guess_approach(self, problem: Problem) -> None:
-        """Set the initial guess of the states and controls of an approach."""
+        """Set the initial guess of the states and controls of the problem of an approach."""
         cone = self.capture.cone
         out = np.zeros(3) if cone is None else cone.length * cone.direction
         guess_approach(problem, self.chaser, self.capture.target, self.start, out=out)
@@ -458,7 +464,7 @@ def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
 
 
 def _of_unit_length(machine: FreeFloating, base: Any) -> Any:
-    """Return the base configuration with its quaternion, if there is one, scaled to unit length."""
+    """Scale the quaternion of a base configuration to unit length; return planar configurations unchanged."""
     if machine.base == "planar":
         return base
     return ca.vertcat(base[:3], base[3:] / ca.norm_2(base[3:]))

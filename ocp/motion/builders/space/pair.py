@@ -1,4 +1,4 @@
-"""Chaser and target of a capture: their model as one machine, tests for impossible captures, and the first guess.
+"""Chaser and target of a capture: their model as one machine, tests for impossible captures, and the initial guess.
 
 The twists match at the grasp, so that there is no impact. The linear momentum of the pair, and the angular momentum
 about its common centre of mass, are
@@ -52,7 +52,7 @@ __all__ = [
 
 
 def join_target(chaser: Robot, target: Robot) -> Robot:
-    """Return the chaser's robot with the target as an additional link, whose tip frame is at the chaser's tip.
+    """Attach the target to the chaser's robot as an additional link; the tip frames of both robots coincide.
 
     Raises:
         ModelError: A robot has no tip, or links have the same name.
@@ -130,12 +130,12 @@ def grasp_wrench(pair: FreeFloating, target: FreeFloating, problem: Problem) -> 
 
 
 Guesses = dict[str, Any]
-"""Type of an initial guess: functions of time by the names of states and controls."""
+"""Type of an initial guess: a dictionary from the names of states and controls to functions of time."""
 
 
 @dataclass(frozen=True)
 class GuessSettings:
-    """Settings of the first guess of a capture.
+    """Settings of the initial guess of a capture.
 
     Attributes:
         steps: Integration steps of a motion.
@@ -160,7 +160,7 @@ GUESS = GuessSettings()
 
 
 def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
-    """Return the configurations of a freely floating body at evenly spaced times, by Runge-Kutta of order four.
+    """Return the configurations of a freely floating body at evenly spaced times by a Runge-Kutta method of order 4.
 
     Shape (M, base_size) at times (M,), s.
     """
@@ -176,7 +176,7 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
 
 
 def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:
-    """Set the guess of the approach; a free duration is guessed such that the tip can reach the grasp, if possible.
+    """Set the initial guess of the approach; if its duration is free, try several until the tip gets to the grasp.
 
     Args:
         start: State of the capture; free velocities are guessed as zero.
@@ -205,7 +205,7 @@ def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating,
 
 
 class _TipTracker:
-    """Tracker of a tip path by the damped pseudo-inverse of the generalized Jacobian, step by step."""
+    """Step-by-step tracker of a tip path that uses the damped pseudo-inverse of the generalized Jacobian."""
 
     def __init__(self, problem: Problem, machine: FreeFloating, rates: Array) -> None:
         n, robot = machine.joint_size, machine.robot
@@ -249,7 +249,7 @@ class _TipTracker:
 
 
 def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
-    """Return rotation vector and translation from an actual to a desired pose, in world axes. Shape (6,)."""
+    """Return the rotation vector and translation from an actual to a desired pose, in world axes. Shape (6,)."""
     return np.concatenate(
         [scipy.spatial.transform.Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()]
     )
@@ -258,7 +258,7 @@ def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
 def _tip_path(
     chaser: FreeFloating, target: FreeFloating, times: Array, bases: Array, start: tuple[Array, Array], out: Array
 ) -> tuple[Array, Array]:
-    """Return tip positions (M, 3) and rotations (M, 3, 3) for the guess of an approach, from rest to the grasp."""
+    """Return tip positions (M, 3) and rotations (M, 3, 3) from rest to the grasp, for the guess of an approach."""
     b = ca.SX.sym("b", target.base_size)
     pose = target.tip_pose(b, ca.DM(0, 1))
     pose_at = ca.Function("pose", [b], [pose.position, ca.vec(pose.rotation)])
@@ -287,7 +287,7 @@ def _tip_path(
 
 
 def guess_braking(problem: Problem, pair: FreeFloating, begin: tuple[Array, Array, Array]) -> None:
-    """Set the guess of a detumbling from its start: the arm slows down evenly, and the wheels take the momentum.
+    """Set the initial guess of a detumbling: the arm slows down smoothly while the wheels take up the momentum.
 
     The final wheel speeds follow from Newton's method, because the final attitude depends on them.
     """
@@ -331,7 +331,7 @@ def _stepper(machine: FreeFloating) -> Any:
 
 
 def _motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
-    """Return a guess as functions of time from samples of joint positions, joint velocities and base."""
+    """Convert samples of joint positions, joint velocities and base to an initial guess of functions of time."""
     second = np.gradient(velocities, times, axis=0)
     tables = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
     return {name: _curve(times, samples) for name, samples in tables.items()}
@@ -350,7 +350,7 @@ def guessed_horizon(problem: Problem) -> float:
 
 
 def set_guess(problem: Problem, duration: float, guesses: Guesses) -> None:
-    """Set the guesses of states and controls by name, and that of a free horizon."""
+    """Set the initial guesses of states and controls by name, and the guess of the horizon if it is free."""
     declared = problem.declared
     assert declared.horizon is not None
     if not declared.horizon.fixed:
@@ -415,7 +415,7 @@ def wheel_capacity(machine: FreeFloating, bounds: JointBounds, start: State, fri
 
 
 def require_capacity(machine: FreeFloating, momentum: Array, capacity: float) -> None:
-    """Raise ProblemError if the wheels cannot store the angular momentum in any final attitude of the base.
+    """Raise ProblemError if the wheels cannot store the pair's angular momentum in any final attitude of the base.
 
     Args:
         momentum: Momentum of both bodies, see `pair_momentum`.
@@ -456,7 +456,7 @@ def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earl
 
 
 def _offset(chaser: FreeFloating, target: FreeFloating, start: State) -> tuple[Array, Array]:
-    """Return the vector from the chaser's to the target's centre of mass, m, and its rate, m/s. Shape (3,) each."""
+    """Return the vector (3,) from the chaser's to the target's centre of mass, m, and its time derivative, m/s."""
     centers, speeds = [], []
     for machine, base, joints in ((target, start.target_base, np.zeros(0)), (chaser, start.base, start.joints)):
         center = center_of_mass(machine.robot, ca.DM(joints), machine.world_from_base(ca.DM(base)))
@@ -467,7 +467,7 @@ def _offset(chaser: FreeFloating, target: FreeFloating, start: State) -> tuple[A
 
 
 def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
-    """Return an upper bound of the distance of the two centres of mass while the tip is at the grasp, m."""
+    """Return an upper bound of the distance between both centres of mass when the tip is at the grasp, m."""
     robot, body = chaser.robot, target.robot
     middle = sum(link.mass * _longest(robot, link.name, link.center_of_mass) for link in robot.links if link.mass)
     reach = _longest(robot, str(robot.tip_link), robot.tip_translation) + middle / robot.total_mass
@@ -475,7 +475,7 @@ def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
 
 
 def _longest(robot: Robot, link: str, point: object) -> float:
-    """Return an upper bound of a link point's distance from the root, m; inf if a prismatic joint has no limits."""
+    """Return an upper bound of the distance of a link's point from the root, m; inf with unlimited prismatic joints."""
     length = float(np.linalg.norm(np.asarray(point, dtype=float)))
     for joint in robot.path_to(link):
         slides = max(abs(joint.lower), abs(joint.upper)) if joint.kind == "prismatic" else 0.0

@@ -1,1 +1,1 @@
-"""Planning for machines that stand on the ground without being fixed to it, on one support or on several in turn."""
+"""Planning for machines that stand on the ground without being fixed to it, on constant or changing support."""

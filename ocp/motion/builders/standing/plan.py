@@ -43,12 +43,12 @@ __all__ = ["Attempt", "guess_in_time", "solve_standing", "solve_steps"]
 
 COARSE = Collocation(4, degree=2, scheme="legendre")
 COARSE_IPOPT = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
-"""IPOPT options of the coarse solves, which determine durations to a percent."""
+"""IPOPT options of the solves on a coarse mesh, which determine durations to about a percent."""
 
 
 @dataclass(frozen=True)
 class PaceSettings:
-    """Settings of the check on a coarse mesh whether steps are possible in their durations.
+    """Settings of the check, on a coarse mesh, whether steps are possible in their requested durations.
 
     Attributes:
         iterations: Largest number of iterations with the requested durations; solvable cases took 31 to 51.
@@ -77,7 +77,7 @@ PACE = PaceSettings()
 def guess_in_time(
     steps: Steps, start: Any, step_options: Mapping[str, Any], options: Mapping[str, Any]
 ) -> dict[str, Any] | None:
-    """Return a guess for `steps_problem` with the requested durations, solved on a coarse mesh; None if that fails.
+    """Solve steps with their requested durations on a coarse mesh, for an initial guess; return None on failure.
 
     Args:
         step_options: Cost and limits of steps_problem.
@@ -117,7 +117,7 @@ def guess_in_time(
 
 
 def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]) -> Phases:
-    """Declare `steps_problem` with durations that may exceed those requested, `seconds`, at a price."""
+    """Declare the problem of steps whose phases may last longer than the requested `seconds`, at a high cost."""
     phases = [
         replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.guess * each))
         if (each := seconds.get(name)) is not None
@@ -141,7 +141,7 @@ def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], secon
 
 
 def _check_conflicts(problem: Phases, coarse: Solution) -> None:
-    """Raise SolveError with the conflicting constraints if longer durations do not resolve them."""
+    """Raise SolveError with the conflicting constraints if longer durations do not resolve their conflict."""
     try:
         solve(problem, COARSE, options={"max_iter": 0})  # searches for conflicts at once
     except SolveError as error:
@@ -161,7 +161,7 @@ def _check_conflicts(problem: Phases, coarse: Solution) -> None:
 def _too_fast(
     problem: Phases, coarse: Solution, seconds: Mapping[str, float], spans: Mapping[str, float]
 ) -> SolveError:
-    """Return the error that steps need more time than requested, with the phases concerned and their active limits."""
+    """Return an error that steps need more time than requested; it names the slow phases and their active limits."""
     late = sorted(seconds, key=lambda name: -spans[name] / seconds[name])
     late = [name for name in late if spans[name] > (1 + PACE.error) * seconds[name]]
     lines = [
@@ -206,9 +206,9 @@ LINEAR = MultipleShooting(50, control="linear")
 STEPS = Collocation(12, degree=3, scheme="legendre")
 """First mesh of each phase in `solve_steps`."""
 MESHES = 3
-"""Largest number of meshes of each formulation, each twice as fine as the one before."""
+"""Largest number of meshes for each formulation; a mesh is twice as fine as the mesh before."""
 POSE_TOLERANCE = 1e-5
-"""Largest pose error of the re-integrated plan, m and rad, if its task allows no gap at the start."""
+"""Largest accepted pose error of the re-integrated plan, m and rad; a start gap that a task allows may be larger."""
 
 Level = Literal["position", "acceleration"]
 Trial = tuple[Level | None, Collocation | MultipleShooting]
@@ -245,12 +245,13 @@ def solve_standing(
     setup: StandingSetup | None = None,
     settings: SolveSettings | None = None,
 ) -> Solution:
-    """Solve `standing_problem` and audit the plan; try several formulations until a plan is accepted.
+    """Plan a motion of a standing machine and audit the plan; try several formulations until a plan is accepted.
 
-    The first plan is returned that passes its audit with pose errors below 1e-5 (m, rad) everywhere. Accelerations at
-    the collocation points are tried first, or, if the final time is free, accelerations linear between the nodes. Jerks
-    are at the points. If the only failures of a plan are limits exceeded between the points, they are tightened there.
-    Other plans are solved again from themselves on up to two meshes, each twice as fine.
+    The problem is `standing_problem`. The first plan that passes its audit with pose errors below 1e-5 (m, rad)
+    everywhere is returned. Accelerations at the collocation points are tried first, or, if the final time is free,
+    accelerations linear between the nodes. Jerks are at the points. If the only failures of a plan are limits exceeded
+    between the points, they are tightened there. Other plans are solved again from themselves on up to two meshes, each
+    twice as fine.
 
     Args:
         machine, tasks, horizon, start, weights, limits: As for `standing_problem`; the rule for the zero moment point
@@ -297,10 +298,11 @@ def solve_steps(
     cost: StepWeights | None = None,
     limits: Limits | None = None,
 ) -> Solution:
-    """Solve `steps_problem` and audit the plan, with tightening and finer meshes as in `solve_standing`.
+    """Plan the steps of a legged machine and audit the plan; refine the mesh until a plan is feasible.
 
-    The first feasible plan is returned; its audit may leave its optimality undetermined. First a coarse mesh shows
-    whether the steps are possible in their durations.
+    The problem is `steps_problem`. Limits are tightened and meshes refined as in `solve_standing`. The audit of the
+    plan may leave its optimality undetermined. First a coarse mesh shows whether the steps are possible in their
+    durations.
 
     Args:
         steps, start, cost, limits: As for `steps_problem`.
@@ -333,7 +335,7 @@ def _first_accepted(
     judge: _Judge,
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
-    """Try formulations and meshes in turn, and return the first plan that is accepted; see `solve_standing`.
+    """Try formulations and meshes in turn, and return the first plan that the audit accepts; see `solve_standing`.
 
     Raises:
         SolveError, ProblemError: As `solve_standing`; at once if collisions are all that is wrong with a plan.
@@ -367,7 +369,7 @@ def _first_accepted(
 
 
 def _formulations(control: str, free_time: bool, method: Collocation | None) -> list[Trial]:
-    """Return the formulations to try, each with its first mesh, the most promising one first."""
+    """Return the formulations to try and the first mesh of each; the most promising formulation comes first."""
     at_points: Trial = ("acceleration" if control == "acceleration" else "position", method or POINTS)
     if method is not None:
         return [("position", method) if method.control == "held" else at_points]
@@ -387,7 +389,7 @@ def _attempts(
     *,
     diagnosed: bool,
 ) -> Iterator[Attempt]:
-    """Yield attempts at one formulation on finer and finer meshes; the caller stops at the first accepted one.
+    """Solve one formulation on finer and finer meshes and yield each attempt; the caller stops at an accepted one.
 
     Args:
         guess: Guess of the first attempt; None for that of the problem.
@@ -413,7 +415,7 @@ def _tip(level: Level | None) -> str:
 
 @dataclass(frozen=True)
 class _Judge:
-    """Function object that audits the result of a solve and accepts or rejects it.
+    """Function object that runs a solve, audits the plan, and accepts or rejects the plan.
 
     Attributes:
         tolerances: Tolerances of the audit.

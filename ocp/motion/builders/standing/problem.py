@@ -73,7 +73,7 @@ __all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_co
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the cost of `standing_problem`: an integral over the motion, plus `time` times a free final time.
+    """Weights of the terms of the cost of `standing_problem`: integrals over the motion, and a free final time.
 
     Attributes:
         acceleration, velocity, jerk: Weights of the sums of squares over the joints.
@@ -137,7 +137,7 @@ class StandingSetup:
 
 @dataclass(frozen=True)
 class FreeTime:
-    """Free final time between a lower and an upper bound, with a first guess, s."""
+    """Free final time, s, with a lower bound, an upper bound and an initial guess."""
 
     lower: float
     upper: float
@@ -163,7 +163,7 @@ def standing_problem(
     limits: Limits | None = None,
     setup: StandingSetup | None = None,
 ) -> Problem:
-    """Declare the optimal control problem of a standing machine that does tip tasks at the lowest cost.
+    """Declare the optimal control problem of a standing machine that performs tip tasks at the lowest cost.
 
     The states are "joints", "velocities", and "accelerations" if the jerk is the control. The controls are
     "accelerations" or "jerks". With tasks along a parameter there are the states "path" from 0 to 1 and "path_rate" >=
@@ -295,7 +295,7 @@ def _constrain_tips(
 
 
 def declare_horizon(problem: Problem, horizon: float | FreeTime) -> Any:
-    """Declare the fixed or free final time of a problem and return it."""
+    """Declare the fixed or free final time of a problem, and return its expression."""
     if isinstance(horizon, FreeTime):
         return problem.horizon(lower=horizon.lower, upper=horizon.upper, guess=horizon.guess)
     return problem.horizon(float(horizon))
@@ -310,7 +310,7 @@ def _motion(
     guess: Mapping[str, Any],
     setup: StandingSetup,
 ) -> tuple[tuple[Any, Any, Any], Any]:
-    """Declare joint positions, velocities and accelerations, and jerks if these are controls, else an empty column."""
+    """Declare joint positions, velocities and accelerations, and jerks if these are controls; return the symbols."""
     n = len(begin)
     joints = problem.state(
         "joints", n, initial=begin, terminal=setup.end, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"],
@@ -335,7 +335,7 @@ def _motion(
 
 
 def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
-    """Declare the path parameter, which runs from 0 to 1; return it with its rate and acceleration."""
+    """Declare the path parameter, which runs from 0 to 1; return the parameter, its rate and its acceleration."""
     at = problem.state("path", initial=0.0, terminal=1.0, lower=0.0, upper=1.0, guess=guess["path"])
     first, last = (0.0 if rest else None for rest in rests)
     rate = problem.state("path_rate", lower=0.0, guess=guess["path_rate"], initial=first, terminal=last, unit="1/s")
@@ -346,7 +346,7 @@ def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, An
 
 
 def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
-    """Return the cost of `standing_problem` for a sampled motion, by the trapezoidal rule and without jerks."""
+    """Return the cost that `standing_problem` assigns to a sampled motion, without jerks, by the trapezoidal rule."""
     w = weights or Weights()
     running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
     running += w.velocity * (motion.joint_velocities**2).sum(axis=1)

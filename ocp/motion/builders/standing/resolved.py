@@ -1,4 +1,4 @@
-"""Sampled motions of legged machines over changing support, planned or resolved by the pseudo-inverse.
+"""Sampled motions of legged machines whose support changes, from plans or from resolved-rate control.
 
 `StepsMotion` has the loads of the feet, the zero moment point and the joint torques of a motion. `steps_motion` samples
 a plan of `steps_problem`. `resolve_steps` tracks the same footholds with the least joint rates at every time, as a
@@ -92,7 +92,10 @@ class StepsMotion:
         return np.asarray(np.einsum("kji,kj->ki", self.sole_rotation[foot], self.loads[foot][:, 3:]))
 
     def friction(self, foot: str) -> Array:
-        """Return the friction coefficient a foot needs, tangential over normal force; nan in the air. Shape (M,)."""
+        """Return the friction coefficient that a foot needs, tangential over normal force; nan in the air.
+
+        Shape (M,).
+        """
         force = self._force(foot)
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
@@ -113,7 +116,7 @@ class StepsMotion:
 
 
 def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> StepsMotion:
-    """Sample a plan of `steps_problem` at evenly spaced times of each phase.
+    """Sample a plan of steps at evenly spaced times of each phase, with the loads of the feet and joint torques.
 
     Args:
         steps: Steps of the plan.
@@ -144,7 +147,7 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
 
 
 def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion:
-    """Join the values that `sample_stance` returns for each phase into one motion."""
+    """Join the sampled quantities of all phases, see `sample_stance`, into one motion."""
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def by_foot(quantity: str) -> dict[str, Array]:
@@ -157,7 +160,9 @@ def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion
 def sample_stance(
     steps: Steps, stance: Stance, motion: tuple[Array, ...], foot_loads: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return the quantities of `StepsMotion` by name along a motion in one stance. Shape (M, ...) each.
+    """Return torques, loads and margins along a motion in one stance: the quantities of `StepsMotion`, by name.
+
+    Shape (M, ...) each.
 
     Args:
         motion: Joint positions, velocities and accelerations in the stance's joint order. Shape (M, n) each.
@@ -186,7 +191,7 @@ def sample_stance(
 
 
 def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
-    """Return a casadi Function that computes the quantities of `StepsMotion` in a stance, and their names.
+    """Return a casadi Function that computes torques, loads and frames in a stance, and the names of its outputs.
 
     Its inputs are joint positions, velocities and accelerations, and the loads of the feet besides the first.
     """
@@ -213,7 +218,7 @@ def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
 
 
 def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsMotion:
-    """Compute steps with the least joint rates at every time by local redundancy resolution, as `resolve` does.
+    """Compute a motion through the stances of a legged machine by resolved-rate control with the least joint rates.
 
     A lifted foot moves to its next foothold from rest to rest. Seen from above its path is straight; at the share s of
     the path it is raised by 64 s^3 (1 - s)^3 times the steps' clearance. A foot without a next foothold follows the
@@ -244,7 +249,7 @@ def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsM
 
 
 def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> tuple[Array, Array, Array]:
-    """Return joint positions, rates and accelerations of phase k in the order of its stance. Shape (M, n) each."""
+    """Return joint positions, rates and accelerations in phase k, in its stance's joint order. Shape (M, n) each."""
     stance = steps.stances[k]
     swings = [swing for swing in steps.swings(k) if swing.lifted is not None and swing.landing is not None]
     if not swings:
@@ -264,7 +269,7 @@ def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> t
 
 
 def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) -> TipTask:
-    """Return the task of a foot from one foothold to the next, from rest to rest."""
+    """Return the task of moving a foot from one foothold to the next, from rest to rest."""
     assert swing.lifted is not None
     assert swing.landing is not None
     lifted, landing = swing.lifted, swing.landing
@@ -287,9 +292,9 @@ def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) 
 
 
 def _least_loads(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str, Array]:
-    """Return the loads of the feet besides the first that make the sum of squared loads of all feet least.
+    """Return those loads of all feet but the first that minimise the sum of the squared loads of all feet.
 
-    They are in the components `Stance.load_rows`, shape (M, k) each.
+    The loads have the components `Stance.load_rows`, shape (M, k) each.
     """
     sizes = {name: len(stance.load_rows[name]) for name in stance.other_feet}
     if not sizes:

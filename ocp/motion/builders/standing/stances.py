@@ -1,4 +1,4 @@
-"""Stances (sets of feet held on footholds) of a legged machine, configurations in them, and a first guess of steps.
+"""Stances (sets of feet held on footholds) of a legged machine, standing configurations, and an initial guess.
 
 `Steps` is a sequence of stances, each for some time. `standing_configuration` finds a configuration with the feet on
 their footholds and the center of mass over a point, near a given configuration. The first guess of steps interpolates
@@ -67,7 +67,7 @@ class StancePhase:
 
     @property
     def seconds(self) -> float:
-        """Duration, or its guess if it is free, s."""
+        """Duration of the phase or, if the duration is free, its guess, s."""
         return self.duration.guess if isinstance(self.duration, FreeTime) else float(self.duration)
 
 
@@ -149,12 +149,12 @@ class Steps:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the phases: a number from 1, and the feet on the ground."""
+        """Names of the phases; each consists of a number, from 1, and the names of the feet on the ground."""
         return tuple(f"{k + 1} {' + '.join(phase.footholds)}" for k, phase in enumerate(self.phases))
 
     @cached_property
     def stances(self) -> tuple[Stance, ...]:
-        """Machine of each phase, rooted at the first of its feet."""
+        """Machine of each phase, rooted at the first of the feet on the ground."""
         return tuple(Stance.on(self.robot, self.feet, phase.footholds, self.gravity) for phase in self.phases)
 
     def order(self, stance: Stance) -> NDArray[np.intp]:
@@ -174,16 +174,16 @@ class Steps:
         return tuple(swings)
 
     def standing(self, k: int) -> Stance:
-        """Return the stance on all feet that stand just before or just after the start of phase k."""
+        """Return the stance on all feet that are on the ground just before or just after the start of phase k."""
         footholds: dict[str, Foothold] = {}
         for phase in self.phases[max(k - 1, 0) : k + 1]:
             footholds |= phase.footholds
         return Stance.on(self.robot, self.feet, footholds, self.gravity)
 
     def balanced(self, k: int) -> Array:
-        """Return a balanced position of the center of mass at the start of phase k, over the feet that stay down.
+        """Return a balanced position of the center of mass at the start of phase k, over the feet that are not lifted.
 
-        It is the mean of the centers of their soles, or of their footholds if none has a sole. Shape (2,), m.
+        The position is the mean of the centers of their soles, or of their footholds if none has a sole. Shape (2,), m.
         """
         phases = self.phases[max(k - 1, 0) : k + 1]
         feet = [name for name in phases[0].footholds if all(name in phase.footholds for phase in phases)]
@@ -196,7 +196,7 @@ class Steps:
         return np.asarray(np.mean(points, axis=0))
 
     def in_order(self, stance: Stance, values: Array) -> Array:
-        """Reorder joint vectors of a stance into the order of the robot's joints. Shape (M, n)."""
+        """Reorder joint vectors from the joint order of a stance to the joint order of the robot. Shape (M, n)."""
         reordered = np.empty_like(values)
         reordered[:, self.order(stance)] = values
         return reordered
@@ -233,7 +233,7 @@ def walk(
 
 
 PLACED = 1e-6
-"""Largest gap between a foot and its foothold at the start, m or rad."""
+"""Largest accepted gap between a foot and its foothold at the start, m or rad."""
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
 
 
@@ -259,7 +259,10 @@ CONFIGURATIONS = ConfigurationSettings()
 
 
 def foothold_equations(stance: Stance, footholds: dict[str, Foothold]) -> TaskEquations:
-    """Return task equations that keep feet other than the first on footholds, in the components joints can move."""
+    """Return task equations that keep feet on footholds, in those pose components that the joints can move.
+
+    The first foot of the stance, at which the machine is rooted, must not be among the feet.
+    """
     tasks = [foot_task(stance, name, foothold.position, foothold.rotation) for name, foothold in footholds.items()]
     return bind(stance, tasks)
 
@@ -280,7 +283,7 @@ def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **options
 
 
 def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array:
-    """Return the configuration nearest to a given one with all feet on footholds and the center of mass over a point.
+    """Return the configuration nearest to `near` with all feet on footholds and the center of mass over a point.
 
     Args:
         stance: Feet and their footholds.
@@ -334,7 +337,9 @@ def check_placed(stance: Stance, joints: Array) -> None:
 
 
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:
-    """Return guesses of joint positions, velocities and accelerations of each phase, in the joint order of its stance.
+    """Return initial guesses of the joint positions, velocities and accelerations in each phase.
+
+    The guesses of a phase are in the joint order of its stance.
 
     Args:
         start: Start configuration, in the robot's joint order.
@@ -361,7 +366,7 @@ def _configuration(steps: Steps, stance: Stance, near: Array, over: Array) -> Ar
 
 
 def _raised_poses(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
-    """Return the poses of swinging feet raised midway between their footholds, by the name of the foot."""
+    """Return the raised poses of swinging feet midway between their footholds, by the name of the foot."""
     raised = {}
     for swing in swings:
         if swing.lifted is None or swing.landing is None:

@@ -1,4 +1,4 @@
-"""Checks whether a standing machine can start a motion, and the first guess of the motion.
+"""Checks whether a standing machine can start a motion, and the initial guess of the motion.
 
 The checks are of joint limits and of what the ground and the joints can bear at the start. The guess is the local
 motion along the task, with the null-space velocities damped.
@@ -32,7 +32,7 @@ __all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Settings of the check whether a motion can start from rest, and of the first guess.
+    """Settings of the check whether a motion can start from rest, and of the initial guess.
 
     Attributes:
         violation: Relative violation of a limit that is tolerated.
@@ -53,7 +53,7 @@ STARTS = StartSettings()
 
 
 def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) -> Array:
-    """Return the start configuration, with joints that exceed a limit by rounding moved onto it. Shape (n,).
+    """Return the start configuration; a joint that exceeds a limit only by rounding is set to the limit. Shape (n,).
 
     Raises:
         ProblemError: A joint starts outside its limits, or has no range between them.
@@ -109,10 +109,10 @@ def check_loads(
     bounds: JointBounds,
     demand: tuple[Array, Array] | None,
 ) -> None:
-    """Raise ProblemError if no joint accelerations satisfy the limits of torque and ground reaction at rest.
+    """Raise ProblemError if no joint accelerations satisfy the limits of torque and ground reaction at the start.
 
-    Torques, vertical force and zero moment point are linear in the accelerations. A linear program finds the least
-    violation.
+    The machine starts from rest. Torques, vertical force and zero moment point are linear in the accelerations. A
+    linear program finds the least violation.
 
     Args:
         machine, joints, wrenches: Machine, configuration and external wrenches at the start.
@@ -199,7 +199,7 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 def _least_violations(
     at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """Return the violations of torque and ground limits with the least sum; None if no accelerations do the tasks."""
+    """Return the violations of torque and ground limits whose sum is least; None if the tasks are impossible."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):

@@ -1,4 +1,4 @@
-"""Least-cost motions of machines whose support changes: steps of legs, bases that dock.
+"""Least-cost motions of machines whose support changes, such as walking legs or docking bases.
 
 A motion is a sequence of stances (`models.machines.stance`), one phase each. Joints and velocities are continuous
 between phases. A held foot does not move: its acceleration is zero, with position errors fed back. The load of each
@@ -45,7 +45,7 @@ GUESSED_LIFT = 1.5  # height of a foot halfway in the guess, over the clearance
 
 @dataclass(frozen=True)
 class StepWeights:
-    """Weights of the cost of `steps_problem`: an integral over the motion, plus `time` times the free durations.
+    """Weights of the terms of the cost of `steps_problem`: integrals over the motion, and free durations of phases.
 
     Attributes:
         acceleration, velocity: Weights of the sums of squares over the joints.
@@ -82,7 +82,7 @@ class _Options:
 @remembers_request("steps")
 @interruptible
 def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, limits: Limits | None = None) -> Phases:
-    """Declare the optimal control problem of a rest-to-rest motion through consecutive stances at the lowest cost.
+    """Declare the optimal control problem of a rest-to-rest motion through stances (sets of feet on the ground).
 
     The phases have the names `Steps.names`; joint vectors of a phase are in its stance's order. The states are "joints"
     and "velocities". The controls are "accelerations", and "FOOT load" of each held foot but the first, in the rows
@@ -138,7 +138,7 @@ def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, 
 
 
 def _check_start(stance: Stance, joints: Array, options: _Options) -> None:
-    """Raise ProblemError if, at the start, a foot is off its foothold or the center of mass not over the support."""
+    """Raise ProblemError if, at the start, a foot is off its foothold or the center of mass is not over the support."""
     check_placed(stance, joints)
     if stance.support is not None:
         left = float(stance.support.margin(stance.center_of_mass(joints)[:2])) - options.margin
@@ -215,7 +215,7 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], opt
 
 
 def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
-    """Return the limits of a phase by name in its stance's joint order; `limits` are in the robot's joint order."""
+    """Return the limits of a phase by name, reordered from the robot's joint order to that of the stance."""
     order = steps.order(stance)
     bounds = limits.bounds(stance, ("velocity", "torque"))._asdict()
     for name in bounds:
@@ -226,7 +226,7 @@ def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
 
 
 def _load(problem: Problem, stance: Stance, name: str) -> Any:
-    """Return the load on a foot other than the first; declare its free components as a control. Shape (6, 1)."""
+    """Declare the load on a foot other than the first as a control, and return this load. Shape (6, 1)."""
     rows = stance.load_rows[name]
     share = stance.weight / len(stance.footholds)
     guess = [share * (row == 5) for row in rows]
@@ -276,7 +276,7 @@ def _swing(
 
 
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the indices of the distinct rows of a constraint; for planar machines, corners of soles coincide."""
+    """Return the indices of the distinct rows of a constraint, since corners of soles coincide in planar machines."""
     rng = np.random.default_rng(0)
     others = [
         symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in ca.vertsplit(joints))
@@ -289,7 +289,7 @@ def _distinct_rows(rows: Any, joints: Any) -> list[int]:
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return the distances of the center of mass from support edges that the joints can change. Shape (k, 1), m."""
+    """Return those distances of the center of mass from support edges that depend on the joints. Shape (k, 1), m."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))
