@@ -247,12 +247,12 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
     request, settings, bounds = task.request, task.request.settings, task.bounds
     candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
     for path in paths:
-        corners = shortest_through_corners(
-            task.motions, path.joints, lambda changes: segment_durations(changes, bounds)
-        )
         try:
+            corners = shortest_through_corners(
+                task.motions, path.joints, lambda changes: segment_durations(changes, bounds)
+            )
             motions.append((path, stopping_motion(corners, bounds, task.torques)))
-        except SolveError as error:
+        except (SolveError, TimeLimitReached) as error:
             reason = Reason.of_error(Rejection.ACTUATORS, error)
             candidates.append(Candidate(path.joints[0], reason=reason, stage=Stage.SEED))
     is_free = request.horizon is None and request.cost.time > 0

@@ -7,6 +7,7 @@ listed with the reason.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import product
 from typing import Any
 
@@ -50,17 +51,29 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
     task = _check_request(request)
     seconds = request.settings.time_limit if request.time_limit is None else request.time_limit
     with time_limited(require.positive("time_limit", seconds)):
-        candidates = synchronised_candidates(task) if task.is_fastest else []
-        if not any(attains_bound(task, candidate) for candidate in candidates):
-            try:
-                with time_limited(request.settings.search_share * seconds):
-                    paths = _paths(task, seconds)
-                task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
-                candidates += motions_along(task, paths)
-            except SolveError:
-                if not any(candidate.passed for candidate in candidates):
-                    raise
-    return _best(task, candidates)
+        try:
+            return _best(task, _candidates(task, seconds))
+        except TimeLimitReached as error:
+            words = f"no motion was found within the time limit of {seconds:.4g} s; raise time_limit"
+            raise SolveError(words, name="time_limit", limit=seconds) from error
+
+
+def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
+    """Return all motions that were found within some seconds, and their audits."""
+    settings, candidates = task.request.settings, list[Candidate]()
+    if task.is_fastest:
+        with suppress(TimeLimitReached), time_limited((1 - settings.search_share) * seconds):
+            candidates = synchronised_candidates(task)
+    if not any(attains_bound(task, candidate) for candidate in candidates):
+        try:
+            with time_limited(settings.search_share * seconds):
+                paths = _paths(task, seconds)
+            task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
+            candidates += motions_along(task, paths)
+        except (SolveError, TimeLimitReached):
+            if not any(candidate.passed for candidate in candidates):
+                raise
+    return candidates
 
 
 def _check_request(request: GoalRequest) -> GoalTask:

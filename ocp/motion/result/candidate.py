@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from models.checks import ROUNDING, Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import ClosestPair
+from ocp.console import TimeLimitReached
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.rates import LocalMotion
@@ -86,7 +87,9 @@ class Reason:
 
     @classmethod
     def of_error(cls, kind: Rejection, error: Exception) -> Reason:
-        """Return a rejection reason that takes its text, name, value, limit and time from an exception."""
+        """Return a reason from an exception: its first line, and its value, limit and time if they are numbers."""
+        if isinstance(error, TimeLimitReached):
+            return cls(kind, "the time limit passed", "time_limit")
         numbers = {name: getattr(error, name, None) for name in ("value", "limit", "time")}
         details: dict[str, Any] = {name: float(x) for name, x in numbers.items() if isinstance(x, int | float)}
         name = getattr(error, "name", None)

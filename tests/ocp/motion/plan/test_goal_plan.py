@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,14 @@ import pytest
 from models import Box, CollisionScene, CollisionShape, FixedBase, Joint, Link, Robot
 from models.checks import Array
 from models.examples import example_robot
-from ocp import Goal, Limits, Plan, ProblemError, SolveError
+from ocp import Goal, Limits, Plan, ProblemError, SolveError, console
 from ocp import plan as plan_motion
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import distances_along
-from ocp.motion.plan.goal_motions import GoalRequest, GoalSettings
+from ocp.motion.plan import goal_plan
+from ocp.motion.plan.goal_motions import GoalRequest, GoalSettings, GoalTask
 from ocp.motion.plan.goal_plan import plan_to_goal
-from ocp.motion.result.candidate import Rejection
+from ocp.motion.result.candidate import Candidate, Rejection
 from ocp.motion.sampling.joint_paths import StraightMotions
 from ocp.motion.sampling.path_search import PathSearchSettings
 from ocp.motion.tasks.goals import Cost
@@ -164,6 +166,37 @@ def test_without_obstacles_the_least_time_is_the_bound_of_the_slowest_joint(jerk
     assert plan.cost == plan.horizon == pytest.approx(expected, rel=1e-9)
     assert plan.bound == pytest.approx(plan.cost, rel=1e-9)
     assert plan.audit().feasible
+
+
+@pytest.mark.parametrize("checks", [1, 4, 16, 64, 256])
+@pytest.mark.parametrize("cost", [LEAST_TIME, Cost(velocity=0.0, length=1.0), Cost()])
+def test_wherever_the_time_limit_passes_a_motion_is_returned_or_refused(
+    checks: int, cost: Cost, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that runs out at a certain check of the time: no other exception than SolveError leaves the planner."""
+    clock = count()
+    monkeypatch.setattr(console, "time_left", lambda: float(checks - next(clock)))
+    limits = None if cost.length else Limits(acceleration=4.0, torque=np.inf)
+    try:
+        feasible, reason = plan_to_goal(request_of(BOX, cost=cost, limits=limits)).audit().feasible, ""
+    except SolveError as error:
+        feasible, reason = False, str(error)
+    assert feasible or "time" in reason
+
+
+def test_the_synchronised_motion_leaves_time_for_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fastest motion that ignores obstacles may take all the time that it is given, and no more."""
+    limits, seen = Limits(acceleration=4.0, jerk=40.0, torque=np.inf), list[float]()
+    goals = np.array([[1.0, y] for y in np.linspace(-0.3, 0.3, 50)])
+
+    def endless(task: GoalTask) -> list[Candidate]:
+        seen.append(console.time_left())
+        raise console.TimeLimitReached
+
+    monkeypatch.setattr(goal_plan, "synchronised_candidates", endless)
+    plan = plan_to_goal(request_of(BOX, goals=goals, cost=LEAST_TIME, limits=limits, time_limit=60.0))
+    assert plan.audit().feasible
+    assert seen[0] < 30.0
 
 
 def test_around_a_box_the_least_time_needs_no_stop() -> None:
