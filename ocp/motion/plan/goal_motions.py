@@ -1,9 +1,9 @@
 """Motions from a start to a goal along collision-free paths, each audited as a candidate of a plan.
 
 Without actuator limits, a path at constant speed is a candidate whose clearance is proven. In least time, the fastest
-motion without obstacles is a candidate if it is clear, and a sequence of linear programs finds a locally fastest motion
-near each path (`ocp.motion.sampling.fastest_motion`). With another cost, each path is the guess of an optimal control
-problem, which stays in its homotopy class. A motion that stops at the corners of the path is the last resort.
+motion without obstacles is a candidate if it is clear. A spline near each path minimises a cost of time and of squared
+velocities, accelerations and jerks (`ocp.motion.sampling.spline_motion`). With another cost, each path is the guess of
+an optimal control problem. A motion that stops at the corners of the path is the last resort.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from ocp.motion.builders.joint_motion import joint_motion_problem, motion_along
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.plan.actuators import limits_actuators
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
-from ocp.motion.sampling.fastest_motion import FastestMotionSettings, MotionLimits, fastest_motion_near
 from ocp.motion.sampling.joint_paths import StraightMotions, path_length, points_along, shortest_through_corners
 from ocp.motion.sampling.path_search import JointPath, PathSearchSettings
+from ocp.motion.sampling.spline_motion import MotionLimits, SplineCost, SplineMotionSettings, optimal_motion_near
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
@@ -67,7 +67,7 @@ class GoalSettings:
         near_bound: Relative excess of the cost over its lower bound below which a motion counts as optimal.
         phase_samples: Number of samples of each phase of a motion at which its clearance is checked before the audit.
         margins: Largest number of margins, each twice the one before, that are tried for the clearance between samples.
-        fastest: Settings of the fastest motions near a path.
+        spline: Settings of the locally optimal splines near a path.
         near: Pairs of bodies closer than the clearance plus this along a path are separated from the first solve on, m.
         turns: Largest number of further full turns by which goals of unlimited joints are shifted.
     """
@@ -82,7 +82,7 @@ class GoalSettings:
     near_bound: float = 1e-3
     phase_samples: int = 9
     margins: int = 4
-    fastest: FastestMotionSettings = field(default_factory=FastestMotionSettings)
+    spline: SplineMotionSettings = field(default_factory=SplineMotionSettings)
     near: float = 0.02
     turns: int = 1
 
@@ -156,6 +156,13 @@ class GoalTask:
         return self.request.start_velocity, self.request.end_velocity
 
     @property
+    def spline_cost(self) -> SplineCost | None:
+        """Cost of splines; None if the cost has other terms, or power is limited."""
+        if np.isfinite(self.bounds.power).any():
+            return None
+        return SplineCost.of(self.request.cost, len(self.start))
+
+    @property
     def is_fastest(self) -> bool:
         """Whether the motion is time-optimal: the cost is a free time alone, and no power is limited."""
         is_free = self.request.horizon is None and self.request.cost.terms == ("time",)
@@ -221,24 +228,31 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
 
 
 def _fastest(task: GoalTask, path: JointPath) -> Candidate:
-    """Return an audited, locally fastest motion near a path or, if none is found, one that stops at its corners."""
-    settings = task.request.settings.fastest
+    """Return a locally fastest motion near a path with its audit or, if none is found, one that stops at corners."""
+    candidate = _spline(task, path, None)
+    if not candidate.passed:
+        with suppress(TimeLimitReached):
+            return next((other for other in _within_actuator_limits(task, [path]) if other.passed), candidate)
+    return candidate
+
+
+def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate:
+    """Return a locally optimal spline near a path with its audit; its horizon is free if None."""
+    settings = task.request.settings.spline
     ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
-    limits = MotionLimits(task.motions, task.bounds, task.torques, *ends)
+    limits, cost = MotionLimits(task.motions, task.bounds, task.torques, *ends), task.spline_cost
+    assert cost is not None
     try:
         for _ in range(task.request.settings.margins):
             with time_limited(task.request.settings.search_share * time_left()):
-                motion = fastest_motion_near(limits, path.joints, settings)
-            candidate = _PathProblem(task, path, motion, None).candidate("is a locally fastest spline")
+                motion = optimal_motion_near(limits, path.joints, cost, horizon, settings)
+            candidate = _PathProblem(task, path, motion, horizon).candidate("is a locally optimal spline")
             task.report(f"path of length {path.length:.4g}: {candidate}")
             if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:
                 break
             settings = replace(settings, margin=2 * settings.margin)
     except (SolveError, TimeLimitReached) as error:
         candidate = Candidate(path.joints[0], reason=Reason.of_error(Rejection.INFEASIBLE, error), stage=Stage.SEED)
-    if not candidate.passed:
-        with suppress(TimeLimitReached):
-            return next((other for other in _within_actuator_limits(task, [path]) if other.passed), candidate)
     return candidate
 
 
@@ -262,7 +276,7 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
     stopping = [(problem, problem.stopping_motion()) for problem in problems]
     for problem, candidate in sorted(stopping, key=lambda pair: (not pair[1].passed, pair[1].cost)):
         enough = attains_bound(task, candidate) or (candidate.passed and (problem.path.length == 0 or task.is_fastest))
-        best = candidate if enough else min(candidate, problem.smooth(), key=lambda c: (not c.passed, c.cost))
+        best = candidate if enough else min(candidate, problem.without_stops(), key=lambda c: (not c.passed, c.cost))
         candidates.append(best)
         task.report(f"path of length {problem.path.length:.4g}: {best}")
     return candidates
@@ -332,8 +346,16 @@ class _PathProblem:
         problem = self.declare(self.task.request.clearance_constraints)
         return _audit_candidate(self.task, self.motion.solution(problem, method), self.path)
 
+    def without_stops(self) -> Candidate:
+        """Return a locally optimal motion without stops near the path, with its audit."""
+        if self.task.spline_cost is not None and not self.task.is_fastest:
+            spline = _spline(self.task, self.path, self.fixed)
+            if spline.passed:
+                return spline
+        return self.smooth()
+
     def smooth(self) -> Candidate:
-        """Solve for a motion without stops, guessed from the path, and return it with its audit."""
+        """Solve the optimal control problem, guessed from the path, and return the motion with its audit."""
         task, joints = self.task, self.path.joints
         settings, duration = task.request.settings, self.horizon_guess
         times = np.linspace(0.0, duration, settings.guess_times)

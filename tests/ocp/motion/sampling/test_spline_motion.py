@@ -13,11 +13,12 @@ from models.checks import Array
 from models.examples import example_robot
 from ocp import Limits, SolveError
 from ocp.motion.builders.constant_jerk import TorqueLimits, least_durations, stopping_motion
-from ocp.motion.sampling.fastest_motion import FastestMotionSettings, MotionLimits, fastest_motion_near
 from ocp.motion.sampling.joint_paths import StraightMotions
+from ocp.motion.sampling.spline_motion import MotionLimits, SplineCost, SplineMotionSettings, optimal_motion_near
 from tests.ocp.motion.sampling.sliders import gap, slider
 
 REST = np.zeros(2)
+TIME = SplineCost(1.0, np.zeros((3, 6)))
 BOX = Box((0.4, 1.4, 1.0), (0.0, 0.0, 0.0))
 AROUND = np.array([[-1.0, 0.1], [-0.3, 0.801], [0.3, 0.801], [1.0, 0.1]])
 """Path around the box with corners near it."""
@@ -52,7 +53,7 @@ def test_without_obstacles_the_time_is_that_of_the_slowest_joint(jerk: float) ->
     for _ in range(4):
         path = random.uniform(-2, 2, (2, 2))
         limits = limits_of(acceleration=[4.0, 2.0], jerk=jerk)
-        motion = fastest_motion_near(limits, path)
+        motion = optimal_motion_near(limits, path, TIME)
         least = least_durations(np.abs(path[1] - path[0]), limits.bounds).max()
         assert least * (1 - 1e-6) <= motion.duration <= 1.01 * least
         np.testing.assert_allclose(kept(limits, motion)[[0, -1]], path, atol=1e-9)
@@ -75,7 +76,7 @@ def test_moving_ends_are_reached_in_the_time_of_ruckig() -> None:
     for _ in range(5):
         path, ends = random.uniform(-1, 1, (2, 2)), (random.uniform(-0.4, 0.4, 2), random.uniform(-0.4, 0.4, 2))
         limits = limits_of(acceleration=[4.0, 2.0], jerk=[40.0, 60.0], ends=ends)
-        motion = fastest_motion_near(limits, path)
+        motion = optimal_motion_near(limits, path, TIME)
         expected = ruckig_duration(path, ends, limits.bounds)
         assert expected * (1 - 1e-5) <= motion.duration <= 1.02 * expected
         kept(limits, motion)
@@ -87,7 +88,7 @@ def test_moving_ends_are_reached_in_the_time_of_ruckig() -> None:
 @pytest.mark.parametrize("jerk", [np.inf, 40.0])
 def test_around_a_box_it_neither_stops_nor_comes_nearer_than_the_clearance(jerk: float) -> None:
     limits = limits_of(BOX, acceleration=4.0, jerk=jerk)
-    motion = fastest_motion_near(limits, AROUND)
+    motion = optimal_motion_near(limits, AROUND, TIME)
     stopping = stopping_motion(AROUND, limits.bounds, limits.torques)
     least = least_durations(np.array([2.0, 0.0]), limits.bounds).max()
     assert least <= motion.duration < 1.01 * least < 0.85 * stopping.duration
@@ -99,7 +100,8 @@ def test_around_a_box_it_neither_stops_nor_comes_nearer_than_the_clearance(jerk:
 def test_a_finer_spline_is_hardly_faster() -> None:
     limits = limits_of(BOX, acceleration=4.0, jerk=40.0)
     coarse, fine = (
-        fastest_motion_near(limits, AROUND, FastestMotionSettings(intervals=count)).duration for count in (40, 120)
+        optimal_motion_near(limits, AROUND, TIME, settings=SplineMotionSettings(intervals=count)).duration
+        for count in (40, 120)
     )
     assert 0.98 * coarse < fine < 1.002 * coarse
 
@@ -110,7 +112,7 @@ def test_torques_of_an_arm_are_at_their_limits_and_not_beyond() -> None:
     bounds = Limits(velocity=3.0, acceleration=60.0, jerk=3000.0, torque=[55.0] * 3 + [28.0] * 3).bounds(machine)
     torques, rest = TorqueLimits(machine, bounds), np.zeros(6)
     limits = MotionLimits(StraightMotions(None), bounds, torques, rest, rest)
-    motion = fastest_motion_near(limits, path)
+    motion = optimal_motion_near(limits, path, TIME)
     straight = torques.slow_down(stopping_motion(path, bounds, torques))
     assert motion.duration < 0.95 * straight.duration
     samples = (each.reshape(-1, 6) for each in motion.sampled(np.linspace(0.0, 1.0, 33)))
@@ -122,5 +124,5 @@ def test_torques_of_an_arm_are_at_their_limits_and_not_beyond() -> None:
 def test_a_path_through_a_wall_is_refused() -> None:
     wall = Box((0.2, 5.0, 1.0), (0.0, 0.0, 0.0))
     with pytest.raises(SolveError, match="no motion within the limits") as caught:
-        fastest_motion_near(limits_of(wall, acceleration=4.0, jerk=40.0), np.array([[-1.0, 0.0], [1.0, 0.0]]))
+        optimal_motion_near(limits_of(wall, acceleration=4.0, jerk=40.0), np.array([[-1.0, 0.0], [1.0, 0.0]]), TIME)
     assert caught.value.name == "limits"

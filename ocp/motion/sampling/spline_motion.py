@@ -1,17 +1,23 @@
-"""Locally fastest motions among obstacles within velocity, acceleration, jerk and torque limits, by linear programs.
+"""Locally optimal motions among obstacles within velocity, acceleration, jerk and torque limits, as B-splines.
 
-Joint positions are a B-spline of the fraction of the duration T, cubic if a jerk is limited, else quadratic. Its
-derivatives are splines too, with control points that are linear in its own. A spline stays within the
-range of its control points (de Boor 2001, chapter XI), so that the limits of velocity, acceleration and jerk hold at
-all times if
+The joint positions are a B-spline of the fraction s of the duration T, cubic if a jerk is limited or weighted, else
+quadratic. Derivatives with respect to s are splines too, with control points that are linear in those of the joint
+positions. A spline stays within the range of its control points (de Boor 2001, chapter XI), so that the limits of
+velocity, acceleration and jerk hold at all times if
 
     |D1 c| <= T V,   |D2 c| <= T^2 A,   |D3 c| <= T^3 J
 
 hold for the control points c. The right sides are convex in T; their tangents are below them. Hence each step of c and
 T that keeps the tangents keeps the limits. Distances of bodies, at samples of the motion, and torques, at the knots,
-are linearised. A step minimises T by a linear program within a trust region; it shrinks if the linearisation was too
-coarse. A slack relaxes the constraints that the present motion violates, by as much as it does. An interior-point
-method without crossover solves the programs: joints that have time to spare then move in the middle of their freedom.
+are linearised. The cost is a weighted sum of T and of the integrals of squared derivatives,
+
+    J = w0 T + sum over k of |L_k c|^2 / T^(2k - 1),
+
+whose terms are squares of residuals that are linearised in c and T (Gauss and Newton's method). A step minimises it by
+a linear or convex quadratic program within a trust region, which shrinks if the linearisation was too coarse. A slack
+relaxes the constraints that the present motion violates, by as much as it does. Where T alone is the cost, an
+interior-point method without crossover solves the programs: joints that have time to spare then move in the middle of
+their freedom.
 
 The proof that the motion is clear between the samples is left to the audit.
 """
@@ -31,14 +37,15 @@ from ocp.console import TimeLimitReached, check_time
 from ocp.errors import SolveError
 from ocp.motion.builders.constant_jerk import ConstantJerkMotion, TorqueLimits
 from ocp.motion.sampling.joint_paths import StraightMotions, points_along
+from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
 
-__all__ = ["FastestMotionSettings", "MotionLimits", "fastest_motion_near"]
+__all__ = ["MotionLimits", "SplineCost", "SplineMotionSettings", "optimal_motion_near"]
 
 
 @dataclass(frozen=True)
-class FastestMotionSettings:
-    """Settings of `fastest_motion_near`: spline, constraints, trust region and linear programs.
+class SplineMotionSettings:
+    """Settings of `optimal_motion_near`: spline, constraints, trust region and programs.
 
     Attributes:
         intervals: Number of intervals of the spline between the short ones at both ends.
@@ -53,11 +60,10 @@ class FastestMotionSettings:
         again: Least trust region at the beginning of a further round.
         change: Largest relative change of the duration in a step.
         widening, narrowing: Factors of the trust region after an accepted and after a refused step.
-        violation: Weight of the slack over the duration.
-        penalty: Weight of the excess of the usages in the merit of a motion, beside the logarithm of its duration.
-        gains: Relative decrease of the duration in a step below which a round ends; the last one serves all further
-            rounds.
-        most_steps: Largest number of linear programs in a round.
+        violation: Weight of the slack beside the relative change of the cost.
+        penalty: Weight of the excess of the usages in the merit of a motion, beside the logarithm of its cost.
+        gains: Relative decrease of the cost in a step below which a round ends; the last one serves all further rounds.
+        most_steps: Largest number of programs in a round.
         finer, most_rounds: Samples of an interval at which the clearance is checked after a round, and the largest
             number of rounds. The closest approaches that are not clear become samples of the next round.
     """
@@ -86,10 +92,11 @@ class FastestMotionSettings:
 
 LIMIT_TOLERANCE = 1e-6
 """Relative excess of velocity, acceleration and jerk that counts as rounding: the tolerance of the linear programs."""
-SOLVER: dict[str, Any] = {
+LINEAR: dict[str, Any] = {
     "error_on_fail": False,
     "highs": {"solver": "ipm", "run_crossover": "off", "output_flag": False},
 }
+QUADRATIC: dict[str, Any] = {"error_on_fail": False, "print_iter": False, "print_header": False}
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,23 +117,51 @@ class MotionLimits:
     end_velocity: Array
 
 
-def fastest_motion_near(
-    limits: MotionLimits, path: Array, settings: FastestMotionSettings = FastestMotionSettings()
-) -> ConstantJerkMotion:
-    """Return a locally fastest motion near a joint path, from its start to its end configuration.
+@dataclass(frozen=True, eq=False)
+class SplineCost:
+    """Cost of a motion: weighted duration plus integrals of weighted squares of derivatives of the joint positions.
 
-    A motion from rest to rest satisfies the torque limits between the knots, too: it is slowed down if it does not.
+    Attributes:
+        time: Weight of the duration.
+        squares: Weights of the squared velocities, accelerations and jerks. Shape (3, n).
+    """
+
+    time: float
+    squares: Array
+
+    @classmethod
+    def of(cls, cost: Cost, size: int) -> SplineCost | None:
+        """Return the cost for `size` joints; None if it has terms of another kind."""
+        if not set(cost.terms) <= {"time", "velocity", "acceleration", "jerk"}:
+            return None
+        rows = cost.joint_weights(size) / 2, cost.acceleration, cost.jerk
+        return cls(cost.time, np.array([np.broadcast_to(np.asarray(row, dtype=float), size) for row in rows]))
+
+
+def optimal_motion_near(
+    limits: MotionLimits,
+    path: Array,
+    cost: SplineCost,
+    horizon: float | None = None,
+    settings: SplineMotionSettings = SplineMotionSettings(),
+) -> ConstantJerkMotion:
+    """Return a locally optimal motion near a path, with the start and end configurations of the path.
+
+    A motion from rest to rest in free time keeps the torque limits between the knots, too: it is slowed down where it
+    does not.
 
     Args:
         limits: Limits, clearance and rates at the ends.
         path: Configurations with straight motions between them. Shape (M, n).
+        cost: The cost, which must weight time if the horizon is free.
+        horizon: Duration, s; None if it is free.
         settings: Settings.
 
     Raises:
         SolveError: No motion within the limits was found near the path.
         TimeLimitReached: Nor was it before the time limit.
     """
-    search = _Search(limits, path, settings)
+    search = _Search(limits, path, cost, horizon, settings)
     state, region = search.evaluate(*search.guess(path)), settings.first
     for number in range(settings.most_rounds):
         state, region = _local_optimum(search, state, region, settings.gains[min(number, len(settings.gains) - 1)])
@@ -138,14 +173,13 @@ def fastest_motion_near(
         state = search.evaluate(state.points, state.duration)
     motion = search.motion(state)
     rests = not (np.any(limits.start_velocity) or np.any(limits.end_velocity))
-    return limits.torques.slow_down(motion) if rests else motion
+    return limits.torques.slow_down(motion) if rests and horizon is None else motion
 
 
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
-    """Solve linear programs in sequence; return the fastest feasible motion and the last trust region.
+    """Solve programs in sequence; return the feasible motion of least cost and the last trust region.
 
-    Without a feasible motion, return the last one. The sequence ends when a step decreases the duration by less than
-    `least_gain`.
+    It is the last motion if none is feasible. The sequence ends when the cost decreases by less than `least_gain`.
 
     Raises:
         TimeLimitReached: The time limit has passed before one was feasible.
@@ -170,7 +204,7 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
         region = min(region * settings.widening, settings.largest)
         idle = idle + 1 if trial.is_feasible and gain < least_gain else 0
         state = trial
-        if state.is_feasible and (best is None or state.duration < best.duration):
+        if state.is_feasible and (best is None or state.cost < best.cost):
             best = state
         if idle > 1:
             break
@@ -184,13 +218,15 @@ class _State:
     Attributes:
         points: Control points. Shape (K, n).
         duration: T, s.
-        rows, usages: Derivatives of the usages with respect to the free control points and log T, and the usages,
-            ratios of quantities to their limits. Shape (R, F + 1) and (R,).
+        cost: The cost.
+        rows, usages: Derivatives of the usages of all limits by the free control points and by log T, and the usages:
+            the limit is kept up to 1. Shape (R, F + 1) and (R,).
         allowed: Largest usage at which the motion counts as feasible, by row. Shape (R,).
     """
 
     points: Array
     duration: float
+    cost: float
     rows: Any
     usages: Array
     allowed: Array
@@ -205,8 +241,8 @@ class _State:
         return self.excess == 0
 
     def merit(self, penalty: float) -> float:
-        """Return the merit function of the iterate: logarithm of the duration plus penalty times excess."""
-        return float(np.log(self.duration)) + penalty * self.excess
+        """Return the merit of the iterate: logarithm of the cost plus penalty times excess."""
+        return float(np.log(self.cost)) + penalty * self.excess
 
 
 _Rows: TypeAlias = tuple[Any, Array, Array, float]
@@ -214,12 +250,15 @@ _Rows: TypeAlias = tuple[Any, Array, Array, float]
 
 
 class _Search:
-    """Sequential linear programming for the locally fastest motion in a spline basis."""
+    """Sequential linear or quadratic programming for the optimal motion in a spline basis."""
 
-    def __init__(self, limits: MotionLimits, path: Array, settings: FastestMotionSettings) -> None:
-        self.limits, self.settings, bounds = limits, settings, limits.bounds
+    def __init__(
+        self, limits: MotionLimits, path: Array, cost: SplineCost, horizon: float | None, settings: SplineMotionSettings
+    ) -> None:
+        self.limits, self.cost, self.horizon, self.settings = limits, cost, horizon, settings
+        bounds = limits.bounds
         self.start, self.end, self.size = path[0], path[-1], path.shape[1]
-        self.degree = 3 if np.isfinite(bounds.jerk).any() else 2
+        self.degree = 3 if np.isfinite(bounds.jerk).any() or cost.squares[2].any() else 2
         spread = np.ptp(path, axis=0).max()
         self.largest = (bounds.velocity, bounds.acceleration, bounds.jerk)[: self.degree]
         self.has_rate_limit = np.isfinite(bounds.velocity)
@@ -242,6 +281,16 @@ class _Search:
         second = scipy.sparse.vstack([self.derivatives[2]] * len(sides)) if both else self._values(at, 2)
         self.at_torques = self._values(at, 0), self._values(at, 1), second
         self._fix_ends()
+        self.residuals = [self._residuals(order) for order in (1, 2, 3) if cost.squares[order - 1].any()]
+
+    def _residuals(self, order: int) -> tuple[int, Any]:
+        """Return 2k - 1 for a derivative of order k, and the matrix L of its term |L c|^2 / T^(2k - 1) of the cost."""
+        places, weights = np.polynomial.legendre.leggauss(self.degree - order + 1)
+        width = np.diff(self.breaks)[:, None]
+        at = (self.breaks[:-1, None] + width * (places + 1) / 2).ravel()
+        basis = scipy.sparse.diags_array(np.sqrt((width * weights / 2).ravel())) @ self._values(at, order)
+        joints = scipy.sparse.diags_array(np.sqrt(self.cost.squares[order - 1]))
+        return 2 * order - 1, scipy.sparse.kron(basis, joints, format="csr")
 
     def _breaks(self, path: Array) -> Array:
         """Return the knots as fractions of the duration, with short intervals at both ends."""
@@ -249,6 +298,7 @@ class _Search:
         with np.errstate(divide="ignore", invalid="ignore"):
             build_up = np.where(np.isfinite(bounds.acceleration), bounds.acceleration / bounds.jerk, 0.0).max()
             least = np.where(self.has_rate_limit, np.abs(self.end - self.start) / bounds.velocity, 0.0).max()
+            least = least if self.horizon is None else self.horizon
         first = min(max(build_up / least if least > 0 else 0.0, settings.shortest), 1 / settings.intervals)
         short = [first]
         while self.degree == 3 and short[-1] * settings.growth < 1 / settings.intervals:
@@ -285,10 +335,7 @@ class _Search:
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
     def guess(self, path: Array) -> tuple[Array, float]:
-        """Return control points along a joint path, and the shortest duration at which they satisfy the joint limits.
-
-        The limits are those of velocity, acceleration and jerk.
-        """
+        """Return control points along a path, and the horizon or, if free, the shortest one within joint limits."""
         p, ramp = self.degree, self.settings.ramp
         at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
         top = 1 / (1 - ramp)
@@ -297,6 +344,8 @@ class _Search:
         speed = np.where(self.has_rate_limit, self.limits.bounds.velocity, 1.0)
         points = points_along(path, 1 / speed, np.clip(share, 0.0, 1.0))
         points[:p], points[-p:] = path[0], path[-1]
+        if self.horizon is not None:
+            return points, self.horizon
         duration = 0.0
         for order in range(1, p + 1):
             used = np.abs(self.derivatives[order] @ points) / self.largest[order - 1]
@@ -319,7 +368,9 @@ class _Search:
         allowed = np.concatenate(
             [np.full(len(usage), 1 + most) for usage, most in zip(usages, tolerances, strict=True)]
         )
-        return _State(points, duration, matrix.tocsr(), np.concatenate(usages), allowed)
+        squares = sum(float(((root @ points.ravel()) ** 2).sum()) / duration**power for power, root in self.residuals)
+        cost = self.cost.time * duration + squares
+        return _State(points, duration, cost, matrix.tocsr(), np.concatenate(usages), allowed)
 
     def _derivative_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
         """Yield the linearised limits of velocity, acceleration and jerk, each in both directions."""
@@ -369,29 +420,43 @@ class _Search:
         return scipy.sparse.csr_array((values, (row, column)), shape=(len(by_joint), self.count * self.size))
 
     def step(self, state: _State, region: float) -> _State | None:
-        """Return the motion after a step within a trust region; None if the linear program has no solution."""
+        """Return the motion after a step within a trust region; None if the program has no solution."""
         settings, bounds, count = self.settings, self.limits.bounds, len(self.free)
         travel = np.where(self.has_rate_limit, bounds.velocity * state.duration, self.spread) * region
         points = state.points.ravel()[self.free]
         joint = self.free % self.size
-        lower = np.concatenate([np.maximum(-travel[joint], bounds.lower[joint] - points), [-settings.change, 0.0]])
-        upper = np.concatenate([np.minimum(travel[joint], bounds.upper[joint] - points), [settings.change, 1.0]])
+        change = settings.change if self.horizon is None else 0.0
+        lower = np.concatenate([np.maximum(-travel[joint], bounds.lower[joint] - points), [-change, 0.0]])
+        upper = np.concatenate([np.minimum(travel[joint], bounds.upper[joint] - points), [change, 1.0]])
         reachable = state.usages + abs(state.rows) @ np.maximum(-lower, upper)[:-1]
         kept = np.flatnonzero(reachable > 1)
         excess = np.maximum(state.usages[kept] - 1, 0.0)
         matrix = ca.DM(scipy.sparse.hstack([state.rows[kept], scipy.sparse.csr_array(-excess[:, None])]).tocsc())
-        cost = np.concatenate([np.zeros(count), [1.0, settings.violation]])
-        shape = {"h": ca.Sparsity(count + 2, count + 2), "a": matrix.sparsity()}
-        solver = ca.conic("step", "highs", shape, SOLVER)
-        solution = solver(
-            g=cost, a=matrix, lba=-np.inf, uba=1 - state.usages[kept], lbx=np.minimum(lower, 0.0), ubx=upper
-        )["x"]
+        curvature, slope = self._cost_model(state)
+        shape = {"h": curvature.sparsity(), "a": matrix.sparsity()}
+        solver = ca.conic("step", *(("ipqp", shape, QUADRATIC) if self.residuals else ("highs", shape, LINEAR)))
+        sides = {"lba": -np.inf, "uba": 1 - state.usages[kept], "lbx": np.minimum(lower, 0.0), "ubx": upper}
+        solution = solver(h=curvature, g=slope, a=matrix, **sides)["x"]
         if not solver.stats()["success"]:
             return None
         change = solution.full().ravel()
         moved = state.points.ravel().copy()
         moved[self.free] += change[:count]
         return self.evaluate(moved.reshape(self.count, self.size), state.duration * (1 + change[count]))
+
+    def _cost_model(self, state: _State) -> tuple[ca.DM, Array]:
+        """Return Hessian and gradient of the relative cost by the free control points, log T and the slack."""
+        count, points, duration = len(self.free), state.points.ravel(), state.duration
+        slope = np.concatenate([np.zeros(count), [self.cost.time * duration / state.cost, self.settings.violation]])
+        curvature = scipy.sparse.csc_array((count + 1, count + 1))
+        for power, root in self.residuals:
+            value = root @ points
+            by_duration = root @ (duration * self.moving.ravel()) - power / 2 * value
+            slopes = scipy.sparse.hstack([root[:, self.free], scipy.sparse.csr_array(by_duration[:, None])])
+            scale = 2 / (duration**power * state.cost)
+            curvature = curvature + scale * (slopes.T @ slopes)
+            slope[:-1] += scale * (slopes.T @ value)
+        return ca.diagcat(ca.DM(curvature.tocsc().sorted_indices()), ca.DM(1, 1)), slope
 
     def add_places(self, state: _State) -> bool:
         """Add constraints at collisions between the samples; return whether there are collisions."""
