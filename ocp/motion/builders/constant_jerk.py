@@ -120,6 +120,26 @@ def least_durations(distances: Array, bounds: JointBounds) -> Array:
     return _ramps(distances, bounds.velocity, bounds.acceleration, bounds.jerk).duration
 
 
+def least_squared_velocities(distances: Array, duration: float, acceleration: Array) -> Array:
+    """Return the least integral of the squared velocity of each joint alone, from rest to rest in a given time.
+
+    Among motions within acceleration limits a, the one that accelerates by a, moves at the constant velocity
+    v = 2 d / (T + sqrt(T^2 - 4 d / a)), and brakes by a has the least integral, v^2 (T - 4/3 v / a).
+
+    Args:
+        distances: Absolute distances d, rad or m. Shape (..., n).
+        duration: Duration T of the motion, s.
+        acceleration: Largest accelerations a, infinite if not limited. Shape (n,).
+
+    Returns:
+        Integrals, inf where the duration is too short. Shape (..., n).
+    """
+    root = np.sqrt(np.maximum(duration**2 - 4 * distances / acceleration, 0.0))
+    velocity = np.divide(2 * distances, duration + root, out=np.zeros_like(root), where=distances > 0)
+    integrals = velocity**2 * (duration - 4 / 3 * velocity / acceleration)
+    return np.asarray(np.where(4 * distances > acceleration * duration**2 * (1 + ROUNDING_SHARE), np.inf, integrals))
+
+
 @dataclass(frozen=True, eq=False)
 class ConstantJerkMotion:
     """Motion of several joints in consecutive phases of constant jerk.

@@ -25,6 +25,7 @@ from ocp.motion.builders.constant_jerk import (
     ConstantJerkMotion,
     TorqueLimits,
     least_durations,
+    least_squared_velocities,
     segment_durations,
     stopping_motion,
     synchronised_motion,
@@ -396,7 +397,8 @@ def _audit_candidate(task: GoalTask, solution: Solution, path: JointPath) -> Can
 def cost_bound(task: GoalTask, horizon: float) -> float | None:
     """Return a lower bound of the cost of any motion to a goal; None if the machine moves at an end.
 
-    Straight motions have the least length and squared rates. No joint reaches its goal faster than by itself.
+    Straight motions have the least length and squared velocities. Each joint by itself needs the least time and, within
+    its acceleration limit, the least squared velocity.
     """
     cost = task.request.cost
     if task.moves:
@@ -404,10 +406,12 @@ def cost_bound(task: GoalTask, horizon: float) -> float | None:
     lengths = np.linalg.norm((task.goals - task.start) * task.scale, axis=1)
     if not task.is_dynamic:
         return float(lengths.min() if task.length else lengths.min() ** 2 / (2 * horizon))
-    durations = least_durations(np.abs(task.goals - task.start), task.bounds).max(axis=1)
-    squares = lengths**2 if cost.velocity else np.zeros(len(lengths))
+    distances = np.abs(task.goals - task.start)
     if task.request.horizon is not None or not cost.time:
-        return float(squares.min() / (2 * horizon) + cost.time * horizon)
+        integrals = least_squared_velocities(distances, horizon, task.bounds.acceleration) @ task.scale**2
+        return float(integrals.min() / 2 if cost.velocity else 0.0) + cost.time * horizon
+    durations = least_durations(distances, task.bounds).max(axis=1)
+    squares = lengths**2 if cost.velocity else np.zeros(len(lengths))
     # time and squared rates: time T + square / (2 T) is least at T = sqrt(square / (2 time))
     best = np.maximum(durations, np.sqrt(squares / (2 * cost.time)))
     totals = cost.time * best + np.where(best > 0, squares / (2 * np.maximum(best, 1e-300)), 0.0)

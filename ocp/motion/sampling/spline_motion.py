@@ -61,7 +61,8 @@ class SplineMotionSettings:
         change: Largest relative change of the duration in a step.
         widening, narrowing: Factors of the trust region after an accepted and after a refused step.
         violation: Weight of the slack beside the relative change of the cost.
-        penalty: Weight of the excess of the usages in the merit of a motion, beside the logarithm of its cost.
+        penalty: Weight of the excess of the usages in the merit of a motion, beside the logarithm of its cost, in free
+            time; in a fixed time, which cannot be extended to satisfy the limits, the weight is `violation`.
         gains: Relative decrease of the cost in a step below which a round ends; the last one serves all further rounds.
         most_steps: Largest number of programs in a round.
         finer, most_rounds: Samples of an interval at which the clearance is checked after a round, and the largest
@@ -185,6 +186,7 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
         TimeLimitReached: The time limit has passed before one was feasible.
     """
     settings = search.settings
+    penalty = settings.penalty if search.horizon is None else settings.violation
     best: _State | None = state if state.is_feasible else None
     idle = 0
     for _ in range(settings.most_steps):
@@ -195,7 +197,7 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
                 raise
             break
         trial = search.step(state, region)
-        gain = 0.0 if trial is None else state.merit(settings.penalty) - trial.merit(settings.penalty)
+        gain = 0.0 if trial is None else state.merit(penalty) - trial.merit(penalty)
         if trial is None or gain <= 0:
             region *= settings.narrowing
             if region < settings.smallest:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pytest
 from ruckig import InputParameter, Result, Ruckig, Trajectory
@@ -13,6 +14,7 @@ from ocp import Limits
 from ocp.motion.builders.constant_jerk import (
     TorqueLimits,
     least_durations,
+    least_squared_velocities,
     segment_durations,
     stopping_motion,
     synchronised_motion,
@@ -23,6 +25,7 @@ from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
 
 INF = np.inf
+QUIET = {"print_iter": False, "print_header": False}
 
 
 def ruckig_duration(distance: float, velocity: float, acceleration: float, jerk: float) -> float:
@@ -166,3 +169,24 @@ def test_a_motion_along_a_path_has_the_length_or_squared_rates_of_the_closed_for
     audit = solution.audit()
     assert audit.feasible, audit
     assert audit["cost, relative"].value < 1e-9
+
+
+def test_the_least_squared_velocity_is_that_of_a_quadratic_program_from_above() -> None:
+    """Velocities at N + 1 equidistant times, within acceleration limits: the integral is a convex quadratic form."""
+    count, duration = 400, 2.0
+    step = duration / count
+    for distance, acceleration in ((1.0, 1.2), (1.0, 2.0), (0.4, 1.2), (0.0, 1.0), (1.0, np.inf)):
+        velocity = ca.SX.sym("v", count - 1)
+        inner = ca.vertcat(0.0, velocity, 0.0)
+        first, last = inner[:-1], inner[1:]
+        integral = step / 3 * ca.sum1(first**2 + first * last + last**2)
+        changes = ca.vertcat((last - first) / step, step * ca.sum1(velocity))
+        solver = ca.qpsol("s", "ipqp", {"x": velocity, "f": integral, "g": changes}, QUIET)
+        largest = np.append(np.full(count, acceleration), distance)
+        lower = np.append(np.full(count, -acceleration), distance)
+        best = float(solver(lbg=lower, ubg=largest)["f"])
+        least = least_squared_velocities(np.array([distance]), duration, np.array([acceleration]))[0]
+        assert least * (1 - 1e-9) - 1e-12 <= best <= least * 1.008 + 1e-9
+    too_far = least_squared_velocities(np.array([1.0, 1.001]), 2.0, np.ones(2))
+    np.testing.assert_allclose(too_far, [2 / 3, np.inf])
+    assert least_squared_velocities(np.zeros(1), 0.0, np.ones(1))[0] == 0

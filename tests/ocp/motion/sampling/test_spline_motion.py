@@ -1,4 +1,4 @@
-"""Fastest motions of a ball among boxes, and of an arm within torque limits, beside bounds, ruckig and closed forms."""
+"""Optimal motions of a ball among boxes, and of an arm within torque limits, beside bounds, ruckig and closed forms."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from ruckig import InputParameter, Result, Ruckig, Trajectory
 from models import Box, CollisionScene, FixedBase
 from models.checks import Array
 from models.examples import example_robot
-from ocp import Limits, SolveError
-from ocp.motion.builders.constant_jerk import TorqueLimits, least_durations, stopping_motion
+from ocp import Cost, Limits, SolveError
+from ocp.motion.builders.constant_jerk import (
+    TorqueLimits,
+    least_durations,
+    least_squared_velocities,
+    stopping_motion,
+)  # fmt: skip
 from ocp.motion.sampling.joint_paths import StraightMotions
 from ocp.motion.sampling.spline_motion import MotionLimits, SplineCost, SplineMotionSettings, optimal_motion_near
 from tests.ocp.motion.sampling.sliders import gap, slider
@@ -126,3 +131,84 @@ def test_a_path_through_a_wall_is_refused() -> None:
     with pytest.raises(SolveError, match="no motion within the limits") as caught:
         optimal_motion_near(limits_of(wall, acceleration=4.0, jerk=40.0), np.array([[-1.0, 0.0], [1.0, 0.0]]), TIME)
     assert caught.value.name == "limits"
+
+
+def integrals(motion: Any, order: int) -> Array:
+    """Integral of the squared derivative of each joint, by Simpson's rule, which is exact for it up to rounding."""
+    values = (*motion.sampled(np.linspace(0.0, 1.0, 5))[1:], np.repeat(motion.jerks[:, None], 5, axis=1))[order - 1]
+    weights = np.array([7, 32, 12, 32, 7]) / 90  # Boole's: exact for the fourth power
+    total: Array = np.einsum("k,ksn,s->n", motion.durations, values**2, weights)
+    return total
+
+
+@pytest.mark.parametrize("jerk", [np.inf, 400.0])
+def test_squared_velocities_within_acceleration_limits_are_those_of_the_closed_form(jerk: float) -> None:
+    limits = limits_of(velocity=np.inf, acceleration=[4.0, 2.0], jerk=jerk)
+    cost = SplineCost.of(Cost(weights=[1.0, 3.0]), 2)
+    assert cost is not None
+    random = np.random.default_rng(3)
+    for _ in range(3):
+        path = random.uniform(-1, 1, (2, 2))
+        distances, duration = np.abs(path[1] - path[0]), 2.2
+        motion = optimal_motion_near(limits, path, cost, duration)
+        assert motion.duration == pytest.approx(duration)
+        np.testing.assert_allclose(kept(limits, motion)[[0, -1]], path, atol=1e-6)
+        least = least_squared_velocities(distances, duration, limits.bounds.acceleration) @ [1.0, 3.0]
+        assert least * (1 - 1e-6) <= integrals(motion, 1) @ [1.0, 3.0] <= 1.02 * least
+
+
+@pytest.mark.parametrize(("order", "factor"), [(2, 12.0), (3, 720.0)])
+def test_squared_accelerations_and_jerks_are_those_of_polynomials(order: int, factor: float) -> None:
+    """The cubic and, with accelerations of zero at the ends, the quintic polynomial."""
+    limits = limits_of(velocity=np.inf)
+    cost = SplineCost.of(Cost(velocity=0.0, **{("acceleration", "jerk")[order - 2]: 1.0}), 2)
+    assert cost is not None
+    path, duration = np.array([[-1.0, 0.2], [0.7, 0.5]]), 1.7
+    motion = optimal_motion_near(limits, path, cost, duration)
+    least = factor * (np.diff(path, axis=0)[0] ** 2).sum() / duration ** (2 * order - 1)
+    assert least * (1 - 1e-6) <= integrals(motion, order).sum() <= 1.02 * least
+
+
+def test_in_free_time_the_duration_balances_its_own_weight_against_velocities() -> None:
+    limits, weight = limits_of(velocity=np.inf, acceleration=20.0), 2.0
+    cost = SplineCost.of(Cost(velocity=1.0, time=weight), 2)
+    assert cost is not None
+    path = np.array([[-1.0, 0.0], [0.5, 0.0]])
+    motion = optimal_motion_near(limits, path, cost)
+    times = np.linspace(0.6, 3.0, 2401)
+    totals = [weight * t + least_squared_velocities(np.array([1.5]), t, np.array([20.0]))[0] / 2 for t in times]
+    total = weight * motion.duration + integrals(motion, 1).sum() / 2
+    assert min(totals) * (1 - 1e-6) <= total <= 1.01 * min(totals)
+    assert motion.duration == pytest.approx(times[np.argmin(totals)], rel=0.05)
+
+
+@pytest.mark.parametrize("jerk", [np.inf, 40.0])
+def test_around_a_box_squared_velocities_are_less_than_with_stops(jerk: float) -> None:
+    limits, cost = limits_of(BOX, velocity=np.inf, acceleration=4.0, jerk=jerk), SplineCost.of(Cost(), 2)
+    assert cost is not None
+    stopping = stopping_motion(AROUND, limits.bounds, limits.torques)
+    motion = optimal_motion_near(limits, AROUND, cost, 2 * stopping.duration)
+    length = float(np.linalg.norm(np.diff(AROUND, axis=0), axis=1).sum())
+    total = integrals(motion, 1).sum()
+    assert total < 0.8 * integrals(stopping.slower(2.0), 1).sum()
+    assert total >= 0.97 * length**2 / motion.duration  # the path is nearly the shortest one around the box
+    assert gap(kept(limits, motion), [BOX]).min() >= 0
+
+
+def test_a_horizon_that_is_too_short_is_refused() -> None:
+    cost = SplineCost.of(Cost(), 2)
+    assert cost is not None
+    path = np.array([[-1.0, 0.0], [1.0, 0.0]])
+    for horizon in (1.0, 1.4):  # 2 sqrt(2 / 4) s are needed
+        with pytest.raises(SolveError, match="no motion within the limits"):
+            optimal_motion_near(limits_of(velocity=np.inf, acceleration=4.0), path, cost, horizon)
+    optimal_motion_near(limits_of(velocity=np.inf, acceleration=4.0), path, cost, 1.5)
+
+
+def test_other_terms_have_no_spline_cost() -> None:
+    assert SplineCost.of(Cost(effort=1.0), 2) is None
+    assert SplineCost.of(Cost(velocity=0.0, length=1.0), 2) is None
+    cost = SplineCost.of(Cost(velocity=2.0, time=3.0, acceleration=[1.0, 4.0], jerk=5.0, weights=[1.0, 0.5]), 2)
+    assert cost is not None
+    assert cost.time == 3.0
+    np.testing.assert_allclose(cost.squares, [[1.0, 0.5], [1.0, 4.0], [5.0, 5.0]])
