@@ -101,15 +101,34 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
     distances = distances_along(scene, base, joints, times, cutoff=scene.clearance)
     if not distances.size:
         return []
-    closest, labels, collisions = distances.argmin(axis=0), scene.labels, list[Collision]()
-    bases = np.broadcast_to(base, (len(joints), scene.machine.base_size))
-    for pair in np.flatnonzero(distances.min(axis=0) < scene.clearance).tolist():
-        at = closest[pair]
-        distance, time = float(distances[at, pair]), float(np.ravel(times)[at])
-        covers = pair in scene.cover_pairs
-        protrusion = distance - _cover_distance(scene, pair, bases[at], joints[at], time) if covers else 0.0
-        collisions.append(Collision(pair, labels[pair], distance, time, protrusion))
+    pairs = np.flatnonzero(distances.min(axis=0) < scene.clearance)
+    places = zip(distances.argmin(axis=0)[pairs].tolist(), pairs.tolist(), strict=True)
+    collisions = [_collision_at(scene, place, distances[place], base, joints, times) for place in places]
     return sorted(collisions, key=lambda collision: collision.distance)
+
+
+def worst_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision | None]:
+    """Return for each sample the closest pair of bodies if it violates the clearance, else None.
+
+    The arguments are those of `distances_along`.
+    """
+    distances = distances_along(scene, base, joints, times, cutoff=scene.clearance)
+    worst = list[Collision | None]([None] * len(joints))
+    for sample in np.flatnonzero(distances.min(axis=1, initial=np.inf) < scene.clearance).tolist():
+        place = sample, int(distances[sample].argmin())
+        worst[sample] = _collision_at(scene, place, distances[place], base, joints, times)
+    return worst
+
+
+def _collision_at(
+    scene: CollisionScene, place: tuple[int, int], distance: float, base: Array, joints: Array, times: Array
+) -> Collision:
+    """Return the collision of a pair at a sample, given as `place`, with the other arguments of `distances_along`."""
+    at, pair = place
+    base, time = np.broadcast_to(base, (len(joints), scene.machine.base_size))[at], float(np.ravel(times)[at])
+    covers = pair in scene.cover_pairs
+    protrusion = float(distance) - _cover_distance(scene, pair, base, joints[at], time) if covers else 0.0
+    return Collision(pair, scene.labels[pair], float(distance), time, protrusion)
 
 
 def _cover_distance(scene: CollisionScene, pair: int, base: Array, joints: Array, time: float) -> float:

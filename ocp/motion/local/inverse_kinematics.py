@@ -18,7 +18,7 @@ from models import CollisionScene, Machine
 from models.checks import NOT_NUMBERS, Array, floats, real
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
-from ocp.motion.local.collisions import Collision, checked_collision_scene, find_collisions, slide_apart
+from ocp.motion.local.collisions import Collision, checked_collision_scene, slide_apart, worst_collisions
 from ocp.motion.local.ik_solver import ik_branches
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
@@ -431,9 +431,9 @@ def spread_points(points: Array, count: int) -> NDArray[np.intp]:
 def _closest_collisions(
     solutions: list[IkSolution], scene: CollisionScene, base: Array, time: float
 ) -> list[Collision | None]:
-    """Return for each IK solution the closest pair of bodies if the pair violates the clearance, else None."""
-    collisions = (find_collisions(scene, base[None], solution.joints[None], np.array([time])) for solution in solutions)
-    return [next(iter(each), None) for each in collisions]
+    """Return for each IK solution its closest pair of bodies if that violates the clearance, else None."""
+    joints = np.array([solution.joints for solution in solutions])
+    return worst_collisions(scene, base, joints, np.full(len(joints), time))
 
 
 def _collision_free(

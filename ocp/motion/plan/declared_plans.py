@@ -52,9 +52,9 @@ __all__ = [
 ]  # fmt: skip
 
 PHASE_INTERVALS = 40
-"""Number of intervals of the first mesh, summed over all phases; a phase gets no more than a single motion would."""
-REGION_SAMPLES = 8
-"""Number of random tip positions in the region of a goal, besides its centre."""
+"""Number of intervals of the first mesh, over all phases; one phase gets no more than a motion of its own."""
+REGION_SAMPLES, REGION_STARTS = 8, 16
+"""Number of random tip positions in the region of a goal, besides its centre, and of IK samples at each position."""
 
 
 def plan_sequence(
@@ -265,10 +265,11 @@ def goal_configurations(
         return clip_to_limits(joints, bounds.lower, bounds.upper, **words)[None]
     scene, options = None if constraints is None else constraints.scene, IkOptions(limits=limits.joints)
     tasks = [goal.task, *(replace(goal.task, position=point) for point in _points_inside(goal.region, seed))]
+    samples = {} if goal.region is None else {"starts": REGION_STARTS}
     solutions, error = list[Array](), None
     for task in tasks:
         try:
-            members = inverse_kinematics(machine, task, near=near, seed=seed, scene=scene, options=options)
+            members = inverse_kinematics(machine, task, **samples, near=near, seed=seed, scene=scene, options=options)
         except Unreachable as unreachable:
             error = error or unreachable
             continue

@@ -70,6 +70,7 @@ class GoalSettings:
         margins: Largest number of margins, each twice the one before, that are tried for the clearance between samples.
         spline: Settings of the locally optimal splines near a path.
         near: Pairs of bodies closer than the clearance plus this along a path are separated from the first solve on, m.
+        most_goals: Largest number of goal configurations, in all full turns of the joints, to which paths are searched.
         turns: Largest number of further full turns by which goals of unlimited joints are shifted.
     """
 
@@ -85,6 +86,7 @@ class GoalSettings:
     margins: int = 4
     spline: SplineMotionSettings = field(default_factory=SplineMotionSettings)
     near: float = 0.02
+    most_goals: int = 200
     turns: int = 1
 
 

@@ -18,6 +18,7 @@ from models.checks import Array
 from ocp.console import TimeLimitReached, interruptible, time_limited
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.constant_jerk import TorqueLimits
+from ocp.motion.local.inverse_kinematics import spread_points
 from ocp.motion.plan.goal_motions import (
     GoalRequest,
     GoalTask,
@@ -104,23 +105,32 @@ def _check_request(request: GoalRequest) -> GoalTask:
     start = _checked_end(machine, "start", request.start, bounds)
     if collisions := motions.collisions(start):
         raise _collision(scene, "start", collisions[0])
-    kept, errors = [], []
+    within, errors = [], []
     for goal in goals:
         try:
-            joints = _checked_end(machine, "end" if len(goals) == 1 else "goal", goal, bounds)
+            within.append(_checked_end(machine, "end" if len(goals) == 1 else "goal", goal, bounds))
         except ProblemError as error:
             errors.append(error)
-            continue
-        if collisions := motions.collisions(joints):
-            errors.append(_collision(scene, "goal", collisions[0]))
-        else:
-            kept.append(joints)
+    clear = motions.are_clear(np.array(within), np.array(within)) if within else np.zeros(0, dtype=bool)
+    kept = [joints for joints, is_clear in zip(within, clear.tolist(), strict=True) if is_clear]
+    if not kept and within:
+        errors = [_collision(scene, "goal", motions.collisions(within[0])[0])]
     if not kept:
         raise errors[0]
-    turned = [
-        shifted for goal in kept for shifted in _equivalent_goals(space, bounds, start, goal, request.settings.turns)
-    ]
-    return GoalTask(request, bounds, start, np.array(turned), scale, motions, space, TorqueLimits(machine, bounds))
+    turned = np.array(
+        [shifted for goal in kept for shifted in _equivalent_goals(space, bounds, start, goal, request.settings.turns)]
+    )
+    turned = _nearest_and_spread(turned, (turned - start) * scale, request.settings.most_goals)
+    return GoalTask(request, bounds, start, turned, scale, motions, space, TorqueLimits(machine, bounds))
+
+
+def _nearest_and_spread(goals: Array, changes: Array, most: int) -> Array:
+    """Return at most `most` of the goals (K, n): one half needs the smallest changes (K, n), one half is spread out."""
+    if len(goals) <= most:
+        return goals
+    order = np.argsort(np.linalg.norm(changes, axis=1), kind="stable")
+    nearest, others = order[: most // 2], order[most // 2 :]
+    return goals[np.concatenate([nearest, others[spread_points(changes[others], most - most // 2)]])]
 
 
 def _checked_end(machine: FixedBase, name: str, value: Any, bounds: JointBounds) -> Array:

@@ -29,7 +29,13 @@ from models.shapes.distance import COLUMNS
 from models.shapes.mesh_files import find_mesh, read_mesh
 from models.spatial import skew
 from ocp import ProblemError
-from ocp.motion.local.collisions import checked_collision_scene, distances_along, find_collisions, scene_hulls
+from ocp.motion.local.collisions import (
+    checked_collision_scene,
+    distances_along,
+    find_collisions,
+    scene_hulls,
+    worst_collisions,
+)  # fmt: skip
 from tests.models.machines.armoured import armoured_arm
 from tests.models.machines.test_collision_scene import OBSTACLES, configurations, machines, turned
 from tests.ocp.motion.tasks.space_tasks import panda, ur5
@@ -127,6 +133,23 @@ def test_colliding_pairs_are_named_at_their_deepest_points_in_order() -> None:
         assert contact.time == TIMES[apart[:, contact.pair].argmin()]
         assert ("overlap by" if contact.distance < 0 else "apart") in str(contact)
         assert f"{abs(contact.distance):.3g} m" in str(contact)
+
+
+@pytest.mark.parametrize("name", machines())
+def test_the_worst_collision_of_each_sample_is_the_one_found_alone(name: str) -> None:
+    around = CollisionScene(machines()[name], (*OBSTACLES, MOVING), clearance=0.05)
+    base, joints = configurations(around.machine, len(TIMES), 5)
+    worst = worst_collisions(around, base, joints, TIMES)
+    assert any(worst)
+    for k, collision in enumerate(worst):
+        alone = find_collisions(around, base[k : k + 1], joints[k : k + 1], TIMES[k : k + 1])
+        assert (collision is None) == (not alone)
+        if collision is not None:
+            assert (collision.pair, collision.bodies, collision.time) == (alone[0].pair, alone[0].bodies, TIMES[k])
+            assert_allclose(
+                [collision.distance, collision.protrusion], [alone[0].distance, alone[0].protrusion], atol=1e-12
+            )
+    assert worst_collisions(around, base[:0], joints[:0], TIMES[:0]) == []
 
 
 def test_one_base_for_all_samples_is_that_base_at_each() -> None:

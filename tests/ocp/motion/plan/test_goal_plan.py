@@ -247,3 +247,25 @@ def test_least_time_of_an_arm_among_boxes_keeps_all_limits_and_its_clearance(jer
     assert (np.abs(sample.rates) <= machine.robot.velocity * 1.001).all()
     assert np.abs(sample.accelerations).max() <= 10.01
     np.testing.assert_allclose(sample.rates[[0, -1]], 0.0, atol=1e-6)
+
+
+def test_of_many_goals_the_nearest_and_the_most_distant_ones_are_kept() -> None:
+    changes = np.random.default_rng(0).normal(size=(500, 3))
+    goals = changes + 1.0
+    kept = goal_plan._nearest_and_spread(goals, changes, 20)
+    assert kept.shape == np.unique(kept, axis=0).shape == (20, 3)
+    sizes = np.linalg.norm(kept - 1.0, axis=1)
+    np.testing.assert_allclose(sizes[:10], np.sort(np.linalg.norm(changes, axis=1))[:10])
+    others = kept[10:]
+    between = np.linalg.norm(others[:, None] - others, axis=2) + 9 * np.eye(10)
+    assert between.min() > 2.0
+    np.testing.assert_array_equal(goal_plan._nearest_and_spread(goals, changes, 500), goals)
+
+
+def test_a_goal_among_many_that_collide_is_reached() -> None:
+    """All but one of 300 goals are behind a wall; the one in front of it is neither among the nearest nor the last."""
+    wall, rng = Box((0.4, 6.0, 1.0), (0.0, 0.0, 0.0)), np.random.default_rng(2)
+    behind = np.column_stack([rng.uniform(0.5, 1.0, 299), rng.uniform(-0.4, 0.4, 299)])
+    goals = np.vstack([behind, [[-1.0, 2.0]]])
+    plan = plan_to_goal(request_of(wall, goals=goals, cost=Cost(velocity=0.0, length=1.0)))
+    np.testing.assert_allclose(sampled(plan)[-1], goals[-1], atol=1e-9)
