@@ -130,7 +130,8 @@ def _nearest_and_spread(goals: Array, changes: Array, most: int) -> Array:
         return goals
     order = np.argsort(np.linalg.norm(changes, axis=1), kind="stable")
     nearest, others = order[: most // 2], order[most // 2 :]
-    return goals[np.concatenate([nearest, others[spread_points(changes[others], most - most // 2)]])]
+    kept: Array = goals[np.concatenate([nearest, others[spread_points(changes[others], most - most // 2)]])]
+    return kept
 
 
 def _checked_end(machine: FixedBase, name: str, value: Any, bounds: JointBounds) -> Array:
