@@ -106,8 +106,8 @@ class CandidateQueue:
 
     @property
     def cost(self) -> float:
-        """Cost of the best candidate that passed its audit; inf if no candidate passed."""
-        return min((candidate.cost for candidate in self.candidates if candidate.passed), default=np.inf)
+        """Cost of the best candidate that passed its audit; inf if none did."""
+        return min((candidate.total for candidate in self.candidates if candidate.passed), default=np.inf)
 
     @property
     def passed(self) -> bool:
@@ -174,13 +174,13 @@ class CandidateQueue:
         """
         if not self.passed:
             raise self.solver.failure(self.candidates)
-        best = min((c for c in self.candidates if c.passed), key=lambda c: c.cost)
+        best = min((c for c in self.candidates if c.passed), key=lambda c: c.total)
         costlier = Reason(Rejection.COSTLIER)
         finished = [
             replace(candidate, reason=costlier) if candidate.passed and candidate is not best else candidate
             for candidate in self.candidates
         ]
-        finished.sort(key=lambda c: (c is not best, np.inf if np.isnan(c.cost) else c.cost))
+        finished.sort(key=lambda c: (c is not best, np.inf if np.isnan(c.cost) else c.total))
         return self.solver.plan([candidate.finished() for candidate in finished])
 
     @property
@@ -190,7 +190,7 @@ class CandidateQueue:
 
     def _push(self, candidate: Candidate) -> None:
         self._pushed += 1
-        cost = -np.inf if candidate.stage is Stage.SEED else candidate.cost
+        cost = -np.inf if candidate.stage is Stage.SEED else candidate.total
         heappush(self._heap, (cost, -candidate.stage, self._pushed, candidate))
 
     def _find_motion(self, candidate: Candidate) -> _Motion | None:
@@ -201,7 +201,7 @@ class CandidateQueue:
             return None
         for motion in self._motions:
             assert motion.first.solution is not None
-            gain, slack = motion.first.cost - candidate.cost, self.settings.same_cost * motion.first.cost
+            gain, slack = motion.first.total - candidate.total, self.settings.same_cost * motion.first.total
             is_same = gain >= -slack and not self._always_costlier
             if gain <= slack and (is_same or self.solver.same_path(candidate.solution, motion.first.solution)):
                 return motion
@@ -214,15 +214,15 @@ class CandidateQueue:
         if stage is Stage.SEED:
             if not candidate.seed.tracked and np.isfinite(self._least):
                 return Reason(Rejection.UNTRACKED)
-            cost = candidate.seed.cost
+            cost = candidate.seed.cost + candidate.seed.approach
             too_costly = np.isfinite(cost) and cost > settings.max_cost_ratio * self._least
             return Reason(Rejection.COSTLIER, "by far, judged by its local motion") if too_costly else None
         audited = self._include_costlier and self._audits < settings.max_failures
-        if audited and candidate.cost <= settings.max_cost_ratio * best:
+        if audited and candidate.total <= settings.max_cost_ratio * best:
             return Reason(Rejection.DUPLICATE) if stage > Stage.FINE and self._has_passed(candidate) else None
-        if stage < Stage.FINE and candidate.cost > best * (1 + self._coarse_error):
+        if stage < Stage.FINE and candidate.total > best * (1 + self._coarse_error):
             return self.solver.collision(candidate) or Reason(Rejection.COSTLIER, "on a coarse mesh")
-        if stage >= Stage.FINE and candidate.cost >= best * (1 - settings.same_cost):
+        if stage >= Stage.FINE and candidate.total >= best * (1 - settings.same_cost):
             return Reason(Rejection.COSTLIER)
         if self._failures < settings.max_failures:
             return None
@@ -233,7 +233,7 @@ class CandidateQueue:
     def _has_passed(self, candidate: Candidate) -> bool:
         """Return whether a candidate of equal cost (if costlier ones are kept, also of equal path) has passed."""
         passed = [c for c in self.candidates if c.passed]
-        same = [c for c in passed if abs(candidate.cost - c.cost) <= self.settings.same_cost * c.cost]
+        same = [c for c in passed if abs(candidate.total - c.total) <= self.settings.same_cost * c.total]
         if not self._always_costlier or candidate.solution is None:
             return bool(same)
         return any(c.solution is not None and self.solver.same_path(candidate.solution, c.solution) for c in same)
@@ -251,7 +251,7 @@ class CandidateQueue:
             self.candidates.append(advanced.with_rejection(Reason(Rejection.DUPLICATE)) if repeated else advanced)
         else:
             if previous.stage is Stage.SEED:
-                self._least = min(self._least, advanced.cost)
+                self._least = min(self._least, advanced.total)
                 if advanced.solution is None or self.solver.reaches_limits(advanced.solution):
                     self._push_turned(previous)
             elif previous.stage < Stage.FINE <= advanced.stage:

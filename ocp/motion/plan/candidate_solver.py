@@ -250,7 +250,7 @@ class CandidateSolver(Solver):
         constraints = self.request.clearance_constraints
         if constraints is not None:
             constraints = constraints.with_collisions(self.local_collisions(candidate.seed))
-        seed = Seed(candidate.solution, local=candidate.seed.local, direct=True)
+        seed = Seed(candidate.solution, approach=candidate.seed.approach, local=candidate.seed.local, direct=True)
         return [Candidate(candidate.start, seed=seed, constraints=constraints)]
 
     # ---- solves ------------------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
 __all__ = [
-    "goal_configurations", "plan_capture", "plan_goal", "plan_sequence",
+    "goal_configurations", "has_only_target", "plan_capture", "plan_goal", "plan_sequence",
     "plan_steps", "plan_to_stand", "with_joints",
 ]  # fmt: skip
 
@@ -127,13 +127,13 @@ def plan_goal(
     Raises:
         ProblemError, SolveError: As `plan_to_goal` or `plan_sequence`.
     """
-    if isinstance(machine, FixedBase) and _has_only_target(goal):
+    if isinstance(machine, FixedBase) and has_only_target(goal):
         return plan_to_goal(_goal_request(machine, goal, horizon, options, constraints=constraints))
     return plan_sequence(machine, (goal,), horizon, options, constraints=constraints)
 
 
-def _has_only_target(goal: Goal) -> bool:
-    """Return whether a goal states only where the motion ends, and neither tasks on the way nor a machine or base."""
+def has_only_target(goal: Goal) -> bool:
+    """Return whether a goal states only a target: no tasks on the way, and no change of machine or base."""
     has_tasks = not (isinstance(goal.tasks, Sequence) and not goal.tasks)
     return not has_tasks and goal.machine is None and goal.base is None
 

@@ -16,12 +16,19 @@ from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
 from ocp.motion.builders.joint_motion import VelocitySetup, joint_motion_problem, minimum_velocity_problem
 from ocp.motion.builders.space.capture import Capture, capture_problem
-from ocp.motion.builders.standing.problem import StandingSetup, Weights, standing_problem
+from ocp.motion.builders.standing.problem import FreeTime, StandingSetup, Weights, standing_problem
 from ocp.motion.builders.standing.stances import Steps
 from ocp.motion.builders.standing.steps import StepWeights, steps_problem
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED
 from ocp.motion.plan.actuators import limits_actuators
-from ocp.motion.plan.declared_plans import plan_capture, plan_goal, plan_sequence, plan_steps, plan_to_stand
+from ocp.motion.plan.declared_plans import (
+    has_only_target,
+    plan_capture,
+    plan_goal,
+    plan_sequence,
+    plan_steps,
+    plan_to_stand,
+)  # fmt: skip
 from ocp.motion.plan.planner import PlanOptions, checked_request, clearance_for, plan_request
 from ocp.motion.plan.sequence import SequenceRequest, plan_consecutive, plan_in_segments
 from ocp.motion.plan.waypoints import plan_path
@@ -166,11 +173,24 @@ def _plan(
         _check_unused("a motion to goals", cyclic=cyclic or None)
         if len(goals) == 1:
             return plan_goal(machine, goals[0], horizon, own_options, constraints=constraints)
+        if isinstance(machine, FixedBase) and horizon in (None, "free") and _are_separate(goals):
+            own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
+            return plan_consecutive(own, goals)
         return plan_sequence(machine, goals, horizon, own_options, constraints=constraints)
     if isinstance(machine, Standing):
         return plan_to_stand(machine, tasks, horizon, own_options, constraints=constraints, wrenches=wrenches)
     request = checked_request(machine, tasks, horizon, own_options)
     return plan_request(replace(request, clearance_constraints=constraints))
+
+
+def _are_separate(goals: Sequence[Any]) -> bool:
+    """Return whether the motions to goals do not depend on each other: each goal is a place where the machine rests."""
+    each = [goal for goal in goals if isinstance(goal, Goal)]
+    if len(each) < len(goals) or not all(map(has_only_target, each)):
+        return False
+    if any(isinstance(goal.duration, FreeTime) for goal in each):
+        return False
+    return all(isinstance(goal.velocity, str) and goal.velocity == "rest" for goal in each[:-1])
 
 
 def _is_sequence(tasks: Any) -> bool:

@@ -66,6 +66,9 @@ __all__ = [
     "plan_request",
 ]
 
+UNLIMITED_RATE = 1.0
+"""Rate of joints without a rate limit in the estimate of an approach, rad/s or m/s."""
+
 
 def plan_from_configurations(
     request: PlanRequest, configurations: Array, solver: CandidateSolver
@@ -132,21 +135,35 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
     """Return candidates with local motions as initial guesses, by rising cost; motions that satisfy tasks come first.
 
+    The cost includes that of the approach from the configuration `near` of the request.
+
     Args:
         motions: K local motions through each stretch.
         options: Further fields of `Seed`.
     """
     errors, costs = np.array(largest_pose_errors([*motions])), np.sum([motion.cost for motion in motions], axis=0)
+    approaches = _approach_costs(solver.request, motions[0].joints[:, 0])
     tracked = errors <= max(REACH_TOLERANCE, errors.min(initial=np.inf))
     candidates = []
-    for index in np.lexsort((costs, ~tracked)).tolist():
+    for index in np.lexsort((costs + approaches, ~tracked)).tolist():
         local = [motion.take(slice(index, index + 1)) for motion in motions]
         guess = solver.motion.guess(local, 0)
         relaxed = solver.is_nearly_singular(local)
-        seed = Seed(guess, float(costs[index]), local, bool(tracked[index]), relaxed=relaxed, **options)
+        cost, approach = float(costs[index]), float(approaches[index])
+        seed = Seed(guess, cost, approach, local, bool(tracked[index]), relaxed=relaxed, **options)
         constraints = solver.request.clearance_constraints
         candidates.append(Candidate(motions[0].joints[index, 0], seed.cost, seed=seed, constraints=constraints))
     return candidates
+
+
+def _approach_costs(request: PlanRequest, starts: Array) -> Array:
+    """Return estimated costs of the motions to start configurations (K, n): straight, at the velocity limits. (K,)."""
+    if request.near is None:
+        return np.zeros(len(starts))
+    changes, velocity = np.abs(starts - request.near), request.bounds.velocity
+    durations = (changes / np.where(np.isfinite(velocity), velocity, UNLIMITED_RATE)).max(axis=1, initial=0.0)
+    squares = np.divide(changes**2 @ request.weights, durations, out=np.zeros(len(starts)), where=durations > 0)
+    return np.asarray(squares / 2 + (0.0 if request.cost is None else request.cost.time) * durations)
 
 
 def _repair(

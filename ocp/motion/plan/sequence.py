@@ -178,7 +178,10 @@ class _Sequence:
         return plan_goal(own, replace(goal, machine=None), horizon, options, constraints=self._constraints())
 
     def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
-        """Plan the motion along tasks from configuration `near` or, if the tasks do not start there, from any other."""
+        """Return the motion along tasks from the configuration `near` or, if they do not start there, from any.
+
+        Among start configurations, those count as better to which the motion from `near` costs less.
+        """
         request, machine = self.request, self.machine
         options: dict[str, Any] = {"cost": request.cost, "limits": request.limits, "seed": request.seed}
         options |= {"search": request.search, "start": None}
@@ -189,6 +192,7 @@ class _Sequence:
         rests = _rests(checked) if request.smooth else (False, False)
         checked = replace(checked, clearance_constraints=self._constraints(), rests=rests)
         if options["start"] is None and near is not None:
+            checked = replace(checked, near=near)
             idle = bind(machine, checked.tasks).idle
             names = np.array(machine.robot.joint_names)[idle].tolist()
             checked = checked.with_held(dict(zip(names, near[idle].tolist(), strict=True)))

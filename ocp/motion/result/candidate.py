@@ -108,6 +108,7 @@ class Seed:
     Attributes:
         guess: Guess of the first solve.
         cost: Cost of the local motion; inf if there is none.
+        approach: Estimated cost of the motion by which the machine comes to the start.
         local: Local motion in each stretch of time; () if there is none.
         tracked: Whether the local motion satisfies the tasks.
         direct: Whether the first solve is on the fine mesh.
@@ -118,6 +119,7 @@ class Seed:
 
     guess: Any = None
     cost: float = np.inf
+    approach: float = 0.0
     local: Sequence[LocalMotion] = ()
     tracked: bool = True
     direct: bool = False
@@ -191,6 +193,11 @@ class Candidate:
     def record(self) -> list[Any]:
         """Return the start, cost, stage and reason of the candidate as plain data for a file."""
         return [self.start.tolist(), self.cost, int(self.stage), self.reason and self.reason.record()]
+
+    @property
+    def total(self) -> float:
+        """Cost by which candidates are compared: that of the motion and of the approach to its start."""
+        return self.cost + self.seed.approach
 
     @property
     def passed(self) -> bool:

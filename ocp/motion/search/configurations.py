@@ -114,6 +114,7 @@ class PlanRequest:
         stretches: Intervals of time in which the same tasks are active.
         start: Joint positions at the start, rad or m, or None if they are searched. Shape (n,).
         base: Base configuration at the start. Shape (base_size,).
+        near: Joint positions from which the machine moves to the start, or None if these do not matter. Shape (n,).
         weights: Weights of the squared joint rates. Shape (n,).
         limits: Limits of joint positions and rates.
         time_cost: Cost of a second if the horizon is free; else None.
@@ -146,6 +147,7 @@ class PlanRequest:
     settings: PlannerSettings = field(default_factory=PlannerSettings)
     held: Mapping[str, float] = field(default_factory=dict)
     whole: Machine | None = None
+    near: Array | None = None
 
     def with_held(self, positions: Mapping[str, float]) -> PlanRequest:
         """Return the request with further joints of the machine held at rest at given positions, rad or m."""
@@ -161,6 +163,7 @@ class PlanRequest:
             machine=machine,
             stretches=stretches_of(machine, self.tasks, self.horizon),
             start=None if self.start is None else self.start[free],
+            near=None if self.near is None else self.near[free],
             weights=self.weights[free],
             cost=None if self.cost is None else self.cost.of_joints(free),
             limits=self.limits.of_joints(free),
