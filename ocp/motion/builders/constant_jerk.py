@@ -58,7 +58,8 @@ class ConstantJerkSettings:
             share of the time at that rate.
         unlimited_rate: Rate of joints without any of these limits, rad/s or m/s.
         samples: Number of samples of each phase at which torques are evaluated.
-        torque_share: Share of the torque limits that is used there, since torques may be larger between the samples.
+        torque_share: Share of the limits of torque and power that is used there, since torques may be larger between
+            the samples.
     """
 
     still: float = 1e-3
@@ -231,42 +232,52 @@ class ConstantJerkMotion:
 
 
 class TorqueLimits:
-    """Joint torques of a machine on a fixed base, and their limits.
+    """Joint torques and actuator powers of a machine on a fixed base, and their limits.
 
     Attributes:
-        limited: Indices of the joints with a torque limit. Shape (L,).
-        largest: Their limits, N m or N. Shape (L,).
+        limited: Indices of the L joints whose torque or power is limited.
+        torque, power: Their limits, N m or N, and W; infinite if only the other one is limited. Shape (L,).
+        largest: The finite ones among these R limits: those of torques first, then those of powers. Shape (R,).
+        two_sided: Whether a quantity is limited in both directions, as torques are; braking power is not. Shape (R,).
     """
 
     def __init__(self, machine: FixedBase, bounds: JointBounds) -> None:
         self.machine = machine
-        self.limited = np.flatnonzero(np.isfinite(bounds.torque))
-        self.largest = bounds.torque[self.limited]
+        self.limited = np.flatnonzero(np.isfinite([bounds.torque, bounds.power]).any(axis=0))
+        self.torque, self.power = bounds.torque[self.limited], bounds.power[self.limited]
+        both = np.concatenate([self.torque, self.power])
+        self._finite = np.flatnonzero(np.isfinite(both))
+        self.largest, self.two_sided = both[self._finite], self._finite < len(self.limited)
         self._samplers: dict[bool, Sampler] = {}
 
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> Array:
-        """Return the torques of the joints that have a torque limit at M samples of a motion. Shape (M, L)."""
+        """Return the torques of the joints in `limited` at M samples of a motion. Shape (M, L)."""
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
     def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
-        """Return torques at M samples, and their Jacobians with respect to joint positions, rates and accelerations.
+        """Return the limited torques and powers at M samples, in the order of `largest`, and their Jacobians.
 
-        Torques of joints without a torque limit are left out. Shapes (M, L), and (M, L, n) for each Jacobian.
+        The Jacobians are those with respect to joint positions, rates and accelerations. Shapes (M, R), and (M, R, n)
+        for each Jacobian.
         """
-        torques, *slopes = self._sampler(True)(joints, rates, accelerations)
+        values, *slopes = self._sampler(True)(joints, rates, accelerations)
         size = joints.shape[1]
-        return torques, [slope.reshape(len(joints), size, -1).swapaxes(1, 2) for slope in slopes]
+        return values, [slope.reshape(len(joints), size, -1).swapaxes(1, 2) for slope in slopes]
 
     def _sampler(self, linearised: bool) -> Sampler:
         if linearised not in self._samplers:
             symbols = [ca.SX.sym("v", self.machine.joint_size) for _ in range(3)]
-            torques = joint_torques(self.machine, (self.machine.base_home(), *symbols))[self.limited.tolist()]
-            outputs = [torques, *(ca.jacobian(torques, each) for each in symbols)] if linearised else [torques]
+            chosen = self.limited.tolist()
+            torques = joint_torques(self.machine, (self.machine.base_home(), *symbols))[chosen]
+            limited = ca.vertcat(torques, torques * symbols[1][chosen])[self._finite.tolist()]
+            outputs = [limited, *(ca.jacobian(limited, each) for each in symbols)] if linearised else [torques]
             self._samplers[linearised] = Sampler(symbols, outputs)
         return self._samplers[linearised]
 
     def slow_down(self, motion: ConstantJerkMotion) -> ConstantJerkMotion:
         """Return the motion slowed down by the smallest factor at which its samples satisfy the torque limits.
+
+        If they then exceed power limits, the motion is slowed down further.
 
         Raises:
             SolveError: A torque limit is too small to keep the machine at rest somewhere on the path.
@@ -277,15 +288,26 @@ class TorqueLimits:
         joints, rates, accelerations = (each.reshape(-1, each.shape[-1]) for each in motion.sampled(places))
         rest = self.torques(joints, np.zeros_like(joints), np.zeros_like(joints))
         moving = self.torques(joints, rates, accelerations) - rest
-        allowed = SETTINGS.torque_share * self.largest
+        allowed = SETTINGS.torque_share * self.torque
         if (np.abs(rest) >= allowed).any():
             row, column = np.argwhere(np.abs(rest) >= allowed)[0]
-            name, limit = self.machine.robot.joint_names[self.limited[column]], float(self.largest[column])
+            name, limit = self.machine.robot.joint_names[self.limited[column]], float(self.torque[column])
             words = f"at rest on the path, joint {name!r} needs {abs(rest[row, column]):.4g}, {limit:.4g} allowed"
             raise SolveError(words, name=name, value=float(rest[row, column]), limit=limit)
         with np.errstate(divide="ignore", invalid="ignore"):
             room = np.where(moving > 0, (allowed - rest) / moving, (allowed + rest) / -moving)
-        return motion.slower(float(1 / np.sqrt(min(1.0, float(np.where(moving == 0, np.inf, room).min())))))
+        speed = float(np.sqrt(min(1.0, float(np.where(moving == 0, np.inf, room).min()))))
+        holding, driving = rest * rates[:, self.limited], moving * rates[:, self.limited]  # the power at a speed s is
+        too_fast, power = speed, SETTINGS.torque_share * self.power  # s holding + s^3 driving
+        if (speed * holding + speed**3 * driving > power).any():
+            speed = 0.0
+            while too_fast - speed > ROUNDING_SHARE * too_fast:
+                middle = (speed + too_fast) / 2
+                if (middle * holding + middle**3 * driving > power).any():
+                    too_fast = middle
+                else:
+                    speed = middle
+        return motion.slower(1 / speed)
 
 
 def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> ConstantJerkMotion:

@@ -29,8 +29,8 @@ from ocp.motion.builders.torques import (
     Motors,
     checked_motors,
     joint_torques,
+    limit_power,
     limit_torques,
-    positive_power,
     running_cost,
 )
 from ocp.motion.tasks.checks import (
@@ -97,8 +97,8 @@ def dynamics_problem(
     """Declare the optimal control problem of a motion within actuator limits that minimises effort, energy or time.
 
     The states are "joints", "velocities", "accelerations" if the jerk is the control, and "base" of a floating machine.
-    The controls are "accelerations" or "jerks", and "power" (W, the positive actuator power) if energy is weighted or
-    power is limited. The path constraints are "torques", "power", and with tasks "tip": the time derivative of the
+    The controls are "accelerations" or "jerks", and "power" (W, the positive actuator power) if energy is weighted.
+    The path constraints are "torques", "power", and with tasks "tip": the time derivative of the
     task velocities, with pose errors fed back. A start with free velocity must satisfy the task velocities.
 
     Args:
@@ -271,7 +271,7 @@ def _declare_actuators(
     limit_torques(problem, machine.robot, torques, bounds.torque)
     running = running_cost(machine, cost, motion[:4], jerks=motion.jerks, torques=torques)
     if cost.energy or np.isfinite(bounds.power).any():
-        running += cost.energy * positive_power(problem, torques * motion.rates, bounds)
+        running += limit_power(problem, torques * motion.rates, bounds, cost)
     return running
 
 

@@ -27,8 +27,8 @@ from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
 
 __all__ = [
-    "Actuation", "JointFriction", "Motors", "checked_motors", "declare_actuators", "joint_torques", "limit_torques",
-    "positive_power", "running_cost", "weights_torques",
+    "Actuation", "JointFriction", "Motors", "checked_motors", "declare_actuators", "joint_torques", "limit_power",
+    "limit_torques", "running_cost", "weights_torques",
 ]  # fmt: skip
 
 LENGTH_RATE = 1e-2
@@ -181,11 +181,9 @@ def declare_actuators(
     if np.isfinite([bounds.torque, bounds.power]).any() or weights_torques(cost):
         torques = joint_torques(checked_motors("limits", machine), (base, joints, rates, second))
         limit_torques(problem, robot, torques, bounds.torque, suffix=suffix)
-        if (rows := np.flatnonzero(np.isfinite(bounds.power)).tolist()) and not cost.energy:
-            problem.path(f"power{suffix}", (torques * rates)[rows], upper=bounds.power[rows], unit="W")
     running = running_cost(machine, cost, (base, joints, rates, second), jerks=jerks, torques=torques)
-    if cost.energy:
-        running += cost.energy * positive_power(problem, torques * rates, bounds, suffix)
+    if torques is not None:
+        running += limit_power(problem, torques * rates, bounds, cost, suffix)
     return rates, second, running + smoothing**2 / 2 * smooth
 
 
@@ -223,11 +221,19 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
     return running
 
 
-def positive_power(problem: Problem, powers: Any, bounds: JointBounds, suffix: str = "") -> Any:
-    """Declare the positive power of each actuator as a limited control, W; return the sum over the actuators."""
+def limit_power(problem: Problem, powers: Any, bounds: JointBounds, cost: Cost, suffix: str = "") -> Any:
+    """Declare the limits of the actuators' powers, W, and return the cost of the positive power per second.
+
+    The path constraint "power" limits them. If the cost weights energy, the positive power of each joint is a limited
+    control of this name, because the cost needs it.
+    """
+    if not cost.energy:
+        if rows := np.flatnonzero(np.isfinite(bounds.power)).tolist():
+            problem.path(f"power{suffix}", powers[rows], upper=bounds.power[rows], unit="W")
+        return 0.0
     power = problem.control(f"power{suffix}", powers.numel(), lower=0.0, upper=bounds.power, unit="W")
     problem.path(f"power{suffix}", power - powers, lower=0.0, unit="W")
-    return ca.sum1(power)
+    return cost.energy * ca.sum1(power)
 
 
 def limit_torques(problem: Problem, robot: Robot, torques: Any, largest: Array, *, suffix: str = "") -> None:

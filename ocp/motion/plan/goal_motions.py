@@ -160,16 +160,13 @@ class GoalTask:
 
     @property
     def spline_cost(self) -> SplineCost | None:
-        """Cost of splines; None if the cost has other terms, or power is limited."""
-        if np.isfinite(self.bounds.power).any():
-            return None
+        """Cost of splines; None if the cost has other terms."""
         return SplineCost.of(self.request.cost, len(self.start))
 
     @property
     def is_fastest(self) -> bool:
-        """Whether the motion is time-optimal: the cost is a free time alone, and no power is limited."""
-        is_free = self.request.horizon is None and self.request.cost.terms == ("time",)
-        return is_free and not np.isfinite(self.bounds.power).any()
+        """Whether the motion is time-optimal: the cost is a free time alone."""
+        return self.request.horizon is None and self.request.cost.terms == ("time",)
 
     @property
     def length(self) -> bool:
@@ -334,8 +331,8 @@ class _PathProblem:
     def stopping_motion(self) -> Candidate:
         """Return the audited motion that stops at the path's corners, slowed down to the horizon if that is fixed."""
         task, factor = self.task, self.horizon_guess / self.motion.duration
-        if task.request.cost.energy or np.isfinite(task.bounds.power).any() or task.moves:
-            words = "motions with stops are not offered where power counts, or the machine moves at an end"
+        if task.request.cost.energy or task.moves:
+            words = "motions with stops are not offered where energy is weighted, or the machine moves at an end"
             reason = Reason(Rejection.NOT_TRIED, words)
             return Candidate(self.path.joints[0], reason=reason)
         if factor < 1 - ROUNDING_SHARE:

@@ -396,7 +396,7 @@ class _Search:
         return matrix, np.zeros(len(at)), 2 - distance / margin, 0.5
 
     def _torque_rows(self, points: Array, duration: float) -> Iterator[_Rows]:
-        """Yield the linearised limits of the torques at the knots, in both directions."""
+        """Yield the linearised limits of torques, in both directions, and of powers, at the knots."""
         torques, share = self.limits.torques, self.settings.torque_share
         first, second = self.at_torques[1] @ points / duration, self.at_torques[2] @ points / duration**2
         values, slopes = torques.linearise(self.at_torques[0] @ points, first, second)
@@ -407,8 +407,9 @@ class _Search:
             by_joint = slope * scale[:, None] / duration**order
             matrix = matrix + self._row_matrix(basis[at], by_joint.reshape(len(at), self.size))
         by_duration = -(slopes[1] @ first[:, :, None] + 2 * slopes[2] @ second[:, :, None])[:, :, 0] * scale
-        for sign in (1.0, -1.0):
-            yield sign * matrix, sign * by_duration.ravel(), sign * (values * scale).ravel(), (1 - share) / 2
+        for sign, rows in ((1.0, slice(None)), (-1.0, np.flatnonzero(np.tile(torques.two_sided, len(values))))):
+            usages = (values * scale).ravel()[rows]
+            yield sign * matrix[rows], sign * by_duration.ravel()[rows], sign * usages, (1 - share) / 2
 
     def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
         """Return the Jacobian of constraints with respect to control points from that with respect to joints (R, n).

@@ -190,3 +190,38 @@ def test_the_least_squared_velocity_is_that_of_a_quadratic_program_from_above() 
     too_far = least_squared_velocities(np.array([1.0, 1.001]), 2.0, np.ones(2))
     np.testing.assert_allclose(too_far, [2 / 3, np.inf])
     assert least_squared_velocities(np.zeros(1), 0.0, np.ones(1))[0] == 0
+
+
+@pytest.mark.parametrize("power", [5.0, 40.0])
+def test_a_motion_within_power_limits_uses_them_and_braking_is_free(power: float) -> None:
+    machine, start = arm(), np.array([0.0, -0.6, 1.2, 0.0, 0.9, 0.0])
+    bounds = Limits(acceleration=10.0, jerk=400.0, torque=INF, power=power).bounds(machine)
+    limits = TorqueLimits(machine, bounds)
+    largest, braking = [], []
+    for end in ([0.9, -0.4, 1.0, 0.3, 0.8, 0.5], [-0.5, 0.2, 0.4, 0.0, 0.2, 0.1], [0.0, -1.2, 1.5, 0.0, 0.9, 0.0]):
+        motion = limits.slow_down(synchronised_motion(start, np.array(end), bounds))
+        joints, rates, accelerations = (each.reshape(-1, 6) for each in motion.sampled(np.linspace(0.0, 1.0, 41)))
+        powers = limits.torques(joints, rates, accelerations) * rates
+        largest.append(powers.max())
+        braking.append(powers.min())
+    assert max(largest) == pytest.approx(power, rel=0.01)
+    assert max(largest) <= power
+    assert min(braking) < -power
+
+
+def test_limited_torques_and_powers_are_linearised_in_their_order() -> None:
+    machine, rng = arm(), np.random.default_rng(0)
+    torque, power = [100.0, INF, 80.0, INF, 10.0, INF], [INF, INF, 50.0, 40.0, INF, INF]
+    limits = TorqueLimits(machine, Limits(torque=torque, power=power).bounds(machine))
+    assert limits.largest.tolist() == [100.0, 80.0, 10.0, 50.0, 40.0]
+    assert limits.two_sided.tolist() == [True, True, True, False, False]
+    state = rng.normal(size=(3, 1, 6))
+    values, slopes = limits.linearise(*state)
+    everything = TorqueLimits(machine, Limits(torque=1.0).bounds(machine)).torques(*state)[0]
+    np.testing.assert_allclose(values[0], [*everything[[0, 2, 4]], *(everything * state[1, 0])[[2, 3]]])
+    for order in range(3):
+        for joint in range(6):
+            step = np.zeros((3, 1, 6))
+            step[order, 0, joint] = 1e-6
+            difference = (limits.linearise(*(state + step))[0] - limits.linearise(*(state - step))[0]) / 2e-6
+            np.testing.assert_allclose(slopes[order][0, :, joint], difference[0], rtol=1e-5, atol=1e-6)

@@ -155,7 +155,7 @@ def test_power_is_limited_and_braking_is_free() -> None:
     assert least < plan.horizon < 1.01 * least
     options = MASS * plan["accelerations"] * plan["velocities"]
     assert options.max() <= power * (1 + 1e-6)
-    assert plan["power"].max() == pytest.approx(power, rel=1e-6)
+    assert options.max() == pytest.approx(power, rel=1e-4)
 
 
 def test_jerks_that_are_limited_make_a_mass_start_softly() -> None:

@@ -222,3 +222,15 @@ def test_contradictory_goals_are_refused_at_construction(fields: dict[str, Any],
     with pytest.raises(ProblemError) as caught:
         Goal(**fields)
     assert caught.value.name == name
+
+
+def test_power_limits_slow_the_fastest_motion_down_and_are_kept() -> None:
+    """Large powers make no difference; the smaller they are, the longer the motion lasts."""
+    goal, times = Goal(joints=END), list[float]()
+    for power in (2.0, 4.0, 1e6, np.inf):
+        limits = Limits(acceleration=10.0, jerk=200.0, power=power)
+        motion = plan(arm(), goal, start=START, cost=Cost(velocity=0.0, time=1.0), limits=limits, scene=False)
+        assert motion.audit().feasible
+        times.append(motion.horizon)
+    assert times[2] == pytest.approx(times[3], rel=1e-6)
+    assert times[0] > times[1] > times[2]

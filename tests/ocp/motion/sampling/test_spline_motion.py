@@ -212,3 +212,16 @@ def test_other_terms_have_no_spline_cost() -> None:
     assert cost is not None
     assert cost.time == 3.0
     np.testing.assert_allclose(cost.squares, [[1.0, 0.5], [1.0, 4.0], [5.0, 5.0]])
+
+
+def test_powers_of_an_arm_are_at_their_limits_and_not_beyond() -> None:
+    machine, power = FixedBase(example_robot("six_axis")), 20.0
+    path = np.array([[0.0, -0.6, 1.2, 0.0, 0.9, 0.0], [0.9, -0.4, 1.0, 0.3, 0.8, 0.5]])
+    bounds = Limits(acceleration=30.0, jerk=1000.0, power=power).bounds(machine)
+    torques, rest = TorqueLimits(machine, bounds), np.zeros(6)
+    motion = optimal_motion_near(MotionLimits(StraightMotions(None), bounds, torques, rest, rest), path, TIME)
+    straight = torques.slow_down(stopping_motion(path, bounds, torques))
+    assert motion.duration < 0.97 * straight.duration
+    joints, rates, accelerations = (each.reshape(-1, 6) for each in motion.sampled(np.linspace(0.0, 1.0, 33)))
+    powers = torques.torques(joints, rates, accelerations) * rates
+    assert 0.97 * power < powers.max() <= power
