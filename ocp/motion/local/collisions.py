@@ -107,12 +107,14 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
     return sorted(collisions, key=lambda collision: collision.distance)
 
 
-def worst_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision | None]:
+def worst_collisions(
+    scene: CollisionScene, base: Array, joints: Array, times: Array, pairs: Sequence[int] | None = None
+) -> list[Collision | None]:
     """Return for each sample the closest pair of bodies if it violates the clearance, else None.
 
     The arguments are those of `distances_along`.
     """
-    distances = distances_along(scene, base, joints, times, cutoff=scene.clearance)
+    distances = distances_along(scene, base, joints, times, cutoff=scene.clearance, pairs=pairs)
     worst = list[Collision | None]([None] * len(joints))
     for sample in np.flatnonzero(distances.min(axis=1, initial=np.inf) < scene.clearance).tolist():
         place = sample, int(distances[sample].argmin())

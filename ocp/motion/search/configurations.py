@@ -16,7 +16,7 @@ from models.machines.machine import hold_joints
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import Stretch, stretches_of
-from ocp.motion.local.collisions import Collision, distances_along
+from ocp.motion.local.collisions import Collision, worst_collisions
 from ocp.motion.local.inverse_kinematics import (
     IkOptions,
     Unreachable,
@@ -219,10 +219,7 @@ def start_collisions(
     if request.clearance_constraints is None or pairs == []:
         return [None] * len(configurations)
     scene, times = request.clearance_constraints.scene, np.zeros(len(configurations))
-    distances = distances_along(scene, request.base, configurations, times, cutoff=scene.clearance, pairs=pairs)
-    closest = zip(distances, distances.argmin(axis=1).tolist(), strict=True)
-    collisions = [Collision(pair, scene.labels[pair], float(row[pair]), 0.0) for row, pair in closest]
-    return [collision if collision.distance < scene.clearance else None for collision in collisions]
+    return worst_collisions(scene, request.base, configurations, times, pairs)
 
 
 def check_clear_start(request: PlanRequest, configurations: Array) -> None:
