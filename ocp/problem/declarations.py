@@ -215,7 +215,7 @@ class Declarations:
                 raise ProblemError(f"{kind} {name!r}: a {pool[:-1]} of this name exists already")
 
     def check_new_constraint(self, kind: str, name: Any) -> None:
-        """Raise ProblemError if the name of a new constraint is invalid or already used; messages contain ``kind``."""
+        """Raise ProblemError if the name of a new constraint is invalid or used; error messages begin with ``kind``."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
         if any(name in pool for pool in (self.path, self.start, self.end, self.watch, self.apart)):
@@ -405,7 +405,7 @@ class ExpressionReader:
         unit: str,
         tolerance: Value,
     ) -> Constraint:
-        """Return a constraint on an expression that contains only the ``known`` symbols; messages contain ``kind``."""
+        """Return a constraint on an expression that contains only ``known`` symbols; errors name its ``kind``."""
         what = f"{kind} constraint {name!r}"
         require.text(f"{what}: unit", unit)
         vector = self.expression(what, expression, known)

@@ -98,7 +98,7 @@ class Frames(NamedTuple):
 
 
 class HullPairs:
-    """Pairs of bodies that are evaluated together because their hulls have the same two kinds; see `Hull.kind`.
+    """Pairs of bodies that are evaluated together because the kinds (see `Hull.kind`) of their hulls are the same.
 
     Attributes:
         has: Whether a pair is in this group. row: Its index in the group. Shape (n,) each.
@@ -197,7 +197,7 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return two arrays for the rows of given pairs: the position in `pair` of each row's pair, and row indices.
+        """Return the pairs of shapes to evaluate for given pairs of bodies: indices in `pair`, and indices in `rows`.
 
         The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow. Shape (R,) each.
         """
@@ -208,7 +208,7 @@ class CoveredPairs:
 
     @staticmethod
     def decisive(place: np.ndarray, gap: np.ndarray, count: int) -> np.ndarray:
-        """Return for each pair the row (hulls or covering shapes) that determines the distance, by index. Shape (K,).
+        """Return, for each pair of bodies, the index of the pair of shapes that determines its distance. Shape (K,).
 
         Args:
             place: As of `of`. gap: Distance of each row. Shape (R,), m. count: K.
@@ -263,7 +263,7 @@ class BodyPairs:
         return self._ball_distance(second - first, pair)
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return the distances of all pairs at all samples; values above `near` may be lower bounds. Shape (M, n), m.
+        """Return the distances of all pairs at all samples, or lower bounds of distances above `near`. Shape (M, n), m.
 
         With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
@@ -288,7 +288,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return distances of given pairs at given samples; values above `near` may be lower bounds. Shape (K,), m."""
+        """Return distances of given pairs at given samples, or lower bounds of those above `near`. Shape (K,), m."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -316,7 +316,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return for each pair the smaller gap along a direction at the two ends of a time interval. Shape (K,), m.
+        """Return the smaller of each pair's gaps along a direction at start and end of an interval. Shape (K,), m.
 
         The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
         """
@@ -337,7 +337,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Split `rows` by hull kind: yield each group, the positions of its rows in `rows`, and their group indices."""
+        """Yield the groups of equal hull kinds that `rows` refer to, with positions in `rows` and in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -451,7 +451,7 @@ class Separation:
         return f"{self.name}: {len(self)} pairs of {len(self.hulls)} bodies, at least {least} apart"
 
     def __len__(self) -> int:
-        """Return the number of pairs."""
+        """Return the number of pairs of bodies."""
         return len(self.pairs)
 
     @property
@@ -495,7 +495,7 @@ def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.nda
 
 
 def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
-    """Convert values to an array with rows of ``count`` indices; raise ProblemError if that is impossible."""
+    """Convert values to an integer array of shape (n, count); raise ProblemError if that is impossible."""
     array = table(f"{what}: {label}", values)
     shaped = array.size % count == 0 and (array.ndim != 2 or not array.size or array.shape[1] == count)
     if not shaped or not np.isfinite(array).all() or (array % 1 != 0).any():
@@ -505,7 +505,7 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
 
 
 def stack_motion_bounds(what: str, bounds: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
-    """Stack motion bounds, given by state name, as columns in the order of ``movers``; missing bounds are zero.
+    """Stack bounds on how strongly each state moves the bodies of pairs, in the order of ``movers``; 0 where missing.
 
     Args:
         movers: Size of each state that moves a body. count: Number of pairs.

@@ -61,7 +61,7 @@ def checked_problem(problem: Any) -> Problem:
 
 
 def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]], Callable[Arguments, Declared]]:
-    """Return a decorator that stores the name and arguments of a builder in the problem that the builder returns.
+    """Return a decorator that stores a function's name and arguments in the problem that the function returns.
 
     From them the problem can be built again.
     """
@@ -466,7 +466,7 @@ class Problem:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
 
     def _inner(self) -> list[Any]:
-        """Return the symbols allowed inside the horizon: states, controls, parameters, signals, time and horizon."""
+        """Return the symbols allowed in path constraints: states, controls, parameters, signals, time and horizon."""
         d = self.declared
         pools = (d.states, d.controls, d.parameters, d.signals)
         return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]
@@ -499,7 +499,7 @@ class Problem:
         tolerance: Value = None,
         known: Sequence[Any] = (),
     ) -> Constraint:
-        """Return a new constraint on an expression of the symbols inside the horizon and of the ``known`` symbols."""
+        """Return a new constraint on an expression of the symbols of path constraints and of the ``known`` symbols."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
         return self._reader.constraint(
             kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from models.checks import NOT_NUMBERS, Array
+from models.checks import NOT_NUMBERS, Array, short_repr
 from ocp.app.files.mcap import read_joint_messages
 from ocp.app.files.safe_files import FileName, children_of, is_number, line_error, read_lines, read_tree, split_cells
 from ocp.errors import ProblemError, require
@@ -71,6 +71,8 @@ class RawTrajectory:
     names_are_joints: bool
     notes: tuple[str, ...]
     file: str
+
+    __repr__ = short_repr
 
 
 def read_trajectory(

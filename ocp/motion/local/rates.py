@@ -470,9 +470,9 @@ def track_tasks(
 
 
 def _cone_function(equations: TaskEquations) -> Any:
-    """Return the CasADi function that computes the cosines of tool-axis tilts, which cone tasks limit, and gradients.
+    """Return the CasADi function that computes the cosines of tool-axis tilt angles, and gradients of these cosines.
 
-    A cone task keeps a tool axis within a cone. The inputs are base, joints and targets.
+    A cone task limits the tilt of a tool axis. The inputs are base, joints and targets.
     """
     machine = equations.machine
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
