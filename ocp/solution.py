@@ -407,7 +407,7 @@ class Solution:
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> Solution:
-        """Build a solution from the arrays of a file, and remove its arrays from ``arrays``; raise errors as `load` does."""
+        """Build a solution from the arrays of a file, which are removed from ``arrays``; raise the errors of `load`."""
         try:
             head = read_head(path, arrays.pop("head"))
             version = head.pop("version")

@@ -202,10 +202,7 @@ class Declarations:
     terminal: Any = None
 
     def check_new_variable(self, kind: str, name: Any) -> None:
-        """Raise ProblemError if the name of a new variable is invalid, reserved or already used.
-
-        ``kind`` appears in the message.
-        """
+        """Raise ProblemError about a variable of this kind if its name is invalid, reserved or already used."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
         if name in RESERVED:
@@ -343,10 +340,7 @@ class ExpressionReader:
     parameters: tuple[Any, ...]
 
     def expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
-        """Return a user value as a column of expressions that contain only the ``known`` symbols.
-
-        With ``finite``, constant entries of an expression must be finite.
-        """
+        """Return a value as a column of expressions of ``known`` symbols; with ``finite``, constants must be finite."""
         if value is None or isinstance(value, str):
             raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
         if is_symbolic(value):

@@ -3,7 +3,6 @@
 A body is the convex hull of points, its core, inflated by a radius. It moves with a frame whose pose is an expression
 of states and time. For any direction that the search of nearest points returns (:mod:`models.shapes.hull`), the gap
 along it is a lower bound of the distance, so a proof does not depend on the search.
-
 A :class:`Separation` declares minimum distances, which the audit proves at all times and no method enforces. A proof
 between two times needs bounds on the relative motion. Let x be the states that move the two bodies, observed from a
 given frame. A state of rate x_k' moves no point of them by more than lever_k |x_k'| and rotates none by more than
@@ -12,9 +11,8 @@ turn_k |x_k'|. For a point carried by a chain of axes,
     |p'| <= sum lever_k |x_k'|,
     |p''| <= sum lever_k |x_k''| + 2 (sum turn_k |x_k'|) (sum lever_k |x_k'|),
 
-where p is a point of one body relative to a point of the other. (The factor 2 is that of the Coriolis acceleration: a
-later axis moves points by at most its lever, and is rotated by all axes before it.) Frames that depend on time alone
-need no such bounds: those follow from their expressions (:mod:`ocp.problem.enclosures`).
+where p is a point of one body relative to the other; the factor 2 is that of the Coriolis acceleration. Bounds for
+frames that depend on time alone follow from their expressions (:mod:`ocp.problem.enclosures`).
 """
 
 from __future__ import annotations
@@ -41,8 +39,7 @@ class Hull:
         frame: Index of the frame with which it moves; -1: the world.
         core: Points in that frame. Shape (m, 3), m.
         radius: Radius by which the hull is inflated, m.
-        normal: Outward unit normal of a half-space, in that frame; its core is one point of its plane. Shape (3,), or
-            (0,) for a hull.
+        normal: Outward unit normal of a half-space, whose core is one point of its plane; shape (0,) for a hull.
 
     Raises:
         ProblemError: Wrong shapes, a value that is not finite, a negative radius, a normal that is not a unit vector.
@@ -222,9 +219,7 @@ class CoveredPairs:
 
 
 class SeparatingDirections(NamedTuple):
-    """Directions of shortest distance between two bodies or between shapes that cover the bodies.
-
-    Each direction belongs to a row of `CoveredPairs`.
+    """Directions of shortest distance between two bodies or the shapes that cover them, for rows of `CoveredPairs`.
 
     Attributes:
         place, row: As of `CoveredPairs.of`. Shape (R,). along: Unit vectors from the first body to the second, in the
@@ -304,10 +299,7 @@ class BodyPairs:
     def nearest(
         self, frames: Frames, at: np.ndarray, pair: np.ndarray
     ) -> tuple[SeparatingDirections, np.ndarray, np.ndarray]:
-        """Return separating directions, distances and nearest points of given pairs of bodies at given samples.
-
-        The points are those of the hulls before inflation. Distances have the shape (K,), m, points (K, 2, 3), m.
-        """
+        """Return directions, distances (K,), m, and nearest points before inflation (K, 2, 3), m, of pairs."""
         place, rows = self._covered.of(pair)
         along, gap, points = np.empty((len(rows), 3)), np.empty(len(rows)), np.empty((len(rows), 2, 3))
         for kind, chosen, row in self._by_kind(rows):
@@ -345,10 +337,7 @@ class BodyPairs:
 
 
 def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
-    """Return pairs of bodies in groups with equal hull kinds.
-
-    A row of ``pairs`` (n, 3) contains the indices of two bodies and of their reference frame, -1 for the world.
-    """
+    """Group pairs (n, 3), given by the indices of two bodies and of a frame (-1: the world), by kinds of hulls."""
     kinds: dict[tuple[int, int], list[int]] = {}
     for i, (first, second, _) in enumerate(pairs):
         kinds.setdefault((hulls[first].kind, hulls[second].kind), []).append(i)
@@ -361,10 +350,7 @@ def _pad_points(core: np.ndarray, count: int) -> np.ndarray:
 
 
 def frames_of(placements: np.ndarray) -> Frames:
-    """Return the poses of frames from samples of their entries, with the world as an additional last frame.
-
-    In ``placements`` (M, 12 F), each frame is its rotation matrix column by column, then its position.
-    """
+    """Return poses from samples of rotation matrices, by columns, and positions (M, 12 F); the world is added last."""
     count = len(placements)
     world = np.broadcast_to(np.vstack([np.eye(3), np.zeros(3)]), (count, 1, 4, 3))
     values = np.concatenate([placements.reshape(count, placements.shape[1] // 12, 4, 3), world], axis=1)

@@ -61,10 +61,7 @@ def checked_problem(problem: Any) -> Problem:
 
 
 def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]], Callable[Arguments, Declared]]:
-    """Return a decorator that stores a function's name and arguments in the problem that the function returns.
-
-    From them the problem can be built again.
-    """
+    """Decorate a problem builder: its problems store its name and arguments, so that they can be built again."""
 
     def decorate(declare: Callable[Arguments, Declared]) -> Callable[Arguments, Declared]:
         parameters = signature(declare)
@@ -112,10 +109,7 @@ class Problem:
         return to_record(self.name, self.symbols, self.time, self.declared)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the problem, with new symbols, from the data of :meth:`__getstate__`.
-
-        Raise ProblemError if the data are damaged.
-        """
+        """Restore the problem, with new symbols, from data of :meth:`__getstate__`; raise ProblemError if damaged."""
         kinds = (Variable, Signal, Constraint, Horizon, PhaseTimes, Declarations, Separation, Hull)
         self.name, self.symbols, self.time, self.declared = from_record(state, kinds)
         self.declared.check(self.symbols)
@@ -288,10 +282,7 @@ class Problem:
     # ---- equations -------------------------------------------------------------------------------------------
 
     def dynamics(self, state: Any, derivative: Value) -> None:
-        """Declare ``d state / dt = derivative``, an expression of states, controls, parameters, time and horizon.
-
-        Shape (n, 1).
-        """
+        """Declare ``d state / dt = derivative``, shape (n, 1), in states, controls, parameters, time and horizon."""
         variable = self._find(self.declared.states, state, "dynamics")
         if variable.name in self.declared.dynamics:
             raise ProblemError(f"state {variable.name!r}: dynamics declared twice", name=variable.name)

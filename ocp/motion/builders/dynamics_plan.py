@@ -439,10 +439,7 @@ def _first_within_limits(
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Yield the results of one or two solves on a mesh: a label, and a plan within its limits or the error.
-
-    The second attempt has nodes at the switches of the first. The caller stops at the first plan that it accepts.
-    """
+    """Yield a label and a plan, or the error, of a solve on a mesh, and of one with nodes at the plan's switches."""
     warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)

@@ -49,8 +49,7 @@ class FeedbackSettings:
     """Settings of the feedback of pose errors, and of relaxed tasks, from which a motion may deviate at a cost.
 
     Attributes:
-        decay: Largest decay of a pose error over an interval of the mesh, as a power of e. Faster feedback would need a
-            finer mesh, for errors that are zero if the tasks begin at their poses.
+        decay: Largest decay of a pose error over a mesh interval, as a power of e; faster decay needs a finer mesh.
         intervals: Least number of intervals of the mesh in a stretch.
         closed_gap: Pose error at the beginning of a task below which there is no gap to close, m and rad.
         relaxation: Velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s.
@@ -99,8 +98,7 @@ class ToolMotion:
     """Optimal control problem of a tool motion, and the time intervals (stretches) in which its tasks are active.
 
     Attributes:
-        problem: Problem with the states "joints" and, on a floating base, "base", and the control "rates", with the
-            suffix of each stretch.
+        problem: Problem with states "joints" and, on a floating base, "base", and controls "rates", with suffixes.
         stretches: Consecutive stretches.
         horizon: Horizon of the motion and of the problem, s.
         breaks: Fractions 0..1 of the horizon at which a mesh should have nodes. Shape (k,).
@@ -112,10 +110,7 @@ class ToolMotion:
     breaks: Array
 
     def guess(self, motions: Sequence[LocalMotion], number: int) -> dict[str, Any]:
-        """Return initial guesses of states and controls, by name, from resolved-rate motions in all time intervals.
-
-        `number` is the index of the resolved-rate motion that is used.
-        """
+        """Return initial guesses of states and controls, by name, from the resolved-rate motion of this number."""
         guess: dict[str, Any] = {}
         for stretch, part in zip(self.stretches, motions, strict=True):
             t = (part.t - stretch.begin) * (self.horizon / stretch.duration)
@@ -313,9 +308,8 @@ class _Motion:
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
     """Declare states, controls and constraints in one time interval of fixed duration with the same active tasks.
 
-    `known` is the Jacobian of the task coordinates that the stretch before fixes at its end, see `_slopes`, or None.
     Return the states that continue in the next stretch, the running cost, and the Jacobian of the coordinates that
-    this stretch fixes.
+    this stretch fixes at its end (see `_slopes`); `known` is that of the stretch before, or None.
     """
     problem, machine, bounds, pace = motion.problem, motion.machine, motion.setup.bounds, motion.pace(stretch)
     begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]
@@ -358,8 +352,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
     The independent variable is the tasks' own time s, and the time t is a state. With q' = dq/ds, z = dt/ds, rates
     u = q'/z and weights W the cost is the integral of (time_cost + u W u/2) dt = (time_cost z + q' W q'/(2 z)) ds,
-    which is convex in q' and z. Tasks, J q' = v(s), and rate limits V, |q'| <= V z, are linear. With accelerations as
-    controls, z is a state.
+    which is convex in q' and z; tasks and rate limits are linear. With accelerations as controls, z is a state.
     """
     machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.setup.bounds
     if len(stretches) > 1 or stretches[0].equations is None:
@@ -405,8 +398,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 def _closure(motion: _Motion) -> Any:
     """Declare and return a constant velocity error of a task whose path is closed, so that the joints return exactly.
 
-    If the joints return, a closed task returns by itself. Both conditions would contradict each other by the error of
-    the discretisation; so the task may deviate by a velocity of that size.
+    If the joints return, the task returns as well. Both conditions differ by the error of the discretisation alone.
     """
     problem, stretches = motion.problem, motion.stretches
     equations = stretches[-1].equations

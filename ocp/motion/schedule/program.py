@@ -156,10 +156,7 @@ class Program(NamedTuple):
     fixed: NDArray[np.intp]
 
     def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
-        """Return the problem reduced to given intervals, and the indices of the coefficients in this problem.
-
-        The motion is fixed in all other intervals.
-        """
+        """Return the problem in which only given intervals are free, and the indices of its coefficients."""
         count = len(self.spline.h)  # stretches are concatenated, with two intervals without rows between them
         cuts = np.flatnonzero(np.diff(free) > 1)
         first, last = free[np.append(0, cuts + 1)], free[np.append(cuts, len(free) - 1)] + 1
@@ -322,10 +319,7 @@ class _Constraints:
         return out
 
     def squares(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return the main and two upper diagonals of the weighted sum of outer products of constraint gradients.
-
-        Shapes (N + 2,), (N + 1,) and (N,).
-        """
+        """Return three diagonals (N + 2,), (N + 1,), (N,) of the weighted sum of outer products of gradients."""
         g = self.gradients
         pulled = g * values[self.alone :]
         main = self._spread(g * pulled)
