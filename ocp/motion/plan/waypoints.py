@@ -386,7 +386,7 @@ class _WaypointPlanner:
         for segment in chain:
             rows = slice(int(chosen[segment.first]), int(chosen[segment.last]) + 1)
             samples = [TimeSample(self.manifolds, k) for k in range(len(self.positions))[rows]]
-            limits, bounds = np.repeat(self.step[None], len(samples) - 1, axis=0), (self.lower, self.upper)
+            limits, bounds = np.full_like(joints[rows][1:], self.step), (self.lower, self.upper)
             times = np.arange(len(self.positions), dtype=float)[rows]
             options: dict[str, Any] = {"bounds": bounds, "scene": self.scene, "widths": self.settings.widths}
             paths.append(shorten_path(joints[rows], samples, Steps(times, self.cost, limits), **options))
