@@ -42,7 +42,7 @@ from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import AuditError, Collocation, Plan, Problem, ProblemError, Scene, Solution, SolveError, TipTask, plan, solve
 from ocp.app.files import read_gcode, read_trajectory, read_waypoints
-from ocp.app.files.mcap import DEFINITIONS, STATE
+from ocp.app.files.exchange import DEFINITIONS, STATE
 from ocp.app.files.task_file import read_obstacles, read_task
 from ocp.motion.schedule import JointTrajectory
 from tests.ocp.app.motions import NAMES, URDF, smooth
