@@ -74,7 +74,7 @@ def motions(draw: st.DrawFn) -> tuple[str, list[str], list[str], Any, Any]:
     return kind, draw(unique), kinds, np.cumsum([0, *steps]) / 1e9, np.array(positions)
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(motions())
 def test_times_and_joints_are_read_back_to_the_digits_written(
     tmp_path_factory: pytest.TempPathFactory, drawn: tuple[str, list[str], list[str], Any, Any]
@@ -215,7 +215,7 @@ def test_other_contents_are_refused_by_their_line(kind: str, tmp_path: Path) -> 
             read_trajectory(file, period=0.02)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.sampled_from(sorted(ROBOT_LANGUAGES)), st.data())
 def test_changed_programs_are_refused_or_are_trajectories(
     tmp_path_factory: pytest.TempPathFactory, kind: str, data: st.DataObject
@@ -239,7 +239,7 @@ def test_long_runs_of_signs_end_in_time(tmp_path: Path) -> None:
     for kind in ROBOT_LANGUAGES:
         head = written(tmp_path, kind).read_text().splitlines()[:12]
         for sign in (" ", "[", "1,", "A1 1.0,", "- ", "="):
-            for begin in ("", "servoj([", "PTP {E6AXIS:", "MoveAbsJ [["):
+            for begin in ("", "servoj([", "PTP {E6AXIS:"):
                 file = tmp_path / f"long{SUFFIX[kind]}"
                 file.write_text("\n".join([*head, (begin + sign * 10_000)[:10_000], "x"]))
                 with pytest.raises(ProblemError, match=r"line 1[34]"):
