@@ -33,7 +33,7 @@ import numpy as np
 import scipy
 
 from models.checks import Array
-from ocp.console import TimeLimitReached, check_time
+from ocp.console import TimeLimitReached, casadi_silenced, check_time
 from ocp.errors import SolveError
 from ocp.motion.builders.constant_jerk import ConstantJerkMotion, TorqueLimits
 from ocp.motion.sampling.joint_paths import StraightMotions, points_along
@@ -440,7 +440,8 @@ class _Search:
         shape = {"h": curvature.sparsity(), "a": matrix.sparsity()}
         solver = ca.conic("step", *(("ipqp", shape, QUADRATIC) if self.residuals else ("highs", shape, LINEAR)))
         sides = {"lba": -np.inf, "uba": 1 - state.usages[kept], "lbx": np.minimum(lower, 0.0), "ubx": upper}
-        solution = solver(h=curvature, g=slope, a=matrix, **sides)["x"]
+        with casadi_silenced():  # it warns of a degenerate program, which ends without success
+            solution = solver(h=curvature, g=slope, a=matrix, **sides)["x"]
         if not solver.stats()["success"]:
             return None
         change = solution.full().ravel()
