@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -81,8 +82,8 @@ class Audit:
             (M,).
         states, controls: Values of the re-integrated plan by name. Shape (M, n) each.
         clearances: Proven clearance of each separation by name.
-        optimality: Costates, multipliers, curvature, and the cost that the plan loses; None for a plan that solves no
-            optimal control problem. The fields from `constraints` on are then empty.
+        optimality: Costates, multipliers, curvature, and the cost that the plan loses; None if only the feasibility was
+            checked, or for a plan that solves no optimal control problem, whose fields from `constraints` on are empty.
     """
 
     name: str
@@ -184,6 +185,7 @@ def audit(
     lost: float = LIMIT_SHARE,
     costates: float | None = None,
     tolerances: Mapping[str, float] | None = None,
+    only_feasible: bool = False,
 ) -> Audit:
     """Check a plan independently of the solver that made it.
 
@@ -211,6 +213,7 @@ def audit(
         costates: Largest error of the costate equation over the whole plan, and of the conditions at the ends, as a
             share of the cost. None: 1e-2, or the root of the share that the plan loses if that is larger.
         tolerances: Largest violation by name of a state, control, constraint or separation, in its own unit.
+        only_feasible: Whether the optimality is not checked, which may take most of the time.
 
     Raises:
         ProblemError: The plan does not belong to the problem, a limit is not a number, or a name in ``tolerances`` is
@@ -264,13 +267,16 @@ def audit(
     )
     findings.append(_jump("control jump, relative", solution.control_interpolant, solution.horizon, size.control, None))
     is_sound = all(finding.passed for finding in findings)
-    # an infeasible plan does not need the best multipliers
-    optimum = optimality(form, solution, p, bounds, along=along, allowed=lost if is_sound else np.inf)
-    excess = cost.value if cost.passed and solution.cost > running + final else 0.0
-    findings += optimality_findings(form, optimum, excess, lost, costates=costates)
-    undecided = optimum.curvature.flat
-    if not solution.success:
-        undecided = f"the solver says {solution.message or solution.status}"
+    optimum: Any = None
+    undecided = "the optimality was not checked"
+    if not only_feasible:
+        # an infeasible plan does not need the best multipliers
+        optimum = optimality(form, solution, p, bounds, along=along, allowed=lost if is_sound else np.inf)
+        excess = cost.value if cost.passed and solution.cost > running + final else 0.0
+        findings += optimality_findings(form, optimum, excess, lost, costates=costates)
+        undecided = optimum.curvature.flat
+        if not solution.success:
+            undecided = f"the solver says {solution.message or solution.status}"
     return Audit(
         form.name,
         tuple(findings),

@@ -380,7 +380,7 @@ def _audit_candidate(task: GoalTask, solution: Solution, path: JointPath) -> Can
     candidate = Candidate(path.joints[0], solution.cost, None, Stage.FINE, solution)
     task.report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
     try:
-        audit = solution.audit()
+        audit = solution.audit(only_feasible=True)
     except TimeLimitReached:
         return candidate.with_rejection(Reason(Rejection.NOT_TRIED, "the time limit passed in its audit", "time_limit"))
     if audit.feasible:

@@ -86,6 +86,16 @@ def test_good_plans_pass(method: str) -> None:
 
 
 @every_method
+def test_the_feasibility_alone_has_the_findings_of_the_whole_audit(method: str) -> None:
+    for solution in (plan(method), TAMPERED["states shifted"][0](plan(method))):
+        whole, part = solution.audit(), solution.audit(only_feasible=True)
+        assert part.findings == tuple(f for f in whole.findings if f.verdict == "feasible")
+        assert part.feasible is whole.feasible
+        assert (part.optimal, part.passed, part.lost.size) == (None, False, 0)
+        assert "optimal: not decided" in str(part)
+
+
+@every_method
 def test_the_reported_loss_is_the_excess_over_the_optimum(method: str) -> None:
     best = solve(van_der_pol(), Collocation(60, 5, "legendre")).cost
     solution = plan(method)
