@@ -1,9 +1,9 @@
-"""Read and write files: tool paths from waypoints and G-code, joint trajectories, and plans as MCAP and Rerun logs."""
+"""Read and write files: tool paths from waypoints and G-code, joint trajectories and limits, logs in MCAP and Rerun."""
 
 from ocp.app.files.gcode import read_gcode
 from ocp.app.files.mcap import log_rerun, write_mcap
 from ocp.app.files.program import Cut, Note, Pause, Program, ProgramMotion, Rapid, Section, TimedProgram
-from ocp.app.files.trajectory import RawTrajectory, read_trajectory
+from ocp.app.files.trajectory import RawTrajectory, read_joint_limits, read_trajectory
 from ocp.app.files.waypoints import Waypoints, read_waypoints
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "Waypoints",
     "log_rerun",
     "read_gcode",
+    "read_joint_limits",
     "read_trajectory",
     "read_waypoints",
     "write_mcap",
