@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
-from models import ModelError, Robot
+from models import ModelError, Robot, named_states
 from tests.bad_values import (
     CHOICE,
     FLAG,
+    INSTANCE,
     MAPPING,
     NAN,
     UNKNOWN,
@@ -63,6 +64,12 @@ OPTIONS = Case(
         "inertia": CHOICE,
     },
 )
+STATES = Case(
+    "named_states",
+    named_states,
+    {"srdf": "<robot/>", "robot": Robot.from_urdf(URDF)},
+    {"srdf": {name: bad for name, bad in SOURCE.items() if name != "no link"}, "robot": INSTANCE},
+)
 TEXTS = {
     "two limits": (LIMIT, LIMIT * 2),
     "two origins": (ORIGIN, ORIGIN * 2),
@@ -107,12 +114,12 @@ TEXTS = {
 }
 
 
-@pytest.mark.parametrize("case", good_calls([OPTIONS]))
+@pytest.mark.parametrize("case", good_calls([OPTIONS, STATES]))
 def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 
-@pytest.mark.parametrize(("case", "argument"), panel([OPTIONS]))
+@pytest.mark.parametrize(("case", "argument"), panel([OPTIONS, STATES]))
 def test_bad_options_are_refused_by_name(case: Case, argument: str) -> None:
     assert_refused(case, argument)
 
