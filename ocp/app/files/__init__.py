@@ -1,9 +1,10 @@
-"""Read and write files: tool paths from waypoints and G-code, joint trajectories and limits, logs in MCAP and Rerun."""
+"""Read and write files: tool paths from waypoints and G-code, joint trajectories, and plans as MCAP and Rerun logs."""
 
 from ocp.app.files.gcode import read_gcode
 from ocp.app.files.mcap import log_rerun, write_mcap
 from ocp.app.files.program import Cut, Note, Pause, Program, ProgramMotion, Rapid, Section, TimedProgram
-from ocp.app.files.trajectory import RawTrajectory, read_joint_limits, read_trajectory
+from ocp.app.files.settings import read_joint_limits
+from ocp.app.files.trajectory import RawTrajectory, read_trajectory
 from ocp.app.files.waypoints import Waypoints, read_waypoints
 
 __all__ = [
