@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from math import inf, isinf, isnan
 from numbers import Real
@@ -257,7 +257,7 @@ class Checks:
         sign: Sign = "any",
         unit: str = "",
     ) -> Array:
-        """Return an array with one number for each item; a single given number holds for all items. Shape (count,).
+        """Return an array with one number for each item; a single given number applies to all items. Shape (count,).
 
         Args:
             items: Plural noun for messages.
@@ -359,3 +359,35 @@ def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tupl
             name = argument_of(label) if name is None else name
             warn(ModelWarning(f"{label} {value:g} {words}", name=name, value=value, limit=low), stacklevel=2)
             return
+
+
+def short_repr(instance: Any) -> str:
+    """Return a dataclass or named tuple as text that gives long values by their sizes and omits default values."""
+    if isinstance(instance, tuple):
+        shown = dict.fromkeys(instance._fields)  # type: ignore[attr-defined]
+    else:
+        shown = {each.name: each.default for each in fields(instance) if each.repr}
+    parts = []
+    for name, default in shown.items():
+        value = getattr(instance, name)
+        is_default = value is default or (isinstance(value, str | int | float) and value == default)
+        if value is not None and not is_default:
+            parts.append(f"{name}={_short(value)}")
+    return f"{type(instance).__name__}({', '.join(parts)})"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        if value.size > SHORT_ARRAY:
+            return f"<array of shape {value.shape}>"
+        return " ".join(np.array2string(value, separator=", ", threshold=SHORT_ARRAY).split())
+    text = " ".join(repr(value).split())
+    if len(text) <= SHORT_TEXT:
+        return text
+    if isinstance(value, list | tuple | dict):
+        return f"<{type(value).__name__} of {len(value)}>"
+    return f"<{getattr(value, '__name__', type(value).__name__)}>"
+
+
+SHORT_ARRAY, SHORT_TEXT = 16, 60
+"""Number of entries of an array, and of characters of another value, up to which `short_repr` shows them."""

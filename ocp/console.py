@@ -186,7 +186,7 @@ def check_time() -> None:
 
 
 class _FilteredStream(io.TextIOBase):
-    """Replacement for ``sys.stderr`` that discards what the threads in ``silent`` write."""
+    """Replacement for ``sys.stderr`` that discards the output of the threads listed in ``silent``."""
 
     def __init__(self, real: Any) -> None:
         self.real = real
@@ -368,7 +368,7 @@ class _Monitor(ca.Callback):  # type: ignore[misc]
         self.construct(name, {})
 
     def open(self, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Prepare the monitor for a solve whose constraint rows have the given bounds."""
+        """Prepare the monitor for a solve; the arguments are the bounds of the constraints of the program."""
         self.lower, self.upper = lower, upper
         self.stopped, self.iterations = None, 0
 
@@ -424,7 +424,7 @@ class IterationMonitor(_Monitor):
 
 
 class FatropMonitor(_Monitor):
-    """Function that serves as callback of fatrop: evaluated at each iterate, it is 1 to continue and 0 to stop."""
+    """Function that serves as callback of fatrop: called at each iterate, it returns 1 to continue or 0 to stop."""
 
     def __init__(self, n: int, title: str) -> None:
         self.size = n

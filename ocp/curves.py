@@ -44,7 +44,7 @@ class PiecewisePolynomial:
         return f"<PiecewisePolynomial of {intervals} intervals of {nodes} nodes, {columns} columns>"
 
     def __call__(self, at: np.ndarray) -> np.ndarray:
-        """Return the values at M positions; they are right-continuous, and constant beyond the ends. Shape (M, n)."""
+        """Return the values at M positions: right limits at breaks, and constants beyond the ends. Shape (M, n)."""
         interval = np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, len(self.breaks) - 2)
         start, end = self.breaks[interval], self.breaks[interval + 1]
         return self.within(interval, np.clip((at - start) / (end - start), 0.0, 1.0))
@@ -72,7 +72,7 @@ def barycentric_weights(nodes: np.ndarray) -> np.ndarray:
 
 
 def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Evaluate the d Lagrange basis polynomials of ``nodes`` at M positions in barycentric form. Shape (M, d)."""
+    """Return the Lagrange basis polynomials of d ``nodes`` at M positions, by the barycentric formula. Shape (M, d)."""
     at = np.asarray(at, dtype=float)
     if len(nodes) == 1:
         return np.ones((len(at), 1))
@@ -115,7 +115,7 @@ def newton_coefficients(nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def rk4_step(slope: Callable[[float, Any], Any], x: Any, h: Any) -> Any:
-    """Return the state after one step of width ``h`` of the classical Runge-Kutta method from the state ``x``.
+    """Return the state that the classical Runge-Kutta method reaches from the state ``x`` in one step of width ``h``.
 
     ``slope(place, x)`` is dx/dt at the position 0, 1/2 or 1 of the step. States are arrays or expressions.
     """

@@ -32,7 +32,7 @@ __all__ = ["Certificate", "Comparison", "Method", "PreparedProblem", "certificat
 
 @dataclass(frozen=True)
 class DescentSettings:
-    """Settings of the descent from a stationary plan that is not a minimum to a better plan.
+    """Settings of the descent from a stationary plan that is not a minimum of the cost to a plan of lower cost.
 
     Attributes:
         descents: Maximum number of consecutive descents.
@@ -200,7 +200,7 @@ def descend(prepared: PreparedProblem, solution: Solution) -> Solution:
 def _displaced_guess(
     form: Formulation, solution: Solution, curvature: Curvature, bounds: Bounds, sign: float
 ) -> dict[str, Any]:
-    """Return an initial guess: the plan displaced, to the side ``sign``, along a variation that lowers the cost.
+    """Return an initial guess: the plan plus or minus (``sign``) a variation of the plan that lowers the cost.
 
     If the variation is unknown, all controls are displaced by seeded random amounts.
     """

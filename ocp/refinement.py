@@ -244,7 +244,7 @@ def _next(
 
 
 class _Row(NamedTuple):
-    """An error that the audit reports: its value and the contributions of mesh intervals, relative to its limit.
+    """An error that the audit reports: its value and each interval's contribution, relative to the error's limit.
 
     ``errors`` (N,) are the contributions, None if it cannot be attributed to intervals; ``order`` is the power of the
     interval width with which it falls.
@@ -269,7 +269,7 @@ class _Parts(NamedTuple):
     summed: bool = False
 
     def shares(self, total: float) -> np.ndarray:
-        """Return the contributions, scaled so that their maximum or, for a sum, their mean is ``total``. Shape (N,)."""
+        """Return the contributions scaled to the maximum (or, if summed, to the mean) ``total``. Shape (N,)."""
         values = self.values if np.isfinite(self.values).all() else np.where(np.isfinite(self.values), 0.0, 1.0)
         reference = values.mean() if self.summed else values.max()
         result = np.zeros(len(values))

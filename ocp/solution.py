@@ -214,7 +214,7 @@ class Solution:
         return entry_named("parameter", name, self.cost_gradients)
 
     def at(self, time: Any) -> Sample:
-        """Return the interpolated states and controls at one time or at several, s. Shape (n,) or (M, n) each.
+        """Return the interpolated states and controls at one or several times (s). Shape (n,) or (M, n) each.
 
         Raises:
             ProblemError: A time outside 0 to the horizon, or not finite.
@@ -249,7 +249,7 @@ class Solution:
 
     @property
     def phases(self) -> dict[str, tuple[float, float]]:
-        """Start and end times of the phases, s, by name; empty if there are none (:mod:`ocp.problem.phases`)."""
+        """Start and end times (s) of all phases, by name; empty without phases (:mod:`ocp.problem.phases`)."""
         declared = {} if self.problem is None else self.problem.declared.phases
         if not declared:
             return {}
@@ -330,7 +330,7 @@ class Solution:
         return replace(self, problem=problem, problem_lost="")
 
     def tied_to(self, problem: Problem) -> Solution:
-        """Return the plan with a problem from a file; raise ProblemError if the problem is damaged or does not fit."""
+        """Return the plan linked to its problem from a file; raise ProblemError if the problem does not match it."""
         try:
             check_variables_match(Formulation.of(problem), self)
         except ProblemError:
@@ -407,7 +407,7 @@ class Solution:
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> Solution:
-        """Return the solution from the arrays of its file, which are removed from ``arrays``; errors as of `load`."""
+        """Build a solution from the arrays of a file, which are removed from ``arrays``; raise the errors of `load`."""
         try:
             head = read_head(path, arrays.pop("head"))
             version = head.pop("version")

@@ -52,7 +52,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any], synced: bool = True) -> None:
-    """Write a file atomically; with ``synced``, return only after it is on the disk.
+    """Write a file atomically; if ``synced`` is true, return only after the file is on the disk.
 
     Without ``synced`` the file appears some ms earlier, and may be empty after a loss of power; use it for files whose
     readers detect incompleteness.

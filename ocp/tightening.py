@@ -155,7 +155,7 @@ def largest_excess(problem: Problem, solution: Solution) -> float:
 
 
 def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[str, dict[str, Any]]:
-    """Return a text about the largest excess over a bound (see :func:`_excess`), and the fields for an error."""
+    """Return a text about the largest excess over a bound (see :func:`_excess`), and the fields of its error."""
     labels = [*form.state_labels, *form.control_labels, *form.path.labels]
     either = beyond.max(axis=0)
     k, i = np.unravel_index(int(np.argmax(either)), either.shape)
@@ -167,7 +167,7 @@ def _worst(form: Formulation, beyond: np.ndarray, times: np.ndarray) -> tuple[st
 def _places(
     form: Formulation, transcription: Transcription, shared: bool
 ) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return which bounded quantity each variable ("x") and row ("g") of a program is, and in which mesh intervals.
+    """Return the bounded quantity that each variable ("x") and constraint ("g") represents, and its mesh intervals.
 
     The quantity is an index among the stacked states, controls and path constraints, or -1. The indices of two
     intervals, left and right, differ at a node between intervals.
@@ -205,7 +205,7 @@ def _slack(
     high: np.ndarray,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Return the smallest distance of grid values from their lower and upper bounds in each interval. Shape (2, N, m).
+    """Return the smallest distance of values from their lower and upper bounds in each mesh interval. Shape (2, N, m).
 
     It is infinite for a bound without grid values in the interval.
     """
@@ -222,7 +222,7 @@ def _slack(
 def _excess(
     form: Formulation, solution: Solution, p: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest excess of each quantity over its lower and upper bound in each interval, and interval ends, s.
+    """Return the largest violation of the lower and upper bounds in each mesh interval, and the interval ends, s.
 
     Shapes (2, N, m) and (N + 1,).
     """

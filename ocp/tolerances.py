@@ -59,7 +59,7 @@ STANDSTILL = 1e-12
 
 
 def path_tolerance(positions: np.ndarray) -> float:
-    """Return the position tolerance of a path, m: 0.1 mm, or a thousandth of the path's extent if that is smaller.
+    """Return the position tolerance of a path, m: 0.1 mm or a thousandth of the path's extent, whichever is smaller.
 
     Args:
         positions: Points of the path, m. Shape (M, 3). For a single point the tolerance is 0.1 mm.

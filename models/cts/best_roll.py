@@ -89,14 +89,14 @@ class RoughRoll(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Cost and cos q2 at a roll angle; the cost is inf if joints 4 to 6 or the pitch link's reach exclude the angle."""
+    """Cost at a roll angle (inf if joints 4 to 6 or the reach of the pitch link exclude the angle), and cos q2."""
 
     cost: Expression
     cos2: Expression
 
 
 class LevelBound(NamedTuple):
-    """A value of cos q2 at which a constraint becomes active, with a lower bound of the cost index near it.
+    """A value of cos q2 at which a constraint becomes active, and a lower bound of the cost index near this value.
 
     `side` is as in RoughRoll.
     """
@@ -188,7 +188,7 @@ def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits
 
 @dataclass(frozen=True)
 class Search:
-    """Search for the best roll angle, whose steps are casadi Functions that the methods return.
+    """Search for the best roll angle; its methods return the casadi Functions that perform the steps of the search.
 
     The argument `best` of these Functions is an Incumbent, `evaluations` columns of Evaluation, `rough` columns of
     RoughRoll. Their result `answer` is a RigSolution.
@@ -269,7 +269,7 @@ class Search:
     # ---- candidates ------------------------------------------------------------------------------------------
 
     def _cheap_ends(self) -> Any:
-        """Return the Function that compares the incumbent with the interval ends that can be computed in closed form.
+        """Return the Function that compares the incumbent with the ends of roll intervals that have a closed form.
 
         (target, previous, best) -> (best, evaluations).
         """
@@ -299,7 +299,7 @@ class Search:
         return ca.Function("rough_stationary", [x], [answer])
 
     def _yaw_level_ends(self, chart: Any, count: int) -> Any:
-        """Return the Function that searches the ends of feasible roll intervals that the yaw joints 2 and 3 cause.
+        """Return the Function that searches the ends of feasible roll intervals that are due to yaw joints 2 and 3.
 
         (target, previous, evaluations, best) -> best. A level, the value of cos q2 at such an end, is searched if an
         evaluated roll better than the incumbent is on its infeasible side. All levels are searched if one violates a
@@ -363,7 +363,7 @@ class Search:
         return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
-        """Return bounds of the changes of sin q4 and cos q2 when the roll angle changes by ROOTS.root_tolerance."""
+        """Return upper bounds of the changes of sin q4 and cos q2 when the roll changes by ROOTS.root_tolerance."""
         rig = self.rig
         sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4
@@ -453,7 +453,7 @@ class Search:
     # ---- answers ---------------------------------------------------------------------------------------------
 
     def _finish(self) -> Any:
-        """Return the Function of (target, previous, best) that computes the joint positions at the incumbent's roll."""
+        """Return the Function of target, previous roll and incumbent that computes joint positions at the incumbent."""
         target, previous = _inputs(ca.SX)
         best = ca.SX.sym("best", INCUMBENT_SIZE)
         answer = self._solution(target, previous, _record(Incumbent, best), 0)

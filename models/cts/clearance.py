@@ -341,7 +341,7 @@ def collision_free_inverse(
 
 
 def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the Function that selects the lowest local minima of the merit on a grid of rolls.
+    """Return inputs and outputs of the Function that selects the lowest local minima of merit values on a roll grid.
 
     (merits) -> columns (angle, merit, step), one for each minimum.
     """
@@ -362,7 +362,7 @@ def _grid_minima(samples: int) -> tuple[list[Any], list[Any]]:
 
 
 def _least_value(count: int) -> tuple[list[Any], list[Any]]:
-    """Return inputs and outputs of the Function that selects from a row of roll angles the one of least value.
+    """Return inputs and outputs of the Function that selects, of several roll angles, the angle of least cost.
 
     (angles, values) -> (best angle, least value, whether it is the first).
     """

@@ -67,7 +67,7 @@ COSINE_SLACK = 1e-7
 
 
 class Candidate(NamedTuple):
-    """A candidate for the best roll angle: cosine, sine, and the index in ACTIVE of the active constraint."""
+    """A roll angle that may be optimal, given by cosine and sine, and the index in ACTIVE of the active constraint."""
 
     c: Expression
     s: Expression
@@ -214,7 +214,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
     s_yaw, c_yaw = ca.sin(target[3]), ca.cos(target[3])
 
     def add(sine: Expression, cosine: Expression, code: int, above: bool, within: Expression) -> None:
-        """Append a value of cos q2 to `levels`, marked as relevant only if joint 3 is then within its limits."""
+        """Append a value of cos q2 to `levels`, marked as an interval end only if joint 3 is then within its limits."""
         if code // 2 != limit_code(3, False) // 2 and rig.limited(3):
             cosine_3, sine_3 = _difference(s_yaw, -c_yaw, sine, cosine)
             within = ca.logic_and(within, _within(rig, 3, sine_3, cosine_3))
@@ -281,7 +281,7 @@ def inside_limit(rig: Rig, joint: int, upper: bool) -> float:
 
 
 def _within(rig: Rig, joint: int, sine: Expression, cosine: Expression, slack: float = COSINE_SLACK) -> Expression:
-    """Return whether an angle, given by sine and cosine, is within a joint's limits up to `slack` of the cosine."""
+    """Return whether an angle, given by sine and cosine, is within a joint's limits; `slack` is a cosine tolerance."""
     if not rig.limited(joint):
         return 1
     middle, half = rig.middle_and_half(joint)
@@ -297,7 +297,7 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return a casadi Function that evaluates cos q2, q1 and cos q4 at a roll angle, and slopes for Newton's method.
+    """Return a casadi Function that evaluates cos q2, q1 and cos q4 at a roll angle, and derivatives of the first two.
 
     (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4); a slope is a derivative with
     respect to the roll. Other functions take the Function as their argument `chart`.
@@ -327,7 +327,7 @@ def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expressi
 
 
 def chart_residual(chart: Any, target: Expression, output: int, value: Expression) -> Slope:
-    """Return a function of the roll angle: cos q2 or q1 minus a given value. `polish` finds the root of the function.
+    """Return the function of the roll angle whose root `polish` finds: the difference of cos q2 or q1 and a value.
 
     `output` is 0 for cos q2 and 2 for q1. The function takes cosine and sine of the roll and also returns the
     derivative.
@@ -391,7 +391,7 @@ def slide_points(rig: Rig, upper: bool) -> Any:
 
 
 def checked_gain(rate_weight: float) -> float:
-    """Return the factor of the squared change of roll in the cost index I2, which is the rate weight over a full turn.
+    """Return the factor of the squared change of roll in the cost index I2: the rate weight divided by 2 pi.
 
     The factor is w4 / (2 pi), equation (37) of the paper.
 
@@ -419,7 +419,7 @@ def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]
 
 
 def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
-    """Return a casadi Function of target and previous roll that computes five rolls, including all minima of I2.
+    """Return a casadi Function from target and previous roll to five roll angles, among them all minima of I2.
 
     I2 = I1 + gain (roll - previous)^2. Output shape (5, 1), rad. If I2 is convex there is one minimum. Otherwise the
     window of rolls is split where I1'' = -2 gain, and each convex interval has its own minimum.
@@ -458,7 +458,7 @@ def minimize_convex(
 
 
 def _inflections(f: Harmonics, gain: float, start: Expression, end: Expression) -> list[Expression]:
-    """Return the roll angles from `start` to `end` at which I2 changes between convex and concave: I1'' = -2 gain."""
+    """Return the roll angles from `start` to `end` at which cost index I2 has an inflection, where I1'' = -2 gain."""
     bend = f.derivative().derivative()
     points = roots(bend._replace(a0=2 * gain))
     return [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in points]

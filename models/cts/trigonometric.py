@@ -348,7 +348,7 @@ def series_roots(degree: int) -> Any:
 
 
 def _steps(step: Any, count: int) -> Any:
-    """Return the Function that performs `count` steps of the simultaneous iteration on all roots of `series_roots`.
+    """Return the Function that performs `count` iterations of the method by which `series_roots` finds all roots.
 
     (roots, coefficients) -> (roots, excess of the last step over the tolerance).
     """

@@ -33,7 +33,7 @@ MIN_SOFTNESS_M = 1e-6
 
 
 class Levers(NamedTuple):
-    """Upper bounds on the relative velocities of the bodies of n pairs, per unit rate of each base and joint
+    """Upper bounds on the relative velocity of the two bodies of each of n pairs, per unit rate of each base and joint
     coordinate.
 
     A coordinate with rate r moves no point faster than its lever times |r|, and rotates the body no faster than its
@@ -98,6 +98,10 @@ class CollisionScene:
     _parts: RigidParts = field(init=False, repr=False)
     _carriers: tuple[str, ...] = field(init=False, repr=False)
 
+    def __repr__(self) -> str:
+        kinds = f"{len(self.bodies)} bodies, {len(self.obstacles)} obstacles"
+        return f"<CollisionScene of {self.machine!r}: {kinds}, {len(self.pairs)} pairs, clearance {self.clearance:g} m>"
+
     def __post_init__(self) -> None:
         single = isinstance(self.obstacles, (*KINDS, MovingObstacle))
         obstacles = _checked_list((self.obstacles,) if single else self.obstacles, "obstacles")
@@ -134,7 +138,7 @@ class CollisionScene:
         self._place(own, checked, with_obstacles)
 
     def with_locked(self, machine: Machine) -> CollisionScene:
-        """Return the scene with some joints locked, without pairs that can no longer move relative to each other.
+        """Return the scene with some joints locked, without the pairs of bodies that then cannot move relatively.
 
         A scene of its own would take links as adjacent that only the locked joints connect.
         """
@@ -221,7 +225,7 @@ class CollisionScene:
         return tuple((self.bodies[i].name, self.bodies[j].name) for i, j, _ in self.pairs)
 
     def pair_names(self, pair: int) -> tuple[str, str]:
-        """Return the two names of a pair as the field `ignored` states them: two links, or a link and an obstacle."""
+        """Return the names of two bodies as the field `ignored` states them: two links, or a link and an obstacle."""
         bodies = [self.bodies[body] for body in self.pairs[pair, :2]]
         own = range(len(self._carriers))
         first, second = (self._carriers[body.frame] if body.frame in own else body.name for body in bodies)
@@ -234,7 +238,7 @@ class CollisionScene:
 
     @property
     def assumed(self) -> dict[str, str]:
-        """Pairs of links, named "A and B", that are excluded without a proof, with the reason for each."""
+        """Pairs of links, named "A and B", unchecked because they seem to collide always; the reason for each pair."""
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value

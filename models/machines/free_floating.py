@@ -255,7 +255,7 @@ class FreeFloating:
 
     @on_scalars
     def jacobians(self, base: Expression, q: Expression) -> tuple[Expression, Expression]:
-        """Return the Jacobians of the tip for the base twist and for the joint rates, taken as independent.
+        """Return the tip's Jacobians with respect to base twist and joint rates, which are regarded as independent.
 
         The tip's twist is F1 base_twist + F2 joint_rates, equation (25) of the paper.
 

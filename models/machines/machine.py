@@ -16,7 +16,7 @@ from typing import Any, Protocol, cast
 import casadi as ca
 import numpy as np
 
-from models.checks import ROUNDING, Array, ArrayInput, require
+from models.checks import ROUNDING, Array, ArrayInput, require, short_repr
 from models.errors import ModelError
 from models.robot.kinematics import (
     TWIST_SIZE,
@@ -103,6 +103,8 @@ class FixedBase:
     robot: Robot
     translation: ArrayInput = (0.0, 0.0, 0.0)
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         require_joints(self.robot)
@@ -267,7 +269,7 @@ def with_wheels(
 
 
 def find_wheels(robot: Robot) -> dict[str, float]:
-    """Find the joints whose angle has no effect, such as reaction wheels; return rotor inertias (kg m^2) by joint.
+    """Return the rotor inertias (kg m^2), by joint, of reaction wheels: joints whose angle has no effect on dynamics.
 
     Such a joint is unbounded and moves a single body, symmetric about the joint axis with its centre of mass on it,
     that carries neither the tip nor a collision shape.

@@ -100,7 +100,7 @@ class Scara:
         return Robot(links, tuple(joints))
 
     def forward(self, joints: Expression) -> Frame:
-        """Return the frame of the tool in the world for joint positions, CasADi or numbers, of shape (4,)."""
+        """Return the frame of the tool in the world for joint positions, shape (4,), as CasADi matrix or numbers."""
         q = checked_vector("joints", joints, 4, f"one entry for each of {list(self.names)}")
         bend = q[0] + q[1]
         x = self.upper_arm * ca.cos(q[0]) + self.forearm * ca.cos(bend)
@@ -139,7 +139,7 @@ class Scara:
         return q
 
     def whole_turn(self, joint: int, least: float, most: float) -> float | None:
-        """Return the multiple of 2 pi that shifts a range of joint positions into the joint's limits, or None.
+        """Return the multiple of 2 pi that shifts a range of positions into the joint's limits; None if there is none.
 
         The tolerance is 1e-9. The result is always 0 for the quill, which is prismatic.
 

@@ -317,7 +317,7 @@ class Stance(FixedBase):
         return rows[self._edges(name, margin)]
 
     def _edges(self, name: str, margin: float) -> list[int]:
-        """Return the indices of the sole's edges for which motion can change the distance of the center of pressure."""
+        """Return the indices of the sole's edges whose distance from the center of pressure depends on the motion."""
         sole = self.feet[name].sole
         assert sole is not None
         distances = self._sampled_pressures[name] @ sole.normals.T - (sole.normals * sole.vertices).sum(axis=1)

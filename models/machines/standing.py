@@ -196,7 +196,7 @@ class Standing(FixedBase):
         x, y = ca.vertsplit(point)
 
         def moments(velocity: Expression, acceleration: Expression) -> Expression:
-            """Return the ground reaction's moments about `point`, (11), (12) of Yoo et al. 2004. Shape (2, 1)."""
+            """Return moments of the ground reaction about `point`, eqs. (11), (12) of Yoo et al. 2004. Shape (2, 1)."""
             reaction = self.ground_reaction(q, velocity, acceleration) - external
             return ca.vertcat(-reaction[1] - x * reaction[5], reaction[0] - y * reaction[5])
 

@@ -75,7 +75,7 @@ The distance at u = 1/2 is |1 - c shape| cos(angle/2) times the remaining distan
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
-    """Return the checked shape factors of blends; a single given factor holds for all vertices. Shape (count,).
+    """Return the checked shape factors of blends; a single given factor applies to all vertices. Shape (count,).
 
     Raises:
         ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
@@ -153,7 +153,7 @@ def _falling_factorials(order: int) -> list[float]:
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
-    """Return the distance of the vertex from a blend between two lines over its distance from the ends of the blend.
+    """Return the ratio of two distances at a corner between lines: from vertex to blend, and from vertex to blend ends.
 
     |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic, eq. (8): the distance at u
     = 1/2, which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).

@@ -134,7 +134,7 @@ def _horner(columns: Any, u: Any) -> Any:
 
 
 def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
-    """Return the table of `path_function`: distances at which the parts of the path start, and a data column for each.
+    """Return the table of `path_function`: distances at which parts of the path start, and a data column for each part.
 
     The length of the path follows the distances. A part is what remains of a segment, or a cell of a blend. For a
     segment: its start point, the axial, tangential and inward vectors of its screw, and its rotation rate. For a blend:

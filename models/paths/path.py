@@ -7,6 +7,7 @@ in the opposite direction, without a corner. It extends beyond the vertex by 1.3
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -60,6 +61,11 @@ class Path:
     torsion: Array = field(init=False, repr=False)
     orientation: Array = field(init=False, repr=False)
     turn: Array = field(init=False, repr=False)
+
+    def __repr__(self) -> str:
+        counts = Counter(type(segment).__name__ for segment in self.segments)
+        kinds = ", ".join(f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in sorted(counts.items()))
+        return f"<Path of {self.length:.6g} m: {kinds.lower()}>"
 
     def __post_init__(self) -> None:
         segments = checked_segments(self.segments)

@@ -293,7 +293,7 @@ def screw(
 def screw_axes(
     tangent: Array, normal: Array, curvature: float | Array, torsion: float | Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return vectors and rotation rate of the screw motion whose path is a line, arc or helix.
+    """Return the direction vectors and the rotation rate of the screw motion along a line, arc or helix.
 
     The axial and tangential components of the tangent and the vector towards the screw axis, shape (..., 3) each; the
     rotation rate, shape (...), rad/m. Arguments as for `screw`.

@@ -114,6 +114,10 @@ class SmoothPath:
     piece_blend: NDArray[np.intp]
     cells: Cells
 
+    def __repr__(self) -> str:
+        counts = f"{len(self.path.segments)} segments and {int((self.piece_blend >= 0).sum())} {self.kind} blends"
+        return f"<SmoothPath of {self.length:.6g} m: {counts}>"
+
     @property
     def length(self) -> float:
         """Length of the path, m."""
@@ -370,7 +374,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    """Return a power series that occurs in derivatives of orientations, and its first two derivatives.
+    """Return the value and first two derivatives of a power series that occurs in derivatives of orientations.
 
     The sum of (-x)^k / (2 k + start)! over k at x = `square`; derivatives are with respect to x.
     """

@@ -173,7 +173,7 @@ def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Ex
 
 
 def _twist_and_rate(base_motion: tuple[Expression, Expression] | None) -> tuple[Expression | None, Expression | None]:
-    """Return the twist of the base and its time derivative; raise ModelError unless `base_motion` is a pair of both."""
+    """Return the twist of the base and its time derivative; raise ModelError unless `base_motion` is this pair."""
     if base_motion is None:
         return None, None
     if not isinstance(base_motion, tuple | list) or len(base_motion) != 2:
@@ -322,7 +322,7 @@ class MassMoments(NamedTuple):
 
 
 def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the Jacobian of the whole robot's centre of mass, world axes. Shape (3, dof)."""
+    """Return the Jacobian of the whole robot's centre of mass in world axes. Shape (3, dof)."""
     matrix = momentum_matrix(robot, q, world_from_base)
     if robot.total_mass == 0:
         raise massless_error("hence no centre of mass")
@@ -378,7 +378,7 @@ def momentum(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return the robot's momentum: (angular about a point of the world, linear). Shape (6, 1), N m s and N s."""
+    """Return the robot's angular momentum about a fixed point, and its linear momentum. Shape (6, 1), N m s and N s."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
     motions = propagate_motions(robot, frames, axes, qd=qd, qdd=ca.DM(robot.dof, 1))
     place = checked_vector("about", about, 3, "a point of the world")
@@ -401,7 +401,7 @@ def momentum_rate(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return the time derivative of :func:`momentum` about a point at rest. Shape (6, 1), N m and N.
+    """Return the time derivative of :func:`momentum` about a fixed point. Shape (6, 1), N m and N.
 
     It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
     """
@@ -419,6 +419,6 @@ def momentum_rate(
 
 
 def inertia_in_world(link: Link, frames: dict[str, Frame]) -> Expression:
-    """Return the rotational inertia of a link about its centre of mass, world axes. Shape (3, 3)."""
+    """Return the rotational inertia of a link about its centre of mass, in world axes. Shape (3, 3)."""
     turn = frames[link.name].rotation
     return ca.mtimes([turn, ca.sparsify(ca.DM(link.inertia)), turn.T])

@@ -153,7 +153,7 @@ class JointCoupling(NamedTuple):
 
 
 def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
-    """Return the coupling of each mimic joint to the independent joint that it finally follows, by joint name.
+    """Return each mimic joint's coupling to the independent joint that it follows, directly or through others, by name.
 
     Raises:
         ModelError: A joint that follows an unknown joint, or itself through others.
@@ -180,7 +180,7 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
 
 
 def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
-    """Lock the joints that have a given position and the joints that mimic these; return all joints.
+    """Lock the joints named in `positions` and the joints that mimic them; return all joints.
 
     Positions are in rad or m, by joint name. Other joints that cannot move are locked too: those that mimic a fixed
     joint (which counts as being at 0), or any joint with multiplier 0. A mimic joint that is locked by its own name is

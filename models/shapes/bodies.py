@@ -251,14 +251,14 @@ class RigidParts:
         return parts
 
     def path(self, first: str, second: str) -> tuple[list[JointStep], list[JointStep]]:
-        """Return the joints on the path between two parts: those up to the part that carries both, then those down."""
+        """Return the joints between two rigid parts: those up to the part that carries both parts, then those down."""
         up, down = self._above(first), self._above(second)
         while up and down and up[-1] is down[-1]:
             up, down = up[:-1], down[:-1]
         return up, down[::-1]
 
     def common_part(self, first: str, second: str) -> str:
-        """Return the rigid part farthest from the root that carries both parts."""
+        """Return the rigid part farthest from the root that carries two given parts."""
         up = self.path(first, second)[0]
         return up[-1].above if up else first
 
@@ -271,7 +271,7 @@ class RigidParts:
         return steps
 
     def adjacent(self, bodied: set[str]) -> set[frozenset[str]]:
-        """Return the pairs of parts with bodies between which there are only joints and parts without bodies."""
+        """Return the pairs of rigid parts with bodies that are connected directly or through parts without bodies."""
         neighbours: dict[str, set[str]] = defaultdict(set)
         for part, step in self.step.items():
             neighbours[part].add(step.above)

@@ -43,7 +43,7 @@ class BoxCore(NamedTuple):
 
 
 def no_stop(value: Expression) -> Expression:
-    """Return the value unchanged: the `StopGradient` that stops no derivative."""
+    """Return the value unchanged; used as `StopGradient` where all derivatives are kept."""
     return value
 
 
@@ -89,7 +89,7 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
 
 
 def _root(square: Expression, excess: float = 0.0) -> Expression:
-    """Return a distance from its square, or a lower bound if the square may be too large by up to `excess` > 0."""
+    """Return a distance from its square, or a lower bound of it if the square is too large by up to `excess` > 0."""
     root = ca.sqrt(square + (excess or KINK**2))
     return (square - excess) * (1 / root) if excess else root - KINK
 
@@ -286,7 +286,7 @@ def _without_derivative(s: Expression) -> Expression:
 
 
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
-    """Return an indicator of the component with the largest |over| / size: 1 for this component, 0 for the others."""
+    """Return 1 for the component of `over` whose magnitude is largest relative to its size, 0 for the others."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])

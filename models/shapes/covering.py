@@ -207,7 +207,7 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
 
 
 def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Array]:
-    """Return approximate capsules around points along k axes: volumes, axis positions and relative excess radii."""
+    """Return approximate capsules around points along k axes: volumes, axis positions, and radii / least radii - 1."""
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
     rows = np.arange(len(bases))

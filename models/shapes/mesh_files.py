@@ -134,7 +134,7 @@ def find_mesh(
 
 
 def _package_folders() -> list[Path]:
-    """Return the folders in which installed ROS and pip packages are searched."""
+    """Return the folders that are searched for installed ROS and pip packages."""
     ros = [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
     ament = [Path(folder, "share") for folder in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if folder]
     pip = [Path(folder, name) for folder in sys.path for name in ("share", "cmeel.prefix/share") if folder]

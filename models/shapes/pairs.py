@@ -46,7 +46,7 @@ MARGIN_M = 1e-6
 
 @dataclass(frozen=True)
 class ProofSettings:
-    """Limits of the effort to prove that a pair need not be checked.
+    """Limits of the computing effort to prove that a pair of bodies need not be checked for collision.
 
     Attributes:
         first_configurations: Random configurations that are tried before a proof.
@@ -309,7 +309,7 @@ class _PairClassifier:
         return self._placed[key]
 
     def _pose(self, part: str) -> Poses:
-        """Return a rigid part's poses relative to the root link in the random configurations tried before a proof."""
+        """Return a rigid part's poses relative to the root link in random configurations of a first collision test."""
         if part not in self._poses:
             q = self.configurations[: SETTINGS.first_configurations]
             step = self.parts.step.get(part)
@@ -339,7 +339,7 @@ class _BodyPair:
     start: Poses = (np.eye(3)[None], np.zeros((1, 3)))
 
     def classify(self, low: Array, high: Array, configurations: Array, margin: float, overhang: float) -> Reason | None:
-        """Return why the bodies need no collision check (ALWAYS, COVERED or NEVER), or None if they need one."""
+        """Return why the bodies need no collision check (they collide always or never), or None if they need one."""
         colliding = self.bounds_at(self.start)[0] <= 0
         if colliding.all():
             largest = float(self.distance_bounds(*self._relative(configurations)).max())
@@ -348,7 +348,7 @@ class _BodyPair:
         return None if colliding.any() or not self._proves_apart(low, high, margin) else NEVER
 
     def check_on_grid(self, low: Array, high: Array) -> Reason | None:
-        """Return NEVER if two hulls are apart at all points of successively refined grids of joint positions.
+        """Return NEVER (no collision) if two hulls are apart at all points of ever finer grids of joint positions.
 
         Returns ALWAYS for hulls that overlap on the whole first grid, else None.
         """
@@ -370,11 +370,11 @@ class _BodyPair:
         return NEVER
 
     def overlap_everywhere(self, configurations: Array) -> Reason | None:
-        """Return ALWAYS if the bodies collide in all given configurations, else None."""
+        """Return ALWAYS (always in collision) if the bodies collide in all given configurations, else None."""
         return None if (self.bounds(configurations)[0] > 0).any() else ALWAYS
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds of the distance at given joint vectors, and where bounding balls did not suffice.
+        """Return lower bounds of the distance at given joint vectors, and whether each needed more than bounding balls.
 
         Joint vectors have shape (k, dof). Bounding balls suffice where they prove a distance greater than `above`, m.
         """
@@ -450,7 +450,7 @@ class _BodyPair:
         return False
 
     def _levers(self, low: Array, high: Array) -> list[_Lever]:
-        """Return the levers of the joints between the bodies, each with the shorter of its arms to the two bodies."""
+        """Return the joints between the bodies as levers, each with the shorter of its arms to the two bodies."""
         chain = [*((step, False) for step in self.up), *((step, True) for step in self.down)]
         reverse = [(step, not down) for step, down in chain[::-1]]
         arms_second, _ = lever_arms(self.robot, chain, self.second.shape, low=low, high=high)

@@ -146,10 +146,10 @@ def _plain(value: Any) -> Any:
 CHECK = """Check a joint trajectory from any source: limits, jumps, units, and clearance proven between the samples.
 
 TRAJECTORY is a CSV with a header (time, and the joints by name; optionally NAME.velocity, NAME.acceleration; a unit
-may follow in brackets: `elbow [deg]`), a JointTrajectory as JSON or YAML, or an MCAP. Between samples the motion is
-interpolated as controllers do: linearly from positions alone, by cubics with velocities, by quintics with
-accelerations. Without --rule, a velocity or acceleration between samples counts only as far as every motion through
-the samples needs it."""
+may follow in brackets: `elbow [deg]`), a JointTrajectory as JSON or YAML, an MCAP, or a robot program as `export`
+writes it. Between samples the motion is interpolated as controllers do: linearly from positions alone, by cubics with
+velocities, by quintics with accelerations. Without --rule, a velocity or acceleration between samples counts only as
+far as every motion through the samples needs it."""
 CHECK_EXAMPLES = """examples:
   selfmotion check panda.urdf motion.csv
   selfmotion check panda.urdf motion.csv --acceleration 15 --jerk 7500 --acceleration panda_joint1=10
@@ -181,10 +181,15 @@ seam.toml:
   csv = "seam.csv"
   report = "seam.html\""""
 EXPORT = """Write a plan in the format of the file's suffix: .csv, .json and .yaml (the fields of a ROS 2
-JointTrajectory), .mcap (joint states and the tip's path, for ROS 2 and Foxglove), .urdf (the robot of the plan)."""
+JointTrajectory), .mcap (joint states and the tip's path, for ROS 2 and Foxglove), .script, .src and .mod (programs in
+URScript of Universal Robots, KRL of KUKA and RAPID of ABB), .urdf (the robot of the plan).
+
+A robot program moves revolute joints as axes of the robot and prismatic joints as external axes. URScript and RAPID
+keep the time of each sample; KRL has no times, only velocities in percent. Try it at low speed first."""
 EXPORT_EXAMPLES = """examples:
   selfmotion export seam.npz seam.csv --period 0.004
-  selfmotion export seam.npz seam.mcap"""
+  selfmotion export seam.npz seam.mcap
+  selfmotion export seam.npz seam.src --joints rail,a1,a2,a3,a4,a5,a6"""
 REPORT = """Write one HTML file about a plan: the verdict in a sentence, pictures, curves with limits, the audit with
 units. The file loads nothing from another host."""
 REPORT_EXAMPLES = """examples:
@@ -219,7 +224,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     check = _command(commands, "check", "check a joint trajectory", CHECK, CHECK_EXAMPLES, run_check)
     _file(check, "robot", "URDF file of the robot")
-    _file(check, "trajectory", "CSV, JointTrajectory as JSON or YAML, or MCAP")
+    _file(check, "trajectory", "CSV, JointTrajectory as JSON or YAML, MCAP, or robot program")
     check.set_defaults(
         called={
             "folders=[FOLDER]": "--folder FOLDER",
@@ -249,6 +254,8 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     _file(exporter, "file", f"file to write: {', '.join(SUFFIXES[kind][0] for kind in EXPORT_KINDS)}")
     _force(exporter)
     exporter.add_argument("--period", type=float, default=0.01, metavar="S", help="sampling period, s (default: 0.01)")
+    exporter.add_argument("--joints", metavar="NAMES", help="joints of a robot program, in the order of its controller")
+    exporter.set_defaults(called={"joints=": "--joints"})
     report = _command(commands, "report", "one HTML file about a plan", REPORT, REPORT_EXAMPLES, run_report)
     _file(report, "plan", "file of a plan (.npz)")
     _file(report, "file", "HTML file to write")
@@ -329,7 +336,7 @@ def check_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand `check`."""
     file = parser.add_argument_group("the file")
     file.add_argument("--columns", metavar="NAMES", help="of a table without a header: time,joint1,...")
-    file.add_argument("--period", type=float, metavar="S", help="sampling period of a table without times, s")
+    file.add_argument("--period", type=float, metavar="S", help="sampling period of a table or KRL without times, s")
     rules = ("linear", "cubic", "quintic")
     file.add_argument("--rule", choices=rules, help="interpolation of the controller (default: by the contents)")
     file.add_argument("--topic", help="topic of an MCAP with several")

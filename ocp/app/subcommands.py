@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from models.spatial import rotation_from_rpy
 from ocp.app.check.data_checks import PLANAR_BASE, clean_trajectory
 from ocp.app.check.joint_limits import limits_by_name
 from ocp.app.check.verdict import CheckTolerances, Interpretation, check_trajectory
-from ocp.app.files import RawTrajectory, read_trajectory, read_waypoints, write_mcap
+from ocp.app.files import RawTrajectory, read_trajectory, read_waypoints, write_mcap, write_robot_program
+from ocp.app.files.exchange import ROBOT_LANGUAGES
 from ocp.app.files.safe_files import MARK, SUFFIXES, checked_output, missing_package
 from ocp.app.files.task_file import Task, read_obstacles, read_task
 from ocp.console import Progress
@@ -122,7 +123,8 @@ def run_plan(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
 def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """Run `selfmotion export`: write a plan in another file format."""
     progress("writing")
-    export_plan(Plan.load(options.plan), options.file, options.period, options.force)
+    joints = None if options.joints is None else [name.strip() for name in options.joints.split(",")]
+    export_plan(Plan.load(options.plan), options.file, options.period, options.force, joints=joints)
     return 0, f"written: {options.file}", {"written": str(options.file)}
 
 
@@ -322,12 +324,14 @@ def _output_lines(files: list[Path]) -> list[str]:
     return [f"written: {file}" for file in files] or [hint]
 
 
-def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> None:
-    """Write a plan to a file in the format that the file's suffix names.
+def export_plan(
+    plan: Plan, file: Path, period: float, force: bool = False, *, joints: Sequence[str] | None = None
+) -> None:
+    """Write a plan to a file in the format that the file's suffix names; `joints` are those of a robot program.
 
     Raises:
-        ProblemError: The suffix is unknown, the period is not positive, or selfmotion did not write an existing file
-            and `force` is False.
+        ProblemError: The suffix is unknown, the period is not positive, selfmotion did not write an existing file and
+            `force` is False, or joints are given for another format.
     """
     kind = next((kind for kind in EXPORT_KINDS if file.suffix.lower() in SUFFIXES[kind]), None)
     if kind is None:
@@ -336,7 +340,13 @@ def export_plan(plan: Plan, file: Path, period: float, force: bool = False) -> N
         raise ProblemError(words, name="file", value=str(file), limit=known)
     path = checked_output(kind, file, force=force)
     check_period(plan, period)
-    WRITERS[kind](plan, path, period, "")
+    if joints is None:
+        WRITERS[kind](plan, path, period, "")
+    elif kind in ROBOT_LANGUAGES:
+        write_robot_program(plan, path, period=period, joints=joints)
+    else:
+        words = f"{file}: joints can be selected only for robot programs; export it without --joints"
+        raise ProblemError(words, name="joints", value=joints, limit=tuple(ROBOT_LANGUAGES))
 
 
 def check_period(plan: Plan, period: float) -> None:
@@ -368,8 +378,9 @@ WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
     "json": lambda plan, file, period, title: write_text(file, json.dumps(plan.to_ros(period)) + "\n"),
     "yaml": lambda plan, file, period, title: _yaml(plan, file, period),
     "mcap": lambda plan, file, period, title: write_mcap(plan, file, period),
+    **dict.fromkeys(ROBOT_LANGUAGES, lambda plan, file, period, title: write_robot_program(plan, file, period=period)),
     "urdf": lambda plan, file, period, title: write_text(file, plan.machine.robot.to_urdf()),
     "report": _report,
 }
 """Functions that write each kind of output; arguments are the plan, the file, the sampling period in s, and a title."""
-EXPORT_KINDS = ("csv", "json", "yaml", "mcap", "urdf")
+EXPORT_KINDS = ("csv", "json", "yaml", "mcap", *ROBOT_LANGUAGES, "urdf")

@@ -61,7 +61,7 @@ class AccessoryProblem:
         self._switches()
 
     def _units(self) -> None:
-        """Choose scales that make the backward sweep over the intervals well conditioned; the scales affect no verdict.
+        """Choose scales that make the backward sweep over the intervals well conditioned; no result depends on them.
 
         Horizon and states are scaled by their sizes; states that hardly move by those of others of the same unit.
         Controls are scaled to equal curvature of the Hamiltonian, however little they move. Controls without curvature
@@ -126,7 +126,7 @@ class AccessoryProblem:
 
     @cached_property
     def residual_slope(self) -> np.ndarray:
-        """Remaining gradient of horizon times Hamiltonian in scaled controls; 0 for linear controls. Shape (M, nu)."""
+        """Residual of dH/du = 0, times horizon, for scaled controls; 0 for linear controls. Shape (M, nu)."""
         along = self.along
         multipliers = self.adjoint.control_multipliers
         gradient = slope(along, self.adjoint.costate) + np.einsum("kmu,km->ku", along.control_limits_u, multipliers)
@@ -249,7 +249,7 @@ def curved_ends(form: Formulation) -> Any:
 
 
 def end_conditions(accessory: AccessoryProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return Hessian and active rows of a plan's end constraints, and then the same of its start constraints.
+    """Return the Hessian and active gradients of a plan's end constraints, then those of its start constraints.
 
     They refer to the scaled variations z. Inequalities are active if they have multipliers, state bounds if the plan
     rests on them.

@@ -121,7 +121,7 @@ class Audit:
 
     @property
     def lost(self) -> np.ndarray:
-        """Excess cost of each mesh interval over the nearest extremal, in units of the cost. Shape (N,)."""
+        """Excess cost of each mesh interval over that of the nearest extremal, in units of the cost. Shape (N,)."""
         return np.zeros(0) if self.optimality is None else self.optimality.lost
 
     def __getitem__(self, name: str) -> Finding:

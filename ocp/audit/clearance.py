@@ -119,7 +119,7 @@ class Track(NamedTuple):
 
 @dataclass(frozen=True)
 class Clearance:
-    """Result of a clearance proof: bounds of the distances between the bodies of each pair along a motion.
+    """Result of a verification of clearances: bounds of the distances between the bodies of each pair along a motion.
 
     Attributes:
         name: Name of the separation.
@@ -291,7 +291,7 @@ class _Search:
         return Clearance(self.apart.name, tuple(closest), settled, checked, reason, self.apart.assumed)
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
-        """Return how a prescribed motion prevents sufficient distance bounds on intervals; "" if no motion does."""
+        """Return how the prescribed motion of a body prevents sufficient distance bounds; "" if it does not."""
         begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         if self.track.prescribed is None:
             return ""
@@ -386,7 +386,7 @@ class _Search:
         return bound, self._sufficient_bounds()
 
     def _fraction(self, place: np.ndarray, level: int) -> np.ndarray:
-        """Return the starts of the intervals with the indices ``place`` of a bisection level, as horizon fractions."""
+        """Return the start, as a fraction of the horizon, of time intervals, given by index and bisection level."""
         if level >= 0:
             return np.asarray(self.breaks[np.minimum(place << level, self.pieces)])
         segment = place >> -level
@@ -421,13 +421,13 @@ class _Search:
 
 
 def _pairwise_maximum(values: np.ndarray) -> np.ndarray:
-    """Return the maximum of every two successive rows; a last row without a partner stays. Shape (ceil(N / 2), k)."""
+    """Return the maximum of every two successive rows of an array; a single last row stays. Shape (ceil(N / 2), k)."""
     even = np.concatenate([values, values[-1:]]) if len(values) % 2 else values
     return np.asarray(np.maximum(even[::2], even[1::2]))
 
 
 def _rate_bounds(curve: PiecewisePolynomial, columns: list[int], horizon: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds of the absolute first and second time derivatives of states on each segment. Shapes (N, k).
+    """Return bounds of the absolute first and second time derivatives of states on each curve segment. Shapes (N, k).
 
     The Bernstein coefficients of a polynomial bound it on its interval.
     """

@@ -137,7 +137,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
 
 
 def _node_shifts(along: Linearisation, holding: np.ndarray, inside: np.ndarray, atoms: np.ndarray | None) -> np.ndarray:
-    """Return the part of the costate reported at each mesh node that belongs to multipliers just before the node.
+    """Return the part of each node's reported costate that is due to multipliers in the mesh interval before it.
 
     Multipliers count by the hat function of the node, and ``atoms`` by half if they are not distributed yet.
     """

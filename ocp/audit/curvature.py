@@ -23,7 +23,7 @@ __all__ = ["Curvature", "curvature"]
 
 
 class RankTolerances(NamedTuple):
-    """Singular values below which constraint rows, scaled to length 1, count as linearly dependent.
+    """Singular values below which constraint gradients, scaled to length 1, count as linearly dependent.
 
     Attributes:
         size: Singular value in the controls of a stage below which constraints on them count as dependent.
@@ -342,7 +342,7 @@ def _reduce_stages(
 def _eliminate_controls(
     rows: np.ndarray, nz: int, tolerances: RankTolerances
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Eliminate the controls that constraint rows (K, r, nz + m) determine, in K stages with m controls each.
+    """Eliminate the controls that linear constraints, ``rows`` (K, r, nz + m), determine in K stages of m controls.
 
     Returns:
         For each group of L stages with equal ranks: their indices, (L,); states and controls from the states and the
@@ -391,7 +391,7 @@ def unit_rows(rows: np.ndarray, rank: float) -> np.ndarray:
 
 
 def _unit_end_rows(rows: np.ndarray) -> np.ndarray:
-    """Scale the rows of end conditions to length 1, so that rows of states that hardly change count as well."""
+    """Scale the gradients of end conditions to length 1, so that conditions on states that hardly change count."""
     return unit_rows(rows / (np.linalg.norm(rows, axis=1).max(initial=0.0) or 1.0), ROUNDING_SHARE)
 
 

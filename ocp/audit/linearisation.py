@@ -357,7 +357,7 @@ def gauss(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def quadrature(places: np.ndarray, ends: np.ndarray, degree: int | None = None) -> np.ndarray:
-    """Return the quadrature weights at q ``places`` for integrals from 0 to each of m ``ends``. Shape (m, q).
+    """Return quadrature weights at q positions, ``places``, for integrals from 0 to each of m ``ends``. Shape (m, q).
 
     The integrand is the least-squares polynomial of the given degree; by default the interpolating one.
     """

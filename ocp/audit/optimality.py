@@ -84,13 +84,13 @@ class _Program:
         self._entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def variables(self, count: int, low: Any = -np.inf, price: Any = 0.0, weight: Any = 0.0) -> np.ndarray:
-        """Add variables to the program and return their indices."""
+        """Add variables to the quadratic program and return their indices."""
         first = sum(part.shape[1] for part in self._variables)
         self._variables.append(np.array([np.broadcast_to(value, (count,)) for value in (low, price, weight)], float))
         return np.arange(first, first + count)
 
     def equations(self, right: np.ndarray) -> np.ndarray:
-        """Add equations with given right-hand sides to the program; return their indices in the same shape."""
+        """Add equations with given right-hand sides to the quadratic program; return their indices."""
         first = sum(part.size for part in self._right)
         self._right.append(right)
         return np.arange(first, first + right.size).reshape(right.shape)
@@ -102,7 +102,7 @@ class _Program:
         self._entries.append((rows.ravel()[keep], columns.ravel()[keep], values.ravel()[keep]))
 
     def solve(self) -> np.ndarray | None:
-        """Return the optimal variables of the program; None if the solver does not converge."""
+        """Return the optimal variables of the quadratic program; None if the solver does not converge."""
         rows, columns, values = (np.concatenate(part) for part in zip(*self._entries, strict=True))
         low, price, weight = np.hstack(self._variables)
         right = np.concatenate([part.ravel() for part in self._right])
@@ -118,7 +118,7 @@ class _Program:
 
 @dataclass
 class _Multipliers:
-    """Nonnegative multipliers of limits as variables of a program, where a multiplier costs the distance to its limit.
+    """Nonnegative multipliers of limits, as variables of a quadratic program whose cost weights them by gaps.
 
     Attributes:
         point, limit: Indices of the point and of the limit of each multiplier. Shape (K,).
@@ -140,7 +140,7 @@ class _Multipliers:
     @classmethod
     def of(cls, program: _Program, limits: Limits, chosen: np.ndarray, slopes: np.ndarray, size: np.ndarray,
            share: Any = 1.0) -> _Multipliers:  # fmt: skip
-        """Add multipliers of both sides of limits that the mask ``chosen`` (M, m) selects to a program; return them.
+        """Add to a quadratic program, and return, the multipliers of limits that the mask ``chosen`` (M, m) selects.
 
         ``slopes`` (M, m, n) are the derivatives of the limits with respect to variables of the given ``size`` (n,).
         A multiplier per unit of the horizon fraction s costs its gap times the ``share`` (M,) of its point.
@@ -157,7 +157,7 @@ class _Multipliers:
         return cls(point, limit, signs, slope, effect, price, program.variables(len(point), 0.0, price))
 
     def table(self, x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Return signed multipliers of all limits from a program's solution; 0 for limits without one. Shape (M, m)."""
+        """Return the signed multipliers of all limits, 0 for limits not in the quadratic program. Shape (M, m)."""
         values = np.zeros(shape)
         np.add.at(values, (self.point, self.limit), self.sign * x[self.index] / self.reach)
         return values
@@ -279,7 +279,7 @@ class _Dual:
             program.add(rows[self.free], self.end_residual[-1], sign)
 
     def fit(self, x: np.ndarray, known: Adjoint) -> Fit:
-        """Convert a solution of the program, in units of cost, to multipliers and loss (excess cost) of the plan."""
+        """Convert a solution of the quadratic program to multipliers and excess cost (loss) of the plan."""
         along, (n, q), nx, size = self.along, self.along.shape, self.along.form.nx, self.along.state_size
         lost = np.zeros(n)
         for part in self.residual:
@@ -417,12 +417,12 @@ def optimality(
 
 
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
-    """Return the excess cost of a plan for given multipliers, except for what a change of the start could save."""
+    """Return a plan's excess cost over the optimum for given multipliers, without what a change of start saves."""
     return float(by_interval.sum() + multipliers.ends.charge)
 
 
 def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
-    """Return the excess cost of a plan plus the errors of given multipliers, by which multipliers are compared."""
+    """Return the measure that compares multipliers: excess cost of the plan plus errors of the multipliers."""
     assert curved is not None
     loss = control_loss(along, multipliers.costate, multipliers.control_multipliers, curved).sum()
     return float(

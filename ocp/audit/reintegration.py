@@ -134,7 +134,7 @@ class Steps(NamedTuple):
 
     @classmethod
     def even(cls, cells: int, each: int) -> Steps:
-        """Return one integration step per grid cell, with ``each`` cells in every mesh interval."""
+        """Return one integration step per grid cell, for mesh intervals of ``each`` cells."""
         cell = np.arange(cells)
         return cls(cell, (cell % each) / each, np.full(cells, 1.0 / each))
 
@@ -336,7 +336,7 @@ def violations(along: Linearisation, motion: Reintegration, states: np.ndarray, 
 
 
 def _with_integrals(form: Formulation, kind: str, g: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return constraint values (K, m) in which those rows that are watched as integrals are integrated over time."""
+    """Return constraint values (K, m), integrated over time where a watched constraint limits an integral."""
     return np.where(form.watch_integral, integral(g, t), g) if kind == "watch" else g
 
 
@@ -346,7 +346,7 @@ def excess_over(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.
 
 
 def _violation_of(label: str, name: str, t: np.ndarray, excess: np.ndarray, sizes: np.ndarray) -> Violation:
-    """Return the `Violation` of a constraint from the excess (K, m) and the sizes, (m,) or (K, m), of its rows."""
+    """Return the `Violation` of a vector constraint from each entry's excess over its bounds and size."""
     shares = excess / sizes
     largest = np.argmax(shares, axis=1)[:, None]
     size = np.take_along_axis(np.broadcast_to(sizes, excess.shape), largest, axis=1)[:, 0]

@@ -189,7 +189,7 @@ def _select(bounds: Bounds, index: np.ndarray) -> Bounds:
 def _sizes_of(
     values: np.ndarray, declared: Bounds, ends: list[np.ndarray], free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sizes of sampled states or controls, and which move or have a nonzero fixed end. Shape (n,) each.
+    """Return the sizes of sampled states or controls, and which vary or have a nonzero fixed end. Shape (n,) each.
 
     Entries that are ``free`` (n,) are constant along a plan: like a horizon they have the size of their value.
     """
@@ -212,7 +212,7 @@ def nearest_bound(declared: Bounds) -> np.ndarray:
 def _raise_to_floor(
     size: np.ndarray, nonzero: np.ndarray, least: np.ndarray, still: Any = STANDSTILL
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Raise the sizes of entries that stay at zero to a floor; return all sizes and a mask of the other entries."""
+    """Return sizes, raised to a minimum for entries that stay at zero, and a mask of the entries that do not."""
     moves = nonzero | (size > np.maximum(ROUNDING_SHARE * size.max(initial=0.0), still))
     floor = SOLVER_SHARE * np.minimum(least, size[moves].max() if moves.any() else 1.0)
     return np.where(moves, size, np.maximum(size, floor)), moves
@@ -238,7 +238,7 @@ def _rows_of(
     entries: tuple[np.ndarray, np.ndarray],
     values: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the characteristic sizes of the constraint rows of one kind, for example "path". Shape (rows,).
+    """Return the characteristic sizes of the constraints of one kind, for example "path". Shape (rows,).
 
     ``values`` (M, rows) are the row values along the grid, if known.
     """
@@ -277,7 +277,7 @@ def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[n
 def _watched_row_sizes(
     form: Formulation, by_variables: np.ndarray, horizon: float, path_lengths: np.ndarray
 ) -> np.ndarray:
-    """Return the sizes of watched constraint rows: their reference path lengths, or changes with the variables.
+    """Return the sizes of watched constraints: lengths of reference paths, or changes if the variables change.
 
     Args:
         by_variables: Change of each row when states and controls change by their sizes. Shape (rows,).
@@ -307,7 +307,7 @@ def _change_by_variables(
     p: np.ndarray,
     entries: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return how strongly the constraint rows of one kind depend on states and controls, at given samples.
+    """Return how strongly the constraints of one kind depend on states and controls, at given samples.
 
     Returns:
         Of each row, shape (rows,): the sum of its changes when single entries change by their sizes; whether an entry
@@ -333,7 +333,7 @@ def row_changes(
     p: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of the constraint rows of one kind at K samples, and their changes with each state or control.
+    """Return the values of the constraints of one kind at K samples, and their changes with each state or control.
 
     Args:
         kind: ``path``, ``start``, ``end`` or ``watch``; or ``running`` or ``terminal`` for the cost.

@@ -77,7 +77,7 @@ def conditions(program: Program, outcome: Outcome, arguments: dict[str, np.ndarr
 def scaled_values(
     program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales
 ) -> dict[str, tuple[np.ndarray, ...]]:
-    """Return values, limits and multipliers of variables (x) and constraint rows (g) in the solver's scaled units."""
+    """Return values, limits and multipliers of variables (x) and constraints (g) in the solver's scaled units."""
     v, lam, p = outcome.variables, outcome.multipliers, arguments["p"]
     result: dict[str, tuple[np.ndarray, ...]] = {}
     slope, jacobian = program.numbers.first(v, p)
@@ -91,7 +91,7 @@ def scaled_values(
 
 
 def active_sides(program: Program, outcome: Outcome, arguments: dict[str, np.ndarray], scales: Scales) -> Sides:
-    """Return which limit of each variable (x) and constraint row (g) is active: -1 lower, 1 upper, 0 neither."""
+    """Return which limit of each variable (x) and constraint (g) is active: -1 lower, 1 upper, 0 neither."""
     sides = {}
     for kind, (value, low, high, multiplier) in scaled_values(program, outcome, arguments, scales).items():
         active = at_limit(value, low, high, multiplier)
@@ -273,7 +273,7 @@ class Newton:
         scales: Scales,
         local: bool = False,
     ) -> _Matrix | None:
-        """Return the factorised Newton matrix for scaled variables and rows; None if it is not positive definite.
+        """Return the factorised Newton matrix for scaled variables and constraints; None unless positive definite.
 
         ``which`` variables are fixed and which rows held. With ``local`` the penalty of a row is relative to the
         curvature of its own variables, so that rounding does not hide small variables. For a sufficient penalty the
@@ -349,7 +349,7 @@ class _Matrix:
 
 
 def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which variables and rows are equalities: those with equal or with active limits. Shapes (n,), (m,)."""
+    """Return which variables and constraints are fixed, by equal limits or by an active limit. Shapes (n,), (m,)."""
     fixed, held = ((arguments[f"lb{kind}"] == arguments[f"ub{kind}"]) | (sides[kind] != 0) for kind in "xg")
     return fixed, held
 
@@ -383,7 +383,7 @@ class Bordered:
         self._size = size
 
     def at(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return where the entries in rows ``first`` and columns ``second`` <= ``first`` are in `cholesky`'s values."""
+        """Return the indices in `cholesky`'s argument of entries in rows ``first``, columns ``second`` <= ``first``."""
         band = second * self.width + first
         below = (self.width + 1) * self.inner + (first - self.inner) * self._size + second
         return np.asarray(np.where(first < self.inner, band, below))

@@ -44,7 +44,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Stages:
-    """Numbers of states, controls and constraint rows of each stage of a program, for structure-exploiting solvers."""
+    """Numbers of states, controls and constraints of each stage of a nonlinear program, for special solvers."""
 
     states: tuple[int, ...]
     controls: tuple[int, ...]
@@ -79,7 +79,7 @@ class Interpolants:
     def __call__(
         self, variables: np.ndarray, parameters: np.ndarray, horizon: float
     ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        """Return the interpolants of states and controls for given values of the variables of a program."""
+        """Return the interpolants of states and controls for given values of the variables of a nonlinear program."""
         values = variables[self.variables].T
         if self.values is not None:
             inputs = variables[self.variables], self.data, horizon, parameters
@@ -144,7 +144,7 @@ class Transcription:
 
     @property
     def n_rows(self) -> int:
-        """Number of constraint rows of the program."""
+        """Number of scalar constraints of the program."""
         return len(self.row_labels)
 
     @property
@@ -209,18 +209,18 @@ class Program:
 
     @cached_property
     def numbers(self) -> NumericDerivatives:
-        """Evaluator of the program's values and derivatives as NumPy and SciPy arrays."""
+        """Evaluator of the program's cost, constraints and derivatives as NumPy and SciPy arrays."""
         return NumericDerivatives(self)
 
     @cached_property
     def jacobian_entries(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each nonzero of the Jacobian of the constraint rows."""
+        """Row and column of each nonzero of the Jacobian of the constraints."""
         row, column = self.jacobian.sparsity_out(1).get_triplet()
         return np.array(row, dtype=np.int32), np.array(column, dtype=np.int32)
 
 
 class NumericDerivatives:
-    """Evaluator of a program's values and derivatives as NumPy and SciPy arrays, with a cache for the last point.
+    """Evaluator of a nonlinear program's functions and derivatives as arrays, with a cache for the last point.
 
     CasADi converts its matrices to Python entry by entry, which takes longer than their evaluation. Here the functions
     write into arrays, and the sparsity patterns are read once.
@@ -233,7 +233,7 @@ class NumericDerivatives:
         self._cached: tuple[Any, ...] = ()
 
     def _evaluate(self, x: np.ndarray, p: np.ndarray) -> tuple[Any, ...]:
-        """Return the cost, its gradient, the values of the constraint rows and their Jacobian."""
+        """Return the cost, its gradient, the values of the constraints and their Jacobian."""
         at = self._at
         if at is None or not (np.array_equal(at[0], x) and np.array_equal(at[1], p)):
             (cost, slope), (rows, jacobian) = self._gradient(x, p), self._jacobian(x, p)
@@ -242,21 +242,21 @@ class NumericDerivatives:
         return self._cached
 
     def first(self, x: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, scipy.sparse.csc_array]:
-        """Return the gradient of the cost and the Jacobian of the constraint rows. Shapes (n,) and (m, n)."""
+        """Return the gradient of the cost and the Jacobian of the constraints. Shapes (n,) and (m, n)."""
         _, slope, _, jacobian = self._evaluate(x, p)
         return slope, jacobian
 
     def values(self, x: np.ndarray, p: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the cost and the values of the m constraint rows. Shape (m,)."""
+        """Return the cost and the values of the m constraints. Shape (m,)."""
         cost, _, rows, _ = self._evaluate(x, p)
         return cost, rows
 
     def gradient(self, x: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return the gradient of the cost without evaluating the constraint rows. Shape (n,)."""
+        """Return the gradient of the cost without evaluating the constraints. Shape (n,)."""
         return np.asarray(self._gradient(x, p)[1])
 
     def second(self, x: np.ndarray, p: np.ndarray, sigma: float, lam: np.ndarray) -> scipy.sparse.csc_array:
-        """Return the upper Hessian triangle of ``sigma`` times the cost plus ``lam`` times the rows. Shape (n, n)."""
+        """Return the upper Hessian triangle of ``sigma`` times cost plus ``lam`` times constraints. Shape (n, n)."""
         upper: scipy.sparse.csc_array = self._hessian(x, p, np.array([sigma]), lam)[0]
         return upper
 
@@ -265,7 +265,7 @@ class NumericDerivatives:
         return np.asarray(self._running(x, p)[0])
 
     def parametric(self, x: np.ndarray, p: np.ndarray, lam: np.ndarray) -> np.ndarray:
-        """Return the gradient of the cost plus ``lam`` times the rows with respect to the parameters. Shape (n_p,)."""
+        """Return the gradient of cost plus ``lam`` times constraints with respect to the parameters. Shape (n_p,)."""
         return np.asarray(self._parametric(x, p, lam)[0])
 
 
@@ -334,7 +334,7 @@ class Derivatives(NamedTuple):
 
 
 def assemble(transcription: Transcription, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
-    """Assemble the nonlinear program of a transcription from derivatives of block functions, computed unless given.
+    """Assemble the nonlinear program of a transcription from its blocks' derivatives, computed unless given.
 
     Raises:
         TimeLimitReached: The time limit is over.
@@ -417,7 +417,7 @@ def derivatives(function: Any) -> Derivatives:
 
 
 def hessian_at(pattern: Any, block: Block) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return where each Hessian nonzero of a block belongs in the program's upper Hessian triangle, and its factor."""
+    """Return the places in the program's upper Hessian triangle to which a block's Hessian adds, and factors."""
     first, second = places_of(pattern)
     where = block.variables
     upper = np.minimum(where[first], where[second]).ravel(order="F")
@@ -447,7 +447,7 @@ def gather(vector: Any, index: np.ndarray) -> Any:
 
 
 def evaluate_block(function: Any, block: Block, arguments: list[Any]) -> Any:
-    """Evaluate the function of a block for every column of its arguments; argument 2, the parameters, is common."""
+    """Evaluate the function of a block for every column of its arguments; the parameters are common to all."""
     check_time()
     count = block.variables.shape[1]
     if count == 1:
@@ -463,7 +463,7 @@ def nonzeros(matrices: list[Any]) -> Any:
 
 
 def scatter(places: list[np.ndarray], matrices: list[Any], size: int) -> Any:
-    """Return a vector of sums: each nonzero of ``matrices`` is added to the entry with its index in ``places``."""
+    """Return a vector of sums: each nonzero of ``matrices`` is added at its index in ``places``."""
     where = np.concatenate([np.zeros(0, int), *places])
     values = nonzeros(matrices)
     collect = sparse(where, np.arange(where.size), np.ones(where.size), (size, where.size))
@@ -477,7 +477,7 @@ def _scatter_matrix(
     shape: tuple[int, int],
     factors: list[np.ndarray] | None = None,
 ) -> Any:
-    """Return a sparse matrix: constant entries plus nonzeros of ``matrices`` times factors, at given places."""
+    """Return a sparse matrix: constant entries plus nonzeros of ``matrices`` times factors, at given indices."""
     rows = np.concatenate([constant[0], *[at[0] for at in places]]).astype(int)
     columns = np.concatenate([constant[1], *[at[1] for at in places]]).astype(int)
     entries, number = np.unique(columns * shape[0] + rows, return_inverse=True)

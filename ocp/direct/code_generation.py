@@ -73,7 +73,7 @@ class CompilerError(RuntimeError):
 
 @dataclass(frozen=True)
 class CodeSizes:
-    """Limits of the length of generated C code, in characters, for its optimisation and its compilation.
+    """Largest lengths, in characters, of generated C code that is optimised and of C code that is compiled.
 
     Attributes:
         optimized: Largest code that is optimised, which takes minutes for more and saves a third of the running time.
@@ -216,7 +216,7 @@ def _compile(text: str) -> bytes:
 
 
 def _start_process(words: list[str], place: Path) -> subprocess.Popen[bytes]:
-    """Start a command in a folder and write its output to a file there; closing the input ends the command."""
+    """Start a command whose output goes to a file in its working folder, and which ends when its input is closed."""
     with open(place / "words", "wb") as output:
         return subprocess.Popen(
             ["sh", "-c", WATCHED, "sh", *words],

@@ -147,7 +147,7 @@ def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]
 def residuals(
     built: Built, v: np.ndarray, arguments: dict[str, np.ndarray]
 ) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
-    """Return labels, horizon fractions, values and violations of all constraint rows, then of all variables."""
+    """Return labels, horizon fractions, values and violations of all constraints, then of all variables."""
     form, transcription = built.formulation, built.transcription
     try:
         g = np.asarray(built.program.values(v, arguments["p"])[1].full()).reshape(-1)
@@ -161,7 +161,7 @@ def residuals(
 
 
 def both_bounds(arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper bounds of the constraint rows and, after them, of the variables."""
+    """Return the lower and upper bounds of the constraints and, after them, of the variables."""
     low, high = (np.concatenate([arguments[f"{side}g"], arguments[f"{side}x"]]) for side in ("lb", "ub"))
     return low, high
 
@@ -303,7 +303,7 @@ def elastic_plan(
 
 
 class _Soft:
-    """Rows and bounds that an elastic plan may violate: all but dynamics, fixed ends and the lower horizon bound.
+    """Limits that an elastic plan may violate: all but dynamics, fixed ends and the lower bound of the horizon.
 
     Rows are numbered before variables. Those with one label share a slack variable.
     """
@@ -334,7 +334,7 @@ class _Soft:
         self.fractions = np.concatenate([transcription.row_fractions, transcription.variable_fraction])
 
     def matrices(self, n: int, m: int, k: int) -> tuple[Any, Any]:
-        """Return two constant matrices that form the rows of the elastic program from rows, variables and slacks.
+        """Return the matrices that combine constraints, variables and slacks to constraints of the elastic program.
 
         The elastic rows are R g(v) + C (v, slack) with the returned matrices R and C.
         """
@@ -349,7 +349,7 @@ class _Soft:
         return rows, sparse(at, columns, signs, (len(chosen), n + k))
 
     def limits(self, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and upper bounds of the rows of the elastic program."""
+        """Return the lower and upper bounds of the constraints of the elastic program."""
         low, high = both_bounds(arguments)
         free = np.full(max(len(self.lower), len(self.upper)), np.inf)
         lower = np.concatenate([low[self.hard], low[self.lower], -free[: len(self.upper)]])
@@ -358,7 +358,7 @@ class _Soft:
     def conflicts(
         self, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float, units: np.ndarray
     ) -> list[Conflict]:
-        """Return the violated constraints in decreasing order of violation, each in the unit of its row or variable."""
+        """Return the violated constraints in decreasing order of violation, each in its own unit."""
         low, high = both_bounds(arguments)
         by_slack: dict[int, Conflict] = {}
         unit_of: dict[int, float] = {}

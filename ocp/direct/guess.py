@@ -96,7 +96,7 @@ def guessed_names(form: Formulation, guess: Guess) -> set[str]:
 
 
 def shifted_indices(transcription: Transcription, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each variable and row, the index of the same quantity a given number of equal intervals later.
+    """Return the index of each variable's and each constraint's counterpart a number of mesh intervals later.
 
     Where the horizon ends earlier, it is the index of the variable or row itself.
     """

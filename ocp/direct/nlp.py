@@ -164,7 +164,7 @@ def iteration_limit(solver: str, options: dict[str, Any]) -> int:
 
 
 def fatrop_functions(program: Program, watch: FatropMonitor) -> dict[str, Any]:
-    """Return the derivatives of a program with the signatures that casadi's fatrop interface uses.
+    """Return the derivatives of a nonlinear program with the signatures that casadi's fatrop interface uses.
 
     The interface raises unless the next state has factor 1 in the rows that close gaps. A zero Jacobian therefore stops
     the solver, which cannot be stopped otherwise.
@@ -275,7 +275,7 @@ def as_good_as_rounding_allows(stats: dict[str, Any], result: dict[str, Any]) ->
 
 
 def largest_violation(values: dict[str, np.ndarray], arguments: dict[str, np.ndarray]) -> float:
-    """Return the largest violation of a bound of variables or rows, relative to the largest variable (at least 1)."""
+    """Return the largest violation of a bound or constraint, relative to the largest variable (at least 1)."""
     gaps = [(arguments[f"lb{k}"] - values[k], values[k] - arguments[f"ub{k}"]) for k in ("x", "g")]
     worst = max(float(np.max(gap, initial=0.0)) for pair in gaps for gap in pair)
     return worst / max(1.0, float(np.max(np.abs(values["x"]), initial=0.0)))

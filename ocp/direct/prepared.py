@@ -172,7 +172,7 @@ class Prepared:
 
     @interruptible
     def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
-        """Write C code of a plan, of the functions of its problem, and of a program that uses them.
+        """Write C code: a plan, the functions of its problem, and an example main program that uses them.
 
         Args:
             folder: Folder that is created and returned; files of the same names are replaced. Its contents are listed
@@ -258,7 +258,7 @@ class Prepared:
         return attempts
 
     def _elastic(self, first: Attempt) -> Elastic | None:
-        """Return the plan of least constraint violation; Ctrl-C raises Interrupted with the last iterate of `first`."""
+        """Return the plan of least constraint violation; Ctrl-C raises Interrupted with the plan of run `first`."""
         horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
             return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon=horizon)
@@ -266,14 +266,14 @@ class Prepared:
             raise Interrupted(str(error), first.solution) from error
 
     def _is_own_plan(self, guess: Guess) -> bool:
-        """Return whether a guess is a plan of this program, with the same method, mesh, sizes and parameters."""
+        """Return whether a guess is a plan of this nonlinear program: same method, mesh, sizes and parameters."""
         if not isinstance(guess, Solution) or guess.method != self.method.settings:
             return False
         sizes = guess.variables.shape, guess.multipliers.shape, set(guess.parameters)
         return sizes == ((self.transcription.size,), (self.transcription.n_rows,), set(self.formulation.parameters))
 
     def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
-        """Return the optimum near a guess, a plan shifted by ``shift`` intervals; None if no optimum is found."""
+        """Return the optimum near a guess that is a plan, shifted by ``shift`` mesh intervals; None if not found."""
         form = self.formulation
         if not isinstance(guess, Solution) or not self._is_own_plan(guess) or self.solver_name != "ipopt":
             return None
@@ -302,7 +302,7 @@ class Prepared:
 
     @cached_property
     def _newton(self) -> Newton:
-        """Newton's method for solves whose guess is a plan of this program."""
+        """Newton's method for solves whose guess is a plan of this nonlinear program."""
         return Newton(self.program, self.transcription)
 
     @cached_property
@@ -344,7 +344,7 @@ class Prepared:
         return Attempt(start, arguments, names, scales, outcome, solution)
 
     def _scales(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> Scales:
-        """Return the scales of the program for an initial point; ``names`` are the variables with intended values."""
+        """Return the scales of the program for an initial point; ``names`` are variables with meaningful values."""
         if not self._scaling:
             return unit_scales(self.transcription)
         scales = compute_scales(self._pattern, sizes_along(self._pattern, point, names, bounds=bounds, p=p), point, p)

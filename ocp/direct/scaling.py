@@ -1,4 +1,4 @@
-"""Scaling of a nonlinear program by the sizes of its variables, constraint rows and cost; removal of redundant limits.
+"""Scaling of a nonlinear program by the sizes of its variables, constraints and cost; removal of redundant limits.
 
 A solver's tolerances are absolute and suit numbers near 1. Each variable is divided by its size; each row and the cost
 by their change when the variables change by their sizes. Scaling is linear and keeps the optimum. Scales are powers of
@@ -61,7 +61,7 @@ class ScalingSettings:
 
     @property
     def bad(self) -> float:
-        """Ratio of sizes, or of a state's change to its size, above which a program counts as badly scaled."""
+        """Ratio of sizes, or of a state's change to its size, above which a problem counts as badly scaled."""
         return self.usual**2
 
 
@@ -70,7 +70,7 @@ SCALING = ScalingSettings()
 
 @dataclass(frozen=True)
 class Scales:
-    """Scales of a program: the numbers by which its n variables, its m constraint rows and its cost are divided."""
+    """Scales of a nonlinear program: divisors of its n variables, of its m constraints and of its cost."""
 
     variables: np.ndarray
     rows: np.ndarray
@@ -103,7 +103,7 @@ class Sizes:
     horizon: float
 
     def of_variables(self, transcription: Transcription) -> np.ndarray:
-        """Return the typical magnitude of each variable of a program; 1 for auxiliary variables."""
+        """Return the typical magnitude of each variable of a nonlinear program; 1 for auxiliary variables."""
         result = np.ones(transcription.size)
         for role, sizes in (("state", self.states), ("control", self.controls), ("horizon", np.array([self.horizon]))):
             chosen = transcription.variable_role == role
@@ -112,7 +112,7 @@ class Sizes:
 
 
 class Pattern:
-    """Sparsity structure of a program, determined once for repeated computation of the program's scales.
+    """Sparsity structure of a nonlinear program, determined once for repeated computation of its scales.
 
     Attributes:
         rows, columns: Row and column of each nonzero of the Jacobian.
@@ -138,12 +138,12 @@ class Pattern:
 
 
 def unit_scales(transcription: Transcription) -> Scales:
-    """Return scales that are all 1, for a program that is not scaled."""
+    """Return scales that are all 1, for a nonlinear program that is not scaled."""
     return Scales(np.ones(transcription.size), np.ones(transcription.n_rows), 1.0)
 
 
 def scaled_program(program: Program) -> Program:
-    """Return the program with variables, rows and cost divided by their scales, which become parameters.
+    """Return the nonlinear program with variables, constraints and cost divided by scales, its new parameters.
 
     The variables are x / a, the rows g / b, the cost f / c and the parameters (p, a, b, c). Only the functions that
     solvers use are replaced.
@@ -247,7 +247,7 @@ def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndarray) -> Scales:
-    """Return the scales of a program; rows and cost are scaled by their change if variables change by their sizes."""
+    """Compute the scales of a nonlinear program from the sizes of its variables and its derivatives at a point."""
     program, size_of_variable = pattern.program, sizes.of_variables(pattern.transcription)
     # squares of smaller sizes underflow
     size_of_variable = np.where(size_of_variable > np.sqrt(np.finfo(float).tiny), size_of_variable, 1.0)
@@ -273,7 +273,7 @@ def compute_scales(pattern: Pattern, sizes: Sizes, point: np.ndarray, p: np.ndar
 
 
 def scaling_fault(pattern: Pattern, point: np.ndarray, p: np.ndarray, *, scales: Scales, sizes: Sizes) -> str:
-    """Return a description of how a solved program is badly scaled; "" if the scaling is good."""
+    """Return a description of how a solved nonlinear program is badly scaled; "" if the scaling is good."""
     form, transcription = pattern.form, pattern.transcription
     scaled_size = sizes.of_variables(transcription) / scales.variables
     deviation = np.abs(np.log(scaled_size))
@@ -303,13 +303,13 @@ def _with_declared_sizes(pattern: Pattern, scales: np.ndarray) -> np.ndarray:
 
 
 def _powers(sizes: np.ndarray) -> np.ndarray:
-    """Return the nearest power of two for unusually large or small sizes, and 1 for the others."""
+    """Return scales: the nearest power of two for unusually large or small sizes, and 1 for the others."""
     unusual = (sizes < 1 / SCALING.usual) | (sizes > SCALING.usual)
     return np.where(unusual, np.exp2(np.round(np.log2(np.where(unusual, sizes, 1.0)))), 1.0)
 
 
 def _evaluate(function: Callable[..., Any], point: np.ndarray, p: np.ndarray) -> Any:
-    """Return the values of a function of the program; None if an integrator fails."""
+    """Return the values of a function of the nonlinear program; None if an integrator fails."""
     try:
         return function(point, p)
     except RuntimeError:

@@ -148,7 +148,7 @@ def program_of(solution: Solution) -> tuple[Formulation, Transcription, Program]
 def _by_parameters(
     transcription: Transcription, v: np.ndarray, p: np.ndarray, lam: np.ndarray, columns: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Differentiate the Lagrangian's gradient and the rows with respect to k parameters. Shapes (n, k) and (m, k)."""
+    """Differentiate Lagrangian gradient and constraints with respect to k parameters. Shapes (n, k) and (m, k)."""
     slope, change = np.zeros((transcription.size, len(columns))), np.zeros((transcription.n_rows, len(columns)))
     for block in transcription.blocks:
         function = block.function
@@ -169,7 +169,7 @@ def _by_parameters(
 def _solve_system(
     at: Conditions, slope: np.ndarray, change: np.ndarray, at_x: np.ndarray, at_g: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the scaled derivatives of variables, row multipliers and bound multipliers with respect to k parameters.
+    """Return the scaled derivatives of the variables and of all multipliers with respect to k parameters.
 
     Shapes (n, k), (m, k) and (n, k).
 

@@ -55,7 +55,7 @@ class Layout:
 
 
 def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizon: bool) -> Layout:
-    """Return the layout of a program with variables in the order node 0, interval 0, node 1, ..., node N, horizon."""
+    """Return the layout of variables in the order node 0, interval 0, node 1, ..., node N, horizon."""
     stride = node_size + interval_size
     grid = np.arange(intervals * stride).reshape(intervals, stride).T
     node = np.column_stack([grid[:node_size], intervals * stride + np.arange(node_size)])
@@ -68,7 +68,7 @@ def plain_layout(intervals: int, node_size: int, interval_size: int, free_horizo
 def _staged_layout(
     intervals: int, node_size: int, interval_size: int, free_horizon: bool, keep_initial: bool
 ) -> Layout:
-    """Return the layout of stages: node k, copies of horizon and start, interval k and a copy of the interval's end."""
+    """Return the layout of variables by stages: node k, copies of horizon and start, interval k, copy of its end."""
     carried = node_size + free_horizon + node_size * keep_initial
     inputs = interval_size + node_size
     stride = carried + inputs
@@ -90,7 +90,7 @@ def _staged_layout(
 
 @dataclass
 class TranscriptionBuilder:
-    """Builder of the nonlinear program of a problem; :meth:`finish` numbers the rows stage by stage.
+    """Builder of the nonlinear program of a problem; :meth:`finish` numbers the constraints stage by stage.
 
     Args:
         formulation: The problem.
@@ -146,7 +146,7 @@ class TranscriptionBuilder:
             self.variable_bounds[index] = self.formulation.bounds.places[bounds][:, None]
 
     def _nodes(self) -> None:
-        """Declare the variables at the nodes and, in the staged layout, the rows that join stages."""
+        """Declare the variables at the nodes and, in the staged layout, the constraints that join stages."""
         nx, layout, mesh = self.formulation.nx, self.layout, self.mesh
         start = np.array([0.0, 0.0])
         for role, part, bounds in (("state", slice(0, nx), "state"), ("control", slice(nx, None), "control")):
@@ -188,7 +188,7 @@ class TranscriptionBuilder:
         joins: bool = False,
         ends: bool = False,
     ) -> np.ndarray:
-        """Allocate constraint rows with given labels at each of K points, and return their indices. Shape (m, K).
+        """Allocate scalar constraints with given labels at each of K points, and return their indices. Shape (m, K).
 
         Args:
             bounds: Indices of the bounds of the m rows in the bound table; None for rows that are equal to zero.
@@ -207,7 +207,7 @@ class TranscriptionBuilder:
         return first + np.arange(m * places).reshape(places, m).T
 
     def linear(self, rows: np.ndarray, columns: np.ndarray, values: np.ndarray | float) -> None:
-        """Add linear terms ``values * variable[columns]`` to constraint rows; the arrays are broadcast together."""
+        """Add linear terms ``values * variable[columns]`` to constraints; the arrays are broadcast together."""
         targets, variables, entries = np.broadcast_arrays(rows, columns, values)
         self._linear.append((targets.ravel(), variables.ravel(), entries.ravel().astype(float)))
 
@@ -315,7 +315,7 @@ class TranscriptionBuilder:
         costate_scale: np.ndarray,
         interpolants: Interpolants,
     ) -> Transcription:
-        """Number the rows stage by stage and return the transcription."""
+        """Number the constraints stage by stage and return the transcription."""
         order = np.concatenate(self._order)
         sequence = np.argsort(order, kind="stable")
         number = np.empty_like(sequence)

@@ -209,7 +209,7 @@ class Hamiltonian:
 
 
 def _assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang: Any) -> Any:
-    """Assemble the control from smooth controls (first entries of ``w``) and linear controls at bounds ``bang``."""
+    """Assemble the control from the smooth controls (first entries of ``w``) and the bang-bang controls ``bang``."""
     order = {index: w[i] for i, index in enumerate(smooth)} | {index: bang[i] for i, index in enumerate(linear)}
     return ca.densify(ca.vertcat(form.problem.symbols(0, 1), *[order[i] for i in range(form.nu)]))
 
@@ -331,7 +331,7 @@ class Extremal:
     nu_end: np.ndarray
 
     def sampled(self, ham: Hamiltonian, outputs: list[Any], p: np.ndarray) -> list[np.ndarray]:
-        """Return the values of given expressions at all K m samples of the extremal. Shape (K m, size) each."""
+        """Return the values of given expressions at all samples of the extremal. Shape (K m, size) each."""
         count = self.t.size
         x, u, lam, mu = (v.reshape(count, -1) for v in (self.states, self.controls, self.costates, self.multipliers))
         return ham.form.sampled(outputs, x, u, self.t.ravel(), self.horizon, p, (ham.lam, lam), (ham.mu, mu))

@@ -259,7 +259,7 @@ class PreparedIndirect:
         return solution
 
     def _no_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
-        """Raise SolveError about an unusable seed or, without ``check``, return the seed as a failed solution."""
+        """Raise SolveError about an unusable seed or, if ``check`` is false, return the seed as a failed solution."""
         if check or seed is None:
             words = f"problem {self.problem.name!r}: the indirect method failed: {why}{error}"
             details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
@@ -394,7 +394,7 @@ class PreparedIndirect:
 
 
 def bisect(marks: Callable[[float], np.ndarray], low: float, high: float, before: np.ndarray) -> float:
-    """Return the position in low..high at which the values of ``marks`` cease to equal ``before``, by bisection."""
+    """Return, by bisection, where in low..high the function ``marks`` ceases to return the values ``before``."""
     for _ in range(40):
         middle = 0.5 * (low + high)
         if np.array_equal(marks(middle), before):

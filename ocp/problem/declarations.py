@@ -202,10 +202,7 @@ class Declarations:
     terminal: Any = None
 
     def check_new_variable(self, kind: str, name: Any) -> None:
-        """Raise ProblemError if the name of a new variable is invalid, reserved or already used.
-
-        ``kind`` appears in the message.
-        """
+        """Raise ProblemError about a variable of this kind if its name is invalid, reserved or already used."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind} name must be a non-empty string, not {name!r}")
         if name in RESERVED:
@@ -215,7 +212,7 @@ class Declarations:
                 raise ProblemError(f"{kind} {name!r}: a {pool[:-1]} of this name exists already")
 
     def check_new_constraint(self, kind: str, name: Any) -> None:
-        """Raise ProblemError if the name of a new constraint is invalid or already used; messages contain ``kind``."""
+        """Raise ProblemError if the name of a new constraint is invalid or used; error messages begin with ``kind``."""
         if not isinstance(name, str) or not name:
             raise ProblemError(f"{kind}: its name must be a non-empty string, not {name!r}")
         if any(name in pool for pool in (self.path, self.start, self.end, self.watch, self.apart)):
@@ -343,10 +340,7 @@ class ExpressionReader:
     parameters: tuple[Any, ...]
 
     def expression(self, what: str, value: Value, known: Sequence[Any], *, finite: bool = True) -> Any:
-        """Return a user value as a column of expressions that contain only the ``known`` symbols.
-
-        With ``finite``, constant entries of an expression must be finite.
-        """
+        """Return a value as a column of expressions of ``known`` symbols; with ``finite``, constants must be finite."""
         if value is None or isinstance(value, str):
             raise ProblemError(f"{what}: a number or an expression is expected, not {value!r}")
         if is_symbolic(value):
@@ -405,7 +399,7 @@ class ExpressionReader:
         unit: str,
         tolerance: Value,
     ) -> Constraint:
-        """Return a constraint on an expression that contains only the ``known`` symbols; messages contain ``kind``."""
+        """Return a constraint on an expression that contains only ``known`` symbols; errors name its ``kind``."""
         what = f"{kind} constraint {name!r}"
         require.text(f"{what}: unit", unit)
         vector = self.expression(what, expression, known)

@@ -51,15 +51,15 @@ class Rows:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the declared constraints to which the rows belong, in the order of declaration."""
+        """Names of the declared vector constraints to which the scalar constraints belong, in order of declaration."""
         return tuple(dict.fromkeys(self.owners))
 
     def of(self, name: str) -> np.ndarray:
-        """Return the indices of the rows that belong to the declared constraint of a given name."""
+        """Return the indices of the scalar constraints that belong to the declared constraint of a given name."""
         return np.array([i for i, owner in enumerate(self.owners) if owner == name])
 
     def select(self, mask: np.ndarray) -> Rows:
-        """Return the constraint rows that a boolean mask of shape (m,) selects."""
+        """Return the scalar constraints that a boolean mask of shape (m,) selects."""
         keep = np.flatnonzero(mask)
         expression = self.expression[keep.tolist()] if keep.size else self.expression[:0, :]
         names, owners = (tuple(texts[i] for i in keep) for texts in (self.labels, self.owners))
@@ -69,7 +69,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class BoundTable:
-    """All bounds of a problem in two vectors, to whose entries the variables and rows of a nonlinear program refer.
+    """All bounds of a problem in two vectors, to whose entries variables and constraints of a nonlinear program refer.
 
     Attributes:
         function: Parameters -> (lower, upper), each of shape (n, 1).
@@ -384,7 +384,7 @@ class Formulation:
         return ca.Function("signals", [t], [ca.densify(ca.vertcat(*parts))])
 
     def _rows(self, kind: str, pool: dict[str, Constraint], end: float | None = None) -> Rows:
-        """Return the constraint rows of one kind, such as "path".
+        """Return the scalar constraints of one kind, such as "path".
 
         ``end`` is 0 for constraints at the start and 1 at the end, where signals are replaced by their values; else
         None.
@@ -465,7 +465,7 @@ def slices(pool: Mapping[str, Variable | Signal]) -> dict[str, slice]:
 
 
 def labels(pool: dict[str, Any]) -> tuple[str, ...]:
-    """Return a name for every entry of variables or constraints: ``q`` for a scalar, ``q[2]`` in a vector."""
+    """Return a name for every entry of variables or constraints: ``q`` for a scalar, ``q[2]`` for a vector's entry."""
     return tuple(f"{v.name}[{i}]" if v.size > 1 else v.name for v in pool.values() for i in range(v.size))
 
 

@@ -3,7 +3,6 @@
 A body is the convex hull of points, its core, inflated by a radius. It moves with a frame whose pose is an expression
 of states and time. For any direction that the search of nearest points returns (:mod:`models.shapes.hull`), the gap
 along it is a lower bound of the distance, so a proof does not depend on the search.
-
 A :class:`Separation` declares minimum distances, which the audit proves at all times and no method enforces. A proof
 between two times needs bounds on the relative motion. Let x be the states that move the two bodies, observed from a
 given frame. A state of rate x_k' moves no point of them by more than lever_k |x_k'| and rotates none by more than
@@ -12,9 +11,8 @@ turn_k |x_k'|. For a point carried by a chain of axes,
     |p'| <= sum lever_k |x_k'|,
     |p''| <= sum lever_k |x_k''| + 2 (sum turn_k |x_k'|) (sum lever_k |x_k'|),
 
-where p is a point of one body relative to a point of the other. (The factor 2 is that of the Coriolis acceleration: a
-later axis moves points by at most its lever, and is rotated by all axes before it.) Frames that depend on time alone
-need no such bounds: those follow from their expressions (:mod:`ocp.problem.enclosures`).
+where p is a point of one body relative to the other; the factor 2 is that of the Coriolis acceleration. Bounds for
+frames that depend on time alone follow from their expressions (:mod:`ocp.problem.enclosures`).
 """
 
 from __future__ import annotations
@@ -41,8 +39,7 @@ class Hull:
         frame: Index of the frame with which it moves; -1: the world.
         core: Points in that frame. Shape (m, 3), m.
         radius: Radius by which the hull is inflated, m.
-        normal: Outward unit normal of a half-space, in that frame; its core is one point of its plane. Shape (3,), or
-            (0,) for a hull.
+        normal: Outward unit normal of a half-space, whose core is one point of its plane; shape (0,) for a hull.
 
     Raises:
         ProblemError: Wrong shapes, a value that is not finite, a negative radius, a normal that is not a unit vector.
@@ -98,7 +95,7 @@ class Frames(NamedTuple):
 
 
 class HullPairs:
-    """Pairs of bodies that are evaluated together because their hulls have the same two kinds; see `Hull.kind`.
+    """Pairs of bodies that are evaluated together because the kinds (see `Hull.kind`) of their hulls are the same.
 
     Attributes:
         has: Whether a pair is in this group. row: Its index in the group. Shape (n,) each.
@@ -197,7 +194,7 @@ class CoveredPairs:
             self._counts[pair] = len(rows)
 
     def of(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return two arrays for the rows of given pairs: the position in `pair` of each row's pair, and row indices.
+        """Return the pairs of shapes to evaluate for given pairs of bodies: indices in `pair`, and indices in `rows`.
 
         The first K rows are the pairs themselves; the pairs of shapes that cover their bodies follow. Shape (R,) each.
         """
@@ -208,7 +205,7 @@ class CoveredPairs:
 
     @staticmethod
     def decisive(place: np.ndarray, gap: np.ndarray, count: int) -> np.ndarray:
-        """Return for each pair the row (hulls or covering shapes) that determines the distance, by index. Shape (K,).
+        """Return, for each pair of bodies, the index of the pair of shapes that determines its distance. Shape (K,).
 
         Args:
             place: As of `of`. gap: Distance of each row. Shape (R,), m. count: K.
@@ -222,9 +219,7 @@ class CoveredPairs:
 
 
 class SeparatingDirections(NamedTuple):
-    """Directions of shortest distance between two bodies or between shapes that cover the bodies.
-
-    Each direction belongs to a row of `CoveredPairs`.
+    """Directions of shortest distance between two bodies or the shapes that cover them, for rows of `CoveredPairs`.
 
     Attributes:
         place, row: As of `CoveredPairs.of`. Shape (R,). along: Unit vectors from the first body to the second, in the
@@ -263,7 +258,7 @@ class BodyPairs:
         return self._ball_distance(second - first, pair)
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return the distances of all pairs at all samples; values above `near` may be lower bounds. Shape (M, n), m.
+        """Return the distances of all pairs at all samples, or lower bounds of distances above `near`. Shape (M, n), m.
 
         With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
@@ -288,7 +283,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return distances of given pairs at given samples; values above `near` may be lower bounds. Shape (K,), m."""
+        """Return distances of given pairs at given samples, or lower bounds of those above `near`. Shape (K,), m."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -304,10 +299,7 @@ class BodyPairs:
     def nearest(
         self, frames: Frames, at: np.ndarray, pair: np.ndarray
     ) -> tuple[SeparatingDirections, np.ndarray, np.ndarray]:
-        """Return separating directions, distances and nearest points of given pairs of bodies at given samples.
-
-        The points are those of the hulls before inflation. Distances have the shape (K,), m, points (K, 2, 3), m.
-        """
+        """Return directions, distances (K,), m, and nearest points before inflation (K, 2, 3), m, of pairs."""
         place, rows = self._covered.of(pair)
         along, gap, points = np.empty((len(rows), 3)), np.empty(len(rows)), np.empty((len(rows), 2, 3))
         for kind, chosen, row in self._by_kind(rows):
@@ -316,7 +308,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return for each pair the smaller gap along a direction at the two ends of a time interval. Shape (K,), m.
+        """Return the smaller of each pair's gaps along a direction at start and end of an interval. Shape (K,), m.
 
         The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
         """
@@ -337,7 +329,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Split `rows` by hull kind: yield each group, the positions of its rows in `rows`, and their group indices."""
+        """Yield the groups of equal hull kinds that `rows` refer to, with positions in `rows` and in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -345,10 +337,7 @@ class BodyPairs:
 
 
 def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
-    """Return pairs of bodies in groups with equal hull kinds.
-
-    A row of ``pairs`` (n, 3) contains the indices of two bodies and of their reference frame, -1 for the world.
-    """
+    """Group pairs (n, 3), given by the indices of two bodies and of a frame (-1: the world), by kinds of hulls."""
     kinds: dict[tuple[int, int], list[int]] = {}
     for i, (first, second, _) in enumerate(pairs):
         kinds.setdefault((hulls[first].kind, hulls[second].kind), []).append(i)
@@ -361,10 +350,7 @@ def _pad_points(core: np.ndarray, count: int) -> np.ndarray:
 
 
 def frames_of(placements: np.ndarray) -> Frames:
-    """Return the poses of frames from samples of their entries, with the world as an additional last frame.
-
-    In ``placements`` (M, 12 F), each frame is its rotation matrix column by column, then its position.
-    """
+    """Return poses from samples of rotation matrices, by columns, and positions (M, 12 F); the world is added last."""
     count = len(placements)
     world = np.broadcast_to(np.vstack([np.eye(3), np.zeros(3)]), (count, 1, 4, 3))
     values = np.concatenate([placements.reshape(count, placements.shape[1] // 12, 4, 3), world], axis=1)
@@ -451,7 +437,7 @@ class Separation:
         return f"{self.name}: {len(self)} pairs of {len(self.hulls)} bodies, at least {least} apart"
 
     def __len__(self) -> int:
-        """Return the number of pairs."""
+        """Return the number of pairs of bodies."""
         return len(self.pairs)
 
     @property
@@ -495,7 +481,7 @@ def _bounds(what: str, label: str, value: Any, shape: tuple[int, ...]) -> np.nda
 
 
 def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
-    """Convert values to an array with rows of ``count`` indices; raise ProblemError if that is impossible."""
+    """Convert values to an integer array of shape (n, count); raise ProblemError if that is impossible."""
     array = table(f"{what}: {label}", values)
     shaped = array.size % count == 0 and (array.ndim != 2 or not array.size or array.shape[1] == count)
     if not shaped or not np.isfinite(array).all() or (array % 1 != 0).any():
@@ -505,7 +491,7 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
 
 
 def stack_motion_bounds(what: str, bounds: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
-    """Stack motion bounds, given by state name, as columns in the order of ``movers``; missing bounds are zero.
+    """Stack bounds on how strongly each state moves the bodies of pairs, in the order of ``movers``; 0 where missing.
 
     Args:
         movers: Size of each state that moves a body. count: Number of pairs.

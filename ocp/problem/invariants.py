@@ -82,7 +82,7 @@ class FirstIntegrals:
 
 
 def coupled_parts(form: Formulation) -> list[np.ndarray]:
-    """Return groups of dynamically coupled states on which first integrals relevant to end conditions may depend.
+    """Return groups of coupled states on which first integrals that make end conditions redundant may depend.
 
     Only states with end conditions are relevant. If f_i is the only rate among these that contains a control u_j, or
     another state, then grad I . f = 0 for all u_j implies that I does not depend on x_i.
@@ -147,7 +147,7 @@ def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
 def implied_conditions(
     form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.ndarray
 ) -> list[tuple[int, float]]:
-    """Return the index in the bound table and the allowed violation of end conditions that first integrals imply."""
+    """Return the end conditions that first integrals imply: indices in the bound table, and allowed violations."""
     nx, places = form.nx, form.bounds.places
     index = np.concatenate([places[kind] for kind in ("initial", "start", "terminal", "end")])
     low, high = (side[index] for side in bounds)

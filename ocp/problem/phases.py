@@ -39,7 +39,7 @@ DURATION = "duration"
 
 @dataclass(frozen=True)
 class Phase:
-    """A phase of :class:`Phases`, with the symbols and times for constraints that couple the phase to others.
+    """A phase of :class:`Phases`, including the symbols and times by which constraints couple it to other phases.
 
     Attributes:
         name: Name of the phase.
@@ -67,7 +67,7 @@ class Phase:
 
 
 class Phases(Problem):
-    """Several consecutive problems, joined into one problem.
+    """Several consecutive optimal control problems, joined into one problem.
 
     ``phases["carry"]`` has the symbols of a phase. :meth:`join` connects phases; ``end`` and ``start`` declare further
     conditions on their ends and starts. The horizon of the whole is 1, the fraction of every phase;

@@ -61,10 +61,7 @@ def checked_problem(problem: Any) -> Problem:
 
 
 def remembers_request(builder: str) -> Callable[[Callable[Arguments, Declared]], Callable[Arguments, Declared]]:
-    """Return a decorator that stores the name and arguments of a builder in the problem that the builder returns.
-
-    From them the problem can be built again.
-    """
+    """Decorate a problem builder: its problems store its name and arguments, so that they can be built again."""
 
     def decorate(declare: Callable[Arguments, Declared]) -> Callable[Arguments, Declared]:
         parameters = signature(declare)
@@ -112,10 +109,7 @@ class Problem:
         return to_record(self.name, self.symbols, self.time, self.declared)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the problem, with new symbols, from the data of :meth:`__getstate__`.
-
-        Raise ProblemError if the data are damaged.
-        """
+        """Restore the problem, with new symbols, from data of :meth:`__getstate__`; raise ProblemError if damaged."""
         kinds = (Variable, Signal, Constraint, Horizon, PhaseTimes, Declarations, Separation, Hull)
         self.name, self.symbols, self.time, self.declared = from_record(state, kinds)
         self.declared.check(self.symbols)
@@ -288,10 +282,7 @@ class Problem:
     # ---- equations -------------------------------------------------------------------------------------------
 
     def dynamics(self, state: Any, derivative: Value) -> None:
-        """Declare ``d state / dt = derivative``, an expression of states, controls, parameters, time and horizon.
-
-        Shape (n, 1).
-        """
+        """Declare ``d state / dt = derivative``, shape (n, 1), in states, controls, parameters, time and horizon."""
         variable = self._find(self.declared.states, state, "dynamics")
         if variable.name in self.declared.dynamics:
             raise ProblemError(f"state {variable.name!r}: dynamics declared twice", name=variable.name)
@@ -466,7 +457,7 @@ class Problem:
         return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
 
     def _inner(self) -> list[Any]:
-        """Return the symbols allowed inside the horizon: states, controls, parameters, signals, time and horizon."""
+        """Return the symbols allowed in path constraints: states, controls, parameters, signals, time and horizon."""
         d = self.declared
         pools = (d.states, d.controls, d.parameters, d.signals)
         return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]
@@ -499,7 +490,7 @@ class Problem:
         tolerance: Value = None,
         known: Sequence[Any] = (),
     ) -> Constraint:
-        """Return a new constraint on an expression of the symbols inside the horizon and of the ``known`` symbols."""
+        """Return a new constraint on an expression of the symbols of path constraints and of the ``known`` symbols."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
         return self._reader.constraint(
             kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance

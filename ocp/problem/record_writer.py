@@ -98,19 +98,19 @@ class FunctionWriter:
         return number
 
     def _leaf(self, record: dict[str, Any]) -> Any:
-        """Store the record of a function that is not scalar arithmetic; return the function rebuilt from the record."""
+        """Store the record of a function, such as a table look-up, and return the function rebuilt from the record."""
         function = BUILDERS[record["kind"]](record, ())
         self._alive.append(function)
         self._append(function.__hash__(), record, function)
         return function
 
     def _call_leaf(self, record: dict[str, Any], entries: Sequence[Any], pattern: Any) -> Any:
-        """Store the record of a function of one column; return the function's value for given entries of the column."""
+        """Store the record of a function of one vector, and return its value for given entries of the vector."""
         argument = ca.vertcat(*entries) if entries else ca.SX(0, 1)
         return from_entries(pattern, self._leaf(record).call([argument], False, True)[0].nonzeros())
 
     def _as_scalars(self, function: Any) -> Any:
-        """Convert a function to SX symbols, with calls for the parts that are not scalar arithmetic."""
+        """Convert a function to one of SX symbols, which calls other functions for, say, table look-ups."""
         kind = function.class_name()
         if kind == "SXFunction":
             return function

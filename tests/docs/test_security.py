@@ -18,7 +18,7 @@ LIMITS = {
     "STL": INPUT_LIMITS.mesh_bytes / MB,
     "OBJ, DAE, text of STL": INPUT_LIMITS.mesh_text_bytes / MB,
     "triangles of a mesh": INPUT_LIMITS.mesh_triangles,
-    "waypoints, trajectory (CSV, JSON, YAML), G-code": INPUT_LIMITS.text_bytes / MB,
+    "waypoints, trajectory (CSV, JSON, YAML), robot program, G-code": INPUT_LIMITS.text_bytes / MB,
     "lines of a text": INPUT_LIMITS.text_lines,
     "characters of a line": INPUT_LIMITS.line_characters,
     "sampled trajectory of a schedule (CSV)": trajectory.MAX_FILE_BYTES / MB,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from models import ModelError
-from models.checks import Checks, floats, require
+from models.checks import Checks, floats, require, short_repr
 from ocp import ProblemError
 from ocp.errors import require as require_of_ocp
 
@@ -153,3 +154,26 @@ def test_a_number_is_accepted_as_an_array_without_dimensions_is(value: Any) -> N
     if number is not None:
         assert type(require.number("a", value)) is float
         assert floats(value) == number
+
+
+@dataclass(frozen=True)
+class Described:
+    name: str
+    values: Any = None
+    weight: float = 1.0
+    hidden: Any = field(default=0, repr=False)
+
+
+def test_the_short_text_of_an_object_has_one_line_whatever_it_holds() -> None:
+    assert repr_of(Described("a", np.zeros((400, 3)))) == "Described(name='a', values=<array of shape (400, 3)>)"
+    assert repr_of(Described("b", np.arange(3.0), 2.0)) == "Described(name='b', values=[0., 1., 2.], weight=2.0)"
+    assert repr_of(Described("c", [0.5] * 99, hidden="x")) == "Described(name='c', values=<list of 99>)"
+    assert repr_of(Described("d" * 99, print)) == "Described(name=<str>, values=<built-in function print>)"
+    nested = repr_of(Described("e", tuple(np.eye(9) for _ in range(3))))
+    assert nested == "Described(name='e', values=<tuple of 3>)"
+
+
+def repr_of(value: Any) -> str:
+    text = short_repr(value)
+    assert "\n" not in text
+    return text

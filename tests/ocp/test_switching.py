@@ -55,6 +55,23 @@ def test_arcs_that_meet_without_a_jump_have_a_node_where_they_meet() -> None:
     assert plan.cost == pytest.approx(2 * c + (1 - 2 * c) / 3, rel=1e-8)
 
 
+def test_limits_of_a_control_that_depend_on_the_state_switch_where_constant_ones_do() -> None:
+    """The control is the force times 2 + place: bounds of the force are path constraints of the state and control."""
+    problem = Problem("geared")
+    horizon = problem.horizon(lower=0.1, upper=9.0, guess=2.0)
+    place = problem.state("place", initial=0.0, terminal=1.0)
+    speed = problem.state("speed", initial=0.0, terminal=0.0)
+    torque = problem.control("torque")
+    force = torque / (2 + place)
+    problem.path("force", force, lower=-3.0, upper=1.0)
+    problem.dynamics(place, speed)
+    problem.dynamics(speed, force)
+    problem.minimize(terminal=horizon)
+    plan = solve(problem, Collocation(7, 4))
+    assert switches(problem, plan) == pytest.approx([0.75], abs=2e-4)
+    assert switches(pushed(), solve(pushed(), Collocation(7, 4))) == pytest.approx([0.75], abs=2e-4)
+
+
 def test_a_plan_that_does_not_switch_stays_as_it_is() -> None:
     problem, method = Problem("soft"), Collocation(4, 3)
     problem.horizon(1.0)

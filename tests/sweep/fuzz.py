@@ -37,12 +37,12 @@ import yaml
 from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer
 
-from models import Box, FixedBase, ModelError, MovingObstacle, Robot, Sphere, planar_chain
+from models import Box, FixedBase, ModelError, MovingObstacle, Robot, Sphere, example_robot, planar_chain
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import AuditError, Collocation, Plan, Problem, ProblemError, Scene, Solution, SolveError, TipTask, plan, solve
-from ocp.app.files import read_gcode, read_trajectory, read_waypoints
-from ocp.app.files.mcap import DEFINITIONS, STATE
+from ocp.app.files import read_gcode, read_trajectory, read_waypoints, write_robot_program
+from ocp.app.files.exchange import DEFINITIONS, STATE
 from ocp.app.files.task_file import read_obstacles, read_task
 from ocp.motion.schedule import JointTrajectory
 from tests.ocp.app.motions import NAMES, URDF, smooth
@@ -388,6 +388,20 @@ def log(packed: CompressionType) -> bytes:
     return stream.getvalue()
 
 
+def program(suffix: str) -> Callable[[], bytes]:
+    """A program of an industrial robot of six joints."""
+
+    def contents() -> bytes:
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / f"motion{suffix}"
+            arm = example_robot("six_axis")
+            q = np.tile(motion().positions[:, :3], 2)
+            write_robot_program(JointTrajectory(tuple(arm.joint_names), motion().t, q, q, q), file, robot=arm)
+            return file.read_bytes()
+
+    return contents
+
+
 def waypoints() -> bytes:
     rows = [(0.1 * k, 0.2, 0.3, 0, 0.1 * k, 1) for k in range(8)]
     return "\n".join(["x,y,z [m],ax,ay,az", *(",".join(map(str, row)) for row in rows)]).encode()
@@ -466,6 +480,10 @@ KINDS: dict[str, Kind] = {
     "mcap": Kind(".mcap", lambda: log(CompressionType.NONE), read_trajectory, BYTES_CHANGED),
     "mcap zstd": Kind(".mcap", lambda: log(CompressionType.ZSTD), read_trajectory, BYTES_CHANGED),
     "mcap lz4": Kind(".mcap", lambda: log(CompressionType.LZ4), read_trajectory, BYTES_CHANGED),
+    **{
+        name: Kind(name, program(name), lambda file: read_trajectory(file, period=0.1))
+        for name in (".script", ".src", ".mod")
+    },
     "task": Kind(".toml", TASK.encode, read_task),
     "obstacles": Kind(".toml", TASK[TASK.index("[[ob") : TASK.index("[out")].encode, read_obstacles),
 }

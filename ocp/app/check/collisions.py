@@ -47,7 +47,7 @@ def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
 
 
 def prove_clearance(scene: CollisionScene, motion: Motion) -> Clearance:
-    """Return the smallest distance found for each pair of bodies along a joint motion, and a proven lower bound of it.
+    """Return the smallest distance found for each pair of bodies along a joint motion, and its proven lower bound.
 
     The base is stationary.
     """
@@ -232,8 +232,8 @@ def _row(name: str, value: float, limit: float, unit: str, time: float | None) -
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:
-    """Return the required z axes of the tool at places (K,) on the path, given as fractional waypoint numbers. Shape
-    (K, 3).
+    """Return the required z axes of the tool, shape (K, 3), at points of the path, which are given by fractional
+    waypoint numbers (K,).
     """
     assert path.orientations is not None
     w, x, y, z = path.orientations.T

@@ -275,8 +275,8 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return the unit below 1 s ("" if none) in which the times make joint speeds plausible, and the top speed for
-    times in s.
+    """Return the unit, smaller than 1 s, that the times must have for plausible joint speeds ("" if there is none), and
+    the highest joint speed for times in seconds.
 
     The speed is that of the fastest joint, relative to its limit, if the times are in seconds. Plausible are samples at
     10 kHz or less, and a fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
@@ -434,7 +434,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
 def _jumps(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], velocity: Array, faults: list[Fault]
 ) -> None:
-    """Add a fault for each joint that jumps, that is, has a step far longer than the neighbouring steps."""
+    """Add a fault for each joint that jumps: it moves far more between two samples than between their neighbours."""
     h = np.diff(t)
     steps = np.diff(q, axis=0)
     speeds = steps / h[:, None]

@@ -59,7 +59,7 @@ class PiecewisePolynomial:
         return self.within(interval, np.clip((times - begin) / (end - begin), 0.0, 1.0))
 
     def within(self, interval: Indices, fraction: Array) -> Array:
-        """Return the values in given intervals (M,) at fractions (M,) of the interval length, 0 to 1. Shape (M, n)."""
+        """Return the values in given intervals (M,) at fractions (M,), 0 to 1, of the interval length. Shape (M, n)."""
         degree = self.coefficients.shape[1] - 1
         s = fraction[:, None]
         total = np.zeros((len(interval), self.coefficients.shape[2]))
@@ -222,8 +222,8 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return the smallest peak that every motion through the samples must have in each interval, of a quantity and
-        of its negative.
+        """Return, for each interval, the smallest possible maxima of a quantity and of its negative in a motion through
+        the samples.
 
         Acceleration: a motion between given positions and velocities needs the least if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h

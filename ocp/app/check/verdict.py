@@ -441,7 +441,7 @@ def _check_samples(
 
 
 def _worst(checks: Sequence[Check]) -> Check:
-    """Merge the checks of several motions: keep all faults and, for each quantity, the row with the worst value."""
+    """Merge the checks of several motions: keep all faults and, for each quantity, the worst table row."""
     rows: dict[str, Row] = {}
     for row in (row for check in checks for row in check.rows):
         if row.name not in rows or _severity(row) > _severity(rows[row.name]):

@@ -1,7 +1,7 @@
-"""Read and write files: tool paths from waypoints and G-code, joint trajectories, and plans as MCAP and Rerun logs."""
+"""Read and write files: tool paths from waypoints and G-code, joint trajectories, plans as logs and robot programs."""
 
+from ocp.app.files.exchange import log_rerun, write_mcap, write_robot_program
 from ocp.app.files.gcode import read_gcode
-from ocp.app.files.mcap import log_rerun, write_mcap
 from ocp.app.files.program import Cut, Note, Pause, Program, ProgramMotion, Rapid, Section, TimedProgram
 from ocp.app.files.settings import read_joint_limits
 from ocp.app.files.trajectory import RawTrajectory, read_trajectory
@@ -24,4 +24,5 @@ __all__ = [
     "read_trajectory",
     "read_waypoints",
     "write_mcap",
+    "write_robot_program",
 ]

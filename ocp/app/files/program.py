@@ -296,6 +296,9 @@ class TimedProgram:
     program: Program
     schedules: tuple[Schedule | None, ...]
 
+    def __repr__(self) -> str:
+        return f"<TimedProgram of {self.duration:.6g} s: {self.program}>"
+
     @cached_property
     def bounds(self) -> Array:
         """Start times of the sections, and the end time of the program. Shape (K + 1,), s."""

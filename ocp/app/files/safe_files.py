@@ -265,6 +265,9 @@ SUFFIXES = {
     "json": (".json",),
     "yaml": (".yaml", ".yml"),
     "mcap": (".mcap",),
+    "urscript": (".script",),
+    "krl": (".src",),
+    "rapid": (".mod",),
     "urdf": (".urdf",),
     "report": (".html", ".htm"),
 }
@@ -272,6 +275,9 @@ SIGNATURES = {
     "json": re.compile(rb'\{"header": \{"stamp": \{"sec": 0, "nanosec": 0\}, "frame_id": ""\}, "joint_names": \['),
     "yaml": re.compile(rf"# {MARK}\n".encode()),
     "mcap": re.compile(rb"\x89MCAP0\r\n\x01.{8}\x04\0\0\0ros2.{4}[ -~]{1,99}\x0c.{8}\x0a\0\0\0selfmotion", re.DOTALL),
+    "urscript": re.compile(rf"def \w+\(\):\n  # {MARK}\n".encode()),
+    "krl": re.compile(rf"&ACCESS RVP\nDEF \w+\(\)\n  ; {MARK}\n".encode()),
+    "rapid": re.compile(rf"MODULE \w+\n  ! {MARK}\n".encode()),
     "urdf": re.compile(rf"<\?xml [^>]*>\n<!-- {MARK} -->\n".encode()),
     "report": re.compile(rb'<!doctype html>\n<html[^>]*>\s*<head>\s*<meta name="generator" content="selfmotion">'),
 }

@@ -1,4 +1,4 @@
-"""Read joint trajectories from CSV tables, from JointTrajectory messages in JSON or YAML, and from MCAP logs.
+"""Read joint trajectories from tables, JointTrajectory messages in JSON or YAML, MCAP logs, and robot programs.
 
 Faults of the motion are kept for the check that reports them: values that are not numbers, times that do not increase,
 and joints that the robot does not have.
@@ -19,11 +19,21 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from models.checks import NOT_NUMBERS, Array
-from ocp.app.files.mcap import read_joint_messages
-from ocp.app.files.safe_files import FileName, children_of, is_number, line_error, read_lines, read_tree, split_cells
+from models.checks import NOT_NUMBERS, Array, short_repr
+from models.files import INPUT_LIMITS
+from ocp.app.files.exchange import ABSENT_AXIS, PROGRAM_UNITS, ROBOT_LANGUAGES, RobotLanguage, read_joint_messages
+from ocp.app.files.safe_files import (
+    SUFFIXES,
+    FileName,
+    children_of,
+    is_number,
+    line_error,
+    read_lines,
+    read_tree,
+    split_cells,
+)
 from ocp.errors import ProblemError, require
-from ocp.storage import table_joints
+from ocp.storage import joint_name, table_joints
 
 Indices: TypeAlias = NDArray[np.intp]
 
@@ -43,7 +53,10 @@ UNITS = {
     **dict.fromkeys(("deg", "°"), np.pi / 180),
 }
 HEADER_WITH_UNIT = re.compile(r"(.*)[\[(]([^\[(\])]*)[\])]")
-FORMATS = {".json": "json", ".yaml": "yaml", ".yml": "yaml", ".mcap": "mcap"}
+FORMATS = {suffix: kind for kind in ("json", "yaml", "mcap", *ROBOT_LANGUAGES) for suffix in SUFFIXES[kind]}
+AXIS_REMARK = re.compile(r"(\S+) = (\S+) \[(rad|deg|mm)\]")
+SPACED_SIGN = re.compile(r" ?([^\w. ]) ?")
+PROGRAM_NUMBER = re.compile(r"-?\d+(?:\.\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +85,8 @@ class RawTrajectory:
     notes: tuple[str, ...]
     file: str
 
+    __repr__ = short_repr
+
 
 def read_trajectory(
     file: FileName,
@@ -82,15 +97,16 @@ def read_trajectory(
     joints: Sequence[str] = (),
     kind: str | None = None,
 ) -> RawTrajectory:
-    """Read a joint trajectory from a CSV, JSON, YAML or MCAP file.
+    """Read a joint trajectory from a CSV, JSON, YAML or MCAP file, or from a robot program of `write_robot_program`.
 
     Args:
-        file: .csv or any text, .json, .yaml (needs the package `pyyaml`), .mcap (needs `mcap-ros2-support`).
+        file: .csv or any text, .json, .yaml (needs the package `pyyaml`), .mcap (needs `mcap-ros2-support`), .script,
+            .src, .mod.
         columns: Names of the columns of a table without a header.
-        period: Sampling period, s, of a table without times.
+        period: Sampling period, s, of a table without times, or of a KRL program, which has none.
         topic: Topic of an MCAP with several.
         joints: Names that are joints even if they look like something else.
-        kind: "csv", "json", "yaml" or "mcap"; None: by the suffix of the name.
+        kind: "csv", "json", "yaml", "mcap", "urscript", "krl" or "rapid"; None: by the suffix of the name.
 
     Raises:
         ProblemError: The file cannot be read or contains no trajectory; names the line where there is one.
@@ -99,7 +115,7 @@ def read_trajectory(
         raise ProblemError(f"a file name is expected, not {file!r}", name="file", value=file)
     if kind is None:
         kind = FORMATS.get(Path(file).suffix.lower(), "csv")
-    require.choice("kind", kind, ("csv", "json", "yaml", "mcap"))
+    require.choice("kind", kind, ("csv", *FORMATS.values()))
     if topic is not None:
         require.text("topic", topic)
     if period is not None:
@@ -113,6 +129,8 @@ def read_trajectory(
         return _read_table(file, columns, period, known)
     if kind == "mcap":
         return _from_messages(file, *read_joint_messages(file, topic))
+    if kind in ROBOT_LANGUAGES:
+        return _read_program(file, ROBOT_LANGUAGES[kind], period)
     return _from_points(file, read_tree(file, kind))
 
 
@@ -369,3 +387,90 @@ def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) 
     v, a, efforts = (values[kind] for kind in KINDS[1:])
     lines = np.arange(1, len(states) + 1)
     return RawTrajectory(names, t, position, v, a, efforts, lines, True, tuple(notes), str(file))
+
+
+# ---- programs of industrial robots -------------------------------------------------------------------------------
+
+
+def _read_program(file: FileName, language: RobotLanguage, period: float | None) -> RawTrajectory:
+    """Read a robot program that `write_robot_program` wrote; spaces, empty lines and other comments are free."""
+    patterns = [re.compile(statement, re.ASCII) for statement in language.statements]
+    joints: dict[str, tuple[str, float]] = {}
+    rows, steps, lines, stage = list[list[float]](), list[float](), list[int](), 0
+    for number, text in enumerate(read_lines(file), 1):
+        code, _, remark = text.partition(language.comment)
+        statement = SPACED_SIGN.sub(r"\1", " ".join(code.split()))
+        try:
+            if match := AXIS_REMARK.fullmatch(" ".join(remark.split())):
+                _name_axis(language, joints, match, bool(rows))
+            if not statement:
+                continue
+            if stage == language.repeated and not patterns[stage].fullmatch(statement):
+                stage += 1
+            match = patterns[stage].fullmatch(statement) if stage < len(patterns) else None
+            if match is None:
+                raise ValueError(f"selfmotion writes no such statement here in {language.title}; remove it")
+            stage += stage != language.repeated
+            if match.lastindex:
+                duration = match.groupdict().get("time")
+                steps.append(0.0 if duration is None else _program_number(duration))
+                positions = match.groups()[: match.lastindex - (duration is not None)]
+                rows.append(_axis_positions(language, ",".join(positions), joints))
+                lines.append(number)
+        except ValueError as error:
+            raise line_error(file, number, text, str(error)) from error
+    if stage < len(patterns) or not rows:
+        words = f"{file}: the {language.title} program has no point, or ends before its last statement; complete it"
+        raise ProblemError(words, name="file", value=str(file))
+    t, notes = np.cumsum(np.rint(np.array(steps) * 1e9)) / 1e9, tuple[str, ...]()
+    if language is ROBOT_LANGUAGES["krl"]:
+        if period is None:
+            words = f"{file}: a KRL program has no times; give the sampling period that it was written with (--period)"
+            raise ProblemError(words, name="period", value=None)
+        t = np.arange(float(len(rows))) * period
+        notes = (f"KRL has no times; they are multiples of the period of {period:g} s",)
+    names = tuple(name for name, _ in joints.values())
+    return RawTrajectory(names, t, np.array(rows), None, None, None, np.array(lines), True, notes, str(file))
+
+
+def _name_axis(
+    language: RobotLanguage, joints: dict[str, tuple[str, float]], remark: re.Match[str], late: bool
+) -> None:
+    """Store the joint and the unit of an axis that a comment states; raise ValueError if it is invalid."""
+    axis, column, unit = remark.groups()
+    if axis not in (*language.arm, *language.external):
+        return  # any other comment
+    name = joint_name(column)
+    if len(name) > INPUT_LIMITS.name_characters or not name.isprintable():
+        raise ValueError(f"{column[:80]!r} is not the name of a joint; correct it")
+    if late or axis in joints or name in [other for other, _ in joints.values()]:
+        raise ValueError("comments must name each axis and joint once, before the first point; remove this one")
+    joints[axis] = name, PROGRAM_UNITS[unit]
+
+
+def _axis_positions(language: RobotLanguage, text: str, joints: dict[str, tuple[str, float]]) -> list[float]:
+    """Return the positions of the joints, rad or m, from the numbers of a statement; raise ValueError if invalid."""
+    items = text.split(",")
+    if language is ROBOT_LANGUAGES["krl"]:
+        pairs = [(item[:2].upper(), item[2:].strip()) for item in items]
+    elif len(items) != (count := len(language.arm) + len(language.external)):
+        raise ValueError(f"{len(items)} positions, there must be {count}; complete them")
+    else:
+        pairs = list(zip((*language.arm, *language.external), items, strict=True))
+        absent = {"0", ABSENT_AXIS}
+        pairs = [(axis, item) for axis, item in pairs if axis in joints or item not in absent]
+    values = dict(pairs)
+    if len(pairs) != len(joints) or values.keys() != joints.keys():
+        raise ValueError(
+            f"positions of the axes {', '.join(values)}, but comments name the joints of {', '.join(joints)}"
+        )
+    return [_program_number(values[axis]) * unit for axis, (_, unit) in joints.items()]
+
+
+def _program_number(text: str) -> float:
+    """Return a decimal number of a robot program; raise ValueError if it is none or has too many digits."""
+    if len(text) > INPUT_LIMITS.number_characters or not PROGRAM_NUMBER.fullmatch(text):
+        raise ValueError(
+            f"{text[:80]!r} is not a decimal number of at most {INPUT_LIMITS.number_characters} characters"
+        )
+    return float(text)

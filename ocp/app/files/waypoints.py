@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import ModelError, Path, SmoothPath
-from models.checks import ROUNDING, Array, warn_of_degrees, warn_of_millimetres
+from models.checks import ROUNDING, Array, short_repr, warn_of_degrees, warn_of_millimetres
 from models.paths import Line, split_at_reversals
 from models.paths.path import Reversal
 from models.paths.segments import SHORTEST_SEGMENT, product, rotation_vector
@@ -82,6 +82,8 @@ class Waypoints:
     ignored: tuple[str, ...]
     lines: NDArray[np.intp]
     file: str
+
+    __repr__ = short_repr
 
     @property
     def free_roll(self) -> bool:

@@ -425,7 +425,7 @@ def _torque_like(solution: Solution, joints: str) -> bool:
 
 
 def _audit_verdict(solutions: Sequence[Solution], judge: Callable[[], Audit | PlanVerdict]) -> dict[str, Any]:
-    """Return the attributes of an Animation that describe the audit; only a sentence if a solution has no problem."""
+    """Return the attributes of an Animation that describe the audit, or that state why there is no audit."""
     lost = next((solution.problem_lost for solution in solutions if solution.problem is None), None)
     if lost is not None:
         return {"verdict": f"There is no audit, because the file has no problem: {lost}."}

@@ -321,7 +321,7 @@ TIP_FRAME = "the tip frame"
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of the links and of the tip in world along a motion, keyed by link name or TIP_FRAME.
+    """Frames of the links and of the tip in the world along a motion, keyed by link name or TIP_FRAME.
 
     Attributes:
         rotations: Axes as columns. Shape (M, 3, 3) each.
@@ -338,7 +338,7 @@ class Frames:
 
 
 def frames_along(machine: Machine, joints: Any, base: Any = None) -> Frames:
-    """Return the frames of all links, and of the tip if the robot has one, in world along a motion.
+    """Return the frames of all links, and of the tip if the robot has one, in the world along a motion.
 
     Args:
         machine: The robot on its base.
@@ -408,7 +408,7 @@ class Obstacle(NamedTuple):
 
 
 def obstacles_of_shapes(shapes: Iterable[Shape]) -> list[Obstacle]:
-    """Return shapes, given in world, as static obstacles for display."""
+    """Return shapes, given in the world frame, as static obstacles for display."""
     return [
         Obstacle(np.asarray(shape.point, dtype=float)[None], 0.0, np.asarray(shape.normal, dtype=float))
         if isinstance(shape, HalfSpace)

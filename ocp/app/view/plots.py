@@ -329,7 +329,7 @@ def _local(other: LocalSolution) -> dict[str, Array]:
 
 
 def _along(motion: Any) -> dict[str, tuple[Array, Array]]:
-    """Return times (s) and values of a motion's states and controls by name, with both one-sided values at a node.
+    """Return times (s) and values of a motion's states and controls by name, including both one-sided values at nodes.
 
     States and controls of a phase are given over the interval of that phase.
     """

@@ -247,7 +247,7 @@ def render(
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
-    """Triangles in world: corners and normals (n, 3), corner indices of the faces (f, 3), and face colours (f, 3)."""
+    """Triangles in the world: corners and normals (n, 3), corner indices of faces (f, 3), and face colours (f, 3)."""
 
     corners: Array
     normals: Array

@@ -1,4 +1,4 @@
-"""Clearance constraints: pairs of bodies whose clearance the audit proves, and pairs that path constraints separate.
+"""Clearance constraints of motions: the audit proves clearances, path constraints keep chosen pairs of bodies apart.
 
 The audit proves the clearance of all declared pairs. Path constraints separate only the pairs that were found too
 close: a planner solves, finds these pairs, adds separation constraints and solves again. A motion without collisions
@@ -164,7 +164,7 @@ class ClearanceConstraints:
 
 
 class Separating(Protocol):
-    """Interface of constraints that keep pairs of bodies apart and whose margins can be increased."""
+    """Interface of constraints that keep pairs of bodies apart with margins that can be increased."""
 
     def widened(self, proofs: Sequence[Clearance]) -> Self:
         """Return a copy of the constraints with larger margins for the pairs of bodies that violate their clearance."""
@@ -230,7 +230,7 @@ def clearance_of(
 
 
 def _check_limits(scene: CollisionScene, joints: Variable) -> None:
-    """Raise ProblemError if a problem lets joints leave the position limits that the collision scene assumes."""
+    """Raise ProblemError if a problem lets a joint leave the position limits that the collision scene presupposes."""
     robot = scene.machine.robot
     inside = (constant(joints.lower) >= robot.lower) & (constant(joints.upper) <= robot.upper)
     if scene.limits and not inside.all():
@@ -289,7 +289,7 @@ def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
 
 
 def _evaluate(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
-    """Evaluate a function that builds an SX expression of base, joints and time, also for MX arguments."""
+    """Evaluate a function that accepts SX symbols only (base, joints and time) also for MX arguments."""
     arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
     if not any(isinstance(value, ca.MX) for value in arguments):
         return ca.SX(expression(*arguments))

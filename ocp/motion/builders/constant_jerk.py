@@ -1,4 +1,4 @@
-"""Rest-to-rest joint motions with phases of constant jerk, in closed form and slowed down to the torque limits.
+"""Rest-to-rest joint motions in phases of constant jerk, in closed form, and slowed down to satisfy torque limits.
 
 A joint that moves by d from rest to rest within limits V, A and J of velocity, acceleration and jerk is fastest if it
 builds up its acceleration for t_j, keeps it for t_a, and releases it for t_j; then it cruises for t_v, and brakes as it
@@ -73,7 +73,7 @@ SETTINGS = ConstantJerkSettings()
 
 
 class _Ramps(NamedTuple):
-    """Fastest rest-to-rest velocity profiles of n joints: phase durations, s, and peak velocities. Shape (..., n)."""
+    """Phase durations, s, and peak velocities of the fastest rest-to-rest motions of n joints. Shape (..., n) each."""
 
     build_up: Array
     steady: Array
@@ -162,7 +162,7 @@ class ConstantJerkMotion:
         return float(self.durations.sum())
 
     def slower(self, factor: float) -> ConstantJerkMotion:
-        """Return the same motion with its duration multiplied by a factor."""
+        """Return a motion along the same joint path with the duration multiplied by a factor."""
         derivatives = self.rates / factor, self.accelerations / factor**2, self.jerks / factor**3
         return ConstantJerkMotion(self.durations * factor, self.joints, *derivatives)
 
@@ -343,7 +343,7 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:
-    """Return the least durations of straight rest-to-rest joint motions if torques are not limited, s.
+    """Return the least durations, s, of straight rest-to-rest motions in joint space without torque limits.
 
     Shape (K,) for changes of the joint positions of shape (K, n).
     """
@@ -355,7 +355,7 @@ def _columns(motion: ConstantJerkMotion) -> Sequence[Array]:
 
 
 def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
-    """Return the limits of velocity, acceleration and jerk, with finite values wherever a profile needs a limit."""
+    """Return joint velocity, acceleration and jerk limits; limits that a profile needs are made finite."""
     velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
     jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
     velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
@@ -365,7 +365,7 @@ def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Arr
 
 
 def _profiles(distances: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest rest-to-rest velocity profile of each joint by itself for absolute distances (..., n)."""
+    """Return the fastest rest-to-rest velocity profile of each joint by itself over a given distance (..., n)."""
     return _ramps(distances, *_effective(distances, bounds))
 
 

@@ -42,7 +42,7 @@ LARGEST_SINE = 1 - 1e-9  # largest magnitude of the sine of q4 and the cosine of
 
 @dataclass(frozen=True)
 class RollGuessSettings:
-    """Settings of the initial guess of the roll, a lowest-cost path through finer and finer grids of times and rolls.
+    """Settings of the search for an initial guess of the roll on finer and finer grids of times and roll angles.
 
     Attributes:
         times: Number of times of the grid.
@@ -266,7 +266,7 @@ def roll_problem(
     target = _column(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Substitute the tool target at the time of the problem, and the roll, into an expression."""
+        """Return an expression with the tool target at the symbolic time and the roll of the problem substituted."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
@@ -284,7 +284,7 @@ def roll_problem(
 
 
 def _column(targets: Targets, time: Any) -> Any:
-    """Return the tool target (5, 1) at a symbolic time; raise ProblemError if the user's function is invalid."""
+    """Return a user's tool target (5, 1) at a symbolic time; raise ProblemError if it is invalid."""
     try:
         target = expression(targets(time))
     except RuntimeError:  # interpolants do not take SX symbols
@@ -307,7 +307,7 @@ def _curve(targets: Targets, symbols: Any) -> Any:
 
 
 def _violation(value: Any, lower: Any, upper: Any) -> Any:
-    """Return the sum of the amounts by which values are below their lower or above their upper bounds."""
+    """Return the summed violation of lower and upper bounds by values of an expression."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
 
 

@@ -162,7 +162,7 @@ def dynamics_problem(
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Boundary conditions of a motion, checked against the limits; values that are free are nan.
+    """Boundary conditions of a motion, checked against the joint limits; free positions and velocities are nan.
 
     Attributes:
         first, last: Joint positions at the start and at the end. Shape (n,).
@@ -204,18 +204,18 @@ class _Ends:
 
     @property
     def end(self) -> Array:
-        """Joint positions at the end of the initial guess; joints with a free end stay at their start. Shape (n,)."""
+        """Joint positions at the end of the initial guess; joints with a free end stay where they start. Shape (n,)."""
         return np.where(np.isnan(self.last), self.start, self.last)
 
     def quintic(self, duration: float, order: int) -> Any:
-        """Return the quintic rest-to-rest joint motion of the guess, or a derivative of it, as a function of time."""
+        """Return the quintic joint motion used as guess, or for `order` > 0 its derivative, as a function of time."""
         shape = QUINTIC.deriv(order) if order else QUINTIC
         begin = self.start if order == 0 else np.zeros(len(self.start))
         return lambda t: begin + (self.end - self.start) * shape(t / duration) / duration**order
 
 
 class _Motion(NamedTuple):
-    """Symbols of the states and controls of a problem, and the expression of the time derivative of the base."""
+    """Symbols of the states and controls of a problem, and the time derivative of the base configuration."""
 
     base: Any
     joints: Any
@@ -291,7 +291,7 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return scales of angles, speeds, accelerations and jerks of reaction wheels for the solver; nan for other joints.
+    """Return, for the solver, scales of reaction wheel angles, speeds, accelerations and jerks; nan for other joints.
 
     Rotors are light and turn fast. Their scales are a quarter of the saturation speed and of the motor torque, or what
     1 N m s and 1 N m cause where these are unlimited. Shape (4, n).
@@ -316,7 +316,7 @@ def end_velocities(name: str, value: Any, n: int) -> Array:
 
 
 def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: Any) -> None:
-    """Constrain the base configuration at the end of a motion; three equations constrain a spatial attitude."""
+    """Constrain the base configuration at the end of a motion; a spatial attitude takes three equations, not four."""
     if not machine.base_size:
         raise ProblemError("a fixed base has no end_base", name="end_base", value=end_base)
     goal = _checked_end("end_base", end_base, machine.base_size)
@@ -334,7 +334,7 @@ def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: An
 
 
 def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, motion: _Motion, duration: float) -> None:
-    """Constrain the tip accelerations to those of the tasks, and declare the pose errors that the audit checks."""
+    """Constrain the tip accelerations to those that tasks prescribe; declare the pose errors that the audit checks."""
     base, joints, rates, second, *_ = motion
     if not np.isnan(ends.first).any():
         checked_tasks(equations, ends.base, ends.first, duration)

@@ -1,4 +1,4 @@
-"""Planners that solve and audit motions to one or several goals within actuator limits.
+"""Planners of motions to one or several goals within actuator limits: they solve a problem and audit the plan.
 
 A plan must satisfy its limits between the nodes of the mesh, too. A smooth plan of least effort needs few intervals. A
 plan of least time switches from limit to limit and gets nodes at its switches. Where a limit is still exceeded
@@ -123,7 +123,7 @@ def dynamics_phases(
 
 
 def checked_goals(goals: Any) -> tuple[Goal, ...]:
-    """Check that goals can be the ends of consecutive phases of one problem, and return these goals as a tuple.
+    """Check that one problem can lead to goals one after the other, a phase to each, and return the goals as a tuple.
 
     Raises:
         ProblemError: There are none; one is no Goal, is a pose, or has no duration; two have the same name.
@@ -181,7 +181,7 @@ def _rests(goal: Goal) -> bool:
 
 
 def _join(phases: Phases, before: str, after: str, goal: Goal) -> None:
-    """Make the states continuous between two phases, except states that the goal between the phases fixes anyway."""
+    """Make the states continuous between two phases, except states whose values the goal between the phases fixes."""
     fixed: dict[str, Any] = {}
     if goal.joints is not None and not np.isnan(np.asarray(goal.joints, dtype=float)).any():
         fixed["joints"] = None
@@ -242,7 +242,7 @@ class SolveSettings:
 
     @property
     def ipopt_options(self) -> dict[str, Any]:
-        """IPOPT options of the user, completed by the defaults of the planner."""
+        """IPOPT options given by the user, completed by the defaults of the planner."""
         return {**IPOPT, **(self.options or {})}
 
 
@@ -258,7 +258,7 @@ def solve_dynamics(
     setup: DynamicsSetup | None = None,
     settings: SolveSettings | None = None,
 ) -> Solution:
-    """Plan a motion within actuator limits along tip tasks or to one or several goals, and audit the plan.
+    """Plan a motion within actuator limits, either along tip tasks or to one or several goals, and audit the plan.
 
     The problem is `dynamics_problem`, or the phases of `dynamics_phases`. The plan satisfies its limits between the
     nodes, too, to 1e-5 of their units. The first plan that passes its audit is returned. If none passes, the feasible
@@ -439,10 +439,7 @@ def _first_within_limits(
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Yield the results of up to two attempts on one mesh: a label, and a plan that satisfies its limits or an error.
-
-    The second attempt has nodes at the switches of the first. The caller stops at the first plan that it accepts.
-    """
+    """Yield a label and a plan, or the error, of a solve on a mesh, and of one with nodes at the plan's switches."""
     warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)
@@ -458,7 +455,7 @@ def _attempts(
 def _tighten_limits(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
-    """Tighten limits until a plan satisfies the original ones between the nodes; return this plan, or an error."""
+    """Tighten limits until a plan satisfies the original limits between mesh nodes; return this plan, or the error."""
     if largest_excess(problem, plan) <= HOLDING.excess:
         return plan
     own, largest = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.cost_increase * abs(plan.cost)
@@ -473,7 +470,7 @@ def _tighten_limits(
 
 
 def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocation:
-    """Return a finer mesh: intervals whose tightened limits cost too much are split, or else all are halved."""
+    """Return a finer mesh: split the intervals whose tightened limits raise the cost too much, or else halve all."""
     if plan.bound_tightening is None or failure.solution is not plan or failure.name != "cost":
         return mesh.halve()
     nodes, amounts = plan.control_interpolant.breaks, plan.bound_tightening.max(axis=(0, 2))
@@ -482,7 +479,7 @@ def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocatio
 
 
 def _with_joint_names(error: SolveError, machines: Mapping[str, tuple[Machine, Limits | None]]) -> SolveError:
-    """Return an error that names joints instead of constraint rows: "torques of 'elbow'" for "torques[1]"."""
+    """Return an error that names joints instead of indices: "torques of 'elbow'" for "torques[1]"."""
 
     def joint_label(label: re.Match[str]) -> str:
         phase, quantity, row = label["phase"] or "", label["quantity"], int(label["row"])

@@ -1,4 +1,4 @@
-"""Optimal control problems of least joint velocity between configurations or along tasks; joint rates are controls.
+"""Optimal control problems of least joint rates between configurations or along tasks; the rates are the controls.
 
 A path of straight motions in joint space at constant speed is a motion of `joint_motion_problem`, with rates that jump
 at its corners. `motion_along` returns it as a solution that can be audited and saved like one of a solver.

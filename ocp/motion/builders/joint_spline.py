@@ -73,7 +73,7 @@ class _Along(NamedTuple):
 
 
 class _Torques(NamedTuple):
-    """Coefficients of joint torques in the acceleration a and speed v along a path: inertia a + drag v^2 + rest."""
+    """Coefficients of joint torques as functions of path speed v and acceleration a: inertia a + drag v^2 + rest."""
 
     inertia: Array
     drag: Array
@@ -152,7 +152,7 @@ def joint_path(
     samples: int = 400,
     names: Sequence[str] | None = None,
 ) -> PlannedJoints:
-    """Return a spline of joint positions over the distance along a path, from a plan at constant speed or samples.
+    """Return a spline of joint positions over the distance along a path, from a plan at constant speed or from samples.
 
     Args:
         machine: Machine of the joints.
@@ -318,7 +318,7 @@ class _BatchedFunction:
         return [part.T for part in np.split(results, np.cumsum(self.sizes)[:-1])]
 
     def _table(self) -> tuple[Array, list[tuple[Any, list[Array]]]]:
-        """Return a work array with a row for each intermediate value, and the function's instructions on these rows."""
+        """Return a work array with one line per intermediate value, and the function's instructions on its lines."""
         table = np.zeros((self.rows + len(self.constants), SPLINE.batch))
         table[self.rows :] = np.array(self.constants).reshape(-1, 1)
         rows = list(table)
@@ -339,7 +339,7 @@ def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
 
 
 def _forces(machine: Machine) -> _BatchedFunction | None:
-    """Return the function that computes the coefficients of joint torques along a path; None if the base moves.
+    """Return a function that computes the coefficients of joint torques along a path; None if the base moves.
 
     Its inputs are joint positions and their first two derivatives with respect to distance, its outputs `_Torques`.
     """

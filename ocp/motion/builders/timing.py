@@ -66,7 +66,7 @@ REFINEMENT = RefinementSettings()
 
 @dataclass(frozen=True, eq=False)
 class TimingProblem:
-    """Minimum-time problem along a path, with its mesh and the reference motion that defines the path parameter.
+    """Minimum-time problem along a path, its mesh, and the reference motion whose time is the path parameter.
 
     Attributes:
         problem: Problem with states "speed" and "acceleration" and control "jerk" in `units`. Its time is theta less
@@ -251,7 +251,7 @@ def _declare(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the minimum-time problem over a span of the path parameter theta, in scaled units.
+    """Declare the minimum-time problem over an interval of the path parameter theta, in scaled units.
 
     `along` is the function of theta that returns the reference speed and the values of `path_columns`.
     """
@@ -295,7 +295,7 @@ def _declare(
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Return the centripetal acceleration and joint velocities, accelerations and jerks divided by their limits.
+    """Return the ratios of centripetal acceleration and joint velocities, accelerations and jerks to their limits.
 
     `values` are the reference speed and the values of `path_columns`; v, a, j are path speed, acceleration and jerk.
     """
@@ -319,7 +319,7 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
 
 
 def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
-    """Return the number of parts into which to split each mesh interval, from its limit excess and integration error.
+    """Return the number of parts into which to split each mesh interval, from limit violation and integration error.
 
     Both decrease with the square of the length of the interval.
     """
@@ -334,7 +334,7 @@ def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
 
 
 def _ends(reference: SpeedProfile, span: tuple[float, float]) -> tuple[float, float]:
-    """Return the distances that the reference motion covers before and after a given interval of its time, m."""
+    """Return the distances, m, that the reference motion covers before and after a given time interval."""
     # the jerk is constant there; the cube is accurate near the end, a difference of distances is not
     left = reference.duration - span[1]
     return float(reference.jerk[0] * span[0] ** 3 / 6), float(reference.jerk[-1] * left**3 / 6)

@@ -74,7 +74,7 @@ TABLES = TableSettings()
 
 
 def table(columns: Columns, breaks: Array) -> Any:
-    """Return a casadi Function of time that approximates path quantities by piecewise polynomials of degree 7.
+    """Return a casadi Function that approximates path quantities over time by piecewise polynomials of degree 7.
 
     Intervals between `breaks` are halved as far as necessary. At a break the interval that begins there applies.
     """
@@ -155,7 +155,7 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
 
 
 def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Return ratios of quantities to their limits at speed 1 m/s, and the power of speed that each is proportional to.
+    """Return ratios of quantities to limits at path speed 1 m/s, and the powers of speed with which they grow.
 
     The speed along the path is constant. The rows are the centripetal acceleration, then velocity, acceleration and
     jerk of each joint. Shapes (C, M), (C,).
@@ -202,7 +202,7 @@ def _bernstein(x: Array) -> Array:
 
 
 def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | None) -> SpeedProfile:
-    """Return a speed profile within all limits along a path: that of `schedule` or, if it fails, a slower one."""
+    """Return a speed profile within all limits along a path, from `schedule` or, if that fails, a slower profile."""
     try:
         return schedule(path, limits, joints=joints).profile
     except ProblemError:

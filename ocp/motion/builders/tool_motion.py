@@ -49,8 +49,7 @@ class FeedbackSettings:
     """Settings of the feedback of pose errors, and of relaxed tasks, from which a motion may deviate at a cost.
 
     Attributes:
-        decay: Largest decay of a pose error over an interval of the mesh, as a power of e. Faster feedback would need a
-            finer mesh, for errors that are zero if the tasks begin at their poses.
+        decay: Largest decay of a pose error over a mesh interval, as a power of e; faster decay needs a finer mesh.
         intervals: Least number of intervals of the mesh in a stretch.
         closed_gap: Pose error at the beginning of a task below which there is no gap to close, m and rad.
         relaxation: Velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s.
@@ -90,17 +89,16 @@ class Stretch:
 
     @property
     def duration(self) -> float:
-        """Duration of the stretch, s."""
+        """Duration of the interval, s."""
         return self.end - self.begin
 
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """Optimal control problem of a tool motion, and the stretches in which its tasks are active.
+    """Optimal control problem of a tool motion, and the time intervals (stretches) in which its tasks are active.
 
     Attributes:
-        problem: Problem with the states "joints" and, on a floating base, "base", and the control "rates", with the
-            suffix of each stretch.
+        problem: Problem with states "joints" and, on a floating base, "base", and controls "rates", with suffixes.
         stretches: Consecutive stretches.
         horizon: Horizon of the motion and of the problem, s.
         breaks: Fractions 0..1 of the horizon at which a mesh should have nodes. Shape (k,).
@@ -112,10 +110,7 @@ class ToolMotion:
     breaks: Array
 
     def guess(self, motions: Sequence[LocalMotion], number: int) -> dict[str, Any]:
-        """Return an initial guess of states and controls, by name, from the resolved-rate motions in each stretch.
-
-        `number` is the index of the resolved-rate motion that is used.
-        """
+        """Return initial guesses of states and controls, by name, from the resolved-rate motion of this number."""
         guess: dict[str, Any] = {}
         for stretch, part in zip(self.stretches, motions, strict=True):
             t = (part.t - stretch.begin) * (self.horizon / stretch.duration)
@@ -128,7 +123,7 @@ class ToolMotion:
 
 
 def stretches_of(machine: Machine, tasks: Sequence[TipTask], horizon: float) -> tuple[Stretch, ...]:
-    """Divide the horizon into intervals (stretches) with the same active tasks, and limit the gains of pose feedback.
+    """Divide the horizon into intervals in each of which the active tasks do not change; limit pose feedback gains.
 
     Raises:
         ProblemError: A task begins or ends outside the horizon.
@@ -265,11 +260,11 @@ class _Motion:
         return self.stretches[-1].end
 
     def pace(self, stretch: Stretch) -> float:
-        """Return the ratio of a stretch's duration to the horizon, by which the dynamics of the stretch are scaled."""
+        """Return the ratio of a time interval's duration to the horizon, by which the dynamics in it are scaled."""
         return stretch.duration / self.horizon
 
     def states(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare the base configuration, if the base moves, and the joint positions of a stretch as states."""
+        """Declare joint positions and, if the base moves, the base configuration in one time interval as states."""
         machine, begins, ends = self.machine, stretch is self.stretches[0], stretch is self.stretches[-1]
         place: Any = np.zeros(0)
         if machine.base_size:
@@ -283,7 +278,7 @@ class _Motion:
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
 
     def velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
-        """Declare the joint velocities of a stretch as states; return velocities, accelerations and running cost."""
+        """Declare the joint velocities in a time interval; return velocities, accelerations and running cost."""
         assert self.setup.actuation is not None
         begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.setup.actuation.rests))
         cost = self.setup.actuation.cost or Cost(weights=self.setup.weights)
@@ -293,7 +288,7 @@ class _Motion:
         return declare_actuators(self.problem, self.machine, self.horizon, (place, joints), **options)
 
     def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare the velocity errors of relaxed tasks as controls; return errors and cost, 0 if no task is relaxed."""
+        """Declare velocity errors of relaxed tasks as controls; return errors and their cost, 0 if none is relaxed."""
         assert stretch.equations is not None
         if not self.setup.relaxed or not stretch.equations.size:
             return 0, 0
@@ -301,7 +296,7 @@ class _Motion:
         return FEEDBACK.relaxation * errors, ca.sumsqr(errors) / 2
 
     def constrain_clearance(self, stretch: Stretch, horizon: float | None) -> None:
-        """Declare the clearance constraints of a stretch; `horizon` is None if the time is free."""
+        """Declare the clearance constraints in one time interval; `horizon` is None if the duration is free."""
         if self.setup.clearance_constraints is not None:
             base = f"base{stretch.suffix}" if self.machine.base_size else self.machine.base_home()
             self.setup.clearance_constraints.declare(
@@ -311,11 +306,10 @@ class _Motion:
 
 
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
-    """Declare the states, controls and constraints of one stretch (interval with the same tasks) in fixed time.
+    """Declare states, controls and constraints in one time interval of fixed duration with the same active tasks.
 
-    `known` is the Jacobian of the task coordinates that the stretch before fixes at its end, see `_slopes`, or None.
     Return the states that continue in the next stretch, the running cost, and the Jacobian of the coordinates that
-    this stretch fixes.
+    this stretch fixes at its end (see `_slopes`); `known` is that of the stretch before, or None.
     """
     problem, machine, bounds, pace = motion.problem, motion.machine, motion.setup.bounds, motion.pace(stretch)
     begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]
@@ -354,12 +348,11 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
 
 
 def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
-    """Declare the problem of a tool motion whose tasks may be executed more slowly than in their own time.
+    """Declare the problem of a tool motion that may execute its tasks more slowly than their targets prescribe.
 
     The independent variable is the tasks' own time s, and the time t is a state. With q' = dq/ds, z = dt/ds, rates
     u = q'/z and weights W the cost is the integral of (time_cost + u W u/2) dt = (time_cost z + q' W q'/(2 z)) ds,
-    which is convex in q' and z. Tasks, J q' = v(s), and rate limits V, |q'| <= V z, are linear. With accelerations as
-    controls, z is a state.
+    which is convex in q' and z; tasks and rate limits are linear. With accelerations as controls, z is a state.
     """
     machine, problem, stretches, bounds = motion.machine, motion.problem, motion.stretches, motion.setup.bounds
     if len(stretches) > 1 or stretches[0].equations is None:
@@ -403,10 +396,9 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
 
 
 def _closure(motion: _Motion) -> Any:
-    """Declare and return a small constant velocity error of a closed task that lets the joint path close exactly.
+    """Declare and return a constant velocity error of a task whose path is closed, so that the joints return exactly.
 
-    If the joints return, a closed task returns by itself. Both conditions would contradict each other by the error of
-    the discretisation; so the task may deviate by a velocity of that size.
+    If the joints return, the task returns as well. Both conditions differ by the error of the discretisation alone.
     """
     problem, stretches = motion.problem, motion.stretches
     equations = stretches[-1].equations
@@ -434,7 +426,7 @@ def _declare_tasks(
     required: NDArray[np.bool_] | None = None,
     derivatives: Sequence[tuple[Any, Any]] | None = None,
 ) -> None:
-    """Declare the task constraints of a stretch; `symbols` are its base configuration, joint positions and rates.
+    """Declare the task constraints in a time interval, given base configuration, joint positions and rates there.
 
     `closure` is the deviation of a closed task. If `free`, the tasks that begin here must be at their start poses,
     except in rows that are not `required`, (size,), to which the stretch before leads. With `derivatives` (of states
@@ -490,7 +482,7 @@ def _declare_tasks(
 
 
 def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
-    """Return the Jacobian of a stretch's task coordinates with respect to base and joints at a random configuration.
+    """Return the Jacobian of task poses with respect to base and joint positions at a random configuration.
 
     A rank found there applies everywhere but on a set of measure zero. Shape (size, base_size + joint_size).
     """

@@ -108,7 +108,7 @@ def joint_torques(
 
 
 def checked_motors(name: str, machine: Any) -> Motors:
-    """Return the machine; raise ProblemError unless the joint torques alone determine its motion."""
+    """Return a machine if the joint torques alone determine its motion, else raise ProblemError."""
     if not isinstance(machine, FixedBase | FreeFloating) or isinstance(machine, Standing):
         words = f"{name}: a FixedBase or a FreeFloating is expected, not a {type(machine).__name__}; use "
         words += "standing_problem for a standing machine"
@@ -118,7 +118,7 @@ def checked_motors(name: str, machine: Any) -> Motors:
 
 @dataclass(frozen=True, eq=False)
 class Actuation:
-    """Options of a motion whose controls are accelerations, or jerks if jerks are limited or weighted.
+    """Options of a motion controlled by joint accelerations, or by jerks if jerks are limited or weighted in the cost.
 
     Attributes:
         cost: Weights of all terms but the time; None for half the squared rates.
@@ -183,7 +183,7 @@ def declare_actuators(
         limit_torques(problem, robot, torques, bounds.torque, suffix=suffix)
     running = running_cost(machine, cost, (base, joints, rates, second), jerks=jerks, torques=torques)
     if torques is not None:
-        running += limit_power(problem, torques * rates, bounds, cost, suffix)
+        running += limit_power(problem, torques * rates, bounds, cost, suffix=suffix)
     return rates, second, running + smoothing**2 / 2 * smooth
 
 
@@ -193,7 +193,7 @@ def weights_torques(cost: Cost) -> bool:
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
-    """Return the running cost of a motion per second, without the costs of time and positive power.
+    """Return the cost per second of a motion, without the terms of duration and positive power.
 
     Args:
         machine: The machine.
@@ -221,8 +221,8 @@ def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any]
     return running
 
 
-def limit_power(problem: Problem, powers: Any, bounds: JointBounds, cost: Cost, suffix: str = "") -> Any:
-    """Declare the limits of the actuators' powers, W, and return the cost of the positive power per second.
+def limit_power(problem: Problem, powers: Any, bounds: JointBounds, cost: Cost, *, suffix: str = "") -> Any:
+    """Declare the limits of the actuators' powers, W, and return the cost per second of the positive power.
 
     The path constraint "power" limits them. If the cost weights energy, the positive power of each joint is a limited
     control of this name, because the cost needs it.

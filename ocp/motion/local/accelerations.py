@@ -40,7 +40,7 @@ Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilise
 
 @dataclass(frozen=True)
 class Layer:
-    """Secondary objective: a configuration index to improve with the freedom that tasks and zero moment point leave.
+    """Secondary objective: a configuration index to improve by joint motions that disturb no task of higher priority.
 
     Attributes:
         index: ``joint_limits``, p1 of equation (23) of Yoo et al. 2004, to be decreased; ``manipulability`` of the rows
@@ -65,7 +65,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Stabiliser:
-    """Gains of the law that keeps a machine upright over a pinned zero moment point, like an inverted pendulum.
+    """Gains of the control law that keeps a machine upright over a fixed zero moment point, like an inverted pendulum.
 
     The centre of mass is commanded y'' = -k2 y' - k1 (y - y*) + k0 L, with L the angular momentum about the point,
     dL/dt = -M g (y - y*): the characteristic polynomial is s^3 + k2 s^2 + k1 s + k0 M g.
@@ -151,7 +151,7 @@ class _TaskHierarchy:
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add a task `rows` q'' = `target` that the joint accelerations q'' shall satisfy with the least change."""
+        """Add equations `rows` q'' = `target` that the joint accelerations q'' shall satisfy with the least change."""
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
@@ -392,7 +392,7 @@ def resolve_accelerations(
 
 
 class _Simulation:
-    """Integrator of joint positions and velocities under a control law that makes many fixed steps in one call."""
+    """Integrator with fixed time steps for joint positions and velocities under a control law; one call makes many."""
 
     def __init__(self, law: Any, n: int, step: float, options: AccelerationOptions) -> None:
         self.step, self._law, self._n = step, law, n

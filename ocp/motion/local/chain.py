@@ -120,7 +120,7 @@ class SymbolicAxis(NamedTuple):
         return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
 
     def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
-        """Return the scalar product of a fixed and a rotated vector as coefficients of 1, cos(angle) and sin(angle).
+        """Return the coefficients of 1, cos(angle), sin(angle) in the scalar product of a fixed and a rotated vector.
 
         The product is fixed . R(sign angle) vector, with the rotation R about the axis. Shape (1, 3).
         """

@@ -183,7 +183,7 @@ class ClosedForm(PoseSolver):
         return self.chain.refine(pose, joints, self.free, tips), np.zeros_like(families), families
 
     def _loop(self) -> _SymbolicLoop:
-        """Return the loop closure equation of the free joints; the meeting or parallel axes are the last ones."""
+        """Return the loop closure equation of the free joints, in which the meeting or parallel axes come last."""
         chain = self.chain
         symbols, fixed = ca.SX.sym("pose", len(self.redundant) + 12), Frame(ca.DM.eye(3), ca.DM(3, 1))
         points, axes = chain.points.copy(), list[SymbolicAxis]()
@@ -202,12 +202,12 @@ class ClosedForm(PoseSolver):
         return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
 
     def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
-        """Convert solutions, lists of joint positions in `order`, to one column in the order of the free joints."""
+        """Join IK solutions, which list the joints in `order`, to one column with the joints in chain order."""
         return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
 
     @cached_property
     def _planar_function(self) -> Sampler:
-        """Function of a tip pose that returns two IK solutions of a SCARA and the relative excess over its reach."""
+        """Function of a tip pose that returns two IK solutions of a SCARA and how far the pose is out of reach."""
         symbols, axes, order, goal = self._loop()
         triple = [axes[order.index(j)] for j in self.triple]
         slide = next(axis for axis in axes if not axis.revolute)
@@ -246,7 +246,7 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function of a tip pose and angles of `_pair_function` that returns two IK solutions of all free joints.
+        """Function of a tip pose and the two angles of `_pair_function` that returns two IK solutions of all joints.
 
         Further outputs are the excess over the reach and the lever arm of joint y, which is between x and z.
         """
@@ -423,7 +423,7 @@ def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
 
 
 def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
-    """Return two solutions of three joints that produce a rotation (meeting axes) or a planar motion (parallel axes).
+    """Return two solutions for three joints that produce a rotation (if axes meet) or planar motion (if parallel).
 
     The second result is the share by which the motion exceeds what the axes can do; the solutions are then the nearest.
     """

@@ -108,7 +108,7 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
 
 
 def worst_collisions(
-    scene: CollisionScene, base: Array, joints: Array, times: Array, pairs: Sequence[int] | None = None
+    scene: CollisionScene, base: Array, joints: Array, times: Array, *, pairs: Sequence[int] | None = None
 ) -> list[Collision | None]:
     """Return for each sample the closest pair of bodies if it violates the clearance, else None.
 
@@ -125,7 +125,7 @@ def worst_collisions(
 def _collision_at(
     scene: CollisionScene, place: tuple[int, int], distance: float, base: Array, joints: Array, times: Array
 ) -> Collision:
-    """Return the collision of a pair at a sample, given as `place`, with the other arguments of `distances_along`."""
+    """Return the collision of one pair of bodies at one sample of a motion; `place` holds the indices of both."""
     at, pair = place
     base, time = np.broadcast_to(base, (len(joints), scene.machine.base_size))[at], float(np.ravel(times)[at])
     covers = pair in scene.cover_pairs
@@ -158,7 +158,7 @@ def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
 
 
 def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -> CollisionScene:
-    """Return a collision scene; raise ProblemError if it is of another machine or assumes limits that do not apply."""
+    """Return a collision scene; raise ProblemError if it is of another machine or wrongly assumes joint limits."""
     if require.instance("scene", value, CollisionScene).machine is not machine:
         words = "scene belongs to another machine; build it from this one: CollisionScene(machine, ...)"
         raise ProblemError(words, name="scene", value=value)

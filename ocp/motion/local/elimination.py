@@ -41,9 +41,9 @@ COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPL
 
 
 def _half_angle_products() -> Array:
-    """Return the coefficients that express products of full-angle and half-angle functions by half-angle functions.
+    """Return coefficients that turn products of the sines and cosines of an angle and of its half into sums.
 
-    The functions are 1, cos h, sin h; cos h/2, sin h/2; and the latter two with cos 3h/2, sin 3h/2. Shape (3, 2, 4).
+    Products of 1, cos h, sin h with cos h/2, sin h/2 are sums of these two and cos 3h/2, sin 3h/2. Shape (3, 2, 4).
     """
     products = np.zeros((3, 2, 4))
     products[0] = np.eye(2, 4)
@@ -300,7 +300,7 @@ def _reverse_axis(axis: Axis) -> Axis:
 
 
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return the conformal coordinates of a moved line element as coefficients of products of cosines and sines.
+    """Return coefficients of the conformal coordinates of a moved line element in cosines and sines of joint angles.
 
     Args:
         axes: Axes of the joints, the one that moves the line element first in front.
@@ -356,9 +356,9 @@ def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]
 
 
 def _companions(matrices: Array) -> tuple[Array, Array, Array]:
-    """Return companion matrices and poles of polynomial eigenvalue problems, and reciprocal condition numbers.
+    """Return companion matrices of eigenvalue problems, the angles at eigenvalue 0, and reciprocal condition numbers.
 
-    The eigenvalues are tan((h - pole) / 2) of an angle h. Shapes (M, 24, 24), (M,), (M,).
+    The problems are polynomial; the eigenvalues are tan((h - pole) / 2) of an angle h. Shapes (M, 24, 24), (M,), (M,).
     """
     count, poles = len(matrices), np.array(ELIMINATION.poles)
     one, cosine, sine = (matrices[:, None, k] for k in range(3))
@@ -416,10 +416,10 @@ def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpen
 
 
 def _factor_angles(vectors: Array) -> tuple[Array, Array, Array]:
-    """Recover two joint angles from each of K eigenvectors (4, 3), whose entries are products of two functions.
+    """Recover two joint angles from each of K eigenvectors, whose entries are products of sines and cosines of both.
 
-    One function is of half the first angle, the other of the second angle. The third result is the largest deviation
-    of an entry from such products, relative to the largest entry.
+    The entries (4, 3) multiply functions of half the first angle by functions of the second. The third result is the
+    largest deviation of an entry from such products, relative to the largest entry.
     """
     flat, rows = vectors.reshape(-1, 12), np.arange(len(vectors))
     largest = flat[rows, np.abs(flat).argmax(axis=1)]

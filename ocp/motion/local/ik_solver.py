@@ -76,6 +76,9 @@ class IkConfigurations:
     parameters: tuple[str, ...]
     reasons: tuple[Incompleteness, ...]
 
+    def __repr__(self) -> str:
+        return f"<IkConfigurations: {len(self)} at {len(self.reasons)} poses, {self.complete.sum()} of them complete>"
+
     @property
     def complete(self) -> NDArray[np.bool_]:
         """Mask of the poses for which all configurations are found. Shape (N,), bool."""
@@ -117,7 +120,7 @@ class IkSolver:
         limits: bool = True,
         samples: int = 36,
     ) -> None:
-        """Prepare the inverse kinematics of one arm for poses of one kind.
+        """Prepare the inverse kinematics of an arm for a given tip, and for the orientations that a task leaves free.
 
         Args:
             machine: Machine on a fixed base.
@@ -153,6 +156,10 @@ class IkSolver:
             words = f"{machine.robot.name}: no six joints on a fixed base determine the tip; use inverse_kinematics"
             raise ProblemError(words, name="machine", value=machine)
         self.prepared, self.samples = prepared, int(samples)
+
+    def __repr__(self) -> str:
+        sampled = f", {self.samples} samples of {' and '.join(self.parameters)}" if self.parameters else ""
+        return f"<IkSolver of six joints{sampled}>"
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -286,7 +286,7 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """List IK solutions (K, n) on all branches; return the list and the number of random guesses to complete it.
+        """Return IK solutions (K, n) on all branches, and how many random initial guesses shall be tried in addition.
 
         The list is empty if no solver of all branches exists.
         """
@@ -309,7 +309,7 @@ class _MultiStart:
         return gauss_newton(function, joints, self.lower, self.upper, **options)
 
     def rank(self, joints: Array, errors: Array) -> list[IkSolution]:
-        """Return the distinct IK solutions among configurations, sorted by decreasing quality."""
+        """Return the distinct IK solutions among configurations, sorted by manipulability times limit distance."""
         solved, lower, upper = np.flatnonzero(errors <= self.options.tolerance), self.lower, self.upper
         if not solved.size:
             return []

@@ -77,10 +77,7 @@ class LocalSolution:
         return f"<LocalSolution of {self.t[-1]:.6g} s, {self.joints.shape[1]} joints: cost {self.cost[-1]:.6g}{end}>"
 
     def at(self, time: float) -> dict[str, Array]:
-        """Interpolate the motion at a time: "base" and "joints" by cubic polynomials, "joint_rates" linearly.
-
-        Times outside the motion are clipped to its ends.
-        """
+        """Interpolate "base" and "joints" cubically and "joint_rates" linearly; times are clipped to the motion."""
         time = float(np.clip(time, self.t[0], self.t[-1]))
         rates = np.array([np.interp(time, self.t, column) for column in self.joint_rates.T])
         if len(self.t) == 1:
@@ -470,10 +467,7 @@ def track_tasks(
 
 
 def _cone_function(equations: TaskEquations) -> Any:
-    """Return the CasADi function that computes the cosines of tool-axis tilts, which cone tasks limit, and gradients.
-
-    A cone task keeps a tool axis within a cone. The inputs are base, joints and targets.
-    """
+    """Return the CasADi function (base, joints, targets) of the cosines of tool-axis tilts, and their gradients."""
     machine = equations.machine
     b, q, u = (ca.SX.sym("v", size) for size in (machine.base_size, machine.joint_size, machine.joint_size))
     targets = ca.SX.sym("targets", equations.target_function().numel_out())

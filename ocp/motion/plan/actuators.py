@@ -185,7 +185,7 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
 
 
 def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError:
-    """Return the error with the actuator demand of the motion that ignores the limits added to its text."""
+    """Add to the text of an error the actuator demand of the motion that ignores the limits; return the error."""
     details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
     words = "no motion within the actuator limits was found"
     if demand is not None:

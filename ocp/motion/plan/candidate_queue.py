@@ -231,7 +231,7 @@ class CandidateQueue:
         return self.solver.collision(candidate) if stage <= Stage.FINE else None
 
     def _has_passed(self, candidate: Candidate) -> bool:
-        """Return whether a candidate of equal cost (if costlier ones are kept, also of equal path) has passed."""
+        """Return whether a candidate of equal cost, and of equal path if costlier ones are kept, has passed."""
         passed = [c for c in self.candidates if c.passed]
         same = [c for c in passed if abs(candidate.total - c.total) <= self.settings.same_cost * c.total]
         if not self._always_costlier or candidate.solution is None:

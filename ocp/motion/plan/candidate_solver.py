@@ -279,7 +279,7 @@ class CandidateSolver(Solver):
     def prepared(
         self, candidate: Candidate, fine: bool, cost: float = np.inf
     ) -> tuple[ToolMotion, Collocation, Prepared]:
-        """Return the problem of a candidate, the first mesh, and the solver prepared for guesses of a similar cost."""
+        """Return the problem of a candidate, its first mesh, and a solver set up for guesses that cost about `cost`."""
         settings, separated = self.settings, _is_separated(candidate)
         margins: tuple[Any, ...] = ()
         if candidate.constraints is not None and separated:

@@ -52,7 +52,7 @@ __all__ = [
 ]  # fmt: skip
 
 PHASE_INTERVALS = 40
-"""Number of intervals of the first mesh, over all phases; one phase gets no more than a motion of its own."""
+"""Number of intervals of the first mesh, summed over all phases; no phase gets more than a single motion would."""
 REGION_SAMPLES, REGION_STARTS = 8, 16
 """Number of random tip positions in the region of a goal, besides its centre, and of IK samples at each position."""
 
@@ -173,7 +173,7 @@ def _goal_request(
 def plan_steps(
     machine: Machine, steps: Steps, *, start: Any, cost: StepWeights | None, limits: Limits | None
 ) -> PhasedPlan:
-    """Plan the steps of a machine on its feet; see `steps_problem`.
+    """Plan the motion of a standing machine that makes given footsteps; see `steps_problem`.
 
     Args:
         machine: Machine of the first stance, `steps.stances[0]`.
@@ -408,7 +408,7 @@ def _takes_scalars(equations: TaskEquations) -> bool:
 def _start_configurations(
     machine: Standing, tasks: list[TipTask], start: Any, limits: Limits | None, seed: int
 ) -> list[Array]:
-    """Return the given start configuration or, without one, inverse kinematics solutions sorted by conditioning."""
+    """Return the given start configuration or, without one, inverse kinematics solutions by decreasing quality."""
     if start is not None:
         return [start]
     poses = [task for task in tasks if task.is_pose]

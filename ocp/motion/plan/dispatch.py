@@ -184,7 +184,7 @@ def _plan(
 
 
 def _are_separate(goals: Sequence[Any]) -> bool:
-    """Return whether the motions to goals do not depend on each other: each goal is a place where the machine rests."""
+    """Return whether motions to goals can be planned one by one, because the machine comes to rest between them."""
     each = [goal for goal in goals if isinstance(goal, Goal)]
     if len(each) < len(goals) or not all(map(has_only_target, each)):
         return False
@@ -194,7 +194,7 @@ def _are_separate(goals: Sequence[Any]) -> bool:
 
 
 def _is_sequence(tasks: Any) -> bool:
-    """Return whether tasks are a sequence of motions: goals mixed with tasks, or groups of tasks.
+    """Return whether the argument `tasks` lists consecutive motions: goals mixed with tasks, or several lists of tasks.
 
     Raises:
         ProblemError: A part is neither a goal nor tasks.
@@ -237,7 +237,7 @@ def plan_problem(
     limits: Limits | None = None,
     scene: Scene | Literal[False] | None = None,
 ) -> Problem:
-    """Declare the optimal control problem that `plan` would solve; start configurations are not searched here.
+    """Declare, but do not solve, the optimal control problem of `plan`; no start configurations are searched for.
 
     The clearance of the scene is proven by the audit of a solution, but no pair of bodies is separated yet, see
     `ClearanceConstraints.with_pairs`. A goal needs joint positions here, not a pose. Limits of actuators beside tip

@@ -128,7 +128,7 @@ class GoalRequest:
 
 @dataclass(frozen=True, eq=False)
 class GoalTask:
-    """Checked request for a motion to goals: bounds, start, goals in all full turns, metric, collision checks."""
+    """Checked request for a motion to goals, with joint limits, goals shifted by full turns, and collision checks."""
 
     request: GoalRequest
     bounds: JointBounds
@@ -160,12 +160,12 @@ class GoalTask:
 
     @property
     def spline_cost(self) -> SplineCost | None:
-        """Cost of splines; None if the cost has other terms."""
+        """Cost of a motion along splines; None if the requested cost has terms that splines do not support."""
         return SplineCost.of(self.request.cost, len(self.start))
 
     @property
     def is_fastest(self) -> bool:
-        """Whether the motion is time-optimal: the cost is a free time alone."""
+        """Whether the motion is time-optimal: the horizon is free, and time is the only term of the cost."""
         return self.request.horizon is None and self.request.cost.terms == ("time",)
 
     @property
@@ -200,7 +200,7 @@ def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate
 
 
 def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return audited candidate motions along paths: fastest, within actuator limits, or at constant speed."""
+    """Return audited candidates along paths: as requested, fastest, within actuator limits, or at constant speed."""
     if task.is_fastest:
         return [_fastest(task, path) for path in paths]
     return _within_actuator_limits(task, paths) if task.is_dynamic else _at_constant_speed(task, paths)
@@ -228,7 +228,7 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
 
 
 def _fastest(task: GoalTask, path: JointPath) -> Candidate:
-    """Return a locally fastest motion near a path with its audit or, if none is found, one that stops at corners."""
+    """Return an audited, locally fastest motion near a path or, if none is found, one that stops at path corners."""
     candidate = _spline(task, path, None)
     if not candidate.passed:
         with suppress(TimeLimitReached):
@@ -237,7 +237,7 @@ def _fastest(task: GoalTask, path: JointPath) -> Candidate:
 
 
 def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate:
-    """Return a locally optimal spline near a path with its audit; its horizon is free if None."""
+    """Return an audited, locally optimal spline near a path; the horizon is free if it is None."""
     settings = task.request.settings.spline
     ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
     limits, cost = MotionLimits(task.motions, task.bounds, task.torques, *ends), task.spline_cost
@@ -245,7 +245,7 @@ def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate
     try:
         for _ in range(task.request.settings.margins):
             with time_limited(task.request.settings.search_share * time_left()):
-                motion = optimal_motion_near(limits, path.joints, cost, horizon, settings)
+                motion = optimal_motion_near(limits, path.joints, cost, horizon, settings=settings)
             candidate = _PathProblem(task, path, motion, horizon).candidate("is a locally optimal spline")
             task.report(f"path of length {path.length:.4g}: {candidate}")
             if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:
@@ -308,7 +308,7 @@ class _PathProblem:
 
     @property
     def horizon_guess(self) -> float:
-        """Horizon or, if it is free, its guess, s."""
+        """Horizon, s; if the horizon is free, an initial guess of it."""
         return self.motion.duration if self.fixed is None else self.fixed
 
     def declare(self, clearance: ClearanceConstraints | None) -> Problem:
@@ -394,7 +394,7 @@ def _audit_candidate(task: GoalTask, solution: Solution, path: JointPath) -> Can
 
 
 def cost_bound(task: GoalTask, horizon: float) -> float | None:
-    """Return a lower bound of the cost of any motion to a goal; None if the machine moves at an end.
+    """Return a lower bound of the cost of any motion to a goal; None if the machine moves at start or end.
 
     Straight motions have the least length and squared velocities. Each joint by itself needs the least time and, within
     its acceleration limit, the least squared velocity.

@@ -60,7 +60,7 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
 
 
 def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
-    """Return all motions that were found within some seconds, and their audits."""
+    """Return all audited candidate motions to the goals that are found within the given time, s."""
     settings, candidates = task.request.settings, list[Candidate]()
     if task.is_fastest:
         with suppress(TimeLimitReached), time_limited((1 - settings.search_share) * seconds):
@@ -78,7 +78,7 @@ def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
 
 
 def _check_request(request: GoalRequest) -> GoalTask:
-    """Check a request; return it with goals of unlimited joints shifted by full turns towards the start.
+    """Check a request; return it with goals shifted towards the start by full turns of the unlimited joints.
 
     Raises:
         ProblemError: As `plan_to_goal`.
@@ -125,7 +125,7 @@ def _check_request(request: GoalRequest) -> GoalTask:
 
 
 def _nearest_and_spread(goals: Array, changes: Array, most: int) -> Array:
-    """Return at most `most` of the goals (K, n): one half needs the smallest changes (K, n), one half is spread out."""
+    """Select at most `most` of K goals: half of them need the least joint changes (K, n), the others are spread out."""
     if len(goals) <= most:
         return goals
     order = np.argsort(np.linalg.norm(changes, axis=1), kind="stable")

@@ -67,7 +67,7 @@ __all__ = [
 ]
 
 UNLIMITED_RATE = 1.0
-"""Rate of joints without a rate limit in the estimate of an approach, rad/s or m/s."""
+"""Rate assumed for joints without a rate limit when the cost of an approach is estimated, rad/s or m/s."""
 
 
 def plan_from_configurations(
@@ -133,12 +133,12 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates with local motions as initial guesses, by rising cost; motions that satisfy tasks come first.
+    """Return candidates with local motions as guesses: those that satisfy the tasks first, then by rising cost.
 
     The cost includes that of the approach from the configuration `near` of the request.
 
     Args:
-        motions: K local motions through each stretch.
+        motions: K local motions through each time interval.
         options: Further fields of `Seed`.
     """
     errors, costs = np.array(largest_pose_errors([*motions])), np.sum([motion.cost for motion in motions], axis=0)
@@ -157,7 +157,7 @@ def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **o
 
 
 def _approach_costs(request: PlanRequest, starts: Array) -> Array:
-    """Return estimated costs of the motions to start configurations (K, n): straight, at the velocity limits. (K,)."""
+    """Return estimated costs (K,) of straight approaches to start configurations (K, n) at the velocity limits."""
     if request.near is None:
         return np.zeros(len(starts))
     changes, velocity = np.abs(starts - request.near), request.bounds.velocity
@@ -325,7 +325,7 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
 
 
 def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
-    """Plan a request with some joints held at rest; `whole` is the request before any joints were held.
+    """Plan a request with some joints held at rest; `whole` is the request before these were held.
 
     Raises:
         ProblemError, SolveError: As in `plan`.

@@ -246,7 +246,7 @@ def _misses(equations: TaskEquations, joints: Array) -> float:
 
 
 def _led_to(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return a goal moved to the start of the next task or, if this start does not satisfy the goal, unchanged."""
+    """Return the goal with the start configuration of the next task, or unchanged if that does not satisfy the goal."""
     first = plan.at(0.0)
     if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
         return goal
@@ -279,7 +279,7 @@ def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:
 
 @contextmanager
 def _naming_part(part: str) -> Iterator[None]:
-    """Add the name of a part of a sequence to the errors that its planner raises."""
+    """Add the name of a motion of a sequence to errors that are raised while this motion is planned."""
     try:
         yield
     except (ProblemError, SolveError) as error:

@@ -53,10 +53,10 @@ def is_nearly_singular(stretches: Sequence[Stretch], motions: Sequence[LocalMoti
 
 @dataclass(frozen=True)
 class MotionSample:
-    """Samples of a motion in one interval of time (stretch) with the same active tasks.
+    """Samples of a motion in one time interval, in which the same tasks are active.
 
     Attributes:
-        stretch: The stretch.
+        stretch: The time interval and its tasks.
         t: Times, s. Shape (M,).
         base, joints, rates: Base and joint positions, and joint rates. Shapes (M, base_size), (M, n), (M, n).
     """
@@ -146,7 +146,7 @@ def describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) ->
 
 
 def _rate_shares(request: PlanRequest, rates: Array) -> Array:
-    """Return absolute joint rates relative to their limits; the ratio is zero for a joint at rest."""
+    """Return absolute joint rates as fractions of the rate limits; the fraction is zero for a joint at rest."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.nan_to_num(np.abs(rates) / request.bounds.velocity, nan=0.0)
 

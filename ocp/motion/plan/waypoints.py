@@ -242,7 +242,7 @@ class _WaypointPlanner:
         return self._best_plan(paths, bound)
 
     def _segmented_paths(self, search: AtlasSearch, segmented: bool) -> tuple[list[list[Segment]], float]:
-        """Return paths through the searched waypoints as lists of segments, and a lower bound of their cost."""
+        """Return paths through the waypoints of a search, each as a list of segments, and a lower cost bound."""
         if segmented:
             result = fewest_segments(search)
             return ([], np.inf) if result is None else ([result[0]], result[1])
@@ -323,7 +323,7 @@ class _WaypointPlanner:
             return None
 
     def _search(self, chosen: NDArray[np.intp], coarse: bool = False) -> AtlasSearch:
-        """Return the search over some waypoints; with two redundant joints, it is over sections with a fixed joint."""
+        """Return the search for paths over some waypoints; of two redundant joints, one is fixed at several values."""
         manifolds = SelfMotionManifolds(self.space, self.manifolds.equations, self.manifolds.targets[chosen])
         distances = np.diff(chosen)[:, None]
         options: dict[str, Any] = {"seeds": lambda k: self._seeds(int(chosen[k])), "scene": self.scene}
@@ -341,7 +341,7 @@ class _WaypointPlanner:
         return SectionSearch(*arguments, **options, **sections, joint=joint)
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
-        """Return the error that says at which waypoint all paths end, including waypoints that the search skipped."""
+        """Return the error that says at which waypoint all paths end, even if the search skipped this waypoint."""
         error, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
         if error is None:
             return SolveError("no path goes through the waypoints", name="waypoints")
@@ -386,7 +386,7 @@ class _WaypointPlanner:
         for segment in chain:
             rows = slice(int(chosen[segment.first]), int(chosen[segment.last]) + 1)
             samples = [TimeSample(self.manifolds, k) for k in range(len(self.positions))[rows]]
-            limits, bounds = np.repeat(self.step[None], len(samples) - 1, axis=0), (self.lower, self.upper)
+            limits, bounds = np.full_like(joints[rows][1:], self.step), (self.lower, self.upper)
             times = np.arange(len(self.positions), dtype=float)[rows]
             options: dict[str, Any] = {"bounds": bounds, "scene": self.scene, "widths": self.settings.widths}
             paths.append(shorten_path(joints[rows], samples, Steps(times, self.cost, limits), **options))

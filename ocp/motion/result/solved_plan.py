@@ -289,7 +289,7 @@ class SolvedPlan(Plan):
 
 
 def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
-    """Return the parts of a plan (time interval and name suffix), one for each stretch of time with the same tasks."""
+    """Return a part of the plan (time interval and suffix of names) for each time interval with the same tasks."""
     return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)
 
 

@@ -1,1 +1,1 @@
-"""Sampling-based planning of joint paths in several homotopy classes, which are proven collision-free."""
+"""Sampling-based planning of joint paths of several homotopy classes; all paths are proven collision-free."""

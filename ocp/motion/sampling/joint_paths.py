@@ -1,4 +1,4 @@
-"""Paths of straight motions in joint space: proofs of their clearance, shortening, and homotopy classes.
+"""Piecewise straight paths in joint space: proofs of clearance, shortening, and tests of homotopy.
 
 **Proof.** On a straight motion by dq, no two bodies of a pair approach each other by more than levers |dq|
 (:class:`models.machines.collision_scene.Levers`). If their distance at the middle of the motion exceeds the clearance
@@ -147,7 +147,7 @@ class StraightMotions:
         clear: NDArray[np.bool_],
         intervals: tuple[Indices, Array, Array],
     ) -> None:
-        """Bound the distances of bodies on shorter and shorter intervals; unset `clear` for motions that may collide.
+        """Prove straight motions collision-free by bisection; unset the marks `clear` of motions that may collide.
 
         Args:
             lines: Starts and ends of the motions.
@@ -197,7 +197,7 @@ class StraightMotions:
             middle = np.concatenate([middle[kept] - shift, middle[kept] + shift])
 
     def _frames_on(self, lines: tuple[Array, Array], motion: Indices, places: Array) -> Frames:
-        """Return the frames of the bodies on K straight motions, each at a fraction of its length."""
+        """Return the frames of all bodies on K straight motions, at one fraction of the length of each motion."""
         starts, ends = lines[0][motion], lines[1][motion]
         return self._frames(starts + places[:, None] * (ends - starts))
 
@@ -243,7 +243,7 @@ def shorten(
     random: np.random.Generator,
     settings: ShorteningSettings = ShorteningSettings(),
 ) -> Array:
-    """Shorten a joint path by random shortcuts; all its straight motions remain proven collision-free.
+    """Shorten a joint path by random shortcuts; each straight motion of the result is proven collision-free.
 
     Args:
         motions: Proofs of clearance.
@@ -286,7 +286,7 @@ def _places(path: Array, scale: Array) -> Array:
 
 
 def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Callable[[Array], Array]) -> Array:
-    """Return the lowest-cost collision-free path through the ends and any subset of the other corners of a path.
+    """Return the collision-free path of least cost from start to end through any subset of the corners of a path.
 
     Args:
         motions: Proofs of clearance.
@@ -408,7 +408,7 @@ def optimise_length(
 
 
 def _resample(motions: StraightMotions, path: Array, scale: Array, count: int) -> Array:
-    """Divide a path into collision-free straight motions of similar length; keep corners where necessary.
+    """Divide a path into collision-free straight motions of similar length; keep old corners where a shortcut fails.
 
     The result is the old path if the motions cannot be proven, since halves of a proven motion need not be.
     """
@@ -433,7 +433,7 @@ def _step(
     inertia: float,
     settings: LengthSettings,
 ) -> Array:
-    """Return the displacements of a path's corners that minimise a bound of its length under linear constraints.
+    """Return displacements of a path's corners that minimise an upper bound of its length under linear constraints.
 
     The clearance constraints are linearised. Shape (m + 1, n).
     """
@@ -467,7 +467,7 @@ def _step(
 
 
 def _nearest_point(target: Array, rows: Array, least: Array) -> Array:
-    """Return the point z nearest to a target in the polyhedron `rows` z >= `least`, which contains the origin."""
+    """Return the point z nearest to a target in a polyhedron, `rows` z >= `least`, that contains the origin."""
     needed = least - rows @ target
     active = np.flatnonzero(needed > -np.inf)
     if not len(active) or needed.max() <= 0:

@@ -67,7 +67,7 @@ class TreeSearch:
 
 
 class _Tree:
-    """Random tree of configurations, each with the index of its parent."""
+    """Random tree of configurations, in which each node stores the index of its parent."""
 
     def __init__(self, roots: Array) -> None:
         self.nodes, self.parents = roots.copy(), np.full(len(roots), -1)
@@ -79,7 +79,7 @@ class _Tree:
         return np.arange(first, len(self.nodes))
 
     def nearest(self, joints: Array, scale: Array) -> Indices:
-        """Return the index of the node that is nearest to each configuration (K, n)."""
+        """Return, for each of K configurations (K, n), the index of the nearest node of the tree."""
         nodes, points = self.nodes * scale, joints * scale
         return np.asarray(((nodes**2).sum(axis=1) - 2 * points @ nodes.T).argmin(axis=1))
 
@@ -140,7 +140,7 @@ def _step_towards(starts: Array, targets: Array, step: float, scale: Array) -> A
 
 
 def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step: float) -> tuple[int, int] | None:
-    """Extend a tree from new nodes towards targets (K, n) in the other tree, step by step.
+    """Extend a random tree step by step from new nodes towards target nodes (K, n) of another tree.
 
     Returns:
         Which of the targets is reached, and the tree's node there; None if none is.

@@ -33,7 +33,7 @@ import numpy as np
 import scipy
 
 from models.checks import Array
-from ocp.console import TimeLimitReached, check_time
+from ocp.console import TimeLimitReached, casadi_silenced, check_time
 from ocp.errors import SolveError
 from ocp.motion.builders.constant_jerk import ConstantJerkMotion, TorqueLimits
 from ocp.motion.sampling.joint_paths import StraightMotions, points_along
@@ -45,7 +45,7 @@ __all__ = ["MotionLimits", "SplineCost", "SplineMotionSettings", "optimal_motion
 
 @dataclass(frozen=True)
 class SplineMotionSettings:
-    """Settings of `optimal_motion_near`: spline, constraints, trust region and programs.
+    """Settings of `optimal_motion_near`: of the spline, the constraints, the trust region and the iterations.
 
     Attributes:
         intervals: Number of intervals of the spline between the short ones at both ends.
@@ -132,7 +132,7 @@ class SplineCost:
 
     @classmethod
     def of(cls, cost: Cost, size: int) -> SplineCost | None:
-        """Return the cost for `size` joints; None if it has terms of another kind."""
+        """Return a cost in this form for `size` joints; None if the cost has terms that this form lacks."""
         if not set(cost.terms) <= {"time", "velocity", "acceleration", "jerk"}:
             return None
         rows = cost.joint_weights(size) / 2, cost.acceleration, cost.jerk
@@ -144,6 +144,7 @@ def optimal_motion_near(
     path: Array,
     cost: SplineCost,
     horizon: float | None = None,
+    *,
     settings: SplineMotionSettings = SplineMotionSettings(),
 ) -> ConstantJerkMotion:
     """Return a locally optimal motion near a path, with the start and end configurations of the path.
@@ -178,9 +179,9 @@ def optimal_motion_near(
 
 
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
-    """Solve programs in sequence; return the feasible motion of least cost and the last trust region.
+    """Solve linear or quadratic programs in sequence; return the best feasible motion and the trust region size.
 
-    It is the last motion if none is feasible. The sequence ends when the cost decreases by less than `least_gain`.
+    If none is, return the last motion. The sequence ends when the cost decreases by less than `least_gain`.
 
     Raises:
         TimeLimitReached: The time limit has passed before one was feasible.
@@ -215,7 +216,7 @@ def _local_optimum(search: _Search, state: _State, region: float, least_gain: fl
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Iterate of the sequential linear programs: a motion, with its constraints linearised there.
+    """Iterate of sequential linear or quadratic programming: a motion, and its constraints linearised at this motion.
 
     Attributes:
         points: Control points. Shape (K, n).
@@ -243,7 +244,7 @@ class _State:
         return self.excess == 0
 
     def merit(self, penalty: float) -> float:
-        """Return the merit of the iterate: logarithm of the cost plus penalty times excess."""
+        """Return the merit of the iterate: logarithm of the cost plus `penalty` times the largest limit violation."""
         return float(np.log(self.cost)) + penalty * self.excess
 
 
@@ -252,7 +253,7 @@ _Rows: TypeAlias = tuple[Any, Array, Array, float]
 
 
 class _Search:
-    """Sequential linear or quadratic programming for the optimal motion in a spline basis."""
+    """Search for the optimal motion in a spline basis by sequential linear or quadratic programming."""
 
     def __init__(
         self, limits: MotionLimits, path: Array, cost: SplineCost, horizon: float | None, settings: SplineMotionSettings
@@ -286,7 +287,7 @@ class _Search:
         self.residuals = [self._residuals(order) for order in (1, 2, 3) if cost.squares[order - 1].any()]
 
     def _residuals(self, order: int) -> tuple[int, Any]:
-        """Return 2k - 1 for a derivative of order k, and the matrix L of its term |L c|^2 / T^(2k - 1) of the cost."""
+        """Return power p and matrix L of the cost |L c|^2 / T^p of a derivative, at control points c, duration T."""
         places, weights = np.polynomial.legendre.leggauss(self.degree - order + 1)
         width = np.diff(self.breaks)[:, None]
         at = (self.breaks[:-1, None] + width * (places + 1) / 2).ravel()
@@ -295,7 +296,7 @@ class _Search:
         return 2 * order - 1, scipy.sparse.kron(basis, joints, format="csr")
 
     def _breaks(self, path: Array) -> Array:
-        """Return the knots as fractions of the duration, with short intervals at both ends."""
+        """Return the spline knots as fractions of the duration, with short intervals at both ends."""
         bounds, settings = self.limits.bounds, self.settings
         with np.errstate(divide="ignore", invalid="ignore"):
             build_up = np.where(np.isfinite(bounds.acceleration), bounds.acceleration / bounds.jerk, 0.0).max()
@@ -313,7 +314,7 @@ class _Search:
         return np.asarray(breaks / breaks[-1])
 
     def _values(self, places: Array, order: int) -> Any:
-        """Return the matrix from control points to a spline derivative at M fractions of the duration. Shape (M, K)."""
+        """Return the matrix that maps control points to a derivative at M fractions of the duration. Shape (M, K)."""
         knots = self.knots[order : len(self.knots) - order]
         return scipy.interpolate.BSpline.design_matrix(places, knots, self.degree - order) @ self.derivatives[order]
 
@@ -337,7 +338,7 @@ class _Search:
         self.fixed[free], self.moving[free] = 0.0, 0.0
 
     def guess(self, path: Array) -> tuple[Array, float]:
-        """Return control points along a path, and the horizon or, if free, the shortest one within joint limits."""
+        """Return control points along a path, and the duration: if free, the shortest within joint limits."""
         p, ramp = self.degree, self.settings.ramp
         at = np.array([self.knots[k + 1 : k + 1 + p].mean() for k in range(self.count)])
         top = 1 / (1 - ramp)
@@ -412,7 +413,7 @@ class _Search:
             yield sign * matrix[rows], sign * by_duration.ravel()[rows], sign * usages, (1 - share) / 2
 
     def _row_matrix(self, basis: Any, by_joint: Array) -> Any:
-        """Return the Jacobian of constraints with respect to control points from that with respect to joints (R, n).
+        """Convert the Jacobian of constraints in joint positions (R, n) to their Jacobian in the control points.
 
         `basis` has the values of the K basis functions at the sample of each constraint. Shape (R, K).
         """
@@ -423,7 +424,7 @@ class _Search:
         return scipy.sparse.csr_array((values, (row, column)), shape=(len(by_joint), self.count * self.size))
 
     def step(self, state: _State, region: float) -> _State | None:
-        """Return the motion after a step within a trust region; None if the program has no solution."""
+        """Return the next iterate, within a trust region; None if the linear or quadratic program has no solution."""
         settings, bounds, count = self.settings, self.limits.bounds, len(self.free)
         travel = np.where(self.has_rate_limit, bounds.velocity * state.duration, self.spread) * region
         points = state.points.ravel()[self.free]
@@ -439,7 +440,8 @@ class _Search:
         shape = {"h": curvature.sparsity(), "a": matrix.sparsity()}
         solver = ca.conic("step", *(("ipqp", shape, QUADRATIC) if self.residuals else ("highs", shape, LINEAR)))
         sides = {"lba": -np.inf, "uba": 1 - state.usages[kept], "lbx": np.minimum(lower, 0.0), "ubx": upper}
-        solution = solver(h=curvature, g=slope, a=matrix, **sides)["x"]
+        with casadi_silenced():  # it warns of a degenerate program, which ends without success
+            solution = solver(h=curvature, g=slope, a=matrix, **sides)["x"]
         if not solver.stats()["success"]:
             return None
         change = solution.full().ravel()
@@ -448,7 +450,7 @@ class _Search:
         return self.evaluate(moved.reshape(self.count, self.size), state.duration * (1 + change[count]))
 
     def _cost_model(self, state: _State) -> tuple[ca.DM, Array]:
-        """Return Hessian and gradient of the relative cost by the free control points, log T and the slack."""
+        """Return the Hessian and gradient of the relative cost in free control points, log duration and slack."""
         count, points, duration = len(self.free), state.points.ravel(), state.duration
         slope = np.concatenate([np.zeros(count), [self.cost.time * duration / state.cost, self.settings.violation]])
         curvature = scipy.sparse.csc_array((count + 1, count + 1))
@@ -462,7 +464,7 @@ class _Search:
         return ca.diagcat(ca.DM(curvature.tocsc().sorted_indices()), ca.DM(1, 1)), slope
 
     def add_places(self, state: _State) -> bool:
-        """Add constraints at collisions between the samples; return whether there are collisions."""
+        """Add clearance constraints at collisions between the samples; return whether there are collisions."""
         dense = np.linspace(0.0, 1.0, self.settings.finer * (len(self.breaks) - 1) + 1)[1:-1]
         at, pair, distance, _ = self.limits.motions.near_pairs(self._values(dense, 0) @ state.points, 0.0)
         worst = {each: at[pair == each][distance[pair == each].argmin()] for each in np.unique(pair).tolist()}

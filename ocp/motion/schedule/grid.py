@@ -75,7 +75,7 @@ SETTINGS = GridSettings()
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Nodes along a path at which the limits are evaluated.
+    """Nodes along a path at which the limits of a motion along the path are evaluated.
 
     Attributes:
         path, limits, joints: As of the schedule.
@@ -96,8 +96,7 @@ class Grid:
     sharp: bool = True
 
     def ends(self, first: int, last: int) -> tuple[Rows, Rows]:
-        """Return the coefficients of all limits at both ends of each interval from node `first` to `last`. Shape (N,)
-        each.
+        """Return the coefficients of all limits at both ends of each of the N intervals between two nodes of the grid.
 
         The rows are evaluated on request: all those of a long path would fill the memory.
         """
@@ -116,7 +115,7 @@ class Grid:
 
 
 class _Cells(NamedTuple):
-    """N intervals of a path that are short enough to resolve the limits, with bounds of the motion in each interval.
+    """Intervals of a path, short enough to resolve the limits, and bounds of speed and acceleration in each interval.
 
     Attributes:
         begin: Distances at which the intervals begin. Shape (N,), m, as of the others.
@@ -230,14 +229,14 @@ def _separate(places: Array, nodes: Array) -> Array:
 
 
 def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Array:
-    """Return the fastest constant speed that the limits and the request permit in each interval. Shape (N,), m/s."""
+    """Return the fastest constant speed permitted in each interval, not above the requested speed. Shape (N,), m/s."""
     steady = rows.steady()[0]
     here = requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)]
     return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), here))
 
 
 def _uneven_intervals(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
-    """Return in which intervals limits vary too nonlinearly with distance at the highest steady speed. Shape (N,)."""
+    """Return in which intervals a limit varies too nonlinearly with distance for linear interpolation. Shape (N,)."""
     sides = left, middle, right
     kinds = (
         # by the squared speed, as the rows of speed are in the program
@@ -255,7 +254,7 @@ def _uneven_intervals(left: Rows, middle: Rows, right: Rows, top: Array) -> NDAr
 def reachable_bounds(
     distance: Array, caps: Array, *, left: Rows, right: Rows, at_rest: tuple[bool, bool]
 ) -> tuple[Array, Array]:
-    """Return upper bounds, for any motion, of squared speeds at nodes (N + 1,) and accelerations in intervals (N,).
+    """Return bounds that no motion exceeds: of squared speeds at nodes (N + 1,) and accelerations in intervals (N,).
 
     Args:
         distance: Distances of the nodes. Shape (N + 1,), m.
@@ -324,5 +323,5 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
 
 
 def _group_indices(sizes: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the index of each element within its group, for consecutive groups of the given sizes."""
+    """Return, for consecutive groups of elements of the given sizes, the index of each element within its group."""
     return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)

@@ -61,7 +61,7 @@ class JointRates(Protocol):
 
 
 class TorqueRates(Protocol):
-    """Coefficients of the joint torques, inertia a + drag v^2 + rest, for speed v and acceleration a along a path.
+    """Coefficients of joint torques as functions of path speed v and acceleration a: inertia a + drag v^2 + rest.
 
     Shape (M, n) each.
     """
@@ -133,7 +133,7 @@ class ToolLimits:
 
 @dataclass(frozen=True, eq=False)
 class LineLimits:
-    """Limits of a motion along a path: of its speed, acceleration and jerk, of the tool and of the joints.
+    """Limits of a motion along a path, including limits of tool and joints, and the requested speed.
 
     Attributes:
         speed: Requested speed along the path, m/s: one number, or one for each segment of the task.
@@ -162,8 +162,7 @@ class LineLimits:
                 require.instance("joint limits" if name == "joints" else "tool limits", getattr(self, name), kind)
 
     def of_joints(self, count: int) -> Array:
-        """Return velocity, acceleration and jerk limits of `count` joints, with 0 replaced by infinity. Shape (3,
-        count).
+        """Return velocity, acceleration and jerk limits of `count` joints, infinite for limits of 0. Shape (3, count).
 
         Joints with a limit of 0 do not move, see `check_line`.
         """
@@ -214,7 +213,7 @@ def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, ze
 
 
 def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> JointPath | None:
-    """Check the arguments of `schedule`; return `joints` if the limits include joint limits, else None.
+    """Check the arguments of `schedule`; return its argument `joints` if joint limits are given, else None.
 
     Raises:
         ProblemError: Path, limits or joints have the wrong type, or there are joint limits without joints.
@@ -235,7 +234,7 @@ def check_line(path: PathLike, limits: LineLimits, joints: JointPath | None) -> 
 
 
 def _check_still(path: PathLike, limits: LineLimits, joints: JointPath) -> None:
-    """Raise ProblemError if a joint whose velocity, acceleration or jerk is limited to 0 moves along the path."""
+    """Raise ProblemError if a joint must move along the path although its velocity, acceleration or jerk limit is 0."""
     own, count = limits.joints or JointLimits(), len(joints.names)
     for name in ("velocity", "acceleration", "jerk"):
         is_zero = np.asarray(getattr(own, name), dtype=float).ravel() == 0
@@ -262,7 +261,7 @@ def check_joints(joints: JointPath) -> None:
 
 
 def rates_along(joints: JointPath, distance: Array) -> JointRates:
-    """Return joint positions and their derivatives with respect to distance at points (M,) of a path, after checks.
+    """Check and return joint positions and their derivatives with respect to distance, at points (M,) of a path.
 
     Raises:
         ProblemError: A shape is not (M, n), or a value is not finite.
@@ -304,7 +303,7 @@ def curvature_along(path: PathLike, distance: Array) -> Array:
 
 
 def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
-    """Return the coefficients of the joint torques at distances (M,) along a path, after checks.
+    """Return the coefficients of the joint torques at distances (M,) along a path; check their shapes and values.
 
     Raises:
         ProblemError: The joints have no torques, a shape is not (M, n), or a value is not finite.
@@ -323,8 +322,9 @@ def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
 
 
 def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the tangent, the curvature vector and its derivative, and the tool's rotation per metre. Shape (M, 3)
-    each.
+    """Return a path's tangent, curvature vector and derivative of curvature, and the tool's rotation per metre.
+
+    Shape (M, 3) each.
     """
     missing = [name for name in ("at", "turn") if not callable(getattr(path, name, None))]
     if missing:
@@ -335,7 +335,7 @@ def tool_along(path: PathLike, distance: Array) -> tuple[Array, Array, Array, Ar
 
 
 def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -> None:
-    """Raise ProblemError if joint or tool jerks are limited although the path's curvature jumps."""
+    """Raise ProblemError if joint or tool jerks are limited and the path's curvature jumps, where they are infinite."""
     joints_limited = joints is not None and np.isfinite(limits.of_joints(len(joints.names))[2]).any()
     tool_limited = limits.tool is not None and np.isfinite(limits.tool.jerk).any()
     jumps = path.curvature_jumps() if joints_limited or tool_limited else np.zeros(0)
@@ -352,7 +352,7 @@ def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -
 
 
 class Rows(NamedTuple):
-    """Coefficients of all limits, as inequalities in speed, acceleration and jerk, at S points of a path.
+    """Coefficients of the inequalities that limit speed, acceleration and jerk, at S points of a path.
 
     Attributes:
         speed: k of each row. Shape (S, K), s/m.
@@ -369,8 +369,9 @@ class Rows(NamedTuple):
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
     def steady(self) -> tuple[Array, NDArray[np.intp]]:
-        """Return the greatest permitted constant speed at each point, m/s, and the index of its active limit. Shape
-        (S,).
+        """Return the greatest permitted constant speed at each point, m/s, and the index of the limit that sets it.
+
+        Shape (S,) each.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             available = 1 - np.sign(self.acceleration[:, :, 1]) * self.acceleration[:, :, 2]
@@ -393,7 +394,7 @@ class Rows(NamedTuple):
         return sum(kind.shape[1] for kind in self)
 
     def usage(self, motion: LineMotion) -> Array:
-        """Return the signed ratio of each limited quantity to its limit during a motion. Shape (S, K + L + P)."""
+        """Return the signed ratio of each limited quantity to its limit in a motion. Shape (S, K + L + P)."""
         v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
         acceleration, jerk = self.acceleration, self.jerk
         return np.concatenate(
@@ -412,7 +413,7 @@ def limit_names(limits: LineLimits, joints: JointPath | None) -> tuple[str, ...]
 
 
 def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[str], list[str], list[str]]:
-    """Return the names of the limits by kind: speed, acceleration and jerk."""
+    """Return three lists of limit names: limits of the speed, of the acceleration and of the jerk."""
     speed, acceleration, jerk = ["centripetal acceleration"], ["line acceleration"], []
     if np.isfinite(limits.jerk):
         jerk = ["line jerk"]
@@ -431,7 +432,7 @@ def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[s
 
 
 def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
-    """Return the number of torque limits, which are the last of the acceleration limits in `Rows`."""
+    """Return the number of torque limits, which `Rows` lists as the last of its acceleration limits."""
     if joints is None or not np.isfinite(limits.torques(len(joints.names))).any():
         return 0
     return len(joints.names)
@@ -440,7 +441,7 @@ def torque_rows(limits: LineLimits, joints: JointPath | None) -> int:
 def limit_rows(
     path: PathLike, limits: LineLimits, joints: JointPath | None, distance: Array, *, torques: bool = True
 ) -> Rows:
-    """Return the coefficients of all limits at distances (S,) along a path; torques count only if `torques` is true.
+    """Return the coefficients of all limits, with or without torque limits, at distances (S,) along a path.
 
     Raises:
         ProblemError: Curvature or joints are not finite, as at a singular arm, or have a wrong shape.

@@ -71,7 +71,7 @@ SETTINGS = ScheduleSettings()
 
 
 def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfile:
-    """Return a motion from rest to rest below a path's maximum velocity curve and within the limits along the path.
+    """Return a rest-to-rest motion below the maximum velocity curve, within limits of path acceleration and jerk.
 
     Raises:
         ProblemError: The curvature is not finite, or no plan below the curve is found.
@@ -87,7 +87,7 @@ def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfil
 
 
 def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
-    """Sample the maximum velocity curve; return distances and speeds (G,), and requested speeds between (G - 1,)."""
+    """Return distances and speeds (G,) on a path's maximum velocity curve, and requested speeds in between (G - 1,)."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
@@ -108,7 +108,7 @@ def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, A
 def _refine_distances(
     path: PathLike, limits: LineLimits, s: Array, bounds: Array, of_pieces: Array
 ) -> tuple[Array, Array, Array]:
-    """Refine sample distances on given segments of a path until the samples resolve the maximum velocity curve."""
+    """Insert sample distances on given segments of a path until the samples resolve the maximum velocity curve."""
 
     def permitted_at(places: Array) -> Array:
         with np.errstate(divide="ignore"):
@@ -132,7 +132,7 @@ def _refine_distances(
 def _unresolved_intervals(
     length: float, s: Array, permitted: Array, requested: Array, acceleration: float
 ) -> NDArray[np.bool_]:
-    """Return which intervals are too coarse to resolve the permitted speed where this speed limits the motion.
+    """Return which intervals are too long to resolve the permitted speed, where the permitted speed limits the motion.
 
     It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.
     """
@@ -152,14 +152,14 @@ def _unresolved_intervals(
 
 
 def _constant_zones(s: Array, speed: Array, limits: LineLimits) -> Zones:
-    """Merge neighbouring intervals of a path with the same speed into zones (stretches with constant limits)."""
+    """Merge neighbouring intervals of a path that have the same speed limit into longer parts with constant limits."""
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(speed))])
     same = np.ones(len(starts))
     return Zones(s[np.append(starts, len(speed))], speed[starts], limits.acceleration * same, limits.jerk * same)
 
 
 def _lower_speeds(s: Array, permitted: Array, speed: Array, profile: SpeedProfile, everywhere: bool) -> bool:
-    """Lower, in place, the speeds of intervals in which a profile is too fast; return whether a speed was lowered."""
+    """Lower, in place, the speed limits of intervals in which a profile is too fast; return whether any was lowered."""
     speeds = np.concatenate([profile.at_distance(part).speed for part in np.array_split(s, len(s) // BLOCK_SIZE + 1)])
     top = np.maximum(speeds[:-1], speeds[1:])
     peaks = profile.peaks()
@@ -252,7 +252,7 @@ class Schedule:
         return self.profile.at_distance(distance).t
 
     def sample(self, period: float) -> LineMotion:
-        """Return the motion every `period` s from the start, and at the end.
+        """Return samples of the motion every `period` s from the start, and at the end.
 
         Raises:
             ProblemError: The period is not positive, or too short.
@@ -307,7 +307,7 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
 
 def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
-    """Return `line_profile`, planned again under all limits where it violates a limit, or everywhere if it is None."""
+    """Return a speed profile within all limits: plan `line_profile` again at violations, or wholly if it is None."""
     count = len(grid.requested)
     if line_profile is None:
         return fastest_profile(Stretch(grid, 0, count))
@@ -364,7 +364,7 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
 
 
 def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float) -> list[tuple[int, int]]:
-    """Return first and last node of each stretch of a path that must be planned again because a limit is violated.
+    """Return first and last node of each part of a path that must be planned again because a limit is violated there.
 
     They end at steady speeds or path ends, beyond the violated intervals by `extent` times the length of a ramp to
     rest.
@@ -392,7 +392,7 @@ def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], e
 
 
 def _reaches_speed_at_ends(grid: Grid, motion: SpeedProfile, first: int, last: int) -> bool:
-    """Return whether a motion has the requested speed near both ends of its stretch, except at the path's ends."""
+    """Return whether a motion has the requested speed near both ends of its part of the path, except at path ends."""
     length = motion.distance[-1] - motion.distance[0]
     for node, inside in ((first, first), (last, last - 1)):
         if node in (0, len(grid.requested)):
@@ -418,7 +418,7 @@ def _cut_profile(profile: SpeedProfile, begin: float, end: float) -> SpeedProfil
 
 
 def _find_dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tuple[Dip, ...]:
-    """Return the parts of a path on which a limit other than those along the path reduces the requested speed."""
+    """Return the parts of a path on which a curvature, tool or joint limit makes the motion slower than requested."""
     middle = profile.at_distance((grid.distance[:-1] + grid.distance[1:]) / 2)
     line_rows = [k for k, name in enumerate(names) if name.startswith("line ")]
     cause, steady = np.zeros(len(grid.requested), dtype=np.intp), np.zeros(len(grid.requested))

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.checks import NOT_NUMBERS, floats
+from models.checks import NOT_NUMBERS, floats, short_repr
 from ocp.errors import ProblemError
 
 __all__ = ["Array", "LineMotion", "SpeedProfile", "integrate_jerk", "join_profiles", "profile_through", "segment_index"]
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class LineMotion(NamedTuple):
-    """Motion along a path at M times: the distance covered, and its time derivatives.
+    """Motion along a path at M times: distance covered, speed, acceleration and jerk.
 
     Attributes:
         t: Time. Shape (M,), s.
@@ -33,9 +33,11 @@ class LineMotion(NamedTuple):
     acceleration: Array
     jerk: Array
 
+    __repr__ = short_repr
+
 
 def integrate_jerk(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple[Any, Any, Any]:
-    """Return distance, speed and acceleration after a time at constant jerk; works for numbers, arrays and CasADi."""
+    """Return distance, speed and acceleration after a time at constant jerk; arguments may be CasADi expressions."""
     s = time * (speed + time * (acceleration / 2 + time * jerk / 6))
     return s, speed + time * (acceleration + time * jerk / 2), acceleration + time * jerk
 
@@ -109,7 +111,7 @@ class SpeedProfile:
         return float(self.t[-1])
 
     def at(self, time: ArrayLike) -> LineMotion:
-        """Return the motion at times (M,) in [0, duration], s; where the jerk jumps, the value after the jump counts.
+        """Return the motion at times (M,) in [0, duration], s; where the jerk jumps, return the value after the jump.
 
         Raises:
             ProblemError: A time is nan, or outside by more than rounding.
@@ -123,7 +125,7 @@ class SpeedProfile:
         return motion
 
     def at_distance(self, distance: ArrayLike) -> LineMotion:
-        """Return the motion at distances (M,) from the start, m; where the motion rests, at the time of arrival.
+        """Return the motion at distances (M,) from the start, m; where the motion rests, return its state on arrival.
 
         Raises:
             ProblemError: A distance is nan, or off the path by more than rounding.
@@ -136,7 +138,7 @@ class SpeedProfile:
         return self._motion(segment, np.where(s == length, np.diff(self.t)[-1], inside))
 
     def peaks(self) -> LineMotion:
-        """Return the motion at all times of possible speed maxima: at segment ends and at zero acceleration."""
+        """Return the motion at all times at which the speed may have a maximum: segment ends and zero acceleration."""
         with np.errstate(divide="ignore", invalid="ignore"):
             zero = -self.acceleration[:-1] / self.jerk
         inside = np.flatnonzero((zero > 0) & (zero < np.diff(self.t)))

@@ -1,5 +1,4 @@
-"""Minimum-time motion along a stretch of a path: a convex program in the squared speed, solved by an interior-point
-method.
+"""Minimum-time motion along part of a path: convex optimisation of the squared speed by an interior-point method.
 
 With x = v^2 as a function of the distance s, a = x'/2 and j = v x''/2, so that
 
@@ -41,7 +40,9 @@ __all__ = ["INTERIOR", "Program", "ProgramSettings", "Spline", "SplineRows", "le
 
 @dataclass(frozen=True)
 class ProgramSettings:
-    """Settings of the interior-point method for the fastest motion. Complementarity is relative to the travel time.
+    """Settings of the interior-point method that computes the fastest motion along part of a path.
+
+    Complementarity is relative to the travel time.
 
     Attributes:
         steps: Largest number of steps.
@@ -77,13 +78,13 @@ INTERIOR = ProgramSettings()
 
 
 class SplineRows(NamedTuple):
-    """M constraints on the squared speed x along a path and its derivatives x' and x'' with respect to distance.
+    """Constraints on the squared speed along a path and on its first two derivatives with respect to distance.
 
     Attributes:
         interval: Interval in which each row holds. Shape (M,).
         fraction: Position in the interval at which it holds, in [0, 1]. Shape (M,).
         root: Position in the interval of the x of x^(-1/2). Shape (M,).
-        of: Coefficients c in c . (x, x', x'') <= bound. Shape (M, 3).
+        of: Coefficients c in c . (x, x', x'') <= bound for squared speed x. Shape (M, 3).
         bound: Upper bound of each row. Shape (M,).
         jerk: Whether the row is a limit of jerk, c . (x, x', x'') <= bound x^(-1/2). Shape (M,).
     """
@@ -97,7 +98,7 @@ class SplineRows(NamedTuple):
 
 
 class Spline:
-    """Quadratic spline for the squared speed along a path, with N + 2 coefficients for nodes at N + 1 distances (m)."""
+    """Quadratic spline of the squared speed over the distance along a path; N + 1 nodes (m) and N + 2 coefficients."""
 
     def __init__(self, nodes: Array) -> None:
         self.nodes, self.h = nodes, np.diff(nodes)
@@ -106,7 +107,7 @@ class Spline:
         self.share = before / self.width
 
     def part(self, at: NDArray[np.intp]) -> Spline:
-        """Return a spline with a subset of the coefficients, as if these coefficients were neighbours."""
+        """Return a spline that has a subset of the coefficients, as if these coefficients were neighbours."""
         part, last = copy(self), len(self.h)
         part.h = self.h[np.minimum(at[:-2], last - 1)]
         nodes = np.minimum(at[:-1], last)
@@ -123,7 +124,7 @@ class Spline:
         return np.append(x - self.share * self.width * slope / 2, x[-1])
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
-        """Return the matrices from coefficients of an interval to x, x', x'' at a point in it. Shape (3, 3, M)."""
+        """Return the map from spline coefficients to squared speed and its derivatives at points. Shape (3, 3, M)."""
         h, share = self.h[interval], self.share[interval]
         inside = fraction * h
         first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
@@ -137,7 +138,7 @@ class Spline:
 
 
 class Program(NamedTuple):
-    """Minimum-time optimisation problem for a stretch of a path.
+    """Minimum-time optimisation problem for a motion along part of a path.
 
     Attributes:
         spline: Spline of the squared speed.
@@ -155,9 +156,7 @@ class Program(NamedTuple):
     fixed: NDArray[np.intp]
 
     def part(self, free: NDArray[np.intp]) -> tuple[Program, NDArray[np.intp]]:
-        """Return the program for given intervals (B,), with fixed motion elsewhere, and the indices of its
-        coefficients.
-        """
+        """Return the problem in which only given intervals are free, and the indices of its coefficients."""
         count = len(self.spline.h)  # stretches are concatenated, with two intervals without rows between them
         cuts = np.flatnonzero(np.diff(free) > 1)
         first, last = free[np.append(0, cuts + 1)], free[np.append(cuts, len(free) - 1)] + 1
@@ -184,7 +183,7 @@ class Program(NamedTuple):
 
 
 class _EndConditions:
-    """End conditions of the motion: fixed coefficients or, at rest, an outer coefficient proportional to the next."""
+    """End conditions as equations for spline coefficients: fixed values or, for rest, a ratio of the outermost two."""
 
     def __init__(self, program: Program) -> None:
         n, h, (first, last) = len(program.upper), program.spline.h, program.rest
@@ -200,7 +199,7 @@ class _EndConditions:
         return b
 
     def follow(self, change: Array) -> None:
-        """Modify a change of the coefficients, in place, so that the end conditions stay satisfied."""
+        """Adapt a change of the coefficients, in place, to the end conditions, so that they stay satisfied."""
         change[self.fixed] = 0.0
         for outer, inner, ratio in self.sides:
             change[outer] = ratio * change[inner]
@@ -212,7 +211,7 @@ class _EndConditions:
         slope[self.fixed] = 0.0
 
     def band(self, main: Array, first: Array, second: Array) -> Array:
-        """Return the diagonals of a Hessian for `_BandSolver`, reduced to the free coefficients.
+        """Return the diagonals of a Hessian with respect to the free coefficients, as input of `_BandSolver`.
 
         Args:
             main, first, second: Diagonals for all coefficients, changed in place. Shape (n,), (n - 1,), (n - 2,).
@@ -233,8 +232,7 @@ class _EndConditions:
 
 
 class _BandSolver:
-    """Solver of linear systems with a symmetric positive definite pentadiagonal matrix, given by three diagonals (3,
-    n).
+    """Solver of linear systems with a symmetric positive definite pentadiagonal matrix, given by diagonals (3, n).
 
     Raises:
         LinAlgError: The equations are not positive definite, for example when only rounding errors remain.
@@ -255,9 +253,9 @@ class _BandSolver:
 
 
 class _Constraints:
-    """Constraints of a program: positive coefficients, bounds of coefficients, then limit rows with jerk limits last.
+    """Constraints of a `Program`: positive coefficients, upper bounds of coefficients, then limits of the motion.
 
-    Values of constraints, shape (M,), are in this order.
+    Values of constraints, shape (M,), are in this order; the jerk limits come last.
 
     Attributes:
         count: Number of intervals.
@@ -294,7 +292,7 @@ class _Constraints:
         self.middles = INTERIOR.block * np.arange(self.blocks.max() + 1) + (INTERIOR.block - 1) / 2
 
     def evaluate(self, b: Array) -> tuple[Array, Array]:
-        """Return violations and scales of the constraints at spline coefficients b, and linearise jerk limits at b."""
+        """Return violations and scales of all constraints at given coefficients; linearise the jerk limits there."""
         coefficients, sharp = self._coefficients(b), self.alone + self.jerk
         at = _weighted_sum(self.square, [each[self.jerk :] for each in coefficients])
         root = self.sharp / np.sqrt(at)
@@ -310,7 +308,7 @@ class _Constraints:
         return gap, size
 
     def change_of(self, change: Array) -> Array:
-        """Return the linearised changes of all constraint values for a change of the coefficients. Shape (M,)."""
+        """Return the linearised change of each constraint value due to a change of the coefficients. Shape (M,)."""
         return self._all_values(change, _weighted_sum(self.gradients, self._coefficients(change)))
 
     def weighted_gradients(self, values: Array) -> Array:
@@ -321,9 +319,7 @@ class _Constraints:
         return out
 
     def squares(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return diagonals of the weighted sum of g g' over all constraint gradients g. Shapes (N + 2,), (N + 1,),
-        (N,).
-        """
+        """Return three diagonals (N + 2,), (N + 1,), (N,) of the weighted sum of outer products of gradients."""
         g = self.gradients
         pulled = g * values[self.alone :]
         main = self._spread(g * pulled)
@@ -332,15 +328,15 @@ class _Constraints:
         return main, self._spread([g[0] * pulled[1], g[1] * pulled[2]]), self._spread([g[0] * pulled[2]])
 
     def _coefficients(self, b: Array) -> list[Array]:
-        """Return, for each limit row, the three spline coefficients of the interval to which the row belongs."""
+        """Return, for each limit of the motion, the three spline coefficients of its interval of the path."""
         return [b[k : self.count + k].take(self.row_interval) for k in range(3)]
 
     def _all_values(self, b: Array, rows: Array) -> Array:
-        """Return the values of all constraints, given spline coefficients ``b`` and the values of the limit rows."""
+        """Return the values of all constraints, given spline coefficients and the values of the motion limits."""
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
     def _spread(self, values: Iterable[Array]) -> Array:
-        """Sum values over the limit rows of each interval; add the k-th sum to the interval's k-th spline coefficient.
+        """Sum values over the limits in each interval; return the sums added to the spline coefficients they belong to.
 
         Shapes (M - `alone`,) each to (N + number of values - 1,).
         """
@@ -351,7 +347,7 @@ class _Constraints:
         return out
 
     def longest(self, rates: Array, share: float, of_positive: float) -> Array:
-        """Return a step length of at most 1 for each interval; the lengths vary slowly along the path. Shape (N,).
+        """Return a Newton step length of at most 1 for each interval; it varies slowly along the path. Shape (N,).
 
         Args:
             rates: Relative rates of change of values that stay positive. Shape (M,).
@@ -378,7 +374,7 @@ def _weighted_sum(weights: Array, values: list[Array]) -> Array:
 
 
 def least_time(program: Program, start: Array, *, accuracy: float, center: float) -> Array:
-    """Return the spline coefficients of the fastest motion by an interior-point method. Shape (N + 2,).
+    """Return the spline coefficients of the fastest motion, found by an interior-point method. Shape (N + 2,).
 
     Args:
         program: Program of the stretch.
@@ -482,17 +478,16 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
 
 def _violations(gap: Array, slack: Array, size: Array, count: int) -> Array:
-    """Return the relative residuals of constraints with slacks; zero for the first `count`, which always hold."""
+    """Return relative residuals of constraints with slacks; 0 for the first `count` constraints, which always hold."""
     violation = (gap + slack) / size
     violation[:count] = 0.0
     return np.asarray(violation)
 
 
 def _travel_time(share: Array, weights: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
-    """Return the travel time, its gradient in the spline coefficients, and the main and two upper diagonals of its
-    Hessian.
+    """Return the travel time, its gradient, and three diagonals of its Hessian in the spline coefficients.
 
-    `weights` are the path lengths that the quadrature points represent.
+    These are the main and two upper diagonals. `weights` are the path lengths that the quadrature points represent.
     """
     x = b[:-1] + share * np.diff(b)
     times = weights / np.sqrt(x)

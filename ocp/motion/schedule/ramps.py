@@ -40,7 +40,7 @@ REACH_MARGIN = 1e-6
 
 
 class Zones(NamedTuple):
-    """Consecutive stretches of a path, each with its own constant limits.
+    """Consecutive parts of a path, each with its own constant limits of speed, acceleration and jerk.
 
     Attributes:
         bounds: Distances at which the zones begin, and at which the last one ends. Shape (Z + 1,), m.
@@ -54,7 +54,7 @@ class Zones(NamedTuple):
 
 
 def ramp_time(change: float, acceleration: float, jerk: float) -> float:
-    """Return the shortest time (s) of a speed change (m/s) with zero acceleration at both ends.
+    """Return the shortest time (s) in which the speed changes by `change` (m/s), with zero acceleration at both ends.
 
     Raises:
         ProblemError: The change is negative, or a limit is not positive.
@@ -68,7 +68,7 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
 
 
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
-    """Return the distance (m) covered by the shortest change between two speeds; raises the errors of `ramp_time`."""
+    """Return the distance (m) covered while the speed changes in the shortest time; raise the errors of `ramp_time`."""
     for name, value in (("first", first), ("last", last)):
         require.nonnegative(f"ramp: {name}", value)
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
@@ -145,7 +145,7 @@ def fastest_motion(distance: float, first: float, last: float, limits: tuple[flo
 
 
 def _closes(phases: Phases, distance: float, first: float, last: float, top: float) -> bool:
-    """Return whether phases of constant jerk end at the given distance and speed, and keep to permitted speeds."""
+    """Return whether a motion in phases of constant jerk ends at the given distance and speed, at permitted speeds."""
     s, v, a = 0.0, first, 0.0
     error = ROUNDING_SHARE * top
     for t, j in phases:
@@ -176,7 +176,7 @@ def _two_ramps(distance: float, first: float, last: float, top: float, accelerat
 
 
 def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
-    """Return the phases of constant jerk that change the speed by `change` (m/s) in the least time."""
+    """Return the phases of constant jerk that change the speed by a given amount (m/s) in the least time."""
     size, sign = abs(change), 1.0 if change > 0 else -1.0
     if size == 0:
         return ()
@@ -190,10 +190,10 @@ def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
 
 
 def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
-    """Return the fastest speed profile from rest to rest, with zero acceleration where zones of constant limits meet.
+    """Return a fast rest-to-rest speed profile through parts of a path that have constant limits each.
 
-    A backward and a forward pass find the speeds at the bounds; each zone is then the fastest motion between them. The
-    result is time-optimal for one zone, and for several up to the condition of zero acceleration at their bounds.
+    Two passes find the speeds at the bounds of the parts; in each part the motion between these is the fastest. The
+    result is time-optimal for one part, and for several under the condition of zero acceleration at their bounds.
     """
     lengths = np.diff(zones.bounds).tolist()
     limits = list(zip(zones.speed.tolist(), zones.acceleration.tolist(), zones.jerk.tolist(), strict=True))
@@ -219,7 +219,7 @@ def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
 
 
 def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
-    """Return the motions through all zones as one speed profile, for given speeds at the zone bounds (Z + 1,), m/s."""
+    """Join the motions through consecutive parts of a path to one speed profile; their end speeds are given, m/s."""
     counts = np.array([len(phases) for phases in motions])
     durations, jerks = np.array([phase for phases in motions for phase in phases]).reshape(-1, 2).T
     if not durations.size or not np.isfinite(durations).all():
@@ -241,7 +241,7 @@ def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
 
 
 def _limit_speed(speed: float, other_end: float, length: float, limits: tuple[float, float, float]) -> float:
-    """Lower the speed at one end of a zone (stretch with constant limits) to what is reachable from the other end."""
+    """Lower the speed at one end of a part of a path to what can be reached from the speed at the other end."""
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
@@ -290,7 +290,7 @@ def reachability_passes(distance: Array, caps: Array, *, p: Array, q: Array, low
 
 
 def _feasible_squares(p: Array, q: Array, low: Array, high: Array, caps: Array) -> tuple[Array, Array]:
-    """Return lower and upper bounds (N,) of the squared speeds at which the limits permit some acceleration."""
+    """Return lower and upper bounds (N,) of the squared speeds at which the limits leave some acceleration possible."""
     floor, ceiling = np.zeros(len(p)), caps.copy()
     count = p.shape[1]
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -44,7 +44,7 @@ ACTIVE_SHARE = 0.98
 
 @dataclass(frozen=True)
 class StretchSettings:
-    """Settings of the search for the fastest motion over a stretch of a path.
+    """Settings of the search for the fastest motion along part of a path.
 
     Attributes:
         rounds: Largest number of rounds of tightening the limits.
@@ -81,7 +81,7 @@ SETTINGS = StretchSettings()
 
 
 def fastest_profile(stretch: Stretch) -> SpeedProfile:
-    """Return the fastest motion over a stretch of a path; its distances count from the start of the path.
+    """Return the fastest motion along part of a path; distances count from the start of the whole path.
 
     Raises:
         ProblemError: No motion keeps the limits, with the distance at fault.
@@ -106,7 +106,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
 def _solve_window(
     window: Window, seam: int, before: EnforcedRows | None
 ) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
-    """Return the fastest motion over a window (intervals solved at once), up to the start of the next window.
+    """Return the fastest motion in a window (intervals of a path solved at once), up to the start of the next window.
 
     Args:
         window: The window.
@@ -130,8 +130,7 @@ def _solve_window(
 
 
 def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> tuple[Array, Array | None]:
-    """Tighten limits until the motion satisfies the original limits; return squared speeds and, with jerk limits,
-    slopes.
+    """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
     If few intervals still violate limits, these are planned again with their neighbours, between fixed motions.
 
@@ -185,12 +184,12 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
 
 
 def _seam_shares(window: Window, seam: int) -> Array:
-    """Return the fraction of the limits that each interval of a window may use. Shape (N,)."""
+    """Return the fraction of the limits that the motion in each interval of a window may use. Shape (N,)."""
     return np.where(np.arange(window.first, window.last) < seam, 1.0, SETTINGS.seam)
 
 
 def _without_jerk(window: Window, margins: Margins) -> Array:
-    """Return the highest squared speeds at a window's nodes without jerk limits, by a forward and a backward pass."""
+    """Return the greatest squared speeds at a window's nodes for unlimited jerk, by a backward and a forward pass."""
     grid = window.grid
     left, right = window.rows[0], window.rows[-1]
     h = np.diff(window.nodes)[:, None]
@@ -218,7 +217,7 @@ def _node_minimum(of_intervals: Array) -> Array:
 def _with_jerk(
     window: Window, enforced: EnforcedRows, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
 ) -> Motion:
-    """Return squared speeds and their slopes at the nodes of a window under jerk limits, by a convex program."""
+    """Return squared speeds and their derivatives at the nodes of a window for the fastest motion under jerk limits."""
     begin, end, ends, grid, nodes = window.first, window.last, window.ends, window.grid, window.nodes
     left, middle, right = (window.rows[k] for k in (0, 2, 4))
     at_rest = ends[0][0] == 0, ends[1][0] == 0
@@ -289,7 +288,7 @@ def _with_jerk(
 
 
 def _resolve(program: Program, known: Array, accuracy: float) -> Array:
-    """Solve a program from the scaled solution of a similar program; if that fails, scale the solution further down."""
+    """Solve a `Program` from the scaled-down solution of a similar one; if that fails, from one scaled down further."""
     free = np.ones(len(known), dtype=bool)
     free[program.fixed] = False
     start = np.where(free, SETTINGS.again, 1.0) * known
@@ -319,7 +318,7 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
 
 
 def _rest_jerk(near: Rows, far: Rows, width: float, side: int, shares: Array) -> float:
-    """Return the greatest jerk that limits permit in the first (side 0) or last interval, beside a point of rest."""
+    """Return the greatest constant jerk that limits permit in the first or last interval, next to a point of rest."""
     of = [near.jerk[0], far.jerk[0]] if side == 0 else [near.jerk[-1], far.jerk[-1]]
     sign, share = 1.0 - 2.0 * side, shares[0 if side == 0 else -1]
     ratio = 0.0
@@ -339,7 +338,7 @@ def _spline_rows(
     speeds: Array,
     in_motion: tuple[bool, bool],
 ) -> SplineRows:
-    """Return the enforced limits as constraints on a spline, with speed limits at nodes and where they are tightened.
+    """Return the enforced limits as constraints on the spline of the squared speed along a path.
 
     Args:
         places: Limit rows where intervals begin, inside them, and where they end. Shape (N,) each.
@@ -378,7 +377,7 @@ def _spline_rows(
 
 
 def _jerk_place(inside: float) -> float:
-    """Return the fraction of an interval where the spline's jerk equals the final motion's jerk in the same half.
+    """Return the fraction of an interval at which a spline's jerk equals the constant jerk of the motion in that half.
 
     With squared speed x, the spline's jerk is x''/2 v. With a = a0 + x''/2 (s - s0), two jerks over half the time T
     each lead to the speed and acceleration at its end if they are x''/2 (v0 + a0 T / 6) and x''/2 (v0 + a0 5 T / 6),
@@ -388,7 +387,7 @@ def _jerk_place(inside: float) -> float:
 
 
 def _speed_ratios(spline: Spline, b: Array) -> Array:
-    """Return speeds where limits are enforced, divided by the speeds at the associated `_jerk_place`. Shape (4, N)."""
+    """Return the speeds at which limits are enforced, divided by those at the points of `_jerk_place`. Shape (4, N)."""
     x, slope = spline.at_nodes(b)
     second = np.diff(slope) / spline.h
 
@@ -401,13 +400,13 @@ def _speed_ratios(spline: Spline, b: Array) -> Array:
 
 
 def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> SplineRows:
-    """Return constraints that keep `of` times the squared speed at most 1 at given fractions of given intervals."""
+    """Return constraints `of` times squared speed <= 1 at given points, each a fraction of an interval."""
     coefficients, none = np.stack([of, 0 * of, 0 * of], axis=1), np.zeros(len(of), dtype=bool)
     return SplineRows(interval, fraction, fraction, coefficients, np.ones(len(of)), none)
 
 
 def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -> NDArray[np.bool_]:
-    """Return which acceleration and jerk limits a motion may reach in each interval. Shape (N, K + L + P).
+    """Return which acceleration and jerk limits some motion can reach in each interval. Shape (N, K + L + P).
 
     Args:
         rows: Limit rows in N intervals.

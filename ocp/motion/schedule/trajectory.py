@@ -1,4 +1,4 @@
-"""Joint trajectories sampled along a timed path, and their exchange as CSV and as ROS 2 JointTrajectory messages."""
+"""Joint trajectories sampled over time, and their exchange as CSV files and as ROS 2 JointTrajectory messages."""
 
 from __future__ import annotations
 

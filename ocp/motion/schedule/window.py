@@ -1,4 +1,4 @@
-"""Windows (parts of a path grid that are solved at once), the limits enforced in a window, and the usage of limits."""
+"""Windows (parts of a path grid that are solved at once), the limits enforced there, and the ratios to the limits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ __all__ = [
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """Settings for enforcing and checking limits in a window of a path grid. Shares are fractions of the limits.
+    """Settings for enforcing and checking limits in a window (part of a path grid that is solved at once).
+
+    Shares are fractions of the limits.
 
     Attributes:
         room: Share of the limits reserved for what happens between the positions where they are enforced: half of the
@@ -74,7 +76,7 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Window(Stretch):
-    """Part of a stretch of a path grid that is solved as one program.
+    """Part of a path grid that is solved as one optimisation problem.
 
     Attributes:
         rows: Limit rows where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
@@ -89,7 +91,7 @@ class Window(Stretch):
 
     @classmethod
     def build(cls, stretch: Stretch, first: int, last: int, ends: Ends) -> Window:
-        """Return the window of a stretch between two nodes, with the coefficients of all limits evaluated."""
+        """Return the window between two nodes of a path grid, and evaluate the coefficients of all limits in it."""
         grid = stretch.grid
         begin, h = grid.distance[first:last], np.diff(grid.distance[first : last + 1])
         left, right = grid.ends(first, last)
@@ -104,9 +106,9 @@ class Window(Stretch):
         return cls(grid, first, last, ends, every, bends)
 
     def fine_rows(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
-        """Return the limit rows at the points that divide intervals into `fine` parts, ordered by point, then interval.
+        """Return the coefficients of all limits at closely spaced points in intervals, ordered by point, then interval.
 
-        Shape ((SETTINGS.fine - 1) B,); with torques, which take longest, on request.
+        The points divide each interval into SETTINGS.fine parts. Torque limits, which take longest, are optional.
         """
         parts = SETTINGS.fine
         missing = [at for at in intervals.tolist() if (self.first + at, torques) not in self.close]
@@ -133,7 +135,7 @@ class Window(Stretch):
 
 
 class Margins(NamedTuple):
-    """Fractions of the speed, acceleration and jerk limits that each interval may use.
+    """Fractions of the speed, acceleration and jerk limits that the motion in each interval may use.
 
     Shape (N,), (N, L) and (N, P).
     """
@@ -143,17 +145,17 @@ class Margins(NamedTuple):
     jerk: Array
 
     def take(self, part: slice) -> Margins:
-        """Return the margins of some intervals, as views of the same memory."""
+        """Return the usable fractions of the limits in some intervals, as views of the same memory."""
         return Margins(*(margin[part] for margin in self))
 
     def times(self, share: Array) -> Margins:
-        """Return the margins multiplied by a factor for each interval (N,)."""
+        """Return the usable fractions of the limits, multiplied by one factor for each interval (N,)."""
         return Margins(self.speed * share, self.acceleration * share[:, None], self.jerk * share[:, None])
 
 
 @dataclass(eq=False)
 class EnforcedRows:
-    """Limit rows (inequalities) that are enforced in a window, and the fractions of the limits that may be used.
+    """Limits enforced in a window (part of a path solved at once), and the fractions of the limits that may be used.
 
     Attributes:
         margins: Usable shares of the limits, lowered where limits are violated although they are enforced there.
@@ -172,7 +174,7 @@ class EnforcedRows:
 
     @classmethod
     def build(cls, window: Window) -> EnforcedRows:
-        """Return the initial set of enforced limit rows of a window, which is empty."""
+        """Return an empty set of enforced limits for a window, with the initial usable fractions of all limits."""
         count, rows = window.last - window.first, window.rows[0]
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
@@ -180,13 +182,12 @@ class EnforcedRows:
         return cls(margins, times, held, np.ones((len(HELD), count)))
 
     def part(self, first: int, last: int) -> EnforcedRows:
-        """Return the enforced rows of the intervals from `first` up to `last`, as views of the same memory."""
+        """Return the enforced limits in the intervals from `first` up to `last`, as views of the same memory."""
         part = slice(first, last)
         return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
 
     def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
-        """Enforce the limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in every
-        interval.
+        """Enforce limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in each interval.
 
         Args:
             used, values: Usage of the limits, see `limit_usage`.
@@ -200,7 +201,7 @@ class EnforcedRows:
         self.hold_jerk(jerks)
 
     def release(self, values: Array, jerks: Array, seam: int) -> None:
-        """Stop enforcing limits that a motion stays well below, but keep at least one jerk limit in each interval.
+        """Stop enforcing limits that a motion does not come near, but keep at least one jerk limit in each interval.
 
         Intervals shared with the previous or next window keep all rows.
         """
@@ -215,8 +216,9 @@ class EnforcedRows:
         self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce the limit rows of a mask (2, N, K + L + P) where they are used most; return which already were
-        enforced.
+        """Enforce given limits at the point of an interval where each is used most; return which were already enforced.
+
+        Masks of shape (2, N, K + L + P).
         """
         already = np.zeros(rows.shape, dtype=bool)
         sign, at, row = np.nonzero(rows)
@@ -226,7 +228,7 @@ class EnforcedRows:
         return already
 
     def lower(self, used: Array, held: NDArray[np.bool_], rows: Rows, seam: int) -> None:
-        """Tighten the violated limits that are already enforced, by more at each call.
+        """Tighten the limits that are violated although they are enforced, by more at each call.
 
         Args:
             used: Usage of the limits. Shape (2, N, K + L + P).
@@ -249,7 +251,7 @@ class EnforcedRows:
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
-    """Return the speed profile with given squared speeds (and slopes, under jerk limits) at a stretch's first nodes."""
+    """Return the speed profile through given squared speeds, and derivatives if given, at the first nodes of a part."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     v = np.sqrt(x)
     if slope is not None:
@@ -261,7 +263,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProf
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return the fractions of limits that a motion uses in given intervals (B,): largest values, and values at `HELD`.
+    """Return the largest ratio of each limited quantity to its limit in given intervals, and the ratios at `HELD`.
 
     Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 
@@ -333,8 +335,9 @@ def limit_usage(
 
 
 def _parabola_errors(rows: list[Array]) -> Array:
-    """Return the largest error of a parabola through three of five equidistant samples of a coefficient. Shape (N, L,
-    3).
+    """Return the largest error of parabolas that interpolate three of five equidistant samples of coefficients.
+
+    Shape (N, L, 3).
     """
     a, b, c, d, e = rows
     # the third difference gives the cubic term; a parabola misses at most 1/(9 sqrt 3) of it
@@ -342,7 +345,7 @@ def _parabola_errors(rows: list[Array]) -> Array:
 
 
 def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
-    """Return which limits a motion may exceed, given the interpolation errors. Shape (N, K + L + P)."""
+    """Return which limits a motion may exceed within the errors of interpolation. Shape (N, K + L + P)."""
     v, a, j = (
         np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
         for kind in ("speed", "acceleration", "jerk")
@@ -360,7 +363,7 @@ def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[Lin
 def _fine_usage(
     window: Window, profile: SpeedProfile, intervals: NDArray[np.intp], f: Array, known: Array, torques: bool
 ) -> Array:
-    """Return the largest usage of each limit in both directions, from dense samples in intervals. Shape (2, B, R).
+    """Return the largest fraction used of each limit, in both directions, from dense samples. Shape (2, B, R).
 
     Args:
         window, profile: As for `limit_usage`.
@@ -389,9 +392,7 @@ def _fine_usage(
 
 
 def _vertex(values: Array, places: list[Array]) -> Array:
-    """Return the vertex value of the parabola through three values if its vertex lies between them, else the first
-    value.
-    """
+    """Return the extremum of the parabola through three points if it lies between these, else the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -305,7 +305,7 @@ class SelfMotionManifolds:
         return Charts(layer, joints, tangents, radii, -low, high, deviations)
 
     def _deviations(self, layer: Indices, joints: Array, tangents: Array, radii: Array) -> tuple[Array, Array]:
-        """Project rim points of tangent boxes onto the manifold; return the projections (nan if failed) and shifts."""
+        """Project boundary points of charts onto the manifold; return projections (nan if failed) and their offsets."""
         rim = _rim(tangents.shape[2])
         tangent_points = joints[:, None] + radii[:, None, None] * np.einsum("knr,cr->kcn", tangents, rim)
         projected, converged = self.project(np.repeat(layer, len(rim)), tangent_points.reshape(-1, joints.shape[1]))
@@ -484,7 +484,7 @@ class TimeSample(NamedTuple):
 
 
 def _rim(r: int) -> Array:
-    """Return the corners and side midpoints (c, r) of the box [-1, 1]^r, where charts are checked."""
+    """Return the corners and side midpoints (c, r) of the box [-1, 1]^r, where the deviation of charts is measured."""
     middles = [side * np.eye(r)[axis] for axis in range(r) for side in (-1.0, 1.0)] if r > 1 else []
     corners = [np.array(signs) for signs in product((-1.0, 1.0), repeat=r)] if r else []
     return np.array([*middles, *corners]).reshape(-1 if r else 0, r)

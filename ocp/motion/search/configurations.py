@@ -193,7 +193,7 @@ class PlanRequest:
 
 
 def start_configurations(request: PlanRequest) -> Array:
-    """Return start configurations sorted by conditioning, with all collision-free ones first. Shape (K, n)."""
+    """Return start configurations (K, n), collision-free ones first, then by manipulability and limit distance."""
     if request.start is not None:
         return request.start[None]
     first = [request.tasks[i] for i in request.stretches[0].tasks if request.tasks[i].is_pose]
@@ -219,7 +219,7 @@ def start_collisions(
     if request.clearance_constraints is None or pairs == []:
         return [None] * len(configurations)
     scene, times = request.clearance_constraints.scene, np.zeros(len(configurations))
-    return worst_collisions(scene, request.base, configurations, times, pairs)
+    return worst_collisions(scene, request.base, configurations, times, pairs=pairs)
 
 
 def check_clear_start(request: PlanRequest, configurations: Array) -> None:
@@ -490,7 +490,7 @@ def end_of_reach(
 
 
 def _joint_at_limit(machine: Machine, joints: Array) -> tuple[str, dict[str, Any]]:
-    """Return the text and the fields of an error about the joint that is nearest to its limit and ends the reach."""
+    """Return text and fields of an error about the joint that is nearest to its limit and so limits the reach."""
     moving = machine.robot.moving_joints
     limits = [min(joint.lower, joint.upper, key=lambda x: abs(x - q)) for joint, q in zip(moving, joints, strict=True)]
     nearest = int(np.abs(joints - limits).argmin())

@@ -30,7 +30,7 @@ __all__ = ["DeadEnd", "Obstruction", "Relaxation", "dead_end"]
 Indices = NDArray[np.intp]
 
 MAX_TRIALS = 3
-"""Largest number of start configurations tried for a step into one chart, and of obstructions in a message."""
+"""Largest number of start configurations tried for a step into a manifold chart, and of obstructions in a message."""
 NEGLIGIBLE = 1e-9
 """Lower bound of the divisors that scale relaxations of the tasks, m or rad, which avoids division by zero."""
 
@@ -229,7 +229,7 @@ class _Propagation:
         return np.array(path[::-1])
 
     def _propagate(self, graph: ChartGraph, k: int) -> None:
-        """Propagate configurations from time sample `k` to the charts of the next sample, by falling clearance."""
+        """Propagate configurations from time sample `k` to the charts of the next, in order of falling clearance."""
         space, limit, successor = self.search.space, self.search.limits[k], k + 1
         reached = np.isfinite(self.joints[k][:, 0])
         parts = [(i[reached[i]], j[reached[i]]) for i, j in graph.edges(k, successor)]
@@ -277,7 +277,7 @@ class _Propagation:
 
 
 def _fine_charts(search: AtlasSearch) -> list[Charts]:
-    """Return all manifold charts, split until no chart is wider than a step or there would be too many charts."""
+    """Return all manifold charts, split until none is wider than the joint step limit or they become too many."""
     layers = search.atlas
     reach = search.limits.max(axis=1) / 2
     max_radius = np.minimum(np.append(reach, np.inf), np.append(np.inf, reach))
@@ -445,7 +445,7 @@ class _RelaxedProblem:
         return float(np.arcsin(min(largest, 1.0))) if self.turning else largest
 
     def solve(self, path: Array, scale: float | None) -> Array | None:
-        """Solve the program from a guess, and return the joint path (K, n); None if the solver fails."""
+        """Solve the nonlinear program from a guess, and return the joint path (K, n); None if the solver fails."""
         search, slack = self.search, ca.MX.sym("slack")
         if scale is None:
             relaxed_constraints, slack_guess = ca.vertcat(self._relaxed_rows - slack, -self._relaxed_rows - slack), 0.1

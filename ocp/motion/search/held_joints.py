@@ -72,7 +72,7 @@ def all_joints(robot: Robot, held: Mapping[str, float], values: Array, *, rates:
 
 
 def hold_idle_joints(request: PlanRequest) -> PlanRequest:
-    """Return the request with joints that move no task frame held at rest at their start or mid-range positions."""
+    """Return a request that holds at rest the joints that move no task frame, at their start or mid-range positions."""
     idle = bind(request.machine, request.tasks).idle
     if idle.all():
         return request
@@ -82,7 +82,7 @@ def hold_idle_joints(request: PlanRequest) -> PlanRequest:
 
 
 def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanRequest, Array]:
-    """Move joints held at rest to collision-free positions; return the request and its start configurations (K, m).
+    """Choose collision-free positions for joints held at rest; return the request and start configurations (K, m).
 
     Held joints stay where they are if any configuration is collision-free there. Otherwise they take the nearest
     sampled positions with a collision-free configuration. A global search may hold further joints, see
@@ -105,7 +105,7 @@ def place_held_joints(whole: PlanRequest, request: PlanRequest) -> tuple[PlanReq
 
 
 def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations: Array) -> PlanRequest:
-    """Hold joints that move no task frame at the nearest positions that permit a collision-free start configuration.
+    """Hold at rest the joints that move no task frame, at the nearest positions with a collision-free configuration.
 
     If held bodies of the machine collide with each other at all sampled positions, that is ignored. So are start
     configurations (K, m) whose collisions do not depend on the held joints, unless all have such collisions.
@@ -176,7 +176,7 @@ def _check_held_bodies(whole: PlanRequest, request: PlanRequest, configuration: 
 
 
 def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[Array, Array]:
-    """Return start positions (n,) that fix the joints without effect on the tasks, and are nan for the other joints.
+    """Return fixed start positions (n,) of the joints that have no effect on the tasks, and nan for all other joints.
 
     Also return the configurations with these joints fixed. An example of such an ignorable (cyclic) coordinate is the
     last joint of an arm whose roll about the tool's axis is free. If it were free, each motion would belong to a family

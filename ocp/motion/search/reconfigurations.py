@@ -106,7 +106,7 @@ def fewest_segments(
 
 
 def _segment_ranges(search: AtlasSearch, gap: int, barred: Collection[Span]) -> tuple[list[range], list[range]] | None:
-    """Return the ranges of start and end samples of each of the fewest segments; None if there is no division.
+    """Return the time samples where each of the fewest path segments may start and end; None if no path was found.
 
     Segments extended greedily forwards give the latest ends, those extended backwards the earliest starts.
     """
@@ -165,7 +165,7 @@ def _solve_segment(search: AtlasSearch, first: int, last: int) -> Segment | None
 def _last_reachable(
     search: AtlasSearch, start: int, barred: Collection[Span], back: bool = False, ruled_out: bool = False
 ) -> int | None:
-    """Return the farthest time sample that a segment from `start` can reach, or None; `back` searches backwards."""
+    """Return the farthest time sample to which a path from `start` leads, or None; `back` searches backwards."""
 
     def reaches(sample: int) -> bool:
         span = min(start, sample), max(start, sample)
@@ -243,7 +243,7 @@ class SectionSettings:
 def section_values(
     prismatic: bool, lower: float, upper: float, max_step: float, *, settings: SectionSettings = SectionSettings()
 ) -> Array:
-    """Return the positions at which sections fix a joint, evenly spaced over its range. Shape (V,), rad or m.
+    """Return evenly spaced positions at which sections of a self-motion manifold fix a joint. Shape (V,), rad or m.
 
     Args:
         prismatic: Whether the joint is prismatic.
@@ -274,7 +274,7 @@ class SectionSearch(AtlasSearch):
         super().__init__(*args, **options)
 
     def _build_atlas(self, seeds: Callable[[int], Array]) -> list[Charts]:
-        """Return for each time sample the charts of all sections, which are curves on which the joint is fixed."""
+        """Return for each time sample the charts of the self-motion manifold's curves on which one joint is fixed."""
         manifolds, count = self.samples[0].manifolds, len(self.samples)
         indices, value_count = [sample.row for sample in self.samples], len(self._values)
         targets = np.tile(manifolds.targets[indices], (value_count, 1))

@@ -69,7 +69,7 @@ class SearchSettings:
 
 
 def checked_bound(bound: float, cost: float) -> float | None:
-    """Return a lower bound of the cost of all motions; warn and return None if a known motion costs less.
+    """Return a lower cost bound after a check; warn and return None if a known motion costs less than the bound.
 
     Warns:
         BoundWarning: The cost of a motion lies below the bound.
@@ -271,7 +271,7 @@ class AtlasSearch:
         return np.array([path[number] for number in range(last + 1)])
 
     def project_in_box(self, k: int, box: Charts, place: Array) -> Array | None:
-        """Return the valid configuration to which a point of a chart, given by coordinates (r,), is projected.
+        """Project a chart point, given by coordinates (r,), onto the manifold; return a valid (collision-free) result.
 
         If the result is not valid, points nearer to the middle of the chart are tried: a box reaches beyond the joint
         limits by the deviation of the manifold. Return None if no point leads to a valid configuration.
@@ -283,7 +283,7 @@ class AtlasSearch:
         return next((configuration for configuration in projected if configuration is not None), None)
 
     def _project(self, k: int, joints: Array) -> Array | None:
-        """Project a configuration to the manifold of a time sample; return None if the result is invalid."""
+        """Project a configuration onto the manifold of a time sample; None if that violates limits or clearance."""
         if k == 0 and self.start is not None:
             return self.start
         projected, converged = self.samples[k].manifolds.project(np.array([self.samples[k].row]), joints[None])
@@ -384,7 +384,7 @@ class AtlasSearch:
             layers = [self.without_collisions(self.split_charts(charts, k), k) for k, charts in enumerate(layers)]
 
     def _follow_bounds(self, graph: ChartGraph, cost_to_go: list[QuadraticBounds]) -> Array | None:
-        """Follow the least cost-to-go and shorten the path; return None if it breaks off or exceeds step limits."""
+        """Return the shortened path of least cost-to-go; None if the path breaks off or exceeds step limits."""
         chart = int(graph.minima(cost_to_go[0], 0).argmin())
         return self._shorten(self._path_through(graph, 0, chart, cost_to_go, cost_to_go), graph.layers)
 

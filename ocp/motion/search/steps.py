@@ -25,7 +25,7 @@ __all__ = [
 MAX_CUTS = 8
 """Number of tangents with which the minimum of a piecewise linear step cost is bracketed; each joint adds a kink."""
 MAX_CONCAVITY = 0.5
-"""Largest concavity of a cost bound, relative to the curvature of a step's cost; a constant replaces the excess."""
+"""Largest concavity of a cost bound, relative to the curvature of a step's cost; more concave bounds are flattened."""
 
 
 class QuadraticBounds(NamedTuple):
@@ -65,7 +65,7 @@ class QuadraticBounds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Limits, durations and cost of the steps between consecutive time samples.
+    """Joint displacement limits, times and cost of the steps between consecutive time samples.
 
     Attributes:
         times: Times of the samples, s. Shape (K,).
@@ -245,9 +245,9 @@ def _nearest_places(
 
 @dataclass(frozen=True, eq=False)
 class SquaredRateBounds:
-    """Lower bounds of the cost of steps plus the remaining cost, as functions of the start coordinates t of the step.
+    """Lower bounds of the cost of steps plus the remaining cost, as functions of the start coordinates of the step.
 
-    The bound is least + slope . t + t . level . t / 2, plus the minimum over t' in the box `end_box` of
+    At t, the bound is least + slope . t + t . level . t / 2, plus the minimum over t' in the box `end_box` of
     v . v / (2 dt) + after . t' + t' . after_curve . t' / 2. Here v = projection - rotation . t + t' is the step along
     the chart. The axis of the steps comes last. Each point p yields a global lower bound: value + slope . (t - p) plus
     (t - p) . curve . (t - p) / 2.
@@ -279,12 +279,12 @@ class SquaredRateBounds:
         return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + _rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
-        """Minimise the bounds over the end of a step; return the step to the centre, the minimum, the best end."""
+        """Minimise the bounds over the end of a step; return step to the chart centre, minimum and minimiser."""
         start = self.projection - _apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        """Return values (P,) and slopes (P, r) of the bounds at start coordinates (P, r)."""
+        """Return values (P,) and gradients (P, r) of the bounds at start coordinates (P, r)."""
         places = _rows_last(places)
         start, after, end_place = self._minimize_after(places)
         products = _apply(self.level, places)
@@ -331,7 +331,7 @@ class Homogeneous(StepCost):
         box = target.low[:, 0], target.high[:, 0]
 
         def linearize(place: Array) -> list[Array]:
-            """Return the coordinates, the cost gradient, and the value at the origin and total slope of the tangent."""
+            """Return the tangent of the cost at coordinates: these, cost gradient, value at 0 and total slope."""
             gradient = self.gradient(delta + along * place[:, None])
             return [place, gradient, (gradient * delta).sum(axis=1), (gradient * along).sum(axis=1) + slope]
 
@@ -384,7 +384,7 @@ class PathLength(Homogeneous):
 
 
 class LargestMotion(Homogeneous):
-    """Cost of a step: the largest weighted joint displacement (a duration for inverse velocity limits)."""
+    """Cost of a step: the largest weighted joint displacement; a duration if the weights are inverse rate limits."""
 
     def evaluate(self, delta: Array, seconds: Any) -> Array:
         return np.asarray((self.weights * np.abs(delta)).max(axis=-1))

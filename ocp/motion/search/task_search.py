@@ -76,7 +76,7 @@ class TaskSearch:
 
         Args:
             request: The request.
-            motions: Local motions through its stretches; the best one determines where samples are needed.
+            motions: Local motions through its time intervals; the best one determines where samples are needed.
             settings: Settings of the time samples.
         """
         self.request, self._settings = request, settings
@@ -126,7 +126,7 @@ class TaskSearch:
         self._search_at(times)
 
     def _search_at(self, times: list[Array]) -> None:
-        """Search over the configurations at given time samples; `times` has an entry for each interval with tasks."""
+        """Search over the configurations at time samples; `times` has an array for each interval with active tasks."""
         self._build_search(times)
         self._path, bound = self._search.solve(self._known_cost)
         self.bound = max(self.bound, bound)  # the bound of fewer samples stays valid
@@ -134,7 +134,7 @@ class TaskSearch:
             self._known_cost = max(self._known_cost, self._search.path_cost(self._path))
 
     def _build_search(self, times: list[Array]) -> None:
-        """Build the atlas of the manifolds at given time samples; `times` has an entry for each interval with tasks."""
+        """Build the manifold atlas at time samples; `times` has an array for each time interval with active tasks."""
         request, samples = self.request, list[TimeSample]()
         for equations, stretch_times in zip(self._equations, times, strict=True):
             manifolds = self._manifolds(equations, stretch_times)
@@ -164,7 +164,7 @@ class TaskSearch:
         return dead_end(self._search, proven=not np.isfinite(self.bound), segments=len(ends) if through else None)
 
     def segments(self, barred: Collection[tuple[float, float]] = ()) -> tuple[list[tuple[float, float]], int] | None:
-        """Divide the tasks into the fewest segments, at least cost; return their times and a bound of their number.
+        """Divide the tasks into the fewest segments, at least cost; return their times and a lower bound of the number.
 
         Args:
             barred: Begin and end, s, of intervals that are known to be infeasible in one segment.
@@ -197,7 +197,7 @@ class TaskSearch:
         return np.asarray(np.diff(self.times) > self._settings.closest * self.request.horizon)
 
     def _with_samples(self, times: Array) -> list[Array]:
-        """Return the sample times of each interval with tasks after inserting additional times."""
+        """Return the sample times of each interval with active tasks after inserting additional times."""
         return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._times_by_stretch]
 
     def refine_samples(self) -> bool:
@@ -253,7 +253,7 @@ class TaskSearch:
 def choose_samples(
     t: Array, joints: Array, weights: Array, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
-    """Choose a few sample times of a motion; straight steps between them lose at most a given share of its cost.
+    """Choose few sample times of a motion such that straight steps between them cost at most a given fraction less.
 
     Times are left out greedily, the one that loses least first; at least `min_steps` steps remain. Joints that are
     `periodic`, (n,), turn by at most a quarter of a turn in a step, so that it is known which way round they go.

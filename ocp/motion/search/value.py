@@ -87,7 +87,7 @@ class ChartGraph:
 
     @cached_property
     def curved(self) -> list[CurvedCharts]:
-        """Manifold charts of each time sample, with the curvature of the manifold."""
+        """Manifold charts of each time sample, and how far the manifold curves away from each chart."""
         return [CurvedCharts(charts, *charts.curvature()) for charts in self.layers]
 
     def cost_to_go(
@@ -233,7 +233,7 @@ class ChartGraph:
 
     @staticmethod
     def _raise_to_floor(values: QuadraticBounds, charts: Charts, floor: Array) -> QuadraticBounds:
-        """Replace a cost bound by the constant `floor` if the mean of its minimum and middle value is smaller."""
+        """Replace a cost bound by the constant `floor` if that exceeds the mean of its minimum and middle value."""
         least = values.minimum(charts.low, charts.high)[0]
         higher = values.at((charts.low + charts.high) / 2) + least < 2 * floor
         return QuadraticBounds(
@@ -260,7 +260,7 @@ def _bound_with_rest(steps: StepBounds, charts: Charts, known_bounds: QuadraticB
 
 
 def _least_of_groups(values: Array, groups: Indices) -> Array:
-    """Return for each value the least value in its group of consecutive values. Shape (P,)."""
+    """Return for each value the least value with the same group number; equal numbers are consecutive. Shape (P,)."""
     starts = np.flatnonzero(np.diff(groups, prepend=-1))
     return np.repeat(np.minimum.reduceat(values, starts), np.diff(np.append(starts, len(values))))
 
@@ -330,7 +330,7 @@ def _best_combination(
 
 
 def _quadratic(curve: Array, place: Array) -> Array:
-    """Return the quadratic form t . curve . t / 2 at P points t. Shape (P,)."""
+    """Return half the value of the quadratic form with matrix `curve` at each of P points. Shape (P,)."""
     return np.asarray((place * np.einsum("pab,pb->pa", curve, place)).sum(axis=1) / 2)
 
 
@@ -341,7 +341,7 @@ def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> 
 def _tangent_bounds(
     places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
 ) -> QuadraticBounds:
-    """Return lower bounds of functions by tangents at given points, after subtracting a common quadratic function.
+    """Return lower bounds of costs by tangents at given points, after subtracting a common quadratic function.
 
     The subtracted function is tilt . t + t . common . t / 2.
     """
@@ -351,7 +351,7 @@ def _tangent_bounds(
 
 
 def _concavity(values: Array, half: Array, curve: Array) -> Array:
-    """Estimate the concavity of functions on charts from values in the middle and at the ends of each axis.
+    """Estimate the concavity of cost bounds on charts from values in the middle and at the ends of each chart axis.
 
     The total curvature is kept non-negative. Shape (M, r, r).
     """
@@ -363,9 +363,9 @@ def _concavity(values: Array, half: Array, curve: Array) -> Array:
 
 
 def _secant_slopes(values: list[Array], half: Array) -> Array:
-    """Estimate the slopes of functions on charts from values in the middle and at the ends of each axis. Shape (M, r).
+    """Estimate the slopes of cost bounds along chart axes from values in the middle and at the ends of each axis.
 
-    A concave function gets the slope from end to end, a convex one the flattest slope.
+    Shape (M, r). A concave function gets the slope from end to end, a convex one the flattest slope.
     """
     slopes = np.zeros(half.shape)
     for axis in range(half.shape[1]):

@@ -1,4 +1,4 @@
-"""Checks of tip tasks against a machine and a start configuration, before a motion is planned."""
+"""Checks made before a motion is planned: whether a machine can perform tip tasks from a start configuration."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """Sampling and tolerances of the checks of tasks.
+    """Settings of the checks of tip tasks: numbers of samples and tolerances.
 
     Attributes:
         track_samples: Number of samples of a track, a target over time.
@@ -66,7 +66,7 @@ def horizon_of(tasks: Sequence[TipTask], horizon: Any) -> float:
 
 
 def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Array, Array]:
-    """Return the joint positions (joint_size,) and the base configuration (base_size,) at the start, after checks.
+    """Check the joint positions (joint_size,) and the base configuration (base_size,) of a start, and return both.
 
     The base is by default the machine's base_home().
 
@@ -92,7 +92,7 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
 
 
 def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, names: Sequence[str], hint: str) -> Array:
-    """Clip joint values (n,) at an end of a motion to their limits; raise ProblemError if the excess is not rounding.
+    """Clip joint positions or velocities (n,) to their limits, which rounding errors alone may have exceeded.
 
     Args:
         joints, lower, upper: Joint positions, or velocities, nan where free, and their limits. Shape (n,).
@@ -116,7 +116,7 @@ def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, nam
 
 
 def checked_weights(weights: Any, size: int) -> Array:
-    """Return weights (size,) of the squared joint rates, 1 if None; raise ProblemError if one is not positive."""
+    """Return weights (size,) of squared joint rates, 1 if None is given; raise ProblemError if one is not positive."""
     if weights is None:
         return np.ones(size)
     array = require.array("weights", weights, (size,), meaning="one for each joint")
@@ -128,7 +128,7 @@ def checked_weights(weights: Any, size: int) -> Array:
 def checked_tasks(
     equations: TaskEquations, base: Array, joints: Array, horizon: float, *, check_start: bool = True
 ) -> None:
-    """Raise ProblemError if tasks require motions that the machine cannot perform, or a jump at the start.
+    """Raise ProblemError if tasks require motions that the machine cannot perform, or a jump of a tip at the start.
 
     Args:
         equations: Equations of the tasks.
@@ -180,7 +180,7 @@ def checked_tasks(
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
-    """Return a description of the tasks if their rows are linearly dependent in a configuration, else None."""
+    """Return a description of the tasks if their equations are linearly dependent in a configuration, else None."""
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
@@ -188,7 +188,7 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joint positions affect neither the required joint rates nor the base motion. Shape (n,), bool.
+    """Return which joint positions affect neither the joint rates that tasks require nor the base motion. Shape (n,).
 
     Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
     and the cones of tool axes do not depend on such a joint position.
@@ -215,7 +215,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the numbers of task rows in error messages: twist components for a single task, else indices."""
+    """Return numbers that identify task equations in error messages: twist components if there is a single task."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -234,7 +234,7 @@ def _sample_targets(equations: TaskEquations, horizon: float, count: int) -> tup
 
 
 def _parts(equations: TaskEquations, values: Array) -> list[tuple[BoundTask, Array]]:
-    """Split the stacked targets of all tasks, and return each task with the rows that belong to it."""
+    """Split the stacked targets of all tasks; return a pair for each task: the task and its own targets."""
     ends = np.cumsum([target_size(part.task) for part in equations.bound])
     return list(zip(equations.bound, np.split(values, ends[:-1]), strict=True))
 
@@ -261,7 +261,7 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if the targets show that a task of a cyclic motion does not return to its start.
+    """Raise ProblemError if the target of a task in a cyclic motion does not return to where it starts.
 
     Poses are checked by their targets, velocities by their integrals.
     """
@@ -291,7 +291,7 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
-    """Raise ProblemError if a task prescribes motion when the joints must be at rest; times of None are skipped."""
+    """Raise ProblemError if a task prescribes motion at a time of rest of the joints; times of None are skipped."""
     targets = equations.target_function()
     for time in times:
         if time is None:
@@ -368,7 +368,7 @@ def _max_tip_speeds(machine: Machine, chain: Sequence[Joint], rate_limits: Array
 
 
 def _task_speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
-    """Return the speed, m/s, and angular speed, rad/s, that the rows of a task prescribe. Shape (M,) each."""
+    """Return the speed, m/s, and angular speed, rad/s, that a task prescribes at M times. Shape (M,) each."""
     angular_rows = [row for row in task.chosen if row in ANGULAR]
     if task.is_pose:
         angular = targets[-3:] if task.tilts else targets[-3:][angular_rows]
@@ -390,9 +390,7 @@ def _chain_length(machine: Machine, joints: Sequence[Joint]) -> float:
 
 
 def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
-    """Return the position of the first moving joint in world, (3,), and the largest distance of the tip from this
-    joint.
-    """
+    """Return the world position (3,) of an arm's first moving joint, and the tip's largest distance from this joint."""
     robot = machine.robot
     chain = robot.path_to(robot.tip_link)
     first = next((i for i, joint in enumerate(chain) if joint.moves), len(chain) - 1)
@@ -406,7 +404,7 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
 
 
 def _rate_rows(task: TipTask) -> list[int]:
-    """Return the indices of the velocities among the entries of a pose task's targets."""
+    """Return the indices of the velocities among the target values of a pose task."""
     tracks = [(task.position, [3, 4, 5], 6), (task.orientation, [9, 10, 11], 12), (task.direction, [3, 4, 5], 6)]
     rows, at = [], 0
     for track, entries, size in tracks:
@@ -417,14 +415,14 @@ def _rate_rows(task: TipTask) -> list[int]:
 
 
 def _integral(values: Array, step: float) -> Array:
-    """Integrate an odd number of equidistant samples by Simpson's rule. Shape (k, samples) to (k,)."""
+    """Integrate k functions from equidistant samples (k, samples), odd in number, by Simpson's rule. Shape (k,)."""
     weights = np.ones(CHECKS.closure_samples)
     weights[1:-1:2], weights[2:-1:2] = 4, 2
     return np.asarray(values @ weights * step / 3)
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:
-    """Return the angle, rad, of the total rotation that a sampled angular velocity (3, samples) in world causes."""
+    """Return the angle, rad, of the rotation that results from a sampled angular velocity (3, samples) in world."""
     rotation = np.eye(3)
     # fourth-order Magnus expansion over two steps at a time
     for k in range(0, CHECKS.closure_samples - 1, 2):
@@ -440,8 +438,7 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities to prescribe where a motion begins or ends at rest: 0, or nan for free joints. Shape
-    (n,).
+    """Return the joint velocities (n,) to prescribe where a motion begins or ends at rest, nan where left free.
 
     A tip whose velocity or acceleration is prescribed comes to rest by itself. As many joints as the tasks have such
     rows then follow from the others, and prescribing their rest too would be redundant. The joints that move the tip

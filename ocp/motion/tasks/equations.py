@@ -50,7 +50,7 @@ __all__ = ["TaskEquations", "bind", "task_errors"]
 
 @dataclass(frozen=True, eq=False)
 class TaskEquations:
-    """Stacked equations of all tip tasks of a machine. Use `bind` to create them.
+    """Stacked equations of all tip tasks of a machine, created by `bind`.
 
     Attributes:
         machine: The machine.
@@ -67,13 +67,12 @@ class TaskEquations:
 
     @property
     def pose_rows(self) -> NDArray[np.bool_]:
-        """Mask of the task rows that belong to pose tasks. Shape (size,), bool."""
+        """Mask of the task equations that belong to pose tasks, not to velocity tasks. Shape (size,), bool."""
         return np.repeat([part.task.is_pose for part in self.bound], [part.task.size for part in self.bound])
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:
-        """Mask of the joints that move neither the frame nor the reference frame of any task. Shape (joint_size,),
-        bool.
+        """Mask of the joints that move neither the frame nor the reference frame of any task. Shape (joint_size,).
 
         On a floating base or a standing machine no joint is idle: each one moves the base or the balance.
         """
@@ -85,7 +84,7 @@ class TaskEquations:
         return idle
 
     def unit(self, pose: str = "/s", velocity: str = "/s") -> str:
-        """Return the units of the task rows as text, for example "rad/s, m/s" for the velocity residual.
+        """Return the units of the task equations as text, for example "rad/s, m/s" for the velocity residual.
 
         Args:
             pose, velocity: Time units of the rows of pose and of velocity tasks: "" for `error`, "/s^2" for
@@ -179,7 +178,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def deviations(self, base: Any, joints: Any, rates: Any, targets: Any) -> dict[str, dict[str, Any]]:
-        """Return the deviations of the tips from their tasks, each as a dictionary of arguments of `Problem.watch`.
+        """Return the deviations of the tips from their tasks by name, each as arguments of `Problem.watch`.
 
         For poses these are their errors, "task position" and "task orientation"; for velocities the integral of their
         residual, "task displacement" and "task rotation"; each is judged relative to the path of the tips. If a task is
@@ -208,20 +207,20 @@ class TaskEquations:
 
     @property
     def tolerances(self) -> Array:
-        """Accepted pose errors of the task rows, m and rad. Shape (size,)."""
+        """Accepted pose error of each task equation, m or rad. Shape (size,)."""
         pairs = np.repeat([part.task.tolerance for part in self.bound], [part.task.size for part in self.bound], axis=0)
         return np.asarray(np.where(self.turning, *pairs.T[::-1]))
 
     @property
     def turning(self) -> NDArray[np.bool_]:
-        """Mask of the angular rows among all task rows. Shape (size,), bool."""
+        """Mask of the angular equations among all task equations. Shape (size,), bool."""
         angular: list[bool] = []
         for task in (part.task for part in self.bound):
             angular += [*([True, True] if task.tilts else []), *(row in ANGULAR for row in task.chosen)]
         return np.array(angular, dtype=bool)
 
     def acceleration(self, base: Any, joints: Any, rates: Any, second: Any, *, progress: Sequence[Any]) -> Any:
-        """Return the residual of the task equation at acceleration level, with pose feedback. Shape (size, 1).
+        """Return the residual of the task equations for joint accelerations, including pose feedback. Shape (size, 1).
 
         d/dt (J u - b) + gain (J u - b): the error of a pose decays as e'' + 2 gain e' + gain^2 e = 0.
 
@@ -248,7 +247,7 @@ class TaskEquations:
 
     @on_scalars
     def error(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return the pose errors (target minus pose) of all rows, m and rad; 0 in velocity rows. Shape (size, 1)."""
+        """Return the pose errors (target minus pose) of all tasks, m and rad; 0 for velocity tasks. Shape (size, 1)."""
         rows = []
         for part, target in self._with_targets(targets):
             if part.task.velocity is not None:
@@ -258,7 +257,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Return pose minus target in the rows of pose tasks, and velocity residuals elsewhere. Shape (size, 1)."""
+        """Return pose minus target for pose tasks, and the velocity residuals for velocity tasks. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         return ca.vertcat(*((-error if is_pose else residual)[i] for i, is_pose in enumerate(self.pose_rows)))
 
@@ -318,9 +317,7 @@ class TaskEquations:
 
     @on_scalars
     def cone_cosines(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return the cosine of the angle between tool axis and target direction for each task with a cone. Shape (k,
-        1).
-        """
+        """Return the cosine of the angle between tool axis and cone axis for each task with a cone. Shape (k, 1)."""
         rows: list[Any] = [ca.DM(0, 1)]
         for part, target in self._with_targets(targets):
             if part.task.within is not None:
@@ -340,7 +337,7 @@ class TaskEquations:
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the errors of the tip poses of all velocity tasks, relative to the poses in a reference configuration.
+        """Return the differences between tip poses of velocity tasks and the poses in a reference configuration.
 
         For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
         """
@@ -356,7 +353,7 @@ class TaskEquations:
         return ca.vertcat(*rows)
 
     def _with_targets(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
-        """Yield each task with its own part of the stacked targets."""
+        """Yield pairs of a task and its own part of the stacked targets of all tasks."""
         at = 0
         for part in self.bound:
             size = target_size(part.task)
@@ -364,19 +361,19 @@ class TaskEquations:
             at += size
 
     def errors(self, t: Any, base: Any, joints: Any) -> Array:
-        """Return the pose errors of all tasks along a motion, m and rad; 0 in velocity rows. Shape (M, size)."""
+        """Return the pose errors of all tasks along a motion, m and rad; 0 for velocity tasks. Shape (M, size)."""
         bases, positions, targets = self._along(t, base, joints)
         count = len(positions)
         return np.array(self.function.map(count)(bases.T, positions.T, targets)[2]).reshape(-1, count).T
 
     def _along(self, t: Any, base: Any, joints: Any) -> tuple[Array, Array, Any]:
-        """Return base configurations (M, base_size), joint positions (M, joint_size) and targets as M columns."""
+        """Return base configurations (M, base_size), joint positions (M, joint_size) and targets (_, M) of a motion."""
         times, positions = np.atleast_1d(np.asarray(t, dtype=float)), np.atleast_2d(np.asarray(joints, dtype=float))
         bases = np.zeros((len(times), 0)) if base is None else np.atleast_2d(np.asarray(base, dtype=float))
         return bases, positions, self.target_function().map(len(times))(times[None, :])
 
     def cone_violations(self, t: Any, base: Any, joints: Any) -> Array:
-        """Return the angles by which tool axes leave their cones, rad. Shape (M, k)."""
+        """Return the angles by which tool axes leave their cones along a motion, rad. Shape (M, k)."""
         bases, positions, targets = self._along(t, base, joints)
         if not self.cone_angles.size:
             return np.zeros((len(positions), 0))
@@ -390,14 +387,17 @@ class TaskEquations:
 
     @cached_property
     def function(self) -> Any:
-        """CasADi Function of the task equations: (base, joints, targets) -> (J, b, pose error, pose residual)."""
+        """CasADi Function of the matrix, right-hand side and pose errors of the task equations.
+
+        (base, joints, targets) -> (J, b, pose error, pose residual).
+        """
         symbols = self._symbols
         rows = [of_targets(*symbols) for of_targets in (self.right, self.error, self.pose_residual)]
         return ca.Function("task", symbols, [self.jacobian(*symbols[:2]), *rows], {"cse": True})
 
     @cached_property
     def pose_residual_function(self) -> Any:
-        """CasADi Function (joints, base, targets) -> (pose residual, its Jacobian with respect to the joints)."""
+        """CasADi Function (joints, base, targets) -> (pose residual, its Jacobian in the joint positions)."""
         base, joints, targets = self._symbols
         residual = self.pose_residual(base, joints, targets)
         jacobian = ca.densify(ca.jacobian(residual, joints))
@@ -405,7 +405,7 @@ class TaskEquations:
 
     @cached_property
     def jacobian_function(self) -> Any:
-        """CasADi Function (joints, base) -> task Jacobian J."""
+        """CasADi Function (joints, base) -> Jacobian of all tasks with respect to the joint rates."""
         base, joints, _ = self._symbols
         return ca.Function("jacobian", [joints, base], [self.jacobian(base, joints)], {"cse": True})
 
@@ -417,7 +417,7 @@ class TaskEquations:
         return tuple(ca.SX.sym(name, size) for name, size in sizes.items())
 
     def target_function(self) -> Any:
-        """Return the CasADi Function from time to targets, with MX symbols if a track requires them."""
+        """Return the targets of all tasks as a CasADi Function of time, in MX symbols if a target rejects SX."""
 
         def build(symbols: Any) -> Any:
             time = symbols.sym("time")
@@ -426,7 +426,7 @@ class TaskEquations:
         return on_symbols(build)
 
     def cyclic_rows(self, base: Array, joints: Array) -> Array:
-        """Return the combinations of task rows whose integral vanishes in a cyclic motion. Shape (size, k).
+        """Return the combinations of task equations whose integral over a cyclic motion vanishes. Shape (size, k).
 
         If the joints return to their start, part of the closure conditions follows from the task: all of its rows on a
         fixed base; on a floating base the combinations of rows that are independent of the base pose while the centre
@@ -445,7 +445,7 @@ class TaskEquations:
 
 
 def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
-    """Return a position target with all three coordinates, zero where the task prescribes none. Shape (3, 1)."""
+    """Return a position target with all three coordinates; a coordinate that is not prescribed is 0. Shape (3, 1)."""
     short = task.along_reference and len(task.linear) < 3
     shapes = ((3, 1), (len(task.linear), 1)) if short else ((3, 1),)
     value = track_expression(track, time, shapes, what=name, begin=task.begin)
@@ -486,7 +486,7 @@ def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
 def task_errors(
     machine: Machine, tasks: TipTask | Sequence[TipTask], t: Any, joints: Any, *, base: Any = None
 ) -> Array:
-    """Return the pose errors of tasks along a motion, m and rad; 0 in velocity rows. Shape (M, size).
+    """Return the pose errors of tasks along a motion, m and rad; 0 for velocity tasks. Shape (M, size).
 
     Args:
         t: Times, s. Shape (M,).

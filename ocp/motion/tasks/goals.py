@@ -1,4 +1,4 @@
-"""Request of a motion: its start, its goal or waypoints, its cost, and the scene that it must not collide with."""
+"""Planning request of a motion: start, goal or waypoints, cost, and the obstacles to avoid."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Box, Machine, Sphere
-from models.checks import NOT_NUMBERS, Array, ArrayInput, floats
+from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, short_repr
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.checks import checked_configuration, checked_weights
 from ocp.motion.tasks.tip_task import TipTask
@@ -35,7 +35,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Convert a value to a Start; return it with its joint positions (n,), None if free, and its base (base_size,).
+        """Convert a value to a Start; return the start, its joint positions (n,) or None if free, and its base.
 
         Args:
             value: A start, joint positions, or None.
@@ -50,8 +50,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Convert a value to a Start with given joint positions; return it, these positions (n,) and its base
-        (base_size,).
+        """Convert a value to a Start that has joint positions; return this start, the positions (n,) and the base.
 
         Args:
             value: A start with joint positions, or joint positions.
@@ -102,6 +101,8 @@ class Goal:
     machine: Machine | None = None
     tasks: TipTask | Sequence[TipTask] = ()
     name: str = ""
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         require.text("goal: name", self.name)
@@ -170,13 +171,15 @@ class Waypoints:
     step: Any = np.inf
     reconfigurations: Literal["forbidden", "counted"] = "forbidden"
 
+    __repr__ = short_repr
+
 
 PER_JOINT = ("effort", "acceleration")
 
 
 @dataclass(frozen=True, eq=False)
 class Cost:
-    """Weights of the cost of a motion, a sum of an integral over time and a term proportional to the duration.
+    """Weights of the cost of a motion: of its duration, and of integrals such as the squared joint velocity.
 
         J = time T + integral of (velocity/2 sum(w q'^2) + effort sum(tau^2) + length sqrt(sum(w q'^2))
             + acceleration sum(q''^2) + jerk sum(q'''^2) + energy sum(max(tau q', 0)) + turning |omega|^2) dt
@@ -227,13 +230,13 @@ class Cost:
         return tuple(name for name in (*self._single, *PER_JOINT) if np.any(np.asarray(getattr(self, name))))
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Cost:
-        """Return the cost for a subset of the joints, given as a mask (n,)."""
+        """Return the cost with the weights of a subset of the joints, given as a mask (n,)."""
         names = ("effort", "acceleration", "weights")
         own: dict[str, Any] = {name: floats(getattr(self, name)) for name in names if np.ndim(getattr(self, name))}
         return replace(self, **{name: values[chosen] for name, values in own.items()})
 
     def joint_weights(self, size: int) -> Array:
-        """Return the joint weights multiplied by the weight `velocity` of the squared joint rates. Shape (size,).
+        """Return the weight of the squared velocity of each joint, its own times that of the term. Shape (size,).
 
         Raises:
             ProblemError: The number of weights is not the number of joints, or a weight is not positive.
@@ -270,6 +273,8 @@ class Scene:
     folders: Any = ()
     missing: Literal["raise", "skip"] = "raise"
     wrenches: Callable[[Any, Any], Sequence[Any]] | None = None
+
+    __repr__ = short_repr
 
     @property
     def collision_options(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Limits of a motion: of the joints and of the contact with the ground, and rules for the zero moment point."""
+"""Limits of joints and of the contact with the ground in a motion, and rules for the zero moment point."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Pinned:
 
 @dataclass(frozen=True)
 class Following:
-    """Rule that the zero moment point follows a reference, a function from CasADi time (s) to (x, y), m.
+    """Rule that the zero moment point follows a reference point, given as a function of CasADi time (s) to (x, y), m.
 
     This holds in the directions in which motion moves the point, as for Pinned.
     """
@@ -131,8 +131,7 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges, moved inwards by the margin, that still need a constraint under a zero moment point
-    rule.
+    """Return the support edges, moved inwards by a margin, that a zero moment point rule needs as constraints.
 
     Returns:
         Inward normals n and offsets o: n . point >= o. Shapes (k, 2) and (k,).
@@ -152,7 +151,7 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the motion-dependent distances of the zero moment point from the edges of `foot_edges`. Shape (k, 1), m.
+    """Return the distances of the zero moment point from support edges, if the motion affects them. Shape (k, 1), m.
 
     Args:
         machine, zmp: The machine and the rule for its zero moment point.
@@ -179,7 +178,7 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 
 
 def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the coordinates (0: x, 1: y) in which the zero moment point may violate the rule on the stability index.
+    """Return in which coordinates, 0 for x and 1 for y, a motion can violate the rule on the stability index.
 
     Args:
         machine, zmp, point, external: As for foot_rows.
@@ -344,7 +343,7 @@ def unknown_limits(robot: Robot, kind: str) -> list[str]:
 
 
 def _numbers(value: Any) -> Array:
-    """Return a limit as a flat array; a value that is not numeric becomes a single 0, which is no valid limit."""
+    """Return a limit as a flat array of numbers, or as a single 0, which is no valid limit, if it is not numeric."""
     try:
         numbers = floats(value).ravel()
         return numbers if numbers.size else np.zeros(1)

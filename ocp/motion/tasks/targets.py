@@ -42,7 +42,7 @@ NODES = NodeSettings()
 
 
 class Target(NamedTuple):
-    """Target frame of a tip task at M times; entries that the task does not prescribe are nan.
+    """Target pose of a tip task at M times; coordinates that the task does not prescribe are nan.
 
     Attributes:
         t: Times, s. Shape (M,).
@@ -142,7 +142,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def _largest_errors(equations: TaskEquations, values: Array) -> Array:
-    """Return the permitted interpolation error of each entry of the targets, from samples (M, size). Shape (size,)."""
+    """Return the permitted interpolation error of each target value, from samples (M, size). Shape (size,)."""
     largest, at = np.full(values.shape[1], NODES.pose_error), 0
     for bound in equations.bound:
         task = bound.task

@@ -1,4 +1,4 @@
-"""Tasks for a frame of the machine: prescribed components (rows) of the frame's twist, or a pose over time to track.
+"""Tasks for a frame of the machine: components of the frame's twist, or a pose over time, are prescribed.
 
 Pose tasks are differentiated to velocities, with the pose error fed back so that it does not accumulate (Baumgarte
 1972): task twist = twist of the target + gain x pose error. The functions of a `BoundTask` are expressions of this
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import FreeFloating, Machine, ModelError, SmoothPath, center_of_mass
-from models.checks import Array, ArrayInput
+from models.checks import Array, ArrayInput, short_repr
 from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, rotation_from_quaternion, skew
 from ocp.errors import ProblemError, require
@@ -92,6 +92,8 @@ class TipTask:
     duration: float | None = None
     breaks: ArrayInput = ()
     tolerance: ArrayInput = (POSITION_TOLERANCE_M, ORIENTATION_TOLERANCE_RAD)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if (self.velocity is None) == (not self.is_pose):
@@ -200,37 +202,37 @@ class TipTask:
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Indices 0..5 of the prescribed twist components, without the two rows that prescribe a tool direction."""
+        """Indices 0..5 of the prescribed twist components; the two equations of a tool direction are not among them."""
         return tuple(self.rows or ())
 
     @property
     def linear(self) -> list[int]:
-        """Indices 0..2 of the position coordinates that the task prescribes, in the order of its rows."""
+        """Indices 0..2 of the position coordinates that the task prescribes, in the order of its equations."""
         return [row - 3 for row in self.chosen if row in LINEAR]
 
     @property
     def along_reference(self) -> bool:
-        """Whether the rows of the task are taken along the axes of the reference frame of the pose."""
+        """Whether the components that the task prescribes are along the axes of the reference frame of the pose."""
         return self.axes == "reference" or (self.axes == "world" and self.relative_to is None)
 
     @property
     def tilts(self) -> bool:
-        """Whether two rows prescribe the direction of the tool axis; False if the axis may lie in a cone."""
+        """Whether the task prescribes the direction of the tool axis; False if the axis need only lie in a cone."""
         return self.direction is not None and self.within is None
 
     @property
     def size(self) -> int:
-        """Number of rows (scalar equations) of the task, including the two rows of a prescribed tool direction."""
+        """Number of scalar equations of the task, including the two equations of a prescribed tool direction."""
         return len(self.chosen) + (2 if self.tilts else 0)
 
     @property
     def end(self) -> float:
-        """End of the task, s; infinite if it lasts to the end of the motion."""
+        """End time of the task, s; infinite if the task lasts to the end of the motion."""
         return np.inf if self.duration is None else float(self.begin + self.duration)
 
 
 def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
-    """Convert a task whose tracks are functions of a path parameter to a task over time.
+    """Convert a task whose targets are functions of a path parameter to a task whose targets are functions of time.
 
     Args:
         task: Task whose tracks are functions of the parameter and whose velocity is per unit of it.
@@ -258,7 +260,7 @@ class BoundTask(NamedTuple):
 
 
 def target_size(task: TipTask) -> int:
-    """Return the number of entries that a task has in the stacked column of the targets of all tasks."""
+    """Return the number of target values of a task in the stacked column of the targets of all tasks."""
     if task.velocity is not None:
         return task.size
     sizes = [(task.position, 6), (task.orientation, 12), (task.direction, 6)]
@@ -266,7 +268,7 @@ def target_size(task: TipTask) -> int:
 
 
 def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
-    """Split the targets of a pose task into (position, velocity) and (rotation or direction, angular velocity).
+    """Split targets of a pose task into (position, velocity) and (rotation or direction, angular velocity).
 
     Either part is None if the task does not prescribe it.
     """
@@ -306,7 +308,7 @@ def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates
 
 
 def task_rows(part: BoundTask, base: Any, joints: Any, twist: Any) -> Any:
-    """Return the components that a task prescribes, selected from a twist in world axes or from columns of twists."""
+    """Return the components that a task prescribes, selected from a world-axes twist or a matrix of twist columns."""
     task = part.task
     angular, linear = twist[0:3, :], twist[3:6, :]
     rotation = None
@@ -325,7 +327,7 @@ def task_rows(part: BoundTask, base: Any, joints: Any, twist: Any) -> Any:
 
 
 def _tool_normals(task: TipTask) -> Any:
-    """Return two unit vectors that form an orthogonal basis with the tool axis, in the tool frame. Shape (3, 2)."""
+    """Return two unit vectors orthogonal to each other and to the tool axis, in the tool frame. Shape (3, 2)."""
     axis = np.asarray(task.tool_axis)
     _, _, basis = np.linalg.svd(axis[None, :])
     if np.count_nonzero(axis) == 1:
@@ -334,7 +336,7 @@ def _tool_normals(task: TipTask) -> Any:
 
 
 def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the pose error, target minus pose, in world axes: axis times sine of the angle, and displacement."""
+    """Return the rotation and position error of a pose, in world axes; the rotation as axis times sine of the angle."""
     position_target, goal = split_targets(part.task, targets)
     pose, reference = part.tip.tip_pose(base, joints), reference_pose(part, base, joints)
     angular, linear = ca.DM(3, 1), ca.DM(3, 1)
@@ -350,7 +352,7 @@ def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
 
 
 def target_twist(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the target's twist relative to the reference, plus pose feedback, in world axes. Shape (6, 1)."""
+    """Return a target's twist relative to the reference frame plus pose feedback, in world axes. Shape (6, 1)."""
     position_target, rotation_target = split_targets(part.task, targets)
     reference = reference_pose(part, base, joints)
     angular = ca.DM(3, 1) if rotation_target is None else rotation_target[1]
@@ -371,12 +373,12 @@ def pose_in_reference(part: BoundTask, base: Any, joints: Any) -> tuple[Any, Any
 
 @on_scalars
 def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the pose error in the rows (prescribed components) of the task."""
+    """Return the components of the pose error that the task prescribes."""
     return task_rows(part, base, joints, pose_error(part, base, joints, targets))
 
 
 def is_holonomic(part: BoundTask) -> Array:
-    """Return which task rows integrate to a pose that does not depend on the path. Shape (size,), bool."""
+    """Return which velocity components of a task have a path-independent integral, a pose coordinate. Shape (size,)."""
     task = part.task
     if task.is_pose:
         return np.ones(task.size, dtype=bool)
@@ -393,7 +395,7 @@ def movable_angular_rows(part: BoundTask) -> list[int]:
 
 
 def derivative(value: Any, time: Any) -> Any:
-    """Return the dense time derivative of an expression; zeros for a constant."""
+    """Return the time derivative of an expression as a dense matrix, zero for a constant."""
     return ca.densify(ca.jacobian(value, time)) if isinstance(value, ca.SX | ca.MX) else ca.DM.zeros(*value.shape)
 
 
@@ -419,7 +421,7 @@ def angular_velocity(rotation: Any, rate: Any) -> Any:
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return the combinations of task rows that base motion with a fixed centre of mass leaves unchanged. Shape (m, k).
+    """Return the combinations of task equations that base motion with a fixed centre of mass does not affect.
 
     Raises:
         ProblemError: The momentum moves the centre of mass, and the joints cannot return.
@@ -447,7 +449,7 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return orthonormal combinations (count, k) of a Jacobian's first `count` rows that are spanned by the others."""
+    """Return orthonormal combinations (count, k) of a matrix's first `count` rows that the other rows span."""
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)

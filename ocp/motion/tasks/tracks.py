@@ -1,4 +1,4 @@
-"""Tracks (target positions and orientations of a task over time): lines between poses, and motions along paths.
+"""Target positions and orientations of tasks as functions of time: lines between poses, and motions along paths.
 
 A track is a constant or a function of CasADi time. A track with a method `rate` returns its own rate where a symbolic
 derivative with respect to time would be wrong or undefined: at the bounds of the segments of a path and at its ends.
@@ -37,7 +37,7 @@ MAX_ROTATION_RAD = np.pi - 1e-3
 
 
 class PoseLine(NamedTuple):
-    """Position and orientation along a line between two poses, as functions of time to be used in a `TipTask`."""
+    """Position and orientation along a straight line between two poses, as functions of time for a `TipTask`."""
 
     position: Callable[[Any], Any]
     orientation: Callable[[Any], Any]
@@ -50,7 +50,7 @@ def pose_line(
     *,
     pace: Literal["constant", "rest"] = "rest",
 ) -> PoseLine:
-    """Return the straight line between two poses, with a rotation about one fixed axis at the same pace (slerp).
+    """Return a motion on a straight line between two poses, with rotation about a fixed axis at the same pace (slerp).
 
     Args:
         first, second: (Orientation, position), the orientation as a matrix (3, 3) or a quaternion (4,); a numeric Frame
@@ -89,7 +89,7 @@ def pose_line(
 
 @dataclass(frozen=True, eq=False)
 class TrackWithRate:
-    """A function of time with its derivative, for a target position, direction or orientation.
+    """Target position, direction or orientation as a function of time, together with its time derivative.
 
     Attributes:
         track, rate: Functions of CasADi time (s).
@@ -178,7 +178,7 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
 
 
 def reparametrize(track: Track, clock: Callable[[Any], Any]) -> Track:
-    """Convert a track from a function of a path parameter to a function of time; constants remain unchanged.
+    """Convert a target from a function of a path parameter to a function of time; return constants unchanged.
 
     Args:
         clock: CasADi function time (s) -> parameter.
@@ -194,7 +194,7 @@ def reparametrize(track: Track, clock: Callable[[Any], Any]) -> Track:
 
 
 def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]:
-    """Return rotation (3, 3) and position (3,) of a numeric pose after checks."""
+    """Check a numeric pose, and return its rotation (3, 3) and position (3,)."""
     try:
         orientation, position = (np.array(ca.DM(expression(part))) for part in pose)
     except NOT_NUMBERS as error:
@@ -227,7 +227,7 @@ def track_expression(
     what: str = "track",
     begin: float = 0.0,
 ) -> Any:
-    """Return a track, a constant or a function of time, as a dense expression of the symbol `time`.
+    """Return a target, given as a constant or a function of time, as a dense expression of the symbol `time`.
 
     Args:
         track: A constant, or a function: CasADi time -> CasADi matrix, array, or a list of expressions.
@@ -267,7 +267,7 @@ def track_expression(
 
 
 def _call_track(track: Callable[[Any], Any], time: Any, what: str) -> Any:
-    """Call a function of time; raise ProblemError if it fails, but pass on the errors by which CasADi rejects SX."""
+    """Evaluate a user's target function; raise ProblemError if it fails, except for errors by which it rejects SX."""
     try:
         return track(time)
     except (RuntimeError, NotImplementedError, ProblemError, ModelError):

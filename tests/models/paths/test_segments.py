@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from models import Arc, Helix, Line, ModelError, Path, smooth
+from models.paths.segments import rotation_vector
 from tests.models.paths.task_paths import seeds, turned
 
 
@@ -154,6 +156,15 @@ def test_the_path_of_a_segment_has_the_derivatives_of_its_position(seed: int) ->
     for order in range(3):
         difference = (after[order] - before[order]) / (2 * h)
         assert difference == pytest.approx(here[order + 1], abs=1e-7 * np.abs(here[order + 1]).max())
+
+
+def test_rotation_vectors_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(0)
+    first, vectors = Rotation.random(100, random_state=rng), rng.normal(size=(100, 3))
+    vectors *= rng.uniform(0, 3.14, (100, 1)) / np.linalg.norm(vectors, axis=1, keepdims=True)
+    last = first * Rotation.from_rotvec(vectors)
+    pairs = zip(*(each.as_quat()[:, [3, 0, 1, 2]] for each in (first, last)), strict=True)
+    np.testing.assert_allclose([rotation_vector(p, q) for p, q in pairs], vectors, rtol=0, atol=1e-13)
 
 
 NAN = float("nan")

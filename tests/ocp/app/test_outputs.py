@@ -121,6 +121,9 @@ FOREIGN = {
     "json": b'{"joint_names": ["a"], "points": []}',
     "yaml": b"joint_names: [a]\n",
     "mcap": b"\x89MCAP0\r\n",
+    "urscript": b"def program():\n  # mine\nend\n",
+    "krl": b"&ACCESS RVP\nDEF seam()\nEND\n",
+    "rapid": b"MODULE seam\n  PROC main()\n",
     "urdf": b'<?xml version="1.0"?>\n<robot name="mine"/>',
     "report": b"<!doctype html>\n<html><head><title>mine</title></head></html>",
 }

@@ -98,7 +98,7 @@ class Cone:
         require.positive("cone: depth", self.depth)
 
     def inside(self, place: Expression) -> Expression:
-        """Return a constraint value that is positive if a tip position is inside the cone, m. Shape (1, 1).
+        """Return a constraint function, m, that is positive where a tip position is inside the cone. Shape (1, 1).
 
         Args:
             place: Position of the tip in the grasped frame. Shape (3, 1), m.
@@ -263,7 +263,7 @@ def chained_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> tuple[Solution, Solution]:
-    """Plan the approach by itself, then the detumbling from its end state, at a higher cost than `solve_capture`.
+    """Plan the approach by itself, then the detumbling from its end; the total cost exceeds that of `solve_capture`.
 
     Args, Raises: As for `solve_capture`.
 
@@ -305,7 +305,7 @@ def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFl
 
 @dataclass(frozen=True, eq=False)
 class _Capture:
-    """Checked arguments of a capture; `pair` is the machine of chaser and target with the momentum of both."""
+    """Checked arguments of a capture, and the machine that consists of chaser and target with their total momentum."""
 
     chaser: FreeFloating
     capture: Capture
@@ -344,7 +344,7 @@ class _Capture:
 
     @property
     def arm_weights(self) -> Array:
-        """Factors that carry joint positions into the second phase: 1, but 0 for wheels, whose angles start again at 0.
+        """Factors of the joint positions at the start of phase two: 1, but 0 for wheels, which restart at angle 0.
 
         Shape (n,).
         """
@@ -434,7 +434,7 @@ class _Capture:
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base configuration at a time; its position follows from the uniform motion of the centre of mass.
+        """Return the base configuration at a time, with a position from the uniform motion of the centre of mass.
 
         The position of the centre of mass and the norm of the quaternion are conserved by the dynamics. Their
         continuity would be a condition that no control influences, and would leave the second-order conditions
@@ -449,7 +449,7 @@ class _Capture:
         return ca.vertcat(place, attitude)
 
     def guess_approach(self, problem: Problem) -> None:
-        """Set the initial guess of the states and controls of the problem of an approach."""
+        """Set the initial guesses of the states and controls in the optimal control problem of an approach."""
         cone = self.capture.cone
         out = np.zeros(3) if cone is None else cone.length * cone.direction
         guess_approach(problem, self.chaser, self.capture.target, self.start, out=out)

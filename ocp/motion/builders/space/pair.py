@@ -176,7 +176,7 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
 
 
 def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:
-    """Set the initial guess of the approach; if its duration is free, try several until the tip gets to the grasp.
+    """Set the initial guess of the approach; try several durations if free, until the tip gets to the grasp.
 
     Args:
         start: State of the capture; free velocities are guessed as zero.
@@ -249,7 +249,7 @@ class _TipTracker:
 
 
 def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
-    """Return the rotation vector and translation from an actual to a desired pose, in world axes. Shape (6,)."""
+    """Return rotation vector and displacement from an actual to a desired tip pose, in world axes. Shape (6,)."""
     return np.concatenate(
         [scipy.spatial.transform.Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()]
     )
@@ -258,7 +258,7 @@ def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
 def _tip_path(
     chaser: FreeFloating, target: FreeFloating, times: Array, bases: Array, start: tuple[Array, Array], out: Array
 ) -> tuple[Array, Array]:
-    """Return tip positions (M, 3) and rotations (M, 3, 3) from rest to the grasp, for the guess of an approach."""
+    """Return tip positions (M, 3) and rotations (M, 3, 3) on the way from rest to the grasp, for an initial guess."""
     b = ca.SX.sym("b", target.base_size)
     pose = target.tip_pose(b, ca.DM(0, 1))
     pose_at = ca.Function("pose", [b], [pose.position, ca.vec(pose.rotation)])
@@ -331,14 +331,14 @@ def _stepper(machine: FreeFloating) -> Any:
 
 
 def _motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
-    """Convert samples of joint positions, joint velocities and base to an initial guess of functions of time."""
+    """Convert samples of joint positions, joint velocities and base configurations to guesses as functions of time."""
     second = np.gradient(velocities, times, axis=0)
     tables = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
     return {name: _curve(times, samples) for name, samples in tables.items()}
 
 
 def _curve(times: Array, samples: Array) -> Any:
-    """Return the linear interpolant of samples as a function of time."""
+    """Return the piecewise linear interpolant of samples as a function of time."""
     return lambda t: np.column_stack([np.interp(t, times, column) for column in samples.T])
 
 
@@ -433,7 +433,7 @@ def require_capacity(machine: FreeFloating, momentum: Array, capacity: float) ->
 
 
 def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earliest: float) -> None:
-    """Raise ProblemError if the arm cannot reach the grasp at any time.
+    """Raise ProblemError if the grasp is out of reach of the arm during the whole approach.
 
     Both centres of mass drift uniformly. The tip is never farther from the chaser's centre of mass than with the arm
     stretched.

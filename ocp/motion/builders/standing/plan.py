@@ -1,4 +1,4 @@
-"""Planners that solve and audit the motions of standing machines and their steps.
+"""Planners of the motions and footsteps of standing machines: they solve a problem and audit the plan.
 
 `solve_standing` tries formulations and meshes until a plan passes its audit, or reports every attempt.
 
@@ -48,7 +48,7 @@ COARSE_IPOPT = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
 
 @dataclass(frozen=True)
 class PaceSettings:
-    """Settings of the check, on a coarse mesh, whether steps are possible in their requested durations.
+    """Settings of the check, on a coarse mesh, whether footsteps are possible in their requested durations.
 
     Attributes:
         iterations: Largest number of iterations with the requested durations; solvable cases took 31 to 51.
@@ -77,7 +77,7 @@ PACE = PaceSettings()
 def guess_in_time(
     steps: Steps, start: Any, step_options: Mapping[str, Any], options: Mapping[str, Any]
 ) -> dict[str, Any] | None:
-    """Solve steps with their requested durations on a coarse mesh, for an initial guess; return None on failure.
+    """Solve for footsteps in their requested durations on a coarse mesh, as initial guess; return None on failure.
 
     Args:
         step_options: Cost and limits of steps_problem.
@@ -117,7 +117,7 @@ def guess_in_time(
 
 
 def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]) -> Phases:
-    """Declare the problem of steps whose phases may last longer than the requested `seconds`, at a high cost."""
+    """Declare the problem of footsteps that may take longer than requested, with a large penalty on the extra time."""
     phases = [
         replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.guess * each))
         if (each := seconds.get(name)) is not None
@@ -141,7 +141,7 @@ def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], secon
 
 
 def _check_conflicts(problem: Phases, coarse: Solution) -> None:
-    """Raise SolveError with the conflicting constraints if longer durations do not resolve their conflict."""
+    """Raise SolveError, naming conflicting constraints, if footsteps are impossible whatever their durations."""
     try:
         solve(problem, COARSE, options={"max_iter": 0})  # searches for conflicts at once
     except SolveError as error:
@@ -161,7 +161,7 @@ def _check_conflicts(problem: Phases, coarse: Solution) -> None:
 def _too_fast(
     problem: Phases, coarse: Solution, seconds: Mapping[str, float], spans: Mapping[str, float]
 ) -> SolveError:
-    """Return an error that steps need more time than requested; it names the slow phases and their active limits."""
+    """Return an error that footsteps need more time than requested, naming the slow phases and their active limits."""
     late = sorted(seconds, key=lambda name: -spans[name] / seconds[name])
     late = [name for name in late if spans[name] > (1 + PACE.error) * seconds[name]]
     lines = [
@@ -176,7 +176,7 @@ def _too_fast(
 
 
 def _active_limits(problem: Phases, coarse: Solution, phase: str) -> str:
-    """Describe which limits are active in a phase of a coarse solution, and for what share of its duration."""
+    """Describe which limits are active in a phase of a coarse solution, and for what part of the phase."""
     form = Formulation.of(problem)
     at = np.linspace(0.0, 1.0, PACE.samples)
     x, u = coarse.state_interpolant(at), coarse.control_interpolant(at)
@@ -245,7 +245,7 @@ def solve_standing(
     setup: StandingSetup | None = None,
     settings: SolveSettings | None = None,
 ) -> Solution:
-    """Plan a motion of a standing machine and audit the plan; try several formulations until a plan is accepted.
+    """Plan a motion of a standing machine; try several formulations until the audit accepts a plan.
 
     The problem is `standing_problem`. The first plan that passes its audit with pose errors below 1e-5 (m, rad)
     everywhere is returned. Accelerations at the collocation points are tried first, or, if the final time is free,
@@ -298,7 +298,7 @@ def solve_steps(
     cost: StepWeights | None = None,
     limits: Limits | None = None,
 ) -> Solution:
-    """Plan the steps of a legged machine and audit the plan; refine the mesh until a plan is feasible.
+    """Plan the footsteps of a legged machine and audit the plan; refine the mesh until a plan is feasible.
 
     The problem is `steps_problem`. Limits are tightened and meshes refined as in `solve_standing`. The audit of the
     plan may leave its optimality undetermined. First a coarse mesh shows whether the steps are possible in their
@@ -415,7 +415,7 @@ def _tip(level: Level | None) -> str:
 
 @dataclass(frozen=True)
 class _Judge:
-    """Function object that runs a solve, audits the plan, and accepts or rejects the plan.
+    """Callable that runs a solver, audits the resulting plan, and accepts or rejects the plan.
 
     Attributes:
         tolerances: Tolerances of the audit.
@@ -457,7 +457,7 @@ def _pose_error(
 
 
 def _is_inequality(problem: Problem, finding: str) -> bool:
-    """Return whether an audit finding concerns bounds, or a path constraint that has inequalities only."""
+    """Return whether an audit finding concerns variable bounds or a path constraint without equations."""
     rows = problem.declared.path.get(finding)
     if rows is None:
         return finding.startswith("bounds of ")

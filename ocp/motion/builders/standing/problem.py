@@ -278,7 +278,7 @@ def _constrain_tips(
     tip_level: str,
     moving: bool,
 ) -> None:
-    """Constrain the tips to their tasks, by poses or by accelerations; `moving` says that the start is not at rest."""
+    """Constrain the tips to their tasks, by poses or by accelerations; `moving` is true for a start not at rest."""
     none, (joints, velocities, accelerations) = ca.DM(0, 1), motion
     targets = equations.targets(*progress[:2])
     if tip_level == "position":
@@ -346,7 +346,7 @@ def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, An
 
 
 def motion_cost(motion: StandingMotion, weights: Weights | None = None) -> float:
-    """Return the cost that `standing_problem` assigns to a sampled motion, without jerks, by the trapezoidal rule."""
+    """Return the cost of a sampled motion as in `standing_problem`, without jerks, by the trapezoidal rule."""
     w = weights or Weights()
     running = w.acceleration * (motion.joint_accelerations**2).sum(axis=1)
     running += w.velocity * (motion.joint_velocities**2).sum(axis=1)

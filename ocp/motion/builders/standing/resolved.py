@@ -74,7 +74,7 @@ class StepsMotion:
     balance: Array
 
     def held(self, foot: str) -> NDArray[np.bool_]:
-        """Return a mask of the times at which a foot is on the ground. Shape (M,), bool."""
+        """Return at which of the M times a foot is on the ground. Shape (M,), bool."""
         by_phase = np.array([foot in phase.footholds for phase in self.steps.phases], dtype=bool)
         return np.asarray(by_phase[self.phase.astype(int)], dtype=bool)
 
@@ -92,7 +92,7 @@ class StepsMotion:
         return np.asarray(np.einsum("kji,kj->ki", self.sole_rotation[foot], self.loads[foot][:, 3:]))
 
     def friction(self, foot: str) -> Array:
-        """Return the friction coefficient that a foot needs, tangential over normal force; nan in the air.
+        """Return the friction coefficient that a foot needs: tangential over normal force, nan in the air.
 
         Shape (M,).
         """
@@ -116,7 +116,7 @@ class StepsMotion:
 
 
 def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> StepsMotion:
-    """Sample a plan of steps at evenly spaced times of each phase, with the loads of the feet and joint torques.
+    """Sample a plan of footsteps at evenly spaced times of each phase, including foot loads and joint torques.
 
     Args:
         steps: Steps of the plan.
@@ -147,7 +147,7 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
 
 
 def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion:
-    """Join the sampled quantities of all phases, see `sample_stance`, into one motion."""
+    """Join the quantities that `sample_stance` has sampled in each phase into one motion."""
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def by_foot(quantity: str) -> dict[str, Array]:
@@ -160,7 +160,7 @@ def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion
 def sample_stance(
     steps: Steps, stance: Stance, motion: tuple[Array, ...], foot_loads: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return torques, loads and margins along a motion in one stance: the quantities of `StepsMotion`, by name.
+    """Return, by name, the quantities of `StepsMotion` along a motion in one stance: torques, loads and margins.
 
     Shape (M, ...) each.
 
@@ -292,7 +292,7 @@ def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) 
 
 
 def _least_loads(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str, Array]:
-    """Return those loads of all feet but the first that minimise the sum of the squared loads of all feet.
+    """Return the loads of all feet but the first for which the sum of the squared loads of all feet is least.
 
     The loads have the components `Stance.load_rows`, shape (M, k) each.
     """

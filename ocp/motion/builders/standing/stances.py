@@ -42,7 +42,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class StancePhase:
-    """Period during which some feet are held on footholds.
+    """Part of a motion during which the same feet are held on footholds.
 
     Attributes:
         footholds: Footholds by the names of the feet; the machine is rooted at the first.
@@ -154,7 +154,7 @@ class Steps:
 
     @cached_property
     def stances(self) -> tuple[Stance, ...]:
-        """Machine of each phase, rooted at the first of the feet on the ground."""
+        """Model of the machine in each phase, rooted at the first of the feet on the ground."""
         return tuple(Stance.on(self.robot, self.feet, phase.footholds, self.gravity) for phase in self.phases)
 
     def order(self, stance: Stance) -> NDArray[np.intp]:
@@ -162,7 +162,7 @@ class Steps:
         return np.array([self.robot.joint_names.index(name) for name in stance.robot.joint_names], dtype=np.intp)
 
     def swings(self, k: int) -> tuple[Swing, ...]:
-        """Return the swings of phase k: motions of feet in the air that stood before or land at its end."""
+        """Return the motions through the air in phase k of feet that stood before or land at the end of the phase."""
         swings = []
         for name in self.feet:
             if name in self.phases[k].footholds:
@@ -259,7 +259,7 @@ CONFIGURATIONS = ConfigurationSettings()
 
 
 def foothold_equations(stance: Stance, footholds: dict[str, Foothold]) -> TaskEquations:
-    """Return task equations that keep feet on footholds, in those pose components that the joints can move.
+    """Return task equations that keep feet on footholds, for the pose components that the joints can change.
 
     The first foot of the stance, at which the machine is rooted, must not be among the feet.
     """
@@ -268,7 +268,7 @@ def foothold_equations(stance: Stance, footholds: dict[str, Foothold]) -> TaskEq
 
 
 def foot_task(stance: Stance, name: str, position: Any, rotation: Any, **options: Any) -> TipTask:
-    """Return the tip task of a foot other than the first: the pose of its sole, constant or a function of time."""
+    """Return the tip task that prescribes the pose of the sole of a foot, constant or as a function of time."""
     foot = stance.feet[name]
     back = np.asarray(foot.rotation).T
     turn = (lambda t: ca.mtimes(rotation(t), back)) if callable(rotation) else np.asarray(rotation) @ back
@@ -360,13 +360,13 @@ def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]
 
 
 def _configuration(steps: Steps, stance: Stance, near: Array, over: Array) -> Array:
-    """Return a balanced configuration in a stance, near a given configuration; both in the robot's joint order."""
+    """Return a balanced configuration in a stance, near a given one; both are in the joint order of the robot."""
     joints = standing_configuration(stance, near[steps.order(stance)], over)
     return np.asarray(steps.in_order(stance, joints[None])[0])
 
 
 def _raised_poses(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]:
-    """Return the raised poses of swinging feet midway between their footholds, by the name of the foot."""
+    """Return, by the name of the foot, the raised poses of swinging feet midway between their footholds."""
     raised = {}
     for swing in swings:
         if swing.lifted is None or swing.landing is None:

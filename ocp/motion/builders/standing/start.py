@@ -69,7 +69,7 @@ def start_inside(machine: Machine, joints: Array, lower: Array, upper: Array) ->
 def check_freedom(
     machine: Standing, size: int, zmp: ZmpRule, *, along_parameter: bool, tip_level: str, ends_at_rest: bool
 ) -> None:
-    """Raise ProblemError if tasks, zero moment point and final rest require more joints than the machine has.
+    """Raise ProblemError if tasks, zero moment point rule and rest at the end need more joints than the machine has.
 
     Args:
         size: Number of rows of all tasks.
@@ -158,7 +158,7 @@ def check_loads(
 
 
 def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) -> tuple[Array, Array]:
-    """Return matrix and right side of the equations that tasks impose on the joint accelerations at a start from rest.
+    """Return matrix and right side of the equations that tasks impose on joint accelerations at a start from rest.
 
     Along a parameter the acceleration in the path's direction is free, and only the equations across it remain.
     """
@@ -181,7 +181,7 @@ def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) 
 
 
 def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
-    """Return inward normals and offsets of the half-planes that must contain the zero moment point."""
+    """Return the half-planes, as inward normals and offsets, that must contain the zero moment point."""
     edges = list(zip(*foot_edges(machine, zmp), strict=True))
     unit = np.eye(2)
     if isinstance(zmp, IndexAtLeast):
@@ -199,7 +199,7 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 def _least_violations(
     at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """Return the violations of torque and ground limits whose sum is least; None if the tasks are impossible."""
+    """Return the violations of torque and ground limits that minimise their sum; None if the tasks are impossible."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):

@@ -276,7 +276,7 @@ def _swing(
 
 
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the indices of the distinct rows of a constraint, since corners of soles coincide in planar machines."""
+    """Return the indices of distinct components of a constraint; in planar machines, corners of soles coincide."""
     rng = np.random.default_rng(0)
     others = [
         symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in ca.vertsplit(joints))
@@ -289,7 +289,7 @@ def _distinct_rows(rows: Any, joints: Any) -> list[int]:
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return those distances of the center of mass from support edges that depend on the joints. Shape (k, 1), m."""
+    """Return the distances of the center of mass from support edges, if the joints affect them. Shape (k, 1), m."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))

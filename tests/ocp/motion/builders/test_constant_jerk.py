@@ -152,6 +152,23 @@ def test_a_motion_through_corners_passes_as_a_solution_within_all_limits(
         assert motion.duration == pytest.approx(factor * durations.sum())
 
 
+def test_a_motion_slowed_down_by_torque_limits_uses_the_torque_of_a_joint_up() -> None:
+    random, machine, slowed = np.random.default_rng(6), arm(), 0
+    limits = Limits(acceleration=100.0, torque=[80.0, 80.0, 80.0, 28.0, 28.0, 28.0])
+    bounds = limits.bounds(machine)
+    free, torques = TorqueLimits(machine, Limits(torque=INF).bounds(machine)), TorqueLimits(machine, bounds)
+    for _ in range(10):
+        path = random.uniform(-0.5, 0.5, (2, 6)) + np.array([0.0, 0.9, 0.5, 0.0, 0.0, 0.0])
+        fastest, motion = (stopping_motion(path, bounds, each) for each in (free, torques))
+        samples = (each.reshape(-1, 6) for each in motion.sampled(np.linspace(0.0, 1.0, 101)))
+        used = (np.abs(torques.torques(*samples)) / torques.largest).max()
+        assert used <= 1
+        if motion.duration > fastest.duration * (1 + 1e-9):
+            assert used > 0.99
+            slowed += 1
+    assert slowed >= 5
+
+
 def corners(random: np.random.Generator) -> Array:
     return random.uniform(-1.0, 1.0, (5, 6))
 

@@ -40,7 +40,7 @@ from ocp import (
     inverse_kinematics,
     plan_problem,
 )
-from ocp.app.files import log_rerun, write_mcap
+from ocp.app.files import log_rerun, write_mcap, write_robot_program
 from ocp.motion.builders.standing.problem import Weights
 from ocp.motion.plan import Plan, plan
 from ocp.motion.schedule import LineLimits, schedule
@@ -98,6 +98,11 @@ def valid_plan() -> Plan:
 def logged(**options: Any) -> None:
     with TemporaryDirectory() as folder:
         write_mcap(**{"plan": valid_plan(), "file": f"{folder}/a.mcap", **options})
+
+
+def programmed(**options: Any) -> None:
+    with TemporaryDirectory() as folder:
+        write_robot_program(**{"motion": valid_plan(), "file": f"{folder}/a.mod", **options})
 
 
 PLANE = TipTask(rows=(3, 4), velocity=(0.0, 0.0))
@@ -327,6 +332,12 @@ CASES = [
         time=but(FINITE, "empty") | {"before": -1.0, "after": 99.0, "some after": [0.1, 99.0]},
     ),
     Case("write_mcap", logged, {"period": 0.1}, {"plan": INSTANCE, "period": POSITIVE, "frame": TEXT}),
+    Case(
+        "write_robot_program",
+        programmed,
+        {"period": 0.1},
+        {"motion": INSTANCE, "period": POSITIVE, "joints": but(SEQUENCE, "None")},
+    ),
     Case(
         "log_rerun",
         lambda **options: log_rerun(**{"plan": valid_plan(), **options}),

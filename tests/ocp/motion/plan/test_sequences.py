@@ -7,14 +7,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path as FilePath
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, FreeFloating, Link, MovingObstacle, Sphere, example_robot, planar_chain
+from models import FixedBase, FreeFloating, Link, MovingObstacle, Path, Sphere, example_robot, planar_chain, smooth
 from models.paths import rest_to_rest
 from ocp import Goal, Limits, Plan, ProblemError, Scene, TipTask, Unreachable, Waypoints, plan
 from ocp.motion.result.segmented_plan import SequencePlan
@@ -64,12 +64,40 @@ def test_joints_are_continuous_and_each_part_is_its_own_plan() -> None:
     for before, after in pairwise(planned.pieces):
         assert np.abs(planned.at(after.begin - 1e-9)["joints"] - planned.at(after.begin)["joints"]).max() < 1e-6
         assert after.begin == pytest.approx(before.begin + before.plan.horizon)
-    alone = plan(ARM, seam(), scene=False)
-    assert planned.parts[2].cost == pytest.approx(alone.cost, rel=1e-9)
+    alone = plan(ARM, seam(), start=planned.parts[2].at(0.0)["joints"], scene=False)
+    assert planned.parts[2].cost == pytest.approx(alone.cost, rel=1e-6)
     times = np.linspace(0.0, planned.horizon, 201)
     sample = planned.sampled(times)
     assert np.abs(np.diff(sample.joints, axis=0)).max() < 1.0 * (times[1] - times[0]) * (1 + 1e-6)
     assert "home" in str(planned)
+
+
+def test_the_start_of_a_task_is_chosen_for_the_way_to_it_and_the_task_together() -> None:
+    """A wrist that may be turned about: the task costs the same from several starts, the way to them does not."""
+    machine, home = FixedBase(example_robot("six_axis")), np.array([0.0, -0.6, 1.2, 0.0, 0.9, 0.0])
+    path = smooth(Path.through([(0.4, -0.1, 0.3), (0.4, 0.1, 0.3)]), deviation=0.002)
+    task = TipTask.along(path, 0.1, direction=(0, 0, -1))
+    planned = plan(machine, [task, Goal(joints=home)], start=home, scene=False)
+    alone = plan(machine, task, scene=False)
+    to_alone = plan(machine, Goal(joints=alone.at(0.0)["joints"]), start=home, scene=False)
+    assert isinstance(planned, SequencePlan)
+    approach, along, _ = planned.parts
+    assert approach.cost + along.cost <= (to_alone.cost + alone.cost) * (1 + 1e-6)
+    others = [c.start for c in alone.candidates]
+    nearest = min(float(((start - home) ** 2).sum()) for start in others)
+    assert ((along.at(0.0)["joints"] - home) ** 2).sum() <= 1.5 * nearest
+
+
+def test_goals_at_which_the_arm_rests_cost_what_their_motions_cost_alone() -> None:
+    planned = in_sequence([Goal(joints=AWAY), Goal(joints=HOME, duration=3.0), Goal(joints=AWAY, name="again")])
+    starts, options = (HOME, AWAY, HOME), {"scene": False}
+    goals = (Goal(joints=AWAY), Goal(joints=HOME, duration=3.0), Goal(joints=AWAY))
+    alone = [plan(ARM, goal, start=start, **options) for goal, start in zip(goals, starts, strict=True)]
+    assert planned.cost == pytest.approx(sum(each.cost for each in alone), rel=1e-9)
+    assert planned.parts[1].horizon == pytest.approx(3.0)
+    assert planned.phases == ("goal 1", "goal 2", "again")
+    passing = [Goal(joints=AWAY, velocity="free", duration=1.0), Goal(joints=HOME, duration=1.0)]
+    assert not isinstance(plan(ARM, passing, start=HOME, scene=False), SequencePlan)
 
 
 def test_a_goal_at_the_start_of_the_seam_takes_its_configuration() -> None:
@@ -118,7 +146,7 @@ def test_a_task_that_moves_at_once_is_entered_at_its_velocity_if_the_goal_may_be
     assert refused.value.name == "velocity"
 
 
-def test_a_file_holds_the_sequence(tmp_path: Path) -> None:
+def test_a_file_holds_the_sequence(tmp_path: FilePath) -> None:
     weld().save(tmp_path / "weld.npz")
     again = Plan.load(tmp_path / "weld.npz")
     assert isinstance(again, SequencePlan)

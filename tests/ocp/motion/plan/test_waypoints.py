@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from models import Box, CollisionScene, FixedBase
 from models.checks import Array
@@ -141,6 +143,21 @@ def test_obstacles_lengthen_the_path_and_are_avoided() -> None:
     assert apart == pytest.approx(worst.distance, abs=1e-3)
     assert worst.bodies[0] in boxed.audit()["clearance"].note
     assert path(panda(), Waypoints(places[:6], turns[:6])).clearance() is None
+
+
+@pytest.mark.parametrize("seed", [9, 17, 47])
+def test_a_waypoint_that_a_path_misses_is_searched_next_and_not_missed_again(seed: int) -> None:
+    """The tool swings so far that paths through every fifth waypoint miss some between them."""
+    random, machine, s = np.random.default_rng(seed), ur5(), np.linspace(0, 2 * np.pi, 11)[:, None]
+    along, turn = random.normal(size=(2, 3))
+    pose = machine.tip_pose((), UR5_START)
+    rotation = Rotation.from_matrix(np.array(ca.DM(pose.rotation))) * Rotation.from_rotvec(np.sin(2 * s) * turn)
+    places = np.array(ca.DM(pose.position)).ravel() + 0.1 * np.sin(s) * along / np.linalg.norm(along)
+    result = path(machine, Waypoints(places, rotation.as_quat()[:, [3, 0, 1, 2]]))
+    reasons = [str(candidate.reason) for candidate in result.candidates if candidate.reason is not None]
+    missed = re.findall(r"waypoint \d+ is missed", "; ".join(reasons))
+    assert missed
+    assert len(set(missed)) == len(missed)
 
 
 def test_infeasible_requests_are_refused() -> None:
