@@ -55,7 +55,7 @@ from models.robot.rebuild import (
     subtree,
     with_load,
 )
-from models.robot.robot import Robot, planar_chain
+from models.robot.robot import Robot, named_states, planar_chain
 from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, MovingObstacle, Sphere
 from models.spatial import Frame
 
@@ -118,6 +118,7 @@ __all__ = [
     "momentum_matrix",
     "momentum_rate",
     "move_tip",
+    "named_states",
     "optimal_inverse",
     "paper_example",
     "planar_chain",

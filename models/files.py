@@ -31,6 +31,7 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import IO, Any
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
@@ -155,8 +156,17 @@ def _check_size(size: int, name: str, most: int) -> None:
         raise error
 
 
-def parse_xml(data: str | bytes) -> ElementTree.Element:
+UNBOUND_PREFIX = expat.errors.codes[expat.errors.XML_ERROR_UNBOUND_PREFIX]
+
+
+def parse_xml(data: str | bytes, unbound: list[str] | None = None) -> ElementTree.Element:
     """Return the root element of an XML document.
+
+    Args:
+        data: The document.
+        unbound: If given, elements and attributes below the root whose namespace prefix is not declared are left out,
+            elements with all their contents, and their names are appended to this list. If None, a document with such a
+            prefix is not well-formed.
 
     Raises:
         ElementTree.ParseError: The document is not well-formed.
@@ -170,7 +180,67 @@ def parse_xml(data: str | bytes) -> ElementTree.Element:
     count = content.count(b"<") - content.count(b"</") + content.count(b"=")
     if count > INPUT_LIMITS.xml_elements:
         raise ValueError(f"it has {count} elements and attributes, at most {INPUT_LIMITS.xml_elements} are read")
-    return ElementTree.fromstring(data)
+    try:
+        return ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        if unbound is None or error.code != UNBOUND_PREFIX:
+            raise
+        return _parse_bound(data, unbound, error)
+
+
+def _parse_bound(data: str | bytes, unbound: list[str], refusal: ElementTree.ParseError) -> ElementTree.Element:
+    """Return the root element of a document without the elements and attributes of undeclared prefixes.
+
+    The parser ignores namespaces; names are resolved here as the standard library's parser does.
+
+    Args:
+        data, unbound: As in `parse_xml`.
+        refusal: Error that is raised if the prefix of the root is not declared.
+    """
+    uris = {"": [""], "xml": ["http://www.w3.org/XML/1998/namespace"]}  # by prefix; the innermost declaration is last
+    open_elements: list[tuple[str, list[str]]] = []  # resolved tag, "" if left out; prefixes declared by the element
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+
+    def resolved(name: str, default: str = "") -> str:
+        prefix, colon, local = name.rpartition(":")
+        uri = (uris.get(prefix) or [""])[-1] if prefix else default
+        return f"{{{uri}}}{local}" if uri and (prefix or not colon) else "" if colon else name
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        declared = {key[6:]: uri for key, uri in attributes.items() if key == "xmlns" or key.startswith("xmlns:")}
+        for prefix, uri in declared.items():
+            uris.setdefault(prefix, []).append(uri)
+        kept = not open_elements or open_elements[-1][0]
+        name = resolved(tag, uris[""][-1]) if kept else ""
+        if not name and not open_elements:
+            raise refusal
+        open_elements.append((name, list(declared)))
+        if name:
+            names = {key: resolved(key) for key in attributes if key != "xmlns" and not key.startswith("xmlns:")}
+            unbound.extend(key for key in names if not names[key])
+            builder.start(name, {names[key]: attributes[key] for key in names if names[key]})
+        elif kept:
+            unbound.append(tag)
+
+    def end(_: str) -> None:
+        name, declared = open_elements.pop()
+        for prefix in declared:
+            uris[prefix].pop()
+        if name:
+            builder.end(name)
+
+    def text(characters: str) -> None:
+        if open_elements[-1][0]:
+            builder.data(characters)
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        malformed = ElementTree.ParseError(str(error))
+        malformed.code, malformed.position = error.code, (error.lineno, error.offset)
+        raise malformed from None
+    return builder.close()
 
 
 MAX_VALUE_BYTES = 2**20

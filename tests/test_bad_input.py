@@ -11,7 +11,7 @@ from tests.models.cts.test_bad_rigs import CASES as RIGS
 from tests.models.machines.test_bad_machines import CASES as MACHINES
 from tests.models.paths.test_bad_paths import CASES as PATHS
 from tests.models.robot.test_bad_robots import CASES as ROBOTS
-from tests.models.robot.test_bad_urdf import OPTIONS, TEXTS
+from tests.models.robot.test_bad_urdf import OPTIONS, STATES, TEXTS
 from tests.models.shapes.test_bad_shapes import CASES as SHAPES
 from tests.ocp.app.batch.test_bad_batches import CASES as BATCHES
 from tests.ocp.app.files.test_bad_files import CASES as FILES
@@ -20,7 +20,21 @@ from tests.ocp.motion.plan.test_bad_plans import CASES as PLANS
 from tests.ocp.motion.schedule.test_bad_schedules import CASES as SCHEDULES
 from tests.ocp.problem.test_bad_problems import CASES as PROBLEMS
 
-CASES = [*ROBOTS, OPTIONS, *MACHINES, *PATHS, *RIGS, *SHAPES, *PROBLEMS, *SCHEDULES, *TASKS, *FILES, *PLANS, *BATCHES]
+CASES = [
+    *ROBOTS,
+    OPTIONS,
+    STATES,
+    *MACHINES,
+    *PATHS,
+    *RIGS,
+    *SHAPES,
+    *PROBLEMS,
+    *SCHEDULES,
+    *TASKS,
+    *FILES,
+    *PLANS,
+    *BATCHES,
+]
 CREATED_BY_THE_PACKAGE = {
     "Audit",
     "Batch",

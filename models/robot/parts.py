@@ -1,12 +1,14 @@
-"""Parts of a robot: links, joints and shapes, validated on construction.
+"""Parts of a robot: links, joints and shapes, validated on construction, and written as elements of URDF.
 
 Array attributes accept anything that NumPy reads and are stored as read-only arrays of floats.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self, TypeAlias, get_args
+from typing import Any, Literal, Self, TypeAlias, get_args
+from xml.etree import ElementTree
 
 import casadi as ca
 import numpy as np
@@ -20,6 +22,8 @@ ShapeKind: TypeAlias = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 
 SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3}
 """Number of entries of the field `size` of a collision shape, by kind of shape."""
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+"""Attributes of <inertia> in URDF: the upper triangle of the inertia by rows."""
 INERTIA_TOLERANCE = 1e-6
 """Relative tolerance of the inertia checks, so that inertias printed to six digits pass."""
 
@@ -306,3 +310,100 @@ def _check_inertia(inertia: Array, owner: str, any_inertia: bool) -> None:
             "triangle inequality: none may exceed the sum of the two others"
         )
         raise ModelError(message, name="inertia", value=float(largest), limit=float(smallest + middle))
+
+
+def urdf_text(
+    name: str, links: Sequence[Link], joints: Sequence[Joint], tip: str | None, *, translation: Array, rotation: Array
+) -> str:
+    """Return a robot as URDF text, from which `read_urdf` recreates links, joints and tip with all digits.
+
+    A tip frame that differs from its link's frame, (3,) and (3, 3) as in Robot, becomes a link "LINK_tip" on a fixed
+    joint. The tip is named by <tip link="NAME"/>, a non-standard element that other readers skip. Infinite limits are
+    omitted, but urdfdom, and so ROS and Pinocchio, rejects revolute and prismatic joints without them: give such a
+    robot limits of effort and velocity, and of position on both sides or none, before writing.
+    """
+    robot = ElementTree.Element("robot", name=name)
+    if tip is not None and (translation.any() or not np.array_equal(rotation, np.eye(3))):
+        taken = {link.name for link in links} | {joint.name for joint in joints}
+        free = (f"{tip}_tip{i or ''}" for i in range(len(taken) + 1))
+        end = next(name for name in free if name not in taken and f"{name}_fixed" not in taken)
+        links, joints = [*links, Link(end)], [*joints, Joint(f"{end}_fixed", "fixed", tip, end, translation, rotation)]
+        tip = end
+    for link in links:
+        _write_link(robot, link)
+    for joint in joints:
+        _write_joint(robot, joint)
+    if tip is not None:
+        ElementTree.SubElement(robot, "tip", link=tip)
+    ElementTree.indent(robot)
+    head = '<?xml version="1.0" encoding="utf-8"?>\n<!-- written by selfmotion -->\n'
+    return head + ElementTree.tostring(robot, encoding="unicode") + "\n"
+
+
+def _write_link(robot: ElementTree.Element, link: Link) -> None:
+    element = ElementTree.SubElement(robot, "link", name=link.name)
+    if link.mass or link.inertia.any() or link.center_of_mass.any():
+        body = ElementTree.SubElement(element, "inertial")
+        _write_origin(body, link.center_of_mass, np.eye(3))
+        ElementTree.SubElement(body, "mass", value=_text(link.mass))
+        moments = map(_text, link.inertia[np.triu_indices(3)])
+        ElementTree.SubElement(body, "inertia", dict(zip(MOMENTS, moments, strict=True)))
+    for visual in link.visuals:
+        shape = _write_shape(element, "visual", visual)
+        if visual.color is not None:
+            material = ElementTree.SubElement(shape, "material", name="")
+            ElementTree.SubElement(material, "color", rgba=_text(visual.color))
+    for collision in link.collisions:
+        _write_shape(element, "collision", collision)
+
+
+def _write_joint(robot: ElementTree.Element, joint: Joint) -> None:
+    element = ElementTree.SubElement(robot, "joint", name=joint.name, type=joint.kind)
+    _write_origin(element, joint.translation, joint.rotation)
+    ElementTree.SubElement(element, "parent", link=joint.parent)
+    ElementTree.SubElement(element, "child", link=joint.child)
+    if not joint.moves:
+        return
+    ElementTree.SubElement(element, "axis", xyz=_text(joint.axis))
+    limits = [limit for limit in ("effort", "velocity") if np.isfinite(getattr(joint, limit))]
+    limits += ["lower", "upper"] if np.isfinite([joint.lower, joint.upper]).any() else []
+    if limits:
+        ElementTree.SubElement(element, "limit", {limit: _text(getattr(joint, limit)) for limit in limits})
+    if (tie := joint.mimic) is not None:
+        numbers = {"multiplier": _text(tie.multiplier), "offset": _text(tie.offset)}
+        ElementTree.SubElement(element, "mimic", {"joint": tie.joint} | numbers)
+
+
+def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> ElementTree.Element:
+    element = ElementTree.SubElement(link, tag)
+    _write_origin(element, shape.translation, shape.rotation)
+    if shape.kind == "mesh":
+        sizes = {"filename": shape.file, "scale": _text(shape.size)}
+    elif shape.kind == "box":
+        sizes = {"size": _text(shape.size)}
+    else:
+        sizes = dict(zip(("radius", "length"), map(_text, shape.size), strict=False))  # a sphere has no length
+    ElementTree.SubElement(ElementTree.SubElement(element, "geometry"), shape.kind, sizes)
+    return element
+
+
+def _write_origin(element: ElementTree.Element, translation: Array, rotation: Array) -> None:
+    """Write an <origin> element; omit rpy if there is no rotation, so that zeros stay exact."""
+    rpy = {} if np.array_equal(rotation, np.eye(3)) else {"rpy": _text(_rpy(rotation))}
+    ElementTree.SubElement(element, "origin", {"xyz": _text(translation)} | rpy)
+
+
+def _rpy(rotation: Array) -> Array:
+    """Return roll, pitch and yaw (about the fixed x, y, z axes) of a rotation matrix. Shape (3,), rad.
+
+    At pitch = +-pi/2 yaw is arbitrary; roll is computed relative to that yaw, so the rotation is exact to rounding
+    there too.
+    """
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
+    across = np.array([-np.sin(yaw), np.cos(yaw)]) @ rotation[:2]  # y axis of the frame rotated by yaw alone
+    return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])
+
+
+def _text(numbers: Any) -> str:
+    return " ".join(repr(float(number)) for number in np.ravel(numbers))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,7 +16,7 @@ import numpy as np
 
 from models.checks import Array, ArrayInput, require, warn_of_millimetres
 from models.errors import ModelError, ModelWarning
-from models.robot.parts import Joint, Link
+from models.robot.parts import Joint, Link, urdf_text
 from models.robot.tree import (
     JointCoupling,
     find_root,
@@ -24,11 +24,10 @@ from models.robot.tree import (
     joint_limits,
     lock_with_followers,
     require_unique,
-    reroot_tree,
     ties_to_leaders,
     tree_order,
 )
-from models.robot.urdf import InertiaRule, Source, read_urdf, urdf_text
+from models.robot.urdf import InertiaRule, Source, numbers_of, parse_urdf, read_urdf, text_of
 
 MimicRule: TypeAlias = Literal["couple", "lock", "free"]
 
@@ -110,20 +109,20 @@ class Robot:
         source: Source,
         *,
         tip: str | None = None,
-        root: str | None = None,
         tip_translation: ArrayInput = (0.0, 0.0, 0.0),
         tip_rotation: ArrayInput = None,
         lock: Mapping[str, float] | None = None,
         mimic: MimicRule = "couple",
         inertia: InertiaRule = "warn",
+        xacro: bool = False,
     ) -> Robot:
         """Read a robot from a URDF description; `models.robot.urdf.read_urdf` documents contents and defaults.
+
+        `models.reroot` makes another link the root of the tree, the base.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
             tip: Link that carries the tip. If None, the one that the file names as to_urdf does, else the only leaf.
-            root: Link to become the root of the tree, the base; the root of the file if None. Links keep their frames,
-                joints their names, limits and signs, see `models.robot.tree.reroot_tree`.
             tip_translation: As in Robot.
             tip_rotation: As in Robot; the identity if None.
             lock: Positions (rad or m) at which joints, and those that mimic them, are locked, by joint name.
@@ -132,16 +131,18 @@ class Robot:
                 ("free").
             inertia: Treatment of physically impossible inertias: accept them with a warning ("warn") or silently
                 ("as_given").
+            xacro: Expand the file as xacro first; needs the package `xacrodoc`, the extra `xacro`. The file may include
+                others and evaluates Python expressions, so expand only files that you trust.
 
         Raises:
             ModelError: As read_urdf, Robot and `models.robot.rebuild.lock_joints`.
 
         Warns:
-            ModelWarning: Physically impossible inertias, attributes without meaning in URDF, joints to which
-                limits of joints that mimic them leave a single position.
+            ModelWarning: Parts of the file that are left out, physically impossible inertias, joints to which limits of
+                joints that mimic them leave a single position.
         """
         require.choice("URDF: mimic", mimic, get_args(MimicRule))
-        description = read_urdf(source, inertia=inertia)
+        description = read_urdf(source, inertia=inertia, xacro=xacro)
         joints = description.joints
         if mimic == "free":
             joints = tuple(replace(joint, mimic=None) for joint in joints)
@@ -153,12 +154,9 @@ class Robot:
         joints = lock_with_followers(joints, positions)
         if mimic == "lock":
             joints = lock_with_followers(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
-        links = description.links
-        if root is not None:
-            original = cls(links, joints, tip=links[0].name)  # validates the tree before it is rerooted
-            links, joints = reroot_tree(links, joints, original.root, root)
         turn = np.eye(3) if tip_rotation is None else tip_rotation
-        robot = cls(links, joints, description.tip if tip is None else tip, tip_translation, turn, description.name)
+        tip = description.tip if tip is None else tip
+        robot = cls(description.links, joints, tip, tip_translation, turn, description.name)
         ranges = zip(robot.moving_joints, robot.lower, robot.upper, strict=True)
         if stuck := [joint.name for joint, lower, upper in ranges if lower == upper and joint.lower < joint.upper]:
             warn(f"joints {stuck} cannot move: limits of joints that follow them leave one position", ModelWarning, 2)
@@ -167,7 +165,7 @@ class Robot:
     def to_urdf(self, file: str | os.PathLike[str] | None = None) -> str:
         """Return the robot as URDF text, from which from_urdf recreates it; also write it to `file` if given.
 
-        See `models.robot.urdf.urdf_text` for how other readers interpret it. The file is replaced atomically.
+        See `models.robot.parts.urdf_text` for how other readers interpret it. The file is replaced atomically.
         """
         place: dict[str, Any] = {"translation": self.tip_translation, "rotation": self.tip_rotation}
         text = urdf_text(self.name, self.links, self.joints, self.tip, **place)
@@ -311,6 +309,46 @@ def _limits(joint: Joint) -> str:
     if 0 < joint.effort < np.inf and joint.moves:
         parts.append(f"{joint.effort:g} {joint.effort_unit}")
     return ", ".join(parts)
+
+
+def named_states(srdf: Source, robot: Robot) -> dict[str, Array]:
+    """Return the named states of an SRDF file, such as "home", as joint vectors. Shape (dof,) each, rad or m.
+
+    A state, <group_state>, gives the positions of the joints of one group. The other joints are at 0, or at the limit
+    nearest to 0 if their limits exclude it. Fixed and mimic joints are skipped. If several groups have a state of one
+    name, its key is "GROUP/NAME".
+
+    Args:
+        srdf: The text, recognised by its first character "<", or the path of a file.
+        robot: The robot, whose joints the file names.
+
+    Raises:
+        ModelError: The file is unreadable, or a state has no name, no group, or a position that is not a finite number.
+
+    Warns:
+        ModelWarning: The file names joints that the robot does not have.
+    """
+    require.instance("named_states: robot", robot, Robot)
+    elements = [(text_of(each, "name", "SRDF"), each) for each in parse_urdf(srdf).findall("group_state")]
+    counts = Counter(name for name, _ in elements)
+    columns = {name: column for column, name in enumerate(robot.joint_names)}
+    known = {joint.name for joint in robot.joints}
+    states, unknown = {}, set()
+    for name, element in elements:
+        owner = f"SRDF: state {name!r}"
+        positions = np.clip(np.zeros(robot.dof), robot.lower, robot.upper)
+        for each in element.findall("joint"):
+            joint = text_of(each, "name", owner)
+            if joint in columns:
+                positions[columns[joint]] = numbers_of(each, "value", f"{owner}: joint {joint!r}", 1)[0]
+            elif joint not in known:
+                unknown.add(joint)
+        states[name if counts[name] == 1 else f"{text_of(element, 'group', owner)}/{name}"] = positions
+    if unknown:
+        names = ", ".join(map(repr, sorted(unknown)))
+        message = f"the SRDF file gives states to joints that {robot.name!r} does not have: {names}"
+        warn(ModelWarning(message, name=min(unknown), value=tuple(sorted(unknown))), stacklevel=2)
+    return states
 
 
 def planar_chain(

@@ -1,9 +1,10 @@
-"""Reading and writing of robot descriptions in URDF, the XML format of ROS.
+"""Reading of robot descriptions in URDF, the XML format of ROS, also from xacro; `parts` writes them.
 
 Read are kinematics, inertias, limits, mimic joints, collision and visual shapes. <transmission>, <gazebo>,
-<safety_controller>, <dynamics>, unknown elements and invalid <visual> elements are skipped. Mesh files are recorded by
-name and folder but not opened here; `models.shapes.bodies` reads them. The standard library's XML parser suffices:
-packages that read URDF depend on mesh and XML packages, which the core does without.
+<safety_controller>, <dynamics>, unknown elements and invalid <visual> elements are skipped. Faults that other readers
+accept, such as a misspelt attribute or a collision shape of size zero, are left out with a warning that names them.
+Mesh files are recorded by name and folder but not opened here; `models.shapes.bodies` reads them. The standard
+library's XML parser suffices: packages that read URDF depend on mesh and XML packages, which the core does without.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from models.checks import Array, require, warn_of_degrees
+from models.checks import MAX_LISTED, Array, require, warn_of_degrees
 from models.errors import ModelError, ModelWarning
 from models.files import INPUT_LIMITS, parse_xml, read_regular
-from models.robot.parts import SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
+from models.robot.parts import MOMENTS, SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
 from models.robot.tree import floating_joint, planar_joint
 
 Source: TypeAlias = str | os.PathLike[str]
@@ -34,10 +35,18 @@ _Shape = TypeVar("_Shape", bound=CollisionShape)
 MOVING: dict[str, Kind] = {"revolute": "revolute", "continuous": "continuous", "prismatic": "prismatic"}
 COMPOSITE = ("planar", "floating")
 """Kinds of joints with several degrees of freedom."""
-XACRO = "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf"
+XACRO_EXTRA = 'the extra xacro: pip install "selfmotion[xacro]", or from a clone pip install ".[xacro]"'
+XACRO = (
+    "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf, or, if "
+    "you trust the file, since xacro evaluates its Python expressions, by Robot.from_urdf(FILE, xacro=True) with "
+    + XACRO_EXTRA
+)
+XACRO_WORDS = {
+    "arg", "attribute", "call", "element", "if", "include", "insert_block", "macro", "property", "unless",
+}  # fmt: skip
+"""Elements of xacro's own language. Any other element of its namespace calls a macro."""
 BLANK = "\ufeff \t\r\n"
 """Characters, such as a byte order mark, that may precede the first "<" of a URDF text."""
-MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "limit": ("lower", "upper", "velocity", "effort"),
     "mimic": ("joint", "multiplier", "offset"),
@@ -70,7 +79,7 @@ class Description:
     tip: str | None = None
 
 
-def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
+def read_urdf(source: Source, *, inertia: InertiaRule = "warn", xacro: bool = False) -> Description:
     """Read a URDF description from a text or a file.
 
     Missing data have the default values of the format: a zero origin, the axis x, no inertia. A revolute or prismatic
@@ -80,28 +89,33 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     floating or planar joint becomes a chain of joints with one degree of freedom, without limits, see
     `models.robot.tree`. A <mimic> of a fixed joint is ignored.
 
+    Left out with one warning that names them, as other readers load such files: collision shapes with an edge, radius,
+    length or scale of zero; all shapes of a <geometry> but the first; misspelt and unknown attributes, for which the
+    defaults apply; elements and attributes whose namespace prefix is not declared; calls of macros that a file expanded
+    from xacro still contains.
+
     Args:
         source: The text, recognised by its first character "<", or the path of a file.
         inertia: Treatment of physically impossible inertias: accept them with a warning ("warn") or silently
             ("as_given").
+        xacro: Expand the file, which must be given by its path, as xacro first. Needs the package `xacrodoc`, the extra
+            `xacro`. The file can include others and evaluates Python expressions: only for files that you trust.
 
     Raises:
-        ModelError: No such file, malformed XML, xacro, missing, misspelt or non-numeric attributes, duplicate elements,
+        ModelError: No such file, malformed XML, xacro, missing or non-numeric attributes, duplicate elements,
             unsupported kinds of joints or shapes, impossible masses, limits or shapes.
 
     Warns:
-        ModelWarning: Physically impossible inertias; attributes without meaning in URDF; angles that look like degrees,
-            lengths that look like millimetres (see `models.checks.warn_of_degrees`); collision shapes of an omitted
-            root link.
+        ModelWarning: Parts that are left out; physically impossible inertias; angles that look like degrees, lengths
+            that look like millimetres (see `models.checks.warn_of_degrees`); collision shapes of an omitted root link.
     """
     require.choice("URDF: inertia", inertia, get_args(InertiaRule))
-    tree = parse_urdf(source)
+    omitted: list[str] = []
+    tree = parse_urdf(_expand_xacro(source) if require.flag("URDF: xacro", xacro) else source, omitted)
     is_file = isinstance(source, os.PathLike) or not source.lstrip(BLANK).startswith("<")
     folder = str(Path(source).resolve().parent) if is_file else ""
-    parts = (*tree.findall("link"), *tree.findall("joint"))
-    if unknown := [attribute for part in parts for attribute in _unknown_attributes(part)]:
-        warn(f"attributes that mean nothing in URDF are not read: {'; '.join(unknown)}", ModelWarning, 3)
-    links = _links(tree, inertia, folder)
+    omitted += [note for kind in ("link", "joint") for part in tree.findall(kind) for note in _unknown_attributes(part)]
+    links = _links(tree, inertia, folder, omitted)
     described = [(each, _joint(each)) for each in tree.findall("joint")]
     joints: list[Joint] = []
     for element, joint in described:
@@ -113,6 +127,11 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
             links, joints = (*links, *added.links), [*joints, *added.joints]
         else:
             joints.append(joint)
+    if omitted := list(dict.fromkeys(omitted)):
+        place = f"file {os.fspath(source)!r}" if is_file else "the given text"
+        more = f"; and {len(omitted) - MAX_LISTED} more" if len(omitted) > MAX_LISTED else ""
+        message = f"{place}: these parts are left out: {'; '.join(omitted[:MAX_LISTED])}{more}"
+        warn(ModelWarning(message, name=omitted[0], value=tuple(omitted)), stacklevel=3)
     tip = _only(tree, "tip", "the robot")
     tip_name = None if tip is None else text_of(tip, "link", "the robot")
     return Description(tree.get("name") or "robot", links, tuple(joints), tip_name)
@@ -137,105 +156,37 @@ def _without_world(floating: Joint, links: tuple[Link, ...]) -> tuple[Link, ...]
     return tuple(link for link in links if link is not base)
 
 
-def urdf_text(
-    name: str, links: Sequence[Link], joints: Sequence[Joint], tip: str | None, *, translation: Array, rotation: Array
-) -> str:
-    """Return a robot as URDF text, from which `read_urdf` recreates links, joints and tip with all digits.
+def _expand_xacro(file: Source) -> str:
+    """Return the URDF text that a xacro file describes; the file's expressions are evaluated."""
+    if not isinstance(file, str | os.PathLike) or os.fspath(file).lstrip(BLANK).startswith("<"):
+        raise ModelError("source: xacro=True needs the path of a file, not a text", name="source", value=file)
+    try:
+        import xacrodoc  # lets xacro find packages without ROS
+        from xacro import process_file
+    except ImportError as error:
+        message = f"expanding xacro needs the package xacrodoc, {XACRO_EXTRA}"
+        raise ModelError(message, name="xacro", value="xacrodoc") from error
+    try:
+        read_regular(file, INPUT_LIMITS.description_bytes)  # only to refuse what is no file
+        xacrodoc.packages.walk_up_from(file)
+        return str(process_file(os.fspath(file)).toxml())
+    except Exception as error:  # of any kind: the expressions are the file's own
+        name = f"file {os.fspath(file)!r}"
+        raise ModelError(f"{name} cannot be expanded by xacro: {error}", name=name, value=file) from error
 
-    A tip frame that differs from its link's frame, (3,) and (3, 3) as in Robot, becomes a link "LINK_tip" on a fixed
-    joint. The tip is named by <tip link="NAME"/>, a non-standard element that other readers skip. Infinite limits are
-    omitted, but urdfdom, and so ROS and Pinocchio, rejects revolute and prismatic joints without them: give such a
-    robot limits of effort and velocity, and of position on both sides or none, before writing.
+
+def parse_urdf(source: Source, omitted: list[str] | None = None) -> ElementTree.Element:
+    """Return the <robot> element of a URDF or SRDF text or file, without namespaces.
+
+    Args:
+        source: The text, or the path of a file.
+        omitted: List to which descriptions of the parts without meaning are appended: of undeclared namespace prefixes,
+            which are not in the result, and of calls of macros.
+
+    Raises:
+        ModelError: The source is unreadable, or xacro.
     """
-    robot = ElementTree.Element("robot", name=name)
-    if tip is not None and (translation.any() or not np.array_equal(rotation, np.eye(3))):
-        taken = {link.name for link in links} | {joint.name for joint in joints}
-        free = (f"{tip}_tip{i or ''}" for i in range(len(taken) + 1))
-        end = next(name for name in free if name not in taken and f"{name}_fixed" not in taken)
-        links, joints = [*links, Link(end)], [*joints, Joint(f"{end}_fixed", "fixed", tip, end, translation, rotation)]
-        tip = end
-    for link in links:
-        _write_link(robot, link)
-    for joint in joints:
-        _write_joint(robot, joint)
-    if tip is not None:
-        ElementTree.SubElement(robot, "tip", link=tip)
-    ElementTree.indent(robot)
-    head = '<?xml version="1.0" encoding="utf-8"?>\n<!-- written by selfmotion -->\n'
-    return head + ElementTree.tostring(robot, encoding="unicode") + "\n"
-
-
-def _write_link(robot: ElementTree.Element, link: Link) -> None:
-    element = ElementTree.SubElement(robot, "link", name=link.name)
-    if link.mass or link.inertia.any() or link.center_of_mass.any():
-        body = ElementTree.SubElement(element, "inertial")
-        _write_origin(body, link.center_of_mass, np.eye(3))
-        ElementTree.SubElement(body, "mass", value=_text(link.mass))
-        moments = map(_text, link.inertia[np.triu_indices(3)])
-        ElementTree.SubElement(body, "inertia", dict(zip(MOMENTS, moments, strict=True)))
-    for visual in link.visuals:
-        shape = _write_shape(element, "visual", visual)
-        if visual.color is not None:
-            material = ElementTree.SubElement(shape, "material", name="")
-            ElementTree.SubElement(material, "color", rgba=_text(visual.color))
-    for collision in link.collisions:
-        _write_shape(element, "collision", collision)
-
-
-def _write_joint(robot: ElementTree.Element, joint: Joint) -> None:
-    element = ElementTree.SubElement(robot, "joint", name=joint.name, type=joint.kind)
-    _write_origin(element, joint.translation, joint.rotation)
-    ElementTree.SubElement(element, "parent", link=joint.parent)
-    ElementTree.SubElement(element, "child", link=joint.child)
-    if not joint.moves:
-        return
-    ElementTree.SubElement(element, "axis", xyz=_text(joint.axis))
-    limits = [limit for limit in ("effort", "velocity") if np.isfinite(getattr(joint, limit))]
-    limits += ["lower", "upper"] if np.isfinite([joint.lower, joint.upper]).any() else []
-    if limits:
-        ElementTree.SubElement(element, "limit", {limit: _text(getattr(joint, limit)) for limit in limits})
-    if (tie := joint.mimic) is not None:
-        numbers = {"multiplier": _text(tie.multiplier), "offset": _text(tie.offset)}
-        ElementTree.SubElement(element, "mimic", {"joint": tie.joint} | numbers)
-
-
-def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> ElementTree.Element:
-    element = ElementTree.SubElement(link, tag)
-    _write_origin(element, shape.translation, shape.rotation)
-    if shape.kind == "mesh":
-        sizes = {"filename": shape.file, "scale": _text(shape.size)}
-    elif shape.kind == "box":
-        sizes = {"size": _text(shape.size)}
-    else:
-        sizes = dict(zip(("radius", "length"), map(_text, shape.size), strict=False))  # a sphere has no length
-    ElementTree.SubElement(ElementTree.SubElement(element, "geometry"), shape.kind, sizes)
-    return element
-
-
-def _write_origin(element: ElementTree.Element, translation: Array, rotation: Array) -> None:
-    """Write an <origin> element; omit rpy if there is no rotation, so that zeros stay exact."""
-    rpy = {} if np.array_equal(rotation, np.eye(3)) else {"rpy": _text(_rpy(rotation))}
-    ElementTree.SubElement(element, "origin", {"xyz": _text(translation)} | rpy)
-
-
-def _rpy(rotation: Array) -> Array:
-    """Return roll, pitch and yaw (about the fixed x, y, z axes) of a rotation matrix. Shape (3,), rad.
-
-    At pitch = +-pi/2 yaw is arbitrary; roll is computed relative to that yaw, so the rotation is exact to rounding
-    there too.
-    """
-    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
-    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
-    across = np.array([-np.sin(yaw), np.cos(yaw)]) @ rotation[:2]  # y axis of the frame rotated by yaw alone
-    return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])
-
-
-def _text(numbers: Any) -> str:
-    return " ".join(repr(float(number)) for number in np.ravel(numbers))
-
-
-def parse_urdf(source: Source) -> ElementTree.Element:
-    """Return the <robot> element of a URDF text or file, without namespaces; raise ModelError if it is unreadable."""
+    unbound: list[str] = []
     text, lines_before = "", 0
     data: str | bytes = b""
     if isinstance(source, str):
@@ -253,12 +204,11 @@ def parse_urdf(source: Source) -> ElementTree.Element:
                 raise ModelError(message, name="source", value=source)
             origin = f"file {os.fspath(source)!r}"
             data = read_regular(source, INPUT_LIMITS.description_bytes)
-        tree = parse_xml(data)
+        tree = parse_xml(data, unbound)
     except ElementTree.ParseError as error:
         line, column = error.position
         reason = str(error).split(": line")[0]
-        hint = f"; {XACRO}" if "unbound prefix" in reason and "xacro" in str(data) else ""
-        message = f"{origin} is not well-formed XML: {reason}, line {line + lines_before}, column {column}{hint}"
+        message = f"{origin} is not well-formed XML: {reason}, line {line + lines_before}, column {column}"
         raise ModelError(message, name=origin, value=(line + lines_before, column)) from error
     except OSError as error:
         message = f"{origin} cannot be read: {error.strerror or error}; a URDF text begins with '<'"
@@ -268,25 +218,30 @@ def parse_urdf(source: Source) -> ElementTree.Element:
     except (ValueError, LookupError) as error:
         raise ModelError(f"{origin} cannot be read: {error}", name=origin, value=source) from error
     namespace = tree.tag[: tree.tag.rfind("}") + 1]
+    macros = [name.partition(":")[2] for name in unbound if name.startswith("xacro:")]
     for element in tree.iter():
-        if isinstance(element.tag, str):
-            if "xacro" in element.tag:
-                tag = element.tag.rpartition("}")[2]
-                raise ModelError(f"{origin} has the element <{tag}>: {XACRO}", name=tag, value=element.tag)
-            if namespace and element.tag.startswith(namespace):
-                element.tag = element.tag[len(namespace) :]
+        if namespace and element.tag.startswith(namespace):
+            element.tag = element.tag[len(namespace) :]
+        elif "xacro" in element.tag.rpartition("}")[0]:
+            macros.append(element.tag.rpartition("}")[2])
+    for tag in macros:
+        if tag in XACRO_WORDS or tree.find("link") is None:
+            raise ModelError(f"{origin} has the element <xacro:{tag}>: {XACRO}", name=tag, value=tag)
+    if omitted is not None:
+        omitted += [f"{name}, whose prefix is not declared" for name in unbound if not name.startswith("xacro:")]
+        omitted += [f"<xacro:{tag}>, a macro that is not defined" for tag in macros]
     if tree.tag != "robot":
         message = f"{origin} is not URDF: its root element is <{tree.tag}>, not <robot>"
         raise ModelError(message, name=origin, value=tree.tag, limit="robot")
     return tree
 
 
-def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[Link, ...]:
+def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str, omitted: list[str]) -> tuple[Link, ...]:
     links, reasons = [], []
     colors = {
         element.get("name"): color for element in tree.findall("material") if (color := _color(element)) is not None
     }
-    for arguments in (_link_arguments(element, folder, colors) for element in tree.findall("link")):
+    for arguments in (_link_arguments(element, folder, colors, omitted) for element in tree.findall("link")):
         try:
             links.append(Link(**arguments))
             continue
@@ -305,29 +260,39 @@ def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str) -> tuple[L
     return tuple(links)
 
 
-def _link_arguments(element: ElementTree.Element, folder: str, colors: dict[str | None, Array]) -> dict[str, Any]:
-    """Return the arguments of Link for a <link> element; `colors` are the colours of the robot's materials by name."""
+def _link_arguments(
+    element: ElementTree.Element, folder: str, colors: dict[str | None, Array], omitted: list[str]
+) -> dict[str, Any]:
+    """Return the arguments of Link for a <link> element.
+
+    Args:
+        element, folder: The element, and the folder of its file.
+        colors: Colours of the robot's materials, by name.
+        omitted: List to which descriptions of collision shapes that are left out are appended.
+    """
     name = name_of(element)
     owner = f"link {name!r}"
-    shapes = tuple(_shape(each, owner, folder, CollisionShape) for each in element.findall("collision"))
-    visuals = []
+    shapes: list[CollisionShape] = []
+    for each in element.findall("collision"):
+        shapes += _shape(each, owner, folder, CollisionShape, omitted)
+    visuals: list[VisualShape] = []
     for each in element.findall("visual"):
         material = each.find("material")
         color = None if material is None else _color(material)
         if color is None and material is not None:
             color = colors.get(material.get("name"))
         with suppress(ModelError):
-            visuals.append(_shape(each, owner, folder, VisualShape, color=color))
+            visuals += _shape(each, owner, folder, VisualShape, [], color=color)
     body = _only(element, "inertial", owner)
     if body is None:
-        return {"name": name, "collisions": shapes, "visuals": tuple(visuals)}
+        return {"name": name, "collisions": tuple(shapes), "visuals": tuple(visuals)}
     center, orientation = origin_of(body, owner)
     mass = number_of(child_of(body, "mass", owner), "value", owner)
     moments = child_of(body, "inertia", owner)
     xx, xy, xz, yy, yz, zz = (number_of(moments, key, owner) for key in MOMENTS)
     inertia = orientation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ orientation.T
     arguments = {"name": name, "mass": mass, "center_of_mass": center, "inertia": inertia}
-    return {**arguments, "collisions": shapes, "visuals": tuple(visuals)}
+    return {**arguments, "collisions": tuple(shapes), "visuals": tuple(visuals)}
 
 
 def _color(material: ElementTree.Element) -> Array | None:
@@ -339,13 +304,27 @@ def _color(material: ElementTree.Element) -> Array | None:
     return np.clip(color, 0.0, 1.0) if color.shape == (4,) and np.isfinite(color).all() else None
 
 
-def _shape(element: ElementTree.Element, owner: str, folder: str, shape_type: type[_Shape], **arguments: Any) -> _Shape:
-    """Return the shape that a <collision> or <visual> element describes, as an instance of `shape_type`."""
+def _shape(
+    element: ElementTree.Element,
+    owner: str,
+    folder: str,
+    shape_type: type[_Shape],
+    omitted: list[str],
+    **arguments: Any,
+) -> list[_Shape]:
+    """Return the shape that a <collision> or <visual> element describes, or an empty list if the shape has no volume.
+
+    Args:
+        element, owner, folder: The element, its link, for messages, and the folder of its file.
+        shape_type: Class of the result.
+        omitted: List to which descriptions of shapes that are left out are appended.
+        arguments: Further arguments of the result.
+    """
     shapes: list[Any] = list(child_of(element, "geometry", owner))
-    if len(shapes) != 1:
-        message = f"{owner}: <geometry> has {len(shapes)} shapes, not one"
-        raise ModelError(message, name="geometry", value=len(shapes), limit=1)
-    (shape,) = shapes
+    if not shapes:
+        raise ModelError(f"{owner}: <geometry> has 0 shapes, not one", name="geometry", value=0, limit=1)
+    shape = shapes[0]
+    omitted += [f"{owner}: <{each.tag}>, since its <geometry> begins with <{shape.tag}>" for each in shapes[1:]]
     kind = require.choice(f"{owner}: shape", shape.tag, SHAPES)
     file = text_of(shape, "filename", owner) if kind == "mesh" else ""
     if kind in ("box", "mesh"):
@@ -353,10 +332,16 @@ def _shape(element: ElementTree.Element, owner: str, folder: str, shape_type: ty
         size = np.ones(3) if kind == "mesh" and key not in shape.attrib else numbers_of(shape, key, owner, 3)
     else:
         size = np.array([number_of(shape, key, owner) for key in ("radius", "length")[: SHAPES[kind]]])
+    empty = not size.all() and np.isfinite(size).all() and (kind == "mesh" or size.min() >= 0)
+    checked_size = np.where(size == 0, 1.0, size) if empty else size  # so that all else is checked
     try:
-        return shape_type(kind, size, file, *origin_of(element, owner), folder if file else "", **arguments)
+        result = shape_type(kind, checked_size, file, *origin_of(element, owner), folder if file else "", **arguments)
     except ModelError as error:
         raise ModelError(f"{owner}: {error}", name=error.name, value=error.value, limit=error.limit) from None
+    if empty:
+        omitted.append(f"{owner}: collision {kind} {file!r} of size {size.tolist()}".replace(" '' ", " "))
+        return []
+    return [result]
 
 
 def _joint(element: ElementTree.Element) -> Joint:
@@ -395,12 +380,11 @@ def _axis(element: ElementTree.Element) -> Array | None:
 
 
 def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
-    """Return descriptions of unknown attributes in a <link> or <joint> that may stand for missing known attributes.
+    """Return descriptions of unknown attributes in a <link> or <joint> that may stand for known attributes.
 
-    Unknown attributes of an element that has all known ones are an extension and are skipped, like unknown elements.
-
-    Raises:
-        ModelError: An unknown attribute that resembles a missing one, or nearly equals a known one: a misspelling.
+    An attribute that resembles a missing known one, or nearly equals any known one, is taken for a misspelling.
+    Other unknown attributes of an element that has all known ones are an extension and are skipped, like unknown
+    elements.
     """
     unknown = []
     parents = [part for path in ("inertial", "collision", "collision/geometry") for part in owner.findall(path)]
@@ -412,9 +396,9 @@ def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
             word = key.casefold()
             # stricter if the known attribute is present too: `iyx` besides `ixy` is no misspelling
             if similar := get_close_matches(word, missing, 1) or get_close_matches(word, known, 1, 0.8):
-                message = f"{place} is no attribute of URDF; did you mean {similar[0]!r}?"
-                raise ModelError(message, name=key, value=element.get(key), limit=known)
-            unknown += [place] if missing else []
+                unknown.append(f"{place} (did you mean {similar[0]!r}?)")
+            elif missing:
+                unknown.append(place)
     return unknown
 
 
@@ -461,7 +445,9 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
     """Return an attribute of an element as text; raise ModelError naming `owner` if it is missing or empty."""
     value = element.get(key)
     if not value:
-        raise ModelError(f"{owner}: <{element.tag}> has no attribute {key!r}", name=key, value=value)
+        similar = [word for word in element.attrib if get_close_matches(word.casefold(), [key], 1)]
+        hint = f", but {similar[0]!r}: is it misspelt?" if similar and value is None else ""
+        raise ModelError(f"{owner}: <{element.tag}> has no attribute {key!r}{hint}", name=key, value=value)
     return value
 
 

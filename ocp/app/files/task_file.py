@@ -77,7 +77,7 @@ from models.checks import NOT_NUMBERS, Array, floats
 from models.shapes.shapes import Shape
 from models.spatial import rotation_from_rpy
 from ocp.app.files.safe_files import SUFFIXES, FileName, checked_output
-from ocp.app.files.toml_table import REQUIRED, TomlTable, read_toml
+from ocp.app.files.settings import REQUIRED, TomlTable, read_toml
 from ocp.app.files.waypoints import read_waypoints
 from ocp.errors import ProblemError
 from ocp.motion.schedule import LineLimits, schedule

@@ -109,7 +109,7 @@ def test_the_hull_is_that_of_an_independent_library(points: list[tuple[int, int]
     [
         ('<mesh filename="package://a/b.stl"/>', r"only meshes, in \['foot'\].*give the support yourself"),
         ('<sphere radius="-0.1"/>', r"link 'foot': .*sphere: size \[-0.1\] is not positive"),
-        ('<box size="0.1 0 0.1"/>', r"link 'foot': .*box: size .* is not positive"),
+        ('<box size="0.1 -1 0.1"/>', r"link 'foot': .*box: size .* is not positive"),
         ('<cylinder radius="0.1"/>', r"link 'foot': <cylinder> has no attribute 'length'"),
         ('<cone radius="0.1"/>', "link 'foot': shape must be .*, not 'cone'"),
         ("", "link 'foot': <geometry> has 0 shapes"),

@@ -6,9 +6,11 @@ from typing import Any
 
 import pytest
 
-from models import ModelError, Robot
+from models import ModelError, Robot, named_states
 from tests.bad_values import (
     CHOICE,
+    FLAG,
+    INSTANCE,
     MAPPING,
     NAN,
     UNKNOWN,
@@ -53,18 +55,22 @@ OPTIONS = Case(
     {
         "source": SOURCE,
         "tip": but(UNKNOWN, "None"),
-        "root": but(UNKNOWN, "None"),
         "tip_translation": array(3),
         "tip_rotation": rotation(),
+        "xacro": FLAG,
         "lock": MAPPING
         | {"unknown": {"nobody": 0.0}, "digits": {"turn": "1"}, "nan": {"turn": NAN}, "none": {"turn": None}},
         "mimic": CHOICE,
         "inertia": CHOICE,
     },
 )
+STATES = Case(
+    "named_states",
+    named_states,
+    {"srdf": "<robot/>", "robot": Robot.from_urdf(URDF)},
+    {"srdf": {name: bad for name, bad in SOURCE.items() if name != "no link"}, "robot": INSTANCE},
+)
 TEXTS = {
-    "misspelt beside all others": (LIMIT, LIMIT.replace("/>", ' uper="1"/>')),
-    "misspelt for another": (LIMIT, LIMIT.replace("upper", "uper")),
     "two limits": (LIMIT, LIMIT * 2),
     "two origins": (ORIGIN, ORIGIN * 2),
     "two masses": (MASS, MASS * 2),
@@ -83,7 +89,6 @@ TEXTS = {
     "origin of two": (ORIGIN, '<origin xyz="0 0"/>'),
     "origin of inf": (ORIGIN, '<origin xyz="0 0 inf"/>'),
     "origin of commas": (ORIGIN, '<origin xyz="0,0,1"/>'),
-    "origin misspelt": (ORIGIN, '<origin xyzz="0 0 1"/>'),
     "xacro": (ORIGIN, '<origin xyz="${x} 0 0"/>'),
     "zero axis": ('xyz="0 0 1"/><limit', 'xyz="0 0 0"/><limit'),
     "limits crossed": ('lower="-1"', 'lower="2"'),
@@ -99,19 +104,22 @@ TEXTS = {
     "nobody followed": (LIMIT, LIMIT + '<mimic joint="nobody"/>'),
     "follows itself": (LIMIT, LIMIT + '<mimic joint="turn"/>'),
     "unknown shape": ('<box size="1 1 1"/>', '<cone size="1 1 1"/>'),
-    "two shapes": ('<box size="1 1 1"/>', '<box size="1 1 1"/><sphere radius="1"/>'),
-    "flat box": ('<box size="1 1 1"/>', '<box size="1 1 0"/>'),
     "shape without size": ('<box size="1 1 1"/>', "<box/>"),
-    "shape misspelt": ('<box size="1 1 1"/>', '<box size="1 1 1" siize="2 2 2"/>'),
+    "shape misspelt": ('<box size="1 1 1"/>', '<box siize="2 2 2"/>'),
+    "no shape": ('<box size="1 1 1"/>', ""),
+    "box of zero and less": ('<box size="1 1 1"/>', '<box size="0 -1 1"/>'),
+    "ball of nan": ('<box size="1 1 1"/>', '<sphere radius="nan"/>'),
+    "cylinder of zero and nan": ('<box size="1 1 1"/>', '<cylinder radius="0" length="nan"/>'),
+    "mesh without file": ('<box size="1 1 1"/>', '<mesh scale="0 0 0"/>'),
 }
 
 
-@pytest.mark.parametrize("case", good_calls([OPTIONS]))
+@pytest.mark.parametrize("case", good_calls([OPTIONS, STATES]))
 def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 
-@pytest.mark.parametrize(("case", "argument"), panel([OPTIONS]))
+@pytest.mark.parametrize(("case", "argument"), panel([OPTIONS, STATES]))
 def test_bad_options_are_refused_by_name(case: Case, argument: str) -> None:
     assert_refused(case, argument)
 

@@ -10,9 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import Path
+from models import Path, planar_chain
 from models.paths import split_at_reversals
-from ocp.app.files import Program, RawTrajectory, TimedProgram, Waypoints, read_gcode, read_trajectory, read_waypoints
+from ocp import Limits
+from ocp.app.files import (
+    Program,
+    RawTrajectory,
+    TimedProgram,
+    Waypoints,
+    read_gcode,
+    read_joint_limits,
+    read_trajectory,
+    read_waypoints,
+)
 from ocp.motion.schedule import LineLimits
 from tests.bad_values import (
     CHOICE,
@@ -73,7 +83,15 @@ def read_motion(**options: Any) -> RawTrajectory:
         return read_trajectory(**{"file": File(folder) / "motion.csv", **options})
 
 
+def read_limits(**options: Any) -> Limits:
+    with TemporaryDirectory() as folder:
+        (File(folder) / "joint_limits.yaml").write_text("joint_limits: {joint1: {max_jerk: 1}}")
+        robot = planar_chain([1.0], [1.0])
+        return read_joint_limits(**{"file": File(folder) / "joint_limits.yaml", "robot": robot, **options})
+
+
 CASES = [
+    Case("read_joint_limits", read_limits, {}, {"file": FILE, "robot": INSTANCE, "scaling": FLAG}),
     Case(
         "read_gcode",
         read_gcode,

@@ -18,12 +18,12 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 
-from models import ModelError, Robot, planar_chain
+from models import ModelError, Robot, named_states, planar_chain
 from models.files import INPUT_LIMITS, UnfitFile, open_regular, parse_xml, read_regular
 from models.shapes.mesh_files import read_mesh
 from models.shapes.pairs import checked_pairs
 from ocp import ProblemError, Solution
-from ocp.app.files import read_gcode, read_trajectory, read_waypoints, safe_files
+from ocp.app.files import read_gcode, read_joint_limits, read_trajectory, read_waypoints, safe_files
 from ocp.app.files.safe_files import read_tree
 from ocp.app.files.task_file import read_obstacles, read_task
 from ocp.motion.schedule import JointTrajectory
@@ -31,6 +31,8 @@ from ocp.motion.schedule import JointTrajectory
 READERS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "URDF": (".urdf", Robot.from_urdf),
     "SRDF": (".srdf", lambda file: checked_pairs(planar_chain([1.0, 1.0], [1.0, 1.0]), [], srdf=file)),
+    "states": (".srdf", lambda file: named_states(file, planar_chain([1.0, 1.0], [1.0, 1.0]))),
+    "joint limits": (".yaml", lambda file: read_joint_limits(file, planar_chain([1.0, 1.0], [1.0, 1.0]))),
     "STL": (".stl", read_mesh),
     "OBJ": (".obj", read_mesh),
     "DAE": (".dae", read_mesh),

@@ -1,21 +1,27 @@
-"""Read TOML files so that each error names its line; entries are read by name and expected type."""
+"""Read settings: TOML files, by name and expected type, with errors that name the line, and joint limits of MoveIt.
+
+`joint_limits.yaml` is the file in which MoveIt keeps the limits that a URDF cannot state.
+"""
 
 from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
+from warnings import warn
 
 import numpy as np
 
-from models.checks import NOT_NUMBERS, floats, real
+from models import ModelWarning, Robot
+from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats, real
 from models.files import INPUT_LIMITS
-from ocp.app.files.safe_files import FileName, checked_depth, line_error, read_lines
-from ocp.errors import ProblemError
+from ocp.app.files.safe_files import FileName, checked_depth, line_error, read_lines, read_tree
+from ocp.errors import ProblemError, require
+from ocp.motion.tasks.limits import Limits
 
-__all__ = ["TomlTable", "read_toml"]
+__all__ = ["TomlTable", "read_joint_limits", "read_toml"]
 
 TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
@@ -242,3 +248,115 @@ def _places(texts: Sequence[str]) -> dict[Place, int]:
                 place = (*place, part.strip().strip("\"'"))
                 lines.setdefault(place, number)
     return lines
+
+
+# ---- joint limits ----------------------------------------------------------------------------------------------
+
+LIMIT_KINDS = {"velocity": "velocity", "acceleration": "acceleration", "jerk": "jerk", "effort": "torque"}
+"""Names of the limits in joint_limits.yaml and in `Limits`."""
+LIMIT_KEYS = [key for kind in LIMIT_KINDS for key in (f"has_{kind}_limits", f"max_{kind}")]
+UNUSED_KEYS = {"max_position": "position", "min_position": "position", "max_deceleration": "deceleration"}
+"""Known keys that `Limits` has no field for, and the kind of limit that they belong to."""
+OTHER_KEYS = {"has_position_limits", "has_deceleration_limits", "angle_wraparound", "has_soft_limits", *UNUSED_KEYS}
+
+
+def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> Limits:
+    """Read the limits of a robot's joints from MoveIt's file joint_limits.yaml.
+
+    The velocity, acceleration, jerk and effort limits of the file replace those of the robot description;
+    ``has_velocity_limits: false`` stands for no limit. Joints without an entry keep the limits of the description.
+    A joint also observes the limits of the joints that mimic it. Position limits remain those of the description.
+
+    Args:
+        file: YAML file with the mapping `joint_limits`, also below `robot_description_planning` or `ros__parameters`.
+        robot: The robot.
+        scaling: Whether velocities and accelerations are multiplied by the file's default_velocity_scaling_factor and
+            default_acceleration_scaling_factor, as MoveIt does by default.
+
+    Raises:
+        ProblemError: The file cannot be read or has no `joint_limits`, or a limit is missing or not positive; names the
+            joint. The package `pyyaml` is not installed.
+
+    Warns:
+        ModelWarning: Joints that the robot does not have, and entries that are not used.
+    """
+    robot = require.instance("read_joint_limits: robot", robot, Robot)
+    require.flag("read_joint_limits: scaling", scaling)
+    tree = read_tree(file, "yaml")
+    for key in ("/**", "ros__parameters", "robot_description_planning"):
+        if isinstance(tree, Mapping) and "joint_limits" not in tree:
+            tree = tree.get(key, tree)
+    entries = tree.get("joint_limits") if isinstance(tree, Mapping) else None
+    if not isinstance(entries, Mapping):
+        words = f"{file} has no mapping joint_limits of joint names to limits"
+        raise ProblemError(words, name="joint_limits", value=repr(entries)[:80])
+    names, unused = {joint.name for joint in robot.joints}, []
+    limits: dict[str, dict[str, float]] = {kind: {} for kind in LIMIT_KINDS}
+    for name, entry in entries.items():
+        if name not in names:
+            unused.append(f"joint {repr(name)[:80]}, which {robot.name!r} does not have")
+            continue
+        if not isinstance(entry, Mapping):
+            words = f"{file}: joint {name!r} must have a mapping of limits, not {repr(entry)[:80]}"
+            raise ProblemError(words, name=name, value=repr(entry)[:80])
+        unused += [f"{note} of joint {name!r}" for note in _unused_keys(entry)]
+        for kind in LIMIT_KINDS:
+            if (value := _limit(file, name, entry, kind)) is not None:
+                limits[kind][name] = value
+    if unused:
+        more = f"; and {len(unused) - MAX_LISTED} more" if len(unused) > MAX_LISTED else ""
+        words = f"{file}: not used are {'; '.join(unused[:MAX_LISTED])}{more}"
+        warn(ModelWarning(words, name=unused[0], value=tuple(unused)), stacklevel=2)
+    factors = {kind: _factor(file, tree, kind) if scaling else 1.0 for kind in ("velocity", "acceleration")}
+    values: dict[str, Any] = {}
+    for kind, attribute in LIMIT_KINDS.items():
+        factor = factors.get(kind, 1.0)
+        if limits[kind] or (kind == "velocity" and factor < 1):
+            vector = factor * _joint_vector(robot, kind, limits[kind])
+            if kind in ("velocity", "effort") or np.isfinite(vector).any():  # else None says the same
+                values[attribute] = vector
+    return Limits(**values)
+
+
+def _joint_vector(robot: Robot, kind: str, limits: Mapping[str, float]) -> Array:
+    """Return one kind of limits of the independent joints, from the file's limits and the description. Shape (dof,)."""
+    vector = np.full(robot.dof, np.inf)
+    for name, (column, multiplier, _) in robot.couplings.items():
+        joint = robot.joint(name)
+        if kind != "effort" or joint.mimic is None:  # mimic joints are driven by the joint that they mimic
+            own = limits.get(name, getattr(joint, kind, 0.0) or np.inf)  # a limit of 0 in a description is unknown
+            vector[column] = min(vector[column], own / abs(multiplier))
+    return vector
+
+
+def _limit(file: FileName, joint: str, entry: Mapping[Any, Any], kind: str) -> float | None:
+    """Return a limit of a joint, infinite for no limit, or None if the entry does not give one."""
+    has, value = entry.get(f"has_{kind}_limits"), entry.get(f"max_{kind}")
+    if has is not None and not isinstance(has, bool):
+        words = f"{file}: joint {joint!r}: has_{kind}_limits must be true or false, not {repr(has)[:80]}"
+        raise ProblemError(words, name=joint, value=repr(has)[:80], limit=(True, False))
+    if has is False:
+        return float(np.inf)
+    if value is None and has is None:
+        return None
+    if not real(value) > 0:
+        words = f"{file}: joint {joint!r}: max_{kind} must be a positive number, not {repr(value)[:80]}; for no limit, "
+        raise ProblemError(words + f"has_{kind}_limits: false", name=joint, value=repr(value)[:80], limit=0.0)
+    return real(value)
+
+
+def _factor(file: FileName, tree: Mapping[Any, Any], kind: str) -> float:
+    """Return the default scaling factor of the velocities or accelerations in a file."""
+    key = f"default_{kind}_scaling_factor"
+    if not 0 < real(tree.get(key, 1.0)) <= 1:
+        words = f"{file}: {key} must be a number above 0, at most 1, not {repr(tree[key])[:80]}"
+        raise ProblemError(words, name=key, value=repr(tree[key])[:80], limit=(0.0, 1.0))
+    return float(tree.get(key, 1.0))
+
+
+def _unused_keys(entry: Mapping[Any, Any]) -> list[str]:
+    """Return the keys of a joint that are not used, misspelt keys with a suggestion."""
+    used = [key for key, kind in UNUSED_KEYS.items() if key in entry and entry.get(f"has_{kind}_limits") is not False]
+    unknown = [str(key) for key in entry if key not in LIMIT_KEYS and key not in OTHER_KEYS]
+    similar = {key: get_close_matches(key[:80], LIMIT_KEYS, 1, 0.8) for key in unknown}
+    return used + [f"{key[:80]}" + (f" (did you mean {similar[key][0]}?)" if similar[key] else "") for key in unknown]
