@@ -56,6 +56,7 @@ from models.robot.rebuild import (
     with_load,
 )
 from models.robot.robot import Robot, named_states, planar_chain
+from models.robot.urdf import expand_xacro
 from models.shapes.shapes import Box, Capsule, Cylinder, HalfSpace, Mesh, MovingObstacle, Sphere
 from models.spatial import Frame
 
@@ -104,6 +105,7 @@ __all__ = [
     "center_of_mass_motion",
     "centers_of_mass",
     "example_robot",
+    "expand_xacro",
     "find_wheels",
     "footprint",
     "frame_jacobian",

@@ -24,6 +24,7 @@ from models.robot.tree import (
     joint_limits,
     lock_with_followers,
     require_unique,
+    reroot_tree,
     ties_to_leaders,
     tree_order,
 )
@@ -109,20 +110,20 @@ class Robot:
         source: Source,
         *,
         tip: str | None = None,
+        root: str | None = None,
         tip_translation: ArrayInput = (0.0, 0.0, 0.0),
         tip_rotation: ArrayInput = None,
         lock: Mapping[str, float] | None = None,
         mimic: MimicRule = "couple",
         inertia: InertiaRule = "warn",
-        xacro: bool = False,
     ) -> Robot:
         """Read a robot from a URDF description; `models.robot.urdf.read_urdf` documents contents and defaults.
-
-        `models.reroot` makes another link the root of the tree, the base.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
             tip: Link that carries the tip. If None, the one that the file names as to_urdf does, else the only leaf.
+            root: Link to become the root of the tree, the base; the root of the file if None. Links keep their frames,
+                joints their names, limits and signs, see `models.robot.tree.reroot_tree`.
             tip_translation: As in Robot.
             tip_rotation: As in Robot; the identity if None.
             lock: Positions (rad or m) at which joints, and those that mimic them, are locked, by joint name.
@@ -131,8 +132,6 @@ class Robot:
                 ("free").
             inertia: Treatment of physically impossible inertias: accept them with a warning ("warn") or silently
                 ("as_given").
-            xacro: Expand the file as xacro first; needs the package `xacrodoc`, the extra `xacro`. The file may include
-                others and evaluates Python expressions, so expand only files that you trust.
 
         Raises:
             ModelError: As read_urdf, Robot and `models.robot.rebuild.lock_joints`.
@@ -142,7 +141,7 @@ class Robot:
                 joints that mimic them leave a single position.
         """
         require.choice("URDF: mimic", mimic, get_args(MimicRule))
-        description = read_urdf(source, inertia=inertia, xacro=xacro)
+        description = read_urdf(source, inertia=inertia)
         joints = description.joints
         if mimic == "free":
             joints = tuple(replace(joint, mimic=None) for joint in joints)
@@ -154,9 +153,12 @@ class Robot:
         joints = lock_with_followers(joints, positions)
         if mimic == "lock":
             joints = lock_with_followers(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
+        links = description.links
+        if root is not None:
+            original = cls(links, joints, tip=links[0].name)  # validates the tree before it is rerooted
+            links, joints = reroot_tree(links, joints, original.root, root)
         turn = np.eye(3) if tip_rotation is None else tip_rotation
-        tip = description.tip if tip is None else tip
-        robot = cls(description.links, joints, tip, tip_translation, turn, description.name)
+        robot = cls(links, joints, description.tip if tip is None else tip, tip_translation, turn, description.name)
         ranges = zip(robot.moving_joints, robot.lower, robot.upper, strict=True)
         if stuck := [joint.name for joint, lower, upper in ranges if lower == upper and joint.lower < joint.upper]:
             warn(f"joints {stuck} cannot move: limits of joints that follow them leave one position", ModelWarning, 2)

@@ -38,7 +38,7 @@ COMPOSITE = ("planar", "floating")
 XACRO_EXTRA = 'the extra xacro: pip install "selfmotion[xacro]", or from a clone pip install ".[xacro]"'
 XACRO = (
     "this is xacro, the macro language that URDF files are made from; expand it first: xacro FILE > FILE.urdf, or, if "
-    "you trust the file, since xacro evaluates its Python expressions, by Robot.from_urdf(FILE, xacro=True) with "
+    "you trust the file, since xacro evaluates its Python expressions: Robot.from_urdf(expand_xacro(FILE)), with "
     + XACRO_EXTRA
 )
 XACRO_WORDS = {
@@ -79,7 +79,7 @@ class Description:
     tip: str | None = None
 
 
-def read_urdf(source: Source, *, inertia: InertiaRule = "warn", xacro: bool = False) -> Description:
+def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     """Read a URDF description from a text or a file.
 
     Missing data have the default values of the format: a zero origin, the axis x, no inertia. A revolute or prismatic
@@ -98,8 +98,6 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn", xacro: bool = Fa
         source: The text, recognised by its first character "<", or the path of a file.
         inertia: Treatment of physically impossible inertias: accept them with a warning ("warn") or silently
             ("as_given").
-        xacro: Expand the file, which must be given by its path, as xacro first. Needs the package `xacrodoc`, the extra
-            `xacro`. The file can include others and evaluates Python expressions: only for files that you trust.
 
     Raises:
         ModelError: No such file, malformed XML, xacro, missing or non-numeric attributes, duplicate elements,
@@ -111,7 +109,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn", xacro: bool = Fa
     """
     require.choice("URDF: inertia", inertia, get_args(InertiaRule))
     omitted: list[str] = []
-    tree = parse_urdf(_expand_xacro(source) if require.flag("URDF: xacro", xacro) else source, omitted)
+    tree = parse_urdf(source, omitted)
     is_file = isinstance(source, os.PathLike) or not source.lstrip(BLANK).startswith("<")
     folder = str(Path(source).resolve().parent) if is_file else ""
     omitted += [note for kind in ("link", "joint") for part in tree.findall(kind) for note in _unknown_attributes(part)]
@@ -156,10 +154,17 @@ def _without_world(floating: Joint, links: tuple[Link, ...]) -> tuple[Link, ...]
     return tuple(link for link in links if link is not base)
 
 
-def _expand_xacro(file: Source) -> str:
-    """Return the URDF text that a xacro file describes; the file's expressions are evaluated."""
-    if not isinstance(file, str | os.PathLike) or os.fspath(file).lstrip(BLANK).startswith("<"):
-        raise ModelError("source: xacro=True needs the path of a file, not a text", name="source", value=file)
+def expand_xacro(file: str | os.PathLike[str]) -> str:
+    """Return the URDF text that a xacro file describes, for `Robot.from_urdf`.
+
+    Needs the package `xacrodoc`, the extra `xacro`. The file can include others and evaluates Python expressions, so
+    expand only files that you trust. Relative names of meshes are completed with the folder of the file.
+
+    Raises:
+        ModelError: There is no such file, xacro cannot expand it, or the package is not installed.
+    """
+    if not isinstance(file, str | os.PathLike):
+        raise ModelError(f"expand_xacro: a file name is expected, not {file!r}", name="file", value=file)
     try:
         import xacrodoc  # lets xacro find packages without ROS
         from xacro import process_file
@@ -169,7 +174,11 @@ def _expand_xacro(file: Source) -> str:
     try:
         read_regular(file, INPUT_LIMITS.description_bytes)  # only to refuse what is no file
         xacrodoc.packages.walk_up_from(file)
-        return str(process_file(os.fspath(file)).toxml())
+        document = process_file(os.fspath(file))
+        for mesh in document.getElementsByTagName("mesh"):
+            if "://" not in (name := mesh.getAttribute("filename")):
+                mesh.setAttribute("filename", os.path.join(os.path.dirname(os.path.abspath(file)), name))
+        return str(document.toxml())
     except Exception as error:  # of any kind: the expressions are the file's own
         name = f"file {os.fspath(file)!r}"
         raise ModelError(f"{name} cannot be expanded by xacro: {error}", name=name, value=file) from error

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from models import Box, CollisionShape, FixedBase, ModelWarning, Robot, link_frames, reroot
+from models import Box, CollisionShape, FixedBase, ModelWarning, Robot, link_frames
 from models.checks import Array
 from models.robot.rebuild import lock_joints
 
@@ -57,7 +57,7 @@ def robot_of(name: str) -> Robot:
     options = _read("robots.json")[name]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)  # of the file's own attributes
-        whole = reroot(Robot.from_urdf(FOLDER / options["urdf"], tip=options["tip"]), options["base"])
+        whole = Robot.from_urdf(FOLDER / options["urdf"], tip=options["tip"], root=options["base"])
     standing = {joint: 0.0 for joint in whole.joint_names if joint not in options["joints"]}
     robot = lock_joints(whole, standing | options.get("locked", {}))
     assert robot.joint_names == tuple(options["joints"])

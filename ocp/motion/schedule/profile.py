@@ -33,7 +33,8 @@ class LineMotion(NamedTuple):
     acceleration: Array
     jerk: Array
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def integrate_jerk(speed: Any, acceleration: Any, jerk: Any, time: Any) -> tuple[Any, Any, Any]:

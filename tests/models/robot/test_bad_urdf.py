@@ -9,7 +9,6 @@ import pytest
 from models import ModelError, Robot, named_states
 from tests.bad_values import (
     CHOICE,
-    FLAG,
     INSTANCE,
     MAPPING,
     NAN,
@@ -57,7 +56,7 @@ OPTIONS = Case(
         "tip": but(UNKNOWN, "None"),
         "tip_translation": array(3),
         "tip_rotation": rotation(),
-        "xacro": FLAG,
+        "root": but(UNKNOWN, "None"),
         "lock": MAPPING
         | {"unknown": {"nobody": 0.0}, "digits": {"turn": "1"}, "nan": {"turn": NAN}, "none": {"turn": None}},
         "mimic": CHOICE,

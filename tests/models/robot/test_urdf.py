@@ -24,7 +24,6 @@ from models import (
     link_frames,
     momentum_matrix,
     rectangle,
-    reroot,
     robot_inertia,
     simplify,
     tip_pose,
@@ -310,8 +309,9 @@ def test_followers_are_coupled_held_or_free() -> None:
 
 @pytest.mark.parametrize("root", ["l0", "l1", "l3"])
 def test_another_root_and_tip_are_chosen_by_name(root: str) -> None:
-    place: dict[str, Any] = {"tip_translation": (0, 0, 1), "tip_rotation": np.diag([1, -1, -1])}
-    robot = reroot(Robot.from_urdf(chain("rpc"), tip="l0", **place), root)
+    robot = Robot.from_urdf(
+        chain("rpc"), root=root, tip="l0", tip_translation=(0, 0, 1), tip_rotation=np.diag([1, -1, -1])
+    )
     assert (robot.root, robot.tip, robot.name) == (root, "l0", "chain")
     assert sorted(robot.joint_names) == ["j1", "j2", "j3"]
     np.testing.assert_array_equal(robot.tip_translation, [0, 0, 1])
@@ -345,7 +345,7 @@ def test_a_chain_of_a_thousand_links_is_read_and_printed() -> None:
         ("\n\n<robot name='r'>\n<link name='a'>\n</robot>", "mismatched tag, line 5"),
         (
             "<robot><xacro:property name='m' value='1'/></robot>",
-            "element <xacro:property>: this is xacro.*expand it first.*xacro=True.*extra xacro",
+            "element <xacro:property>: this is xacro.*expand it first.*expand_xacro.*extra xacro",
         ),
         (
             "<robot xmlns:xacro='http://ros.org/wiki/xacro'>\n<xacro:include filename='x'/></robot>",
@@ -433,7 +433,7 @@ def test_invalid_robots_are_refused(source: Any, message: str) -> None:
         ({"inertia": "fix"}, r"inertia must be 'warn' or 'as_given', not 'fix'"),
         ({"tip_translation": (1, 2)}, "tip_translation has shape"),
         ({"tip_rotation": np.ones((3, 3))}, "tip_rotation .* not a rotation"),
-        ({"xacro": True}, "source: xacro=True needs the path of a file, not a text"),
+        ({"root": "L2"}, "root link 'L2' does not exist; did you mean 'l2'"),
     ],
 )
 def test_arguments_that_do_not_fit_the_robot_are_refused(options: dict[str, Any], message: str) -> None:

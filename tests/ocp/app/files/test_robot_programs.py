@@ -77,9 +77,9 @@ def motions(draw: st.DrawFn) -> tuple[str, list[str], list[str], Any, Any]:
 @settings(max_examples=20)
 @given(motions())
 def test_times_and_joints_are_read_back_to_the_digits_written(
-    tmp_path_factory: pytest.TempPathFactory, drawn: tuple[str, list[str], list[str], Any, Any]
+    tmp_path_factory: pytest.TempPathFactory, values: tuple[str, list[str], list[str], Any, Any]
 ) -> None:
-    kind, names, kinds, t, q = drawn
+    kind, names, kinds, t, q = values
     folder = tmp_path_factory.getbasetemp()
     file = written(folder, kind, sampled(names, t, q), robot=robot(names, kinds))
     result = read_trajectory(file, period=0.01)
