@@ -382,8 +382,7 @@ def optimality(
     spread = accessory.hamiltonian_scale
     cost = max(abs(solution.cost), LIMIT_SHARE * accessory.cost_scale, LIMIT_SHARE**2 * along.slope_size)
     cost = cost if cost > 0 else 1.0
-    total = control_loss(along, first.costate, first.control_multipliers, accessory.curved)
-    total, best = np.maximum(total, 0.0) + first.charge, first
+    total, best = _loss_by_interval(along, first, accessory.curved), first
     loss, costate_error = _total_loss(total, first), 0.0
     is_degenerate = along.may_be_degenerate or bool(accessory.linear_controls.any())
     if loss > allowed * cost and is_degenerate:
@@ -416,6 +415,12 @@ def optimality(
     )
 
 
+def _loss_by_interval(along: Linearisation, multipliers: Adjoint, curved: np.ndarray) -> np.ndarray:
+    """Return the excess cost of a plan in each interval for given multipliers, to second order. Shape (N,)."""
+    loss = control_loss(along, multipliers.costate, multipliers.control_multipliers, curved)
+    return np.asarray(np.maximum(loss, 0.0) + multipliers.charge)
+
+
 def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
     """Return a plan's excess cost over the optimum for given multipliers, without what a change of start saves."""
     return float(by_interval.sum() + multipliers.ends.charge)
@@ -424,10 +429,8 @@ def _total_loss(by_interval: np.ndarray, multipliers: Adjoint) -> float:
 def _loss_of_fit(along: Linearisation, multipliers: Adjoint, curved: np.ndarray | None) -> float:
     """Return the measure that compares multipliers: excess cost of the plan plus errors of the multipliers."""
     assert curved is not None
-    loss = control_loss(along, multipliers.costate, multipliers.control_multipliers, curved).sum()
-    return float(
-        loss + multipliers.charge.sum() + multipliers.ends.charge + multipliers.total + multipliers.ends.transversality
-    )
+    loss = _total_loss(_loss_by_interval(along, multipliers, curved), multipliers)
+    return loss + multipliers.total + multipliers.ends.transversality
 
 
 def _control_curvature(along: Linearisation) -> np.ndarray | None:

@@ -126,7 +126,7 @@ def _solve_window(
     to_seam, checked = seam - window.first, min(seam + SETTINGS.overlap // 2, window.last) - window.first
     x, slope = _tighten(window, enforced, seam, checked)
     state = float(x[to_seam]), 0.0 if slope is None else float(slope[to_seam])
-    return motion_profile(window, x[: to_seam + 1], slope), state, enforced.part(to_seam, window.last - window.first)
+    return motion_profile(window, x[: to_seam + 1], slope), state, enforced.after(to_seam)
 
 
 def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> tuple[Array, Array | None]:
@@ -233,8 +233,7 @@ def _with_jerk(
         if resting:
             node, width = (1, nodes[1] - nodes[0]) if side == 0 else (-2, nodes[-1] - nodes[-2])
             rest[side] = float(width)
-            outer, inside = (left, right) if side == 0 else (right, left)
-            sharp = _rest_jerk(outer, inside, float(width), side, shares.jerk)
+            sharp = _rest_jerk(left, right, float(width), side, shares.jerk)
             caps[node] = min(caps[node], (9 * width**2 * sharp / 2) ** (2 / 3))
     inner = slice(low, high)
     cells = slice(low, high - 1)
@@ -317,15 +316,14 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
     return np.asarray(np.maximum(start, 1e-9 * start.max()))
 
 
-def _rest_jerk(near: Rows, far: Rows, width: float, side: int, shares: Array) -> float:
-    """Return the greatest constant jerk that limits permit in the first or last interval, next to a point of rest."""
-    of = [near.jerk[0], far.jerk[0]] if side == 0 else [near.jerk[-1], far.jerk[-1]]
-    sign, share = 1.0 - 2.0 * side, shares[0 if side == 0 else -1]
-    ratio = 0.0
+def _rest_jerk(left: Rows, right: Rows, width: float, side: int, shares: Array) -> float:
+    """Return the greatest constant jerk that limits permit in the first (side 0) or last interval, next to rest."""
+    interval, sign, ratio = -side, 1.0 - 2.0 * side, 0.0
     for s in (0.0, width):
-        for rows in of:
-            jerk = rows[:, 0] + sign * 3 * s * rows[:, 1] + 4.5 * s * s * rows[:, 2]
-            ratio = max(ratio, float((np.abs(jerk) / share).max(initial=0.0)))
+        for rows in (left, right):
+            p, q, r = rows.jerk[interval].T
+            jerk = p + sign * 3 * s * q + 4.5 * s * s * r
+            ratio = max(ratio, float((np.abs(jerk) / shares[interval]).max(initial=0.0)))
     return 1 / ratio
 
 

@@ -181,9 +181,9 @@ class EnforcedRows:
         held = np.zeros((len(HELD), 2, count, rows.total), dtype=bool)
         return cls(margins, times, held, np.ones((len(HELD), count)))
 
-    def part(self, first: int, last: int) -> EnforcedRows:
-        """Return the enforced limits in the intervals from `first` up to `last`, as views of the same memory."""
-        part = slice(first, last)
+    def after(self, first: int) -> EnforcedRows:
+        """Return the enforced limits in the intervals from `first` on, as views of the same memory."""
+        part = slice(first, None)
         return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
 
     def hold_near(self, used: Array, values: Array, jerks: Array) -> None:

@@ -80,6 +80,23 @@ def test_milliseconds_that_are_not_whole_are_suspected(ur5: Robot) -> None:
     assert check.faults == ()
 
 
+def test_positions_in_degrees_hide_no_milliseconds(ur5: Robot) -> None:
+    """The rest of the check takes them as degrees, and suspects what it suspects of radians."""
+    t = np.linspace(0.0, 4.237, 301)
+    q = HOME + 0.3 * np.sin(np.outer(t, SWINGS))
+    in_radians, in_degrees = checked(ur5, 1e3 * t, q), checked(ur5, 1e3 * t, np.rad2deg(q))
+    assert {(fault.kind, fault.name == "time") for fault in in_degrees.faults} == {("units", False)}
+    assert [one.text for one in in_degrees.suspicions] == [one.text for one in in_radians.suspicions] != []
+
+
+def test_a_unit_of_times_that_is_a_fault_is_no_suspicion_as_well(ur5: Robot) -> None:
+    """Whole milliseconds, and a second apart as sample numbers are."""
+    t = np.arange(100.0)
+    check = checked(ur5, 1e3 * t, HOME + 0.8 * np.sin(0.1 * t)[:, None] * np.linspace(0.2, 1.0, 6))
+    assert [(fault.kind, fault.name) for fault in check.faults] == [("units", "time")]
+    assert check.suspicions == ()
+
+
 def test_velocities_tell_the_unit_by_themselves(ur5: Robot) -> None:
     t, q, v = swings(0.3)
     check = checked(ur5, np.rint(1e3 * t), q, v)

@@ -98,6 +98,18 @@ def test_the_integrated_costates_are_the_closed_form() -> None:
     assert not adjoint.state_multipliers.any()
 
 
+def test_an_error_of_a_costate_reported_inside_an_interval_is_one_of_this_interval() -> None:
+    plan = solve(energy(), Collocation(10))
+    fractions = plan.t / plan.horizon
+    inside = np.abs(10 * fractions - np.round(10 * fractions)) > 1e-6
+    errors = np.arange(1.0, 11.0)
+    by_sample = np.where(inside, errors[np.minimum((10 * fractions).astype(int), 9)], 0.0)[:, None]
+    costates = {name: values + by_sample for name, values in plan.costates.items()}
+    between = replace(plan, costates=costates).audit().optimality.adjoint.between
+    assert between[0] > 0
+    np.testing.assert_allclose(between / between[0], errors, rtol=1e-6)
+
+
 @every_method
 def test_scaled_shifted_or_perturbed_costates_fail(method: str) -> None:
     plan = free_end(method)

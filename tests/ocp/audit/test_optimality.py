@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ocp import Collocation, Problem, Solution, solve
+from ocp import Collocation, MultipleShooting, Problem, Solution, solve
 from ocp.audit.optimality import Optimality, optimality
 from ocp.problem.formulation import Formulation
 from tests.ocp.problems import double_integrator, energy
@@ -53,6 +53,19 @@ def test_the_loss_is_the_excess_cost(size: float) -> None:
     result = optimality_of(plan)
     assert result.lost.sum() == pytest.approx(excess, rel=1e-6)
     assert result.costate_accuracy == pytest.approx(np.sqrt(excess / (6 + excess)), rel=1e-6)
+
+
+def under(ceiling: float) -> Problem:
+    """Up and down again in 1 s with least energy under a ceiling c, which costs 4 / (9 c) (Bryson, Denham)."""
+    problem, _, _, u = double_integrator("ceiling", (0.0, 1.0), (0.0, -1.0), ceiling=ceiling)
+    problem.minimize(running=u**2 / 2)
+    return problem
+
+
+@pytest.mark.parametrize("method", [Collocation(30), MultipleShooting(60, control="linear")], ids=str)
+def test_the_loss_at_a_gap_from_the_ceiling_is_what_the_ceiling_saves(method: Collocation | MultipleShooting) -> None:
+    plan = replace(solve(under(0.111), method), problem=under(1 / 9))
+    assert optimality_of(plan).lost.sum() == pytest.approx(4 / (9 * 0.111) - 4, rel=1e-3)
 
 
 def test_units_of_the_cost_scale_the_loss_and_keep_its_share() -> None:

@@ -482,6 +482,15 @@ def test_a_horizon_held_by_its_bound_is_not_passed_over() -> None:
         solve(problem, Indirect())
 
 
+@pytest.mark.parametrize("bounds", [{"lower": 0.1, "upper": np.sqrt(0.5)}, {"lower": np.sqrt(0.5), "upper": 5.0}])
+def test_bounds_at_the_best_horizon_leave_it_as_it_is(bounds: dict[str, float]) -> None:
+    problem, x, u = plant("at its bound", initial=0.0, terminal=1.0, u={"guess": 1.0}, horizon=None)
+    horizon = problem.horizon(**bounds, guess=sum(bounds.values()) / 2)
+    problem.dynamics(x, u)
+    problem.minimize(running=u**2 / 2, terminal=horizon)
+    assert solve(problem, Indirect()).horizon == pytest.approx(np.sqrt(0.5), rel=1e-9)
+
+
 def stiff(shove: float) -> Problem:
     problem, x, u = plant("stiff", size=2, initial=[1.0, 0.0], horizon=10.0)
     problem.dynamics(x, ca.vertcat(x[1], shove * (1 - x[0] ** 2) * x[1] - x[0] + u))

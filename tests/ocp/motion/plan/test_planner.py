@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from models import FixedBase, Joint, Link, Robot
-from ocp import Cost, Limits, Plan, SolveError, TipTask, Unreachable, plan
+from models.examples import paper_example
+from ocp import Candidate, Cost, Limits, Plan, SolveError, TipTask, Unreachable, plan
+from ocp.motion.plan import planner
+from ocp.motion.plan.candidate_solver import CandidateSolver
+from ocp.motion.plan.planner import PlanOptions, checked_request
+from ocp.motion.result.candidate import Reason, Rejection
+from ocp.motion.search.configurations import local_motions_from
 
 SPEED, SECONDS, MOST = 0.4, 1.0, 0.5
 ALONG = TipTask(velocity=(SPEED,), rows=(3,))
@@ -83,3 +90,34 @@ def test_unreachable_tasks_are_reported_with_a_time() -> None:
     with pytest.raises(SolveError, match=r"misses its task by .* m, with '(one|two)' at its limit 0.5 m") as refused:
         plan(slides(), ALONG, 3.0, start=(0.1, 0.2))
     assert (refused.value.limit, refused.value.time) == (pytest.approx(0.5), pytest.approx(3.0))
+
+
+def test_of_each_run_of_a_cell_search_the_motions_of_lowest_cost_are_tried_in_turns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """If all fail, a few of each run at a time, and no more than failures are allowed; the others are reported."""
+    machine, task, start = paper_example(), TipTask(velocity=[-1.0, -1.0], rows=[3, 4], duration=1.0), [0.8, 1.0, -1.0]
+    request = checked_request(machine, task, None, PlanOptions(start=start))
+    most, batch = request.settings.max_failures, request.settings.batch
+    (local,) = local_motions_from(request, np.array([start]))
+    sizes = (most // 2 - 1, most + 3, most - 1, most)
+    costs = [np.arange(100.0, 100.0 + size) + 100 * run for run, size in enumerate(sizes)]
+    runs = [[replace(local.take(np.zeros(len(cost), dtype=np.intp)), cost=cost[::-1])] for cost in costs]
+    tried = list[float]()
+
+    class KnownRuns:
+        def __init__(self, *_: Any) -> None: ...
+
+        def local_motions(self) -> Any:
+            return runs
+
+    def fails(solver: CandidateSolver, candidate: Candidate) -> list[Candidate]:
+        tried.append(candidate.cost)
+        return [candidate.with_rejection(Reason(Rejection.AUDIT, "fails"))]
+
+    monkeypatch.setattr(planner, "CellSearch", KnownRuns)
+    monkeypatch.setattr(CandidateSolver, "advance", fails)
+    with pytest.raises(SolveError, match=rf"3 of \d+ candidates: not tried: the {most} lowest-cost motions"):
+        plan(machine, task, start=start, scene=False)
+    turns = [each[begin : begin + batch] for begin in range(0, most, batch) for each in costs]
+    assert tried[1:] == np.concatenate(turns).tolist()  # after the local motion
