@@ -124,3 +124,11 @@ def test_the_least_point_turns_with_the_polynomial(one: Any, turn: float) -> Non
         least.append(float(f.value(c, s)))
         assert least[-1] <= values(f, np.linspace(-np.pi, np.pi, 2000)).min() + 1e-12 * (1 + np.abs(one).sum())
     assert least[0] == pytest.approx(least[1], abs=1e-11 * (1 + np.abs(one).sum()))
+
+
+@pytest.mark.parametrize("factor", [2.0**400, 2.0**-250])
+def test_the_least_point_of_a_multiple_is_the_same(factor: float) -> None:
+    random = np.random.default_rng(0)
+    for each in random.normal(size=(50, 5)):
+        one, multiple = (numbers([least_point(Harmonics(*(ca.DM(part) for part in k * each)))]) for k in (1.0, factor))
+        np.testing.assert_allclose(multiple, one, rtol=0, atol=1e-14)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from models import FixedBase, Joint, Link, Machine, Robot, planar_chain
 from ocp import IkOptions, ProblemError, TipTask, Unreachable, inverse_kinematics
-from ocp.motion.local.inverse_kinematics import inverse_kinematics_at
+from ocp.motion.local.inverse_kinematics import inverse_kinematics_at, sample_starts
 from ocp.motion.tasks.equations import bind
 from tests.models.robot.trees import seeds
 from tests.ocp.motion.local.arms import build
@@ -141,6 +141,18 @@ def test_a_start_that_is_near_is_kept_and_seeds_repeat() -> None:
     np.testing.assert_allclose(only.joints, UR5_START, atol=1e-8)
     one, other = (inverse_kinematics(ur5(), task, seed=4, starts=8) for _ in range(2))
     np.testing.assert_array_equal([p.joints for p in one], [p.joints for p in other])
+
+
+@pytest.mark.parametrize("limited", ["below", "above", "nowhere"])
+def test_random_starts_of_joints_without_two_limits_are_spread_over_one_turn_within_them(limited: str) -> None:
+    middle, unlimited = np.random.default_rng(3).uniform(-9, 9, 6), np.full(6, np.inf)
+    lower, upper = middle if limited == "below" else -unlimited, middle if limited == "above" else unlimited
+    starts = sample_starts(ur5(), lower, upper, 400, seed=0)
+    assert ((lower <= starts) & (starts <= upper)).all()
+    assert (np.ptp(starts, axis=0) <= 2 * np.pi).all()
+    angles = np.sort(starts, axis=0)
+    gaps = np.diff(np.vstack([angles, angles[:1] + 2 * np.pi]), axis=0)
+    assert gaps.max() < 0.2
 
 
 def test_the_nearest_miss_is_reported_and_pickled() -> None:
