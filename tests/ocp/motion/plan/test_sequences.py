@@ -90,9 +90,9 @@ def test_the_start_of_a_task_is_chosen_for_the_way_to_it_and_the_task_together()
 
 def test_goals_at_which_the_arm_rests_cost_what_their_motions_cost_alone() -> None:
     planned = in_sequence([Goal(joints=AWAY), Goal(joints=HOME, duration=3.0), Goal(joints=AWAY, name="again")])
-    starts, options = (HOME, AWAY, HOME), {"scene": False}
+    starts = HOME, AWAY, HOME
     goals = (Goal(joints=AWAY), Goal(joints=HOME, duration=3.0), Goal(joints=AWAY))
-    alone = [plan(ARM, goal, start=start, **options) for goal, start in zip(goals, starts, strict=True)]
+    alone = [plan(ARM, goal, start=start, scene=False) for goal, start in zip(goals, starts, strict=True)]
     assert planned.cost == pytest.approx(sum(each.cost for each in alone), rel=1e-9)
     assert planned.parts[1].horizon == pytest.approx(3.0)
     assert planned.phases == ("goal 1", "goal 2", "again")
