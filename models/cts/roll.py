@@ -238,7 +238,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
 
 
 def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
-    """Return four approximate roll angles, as (cos, sin), at which joint 2 has a given cosine for a fixed target.
+    """Return four approximate roll angles of a target, as (cos, sin), at which the cosine of joint angle 2 is given.
 
     They are roots of the squared equation cos q2 = `cosine`. The squared equation is smooth near a stretched pitch
     link, where cos q2 is not; near yaw 0 it has nearly double roots, where cos q2 has simple ones.

@@ -428,7 +428,7 @@ def parameter(coefficients: Array, start: Array, width: Array, *, length: Array,
 
 
 def arc_length(coefficients: Array, u: Array) -> Array:
-    """Return the arc length of a curve, shape (6, 3), from u = 0 to parameters u. Shapes (M,) to (M,), m."""
+    """Return the arc lengths (M,), m, of a curve with coefficients (6, 3) from its start to the parameters u (M,)."""
     curve = coefficients[None]
     parts = cells(curve)
     index = np.clip(np.searchsorted(parts.start, u, side="right") - 1, 0, len(parts.start) - 1)

@@ -226,7 +226,7 @@ class StoppedGradients:
         return self._symbols[-1]
 
     def restore(self, expressions: list[Expression]) -> list[Expression]:
-        """Return the expressions with the original values in place of the symbols."""
+        """Return expressions in which the values that symbols had replaced are restored."""
         return list(ca.substitute_inplace(self._symbols, self._values, expressions)[1])
 
 

@@ -293,7 +293,7 @@ def audit(
 
 
 def horizon_finding(form: Formulation, solution: Solution, bounds: Bounds) -> Finding:
-    """Return the finding about the difference of a plan's horizon and last time from the declared horizon."""
+    """Return the finding on whether a plan's horizon and its last time agree with the declared horizon."""
     low, high = (float(side[form.bounds.places["horizon"][0]]) for side in bounds)
     miss = max(low - solution.horizon, solution.horizon - high, abs(float(solution.t[-1]) - solution.horizon))
     declared = f"{low:.6g} s" if low == high else f"{low:.6g} to {high:.6g} s"

@@ -291,7 +291,7 @@ class _Search:
         return Clearance(self.apart.name, tuple(closest), settled, checked, reason, self.apart.assumed)
 
     def _reason(self, pair: np.ndarray, block: np.ndarray, level: int) -> str:
-        """Return how the prescribed motion of a body prevents sufficient distance bounds; "" if it does not."""
+        """Return why a prescribed motion keeps distance bounds from proving the clearance; "" if it does not."""
         begin, end = (self._fraction(block + k, level) * self.track.horizon for k in (0, 1))
         if self.track.prescribed is None:
             return ""

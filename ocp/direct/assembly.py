@@ -334,7 +334,7 @@ class Derivatives(NamedTuple):
 
 
 def assemble(transcription: Transcription, parameters: int, functions: Sequence[Derivatives] | None = None) -> Program:
-    """Assemble the nonlinear program of a transcription from its blocks' derivatives, computed unless given.
+    """Assemble the nonlinear program of a transcription from the derivatives of its blocks of cost and constraints.
 
     Raises:
         TimeLimitReached: The time limit is over.

@@ -197,7 +197,7 @@ class Prepared:
     def _solve(
         self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, shift: int
     ) -> Solution:
-        """Solve by Newton steps near a known plan, or from the guess, other initial points and the elastic plan."""
+        """Solve by Newton steps near a known plan, else from the guess, other points or a relaxed problem."""
         form, transcription = self.formulation, self.transcription
         p = form.parameter_vector(require.mapping("parameters", parameters))
         bounds = form.bound_values(p)

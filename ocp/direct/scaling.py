@@ -317,7 +317,7 @@ def _evaluate(function: Callable[..., Any], point: np.ndarray, p: np.ndarray) ->
 
 
 class PredeterminedVariables:
-    """Variables of a program that the initial state determines for all controls, and the limits of these variables.
+    """Variables of a nonlinear program that the initial state determines whatever the controls are, and their limits.
 
     Variables that are joined to a fixed variable, as the end of the last interval is to a fixed end, are known too.
     """

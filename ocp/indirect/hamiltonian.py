@@ -116,7 +116,7 @@ class Hamiltonian:
         return mu
 
     def _eliminate(self, name: str, outputs: list[Any]) -> Any:
-        """Return the CasADi Function of expressions at the controls and multipliers that minimise the Hamiltonian."""
+        """Return a CasADi Function that evaluates expressions at the minimum of the Hamiltonian over the controls."""
         form = self.form
         sym = form.sym
         w, bang = sym("w", self.sizes[-1]), sym("bang", self.sizes[-2])

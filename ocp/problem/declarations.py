@@ -254,7 +254,7 @@ class Declarations:
                 _require(isinstance(variable.unit, str), what)
 
     def _check_equations(self, symbols: Any) -> None:
-        """Check sizes and types of the dynamics, the symbols of start values, the signals and the cost."""
+        """Check sizes and types of dynamics, signals and cost, and that start values have permitted symbols only."""
         for name, rate in self.dynamics.items():
             _require(name in self.states, f"dynamics of {name!r}")
             _require_columns(symbols, self.states[name].size, f"dynamics of {name!r}", rate)

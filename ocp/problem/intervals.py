@@ -186,7 +186,7 @@ def _absolute(x: Interval) -> Interval:
 def _increasing_rule(
     function: Callable[[Any], Any], low: float = -np.inf, high: float = np.inf
 ) -> Callable[..., Interval]:
-    """Return the interval rule of an increasing function with the domain from `low` to `high`."""
+    """Return the interval extension of an increasing function that is defined from `low` to `high`."""
 
     def rule(x: Interval) -> Interval:
         inside = _clamp(x, low, high)

@@ -76,7 +76,7 @@ class FunctionWriter:
         return self._register(key, len(self.records) - 1)
 
     def _forwarded_to(self, record: dict[str, Any]) -> int | None:
-        """Return the number of the function to which a record merely passes its arguments on; else None.
+        """Return the number of the function that a recorded function merely calls with its own arguments, or None.
 
         Without this check, each save of a loaded problem would wrap its tables in one more function.
         """

@@ -81,7 +81,7 @@ class Motion(NamedTuple):
         return np.asarray((self.turn @ vectors[:, :, None])[:, :, 0])
 
     def at(self, points: Array) -> Array:
-        """Transform points (M, 3) by the motions."""
+        """Return points (M, 3) after each of these rigid-body transformations."""
         return self.rotate(points) + self.shift
 
     @property

@@ -389,7 +389,7 @@ def _inverses(matrices: Array) -> Array:
 
 
 def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpening) -> _Candidates:
-    """Return candidate IK solutions from the real eigenvalues of one opening of the kinematic loop."""
+    """Return candidate IK solutions of the loop cut at one joint, from real eigenvalues of the resulting problem."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)
     matrices = _matrices(singular_vectors[:, :, opening.rank :], remaining, opening.roles)

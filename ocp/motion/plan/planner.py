@@ -133,7 +133,7 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
 
 
 def candidates_from(solver: CandidateSolver, motions: Sequence[LocalMotion], **options: bool) -> list[Candidate]:
-    """Return candidates with local motions as guesses: those that satisfy the tasks first, then by rising cost.
+    """Return candidates whose guesses are tracked motions, those that satisfy the tasks first, then sorted by cost.
 
     The cost includes that of the approach from the configuration `near` of the request.
 
@@ -272,7 +272,7 @@ def _search_cells(
 
 
 def _try_alternatives(queue: CandidateQueue, solver: CandidateSolver, seeds: list[Candidate]) -> None:
-    """Solve candidates in collision again with separated bodies, and from fixed, collision-free starts.
+    """Solve candidates that collide once more: with bodies separated, and with the start fixed where it is clear.
 
     Without obstacles, free starts slide along their self-motion into one motion, whatever their clearance. Their local
     motions belong to different homotopy classes; those without collision, or with the least, come first. A free start

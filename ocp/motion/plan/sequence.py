@@ -90,7 +90,7 @@ class _State(NamedTuple):
 
 
 def _velocity(rates: Array, smooth: bool) -> Any:
-    """Return the joint velocity at a junction: "rest" if it is zero, or if rates may jump."""
+    """Return the joint velocity at a junction of two motions; "rest" if it is zero or velocities may jump there."""
     return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
 
 

@@ -341,7 +341,7 @@ class _WaypointPlanner:
         return SectionSearch(*arguments, **options, **sections, joint=joint)
 
     def _dead_end_error(self, search: AtlasSearch) -> SolveError:
-        """Return the error that says at which waypoint all paths end, even if the search skipped this waypoint."""
+        """Return the error that names the first waypoint that no path reaches, which the search may have skipped."""
         error, chosen = dead_end(search, WAYPOINT), search.times.astype(int)
         if error is None:
             return SolveError("no path goes through the waypoints", name="waypoints")

@@ -139,7 +139,7 @@ def declared_motion(
     actuation: Actuation | None = None,
     relaxed: bool = False,
 ) -> ToolMotion:
-    """Declare the optimal control problem of a request, and store in the problem how to declare it again.
+    """Declare the optimal control problem of a request, and store the request in it, so that files can rebuild it.
 
     Args:
         request: The request.

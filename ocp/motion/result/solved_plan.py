@@ -363,7 +363,7 @@ class PhasedPlan(SolvedPlan):
         return {**super().arrays(path), PHASED: np.ones(1)}
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return an empty list, because the phases of one problem are not evaluated separately."""
+        """Return the separately solved parts of the plan: none, because its phases are solved as one problem."""
         return []
 
     def _check_parts(self) -> None:

@@ -328,7 +328,7 @@ class _Constraints:
         return main, self._spread([g[0] * pulled[1], g[1] * pulled[2]]), self._spread([g[0] * pulled[2]])
 
     def _coefficients(self, b: Array) -> list[Array]:
-        """Return, for each limit of the motion, the three spline coefficients of its interval of the path."""
+        """Return, for each limit constraint, the three spline coefficients of the interval in which it holds."""
         return [b[k : self.count + k].take(self.row_interval) for k in range(3)]
 
     def _all_values(self, b: Array, rows: Array) -> Array:

@@ -204,7 +204,7 @@ def fix_ignorable_joints(request: PlanRequest, configurations: Array) -> tuple[A
 
 
 def move_aside(whole: PlanRequest, request: PlanRequest, error: SolveError) -> PlanRequest | None:
-    """Return a request whose held joints are at positions where they do not cause the collision of a given error.
+    """Return a planning request whose joints at rest are moved so that they do not cause the collision in an error.
 
     Args:
         whole: Request before joints were held.

@@ -66,7 +66,7 @@ class Segment(NamedTuple):
 def fewest_segments(
     search: AtlasSearch, gap: int = 1, barred: Collection[Span] = (), settings: SegmentSettings = SegmentSettings()
 ) -> tuple[list[Segment], float] | None:
-    """Cover all time samples by the fewest segments, at least cost; return the segments and a lower cost bound.
+    """Cover all time samples by as few segments as possible at minimum cost; return them and a lower bound of the cost.
 
     Args:
         gap: Samples from the end of a segment to the start of the next one: 1, or 0 if the samples stand for a
@@ -261,7 +261,7 @@ class SectionSearch(AtlasSearch):
     """Search for paths on sections of the self-motion manifolds; on each section, one joint has a fixed position."""
 
     def __init__(self, *args: Any, joint: int, values: Array, radius: float, charts: int, **options: Any) -> None:
-        """Build the charts of all sections of the self-motion manifolds at all time samples.
+        """Build charts of the self-motion manifolds cut at fixed values of a joint, at all time samples.
 
         Args:
             args, options: As in `AtlasSearch`; all samples must belong to one `SelfMotionManifolds` of dimension two.

@@ -190,7 +190,7 @@ class ChartGraph:
     def _propagate(
         self, k: int, neighbour: int, after: QuadraticBounds, known_bounds: QuadraticBounds | None, max_cost: float
     ) -> QuadraticBounds:
-        """Return lower cost bounds on the charts of time sample `k`, from the bounds `after` on a neighbouring sample.
+        """Return lower bounds of the cost on the charts of time sample `k` from those, `after`, of the adjacent sample.
 
         With `known_bounds` of the other part of the motions, those that cost `max_cost` or more are left out.
         """

@@ -215,7 +215,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return numbers that identify task equations in error messages: twist components if there is a single task."""
+    """Return the numbers of task equations in error messages: twist components of a single task, else positions."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)

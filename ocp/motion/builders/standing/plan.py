@@ -77,7 +77,7 @@ PACE = PaceSettings()
 def guess_in_time(
     steps: Steps, start: Any, step_options: Mapping[str, Any], options: Mapping[str, Any]
 ) -> dict[str, Any] | None:
-    """Solve for footsteps in their requested durations on a coarse mesh, as initial guess; return None on failure.
+    """Solve the motion of footsteps with the requested durations on a coarse mesh, for a guess; return None on failure.
 
     Args:
         step_options: Cost and limits of steps_problem.
