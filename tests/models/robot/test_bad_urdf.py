@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
 
-from models import ModelError, Robot, named_states
+from models import ModelError, Robot, expand_xacro, named_states
 from tests.bad_values import (
     CHOICE,
     INSTANCE,
@@ -69,6 +71,15 @@ STATES = Case(
     {"srdf": "<robot/>", "robot": Robot.from_urdf(URDF)},
     {"srdf": {name: bad for name, bad in SOURCE.items() if name != "no link"}, "robot": INSTANCE},
 )
+
+
+def expanded(**options: Any) -> str:
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "arm.xacro").write_text(URDF)
+        return expand_xacro(**{"file": Path(folder) / "arm.xacro", **options})
+
+
+XACRO = Case("expand_xacro", expanded, {}, {"file": {k: v for k, v in SOURCE.items() if k != "no link"}})
 TEXTS = {
     "two limits": (LIMIT, LIMIT * 2),
     "two origins": (ORIGIN, ORIGIN * 2),
@@ -113,12 +124,12 @@ TEXTS = {
 }
 
 
-@pytest.mark.parametrize("case", good_calls([OPTIONS, STATES]))
+@pytest.mark.parametrize("case", good_calls([OPTIONS, STATES, XACRO]))
 def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 
-@pytest.mark.parametrize(("case", "argument"), panel([OPTIONS, STATES]))
+@pytest.mark.parametrize(("case", "argument"), panel([OPTIONS, STATES, XACRO]))
 def test_bad_options_are_refused_by_name(case: Case, argument: str) -> None:
     assert_refused(case, argument)
 

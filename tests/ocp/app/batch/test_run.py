@@ -102,6 +102,7 @@ def test_plans_are_kept_as_files_and_problems_are_prepared_once_in_a_worker(tmp_
     assert len(distinct) <= 2 * len({value["process"] for value in matches}) <= 4
 
 
+@pytest.mark.long
 def test_tasks_begin_from_the_results_of_neighbours_the_same_whoever_does_them(
     tmp_path: Path, here: Any, pair: Any
 ) -> None:

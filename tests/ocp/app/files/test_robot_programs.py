@@ -283,7 +283,7 @@ def test_motions_without_a_program_are_refused_by_name(tmp_path: Path) -> None:
 # ---- the command ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["krl", "rapid"])
+@pytest.mark.parametrize("kind", [pytest.param("krl", marks=pytest.mark.long), "rapid"])
 def test_an_exported_program_passes_the_check(kind: str, tmp_path: Path, capsys: Any) -> None:
     folder, file = planned(), tmp_path / f"seam{SUFFIX[kind]}"
     status, _, err = run(capsys, "export", folder / "seam.npz", file, "--period", 0.02)

@@ -224,6 +224,7 @@ def test_contradictory_goals_are_refused_at_construction(fields: dict[str, Any],
     assert caught.value.name == name
 
 
+@pytest.mark.long
 def test_power_limits_slow_the_fastest_motion_down_and_are_kept() -> None:
     """Large powers make no difference; the smaller they are, the longer the motion lasts."""
     goal, times = Goal(joints=END), list[float]()

@@ -92,6 +92,7 @@ def test_a_path_meets_its_poses_and_costs_no_more_than_with_the_lift_fixed() -> 
         assert result.cost <= held.cost * (1 + 1e-6)
 
 
+@pytest.mark.long
 def test_poses_out_of_reach_at_a_fixed_height_are_reached_by_lifting() -> None:
     machine, count = problem_of("fetch__square").machine, 40
     places = np.column_stack([np.full(count, 0.75), np.zeros(count), np.linspace(0.2, 1.4, count)])
