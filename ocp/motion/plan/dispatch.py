@@ -173,7 +173,9 @@ def _plan(
         _check_unused("a motion to goals", cyclic=cyclic or None)
         if len(goals) == 1:
             return plan_goal(machine, goals[0], horizon, own_options, constraints=constraints)
-        if isinstance(machine, FixedBase) and horizon in (None, "free") and _are_separate(goals):
+        moving = constraints is not None and constraints.scene.has_moving_obstacles
+        is_open = horizon is None or (isinstance(horizon, str) and horizon == "free")
+        if isinstance(machine, FixedBase) and is_open and not moving and _are_separate(goals):
             own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
             return plan_consecutive(own, goals)
         return plan_sequence(machine, goals, horizon, own_options, constraints=constraints)

@@ -112,9 +112,13 @@ def _check_request(request: GoalRequest) -> GoalTask:
         except ProblemError as error:
             errors.append(error)
     clear = motions.are_clear(np.array(within), np.array(within)) if within else np.zeros(0, dtype=bool)
-    kept = [joints for joints, is_clear in zip(within, clear.tolist(), strict=True) if is_clear]
-    if not kept and within:
-        errors = [_collision(scene, "goal", motions.collisions(within[0])[0])]
+    kept = []
+    for joints, is_clear in zip(within, clear.tolist(), strict=True):
+        collisions = [] if is_clear else motions.collisions(joints)  # without a proof it may be clear all the same
+        if collisions:
+            errors.append(_collision(scene, "goal", collisions[0]))
+        else:
+            kept.append(joints)
     if not kept:
         raise errors[0]
     turned = np.array(

@@ -192,7 +192,8 @@ class _Sequence:
         rests = _rests(checked) if request.smooth else (False, False)
         checked = replace(checked, clearance_constraints=self._constraints(), rests=rests)
         if options["start"] is None and near is not None:
-            checked = replace(checked, near=near)
+            if request.search != "global":  # its bound is that of the task alone
+                checked = replace(checked, near=near)
             idle = bind(machine, checked.tasks).idle
             names = np.array(machine.robot.joint_names)[idle].tolist()
             checked = checked.with_held(dict(zip(names, near[idle].tolist(), strict=True)))
