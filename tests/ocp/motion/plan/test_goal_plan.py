@@ -269,3 +269,16 @@ def test_a_goal_among_many_that_collide_is_reached() -> None:
     goals = np.vstack([behind, [[-1.0, 2.0]]])
     plan = plan_to_goal(request_of(wall, goals=goals, cost=Cost(velocity=0.0, length=1.0)))
     np.testing.assert_allclose(sampled(plan)[-1], goals[-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("beyond", [-1e-6, -1e-9, -1e-12, 0.0, 1e-12, 1e-9, 1e-6])
+def test_a_goal_at_the_required_clearance_is_reached_or_refused_by_name(beyond: float) -> None:
+    """No proof of clearance succeeds where bodies touch; the measured distance decides."""
+    goal, plan, name = np.array([0.0, 0.7 + RADIUS + beyond]), None, None
+    try:
+        plan = plan_to_goal(request_of(BOX, goals=goal, cost=Cost(velocity=0.0, length=1.0), time_limit=4.0))
+    except (ProblemError, SolveError) as error:
+        name = error.name
+    assert name is not None if plan is None else beyond > -1e-6
+    if plan is not None:
+        np.testing.assert_allclose(sampled(plan)[-1], goal, atol=1e-9)

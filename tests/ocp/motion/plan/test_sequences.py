@@ -19,6 +19,7 @@ from models.paths import rest_to_rest
 from ocp import Goal, Limits, Plan, ProblemError, Scene, TipTask, Unreachable, Waypoints, plan
 from ocp.motion.result.segmented_plan import SequencePlan
 from ocp.motion.tasks.equations import task_errors
+from tests.ocp.motion.sampling.sliders import slider
 
 ARM = FixedBase(planar_chain([0.5, 0.4, 0.3], [2.0, 1.5, 1.0]))
 HOME, AWAY = np.array([0.3, 0.8, 0.4]), np.array([1.0, 0.5, -0.3])
@@ -98,6 +99,10 @@ def test_goals_at_which_the_arm_rests_cost_what_their_motions_cost_alone() -> No
     assert planned.phases == ("goal 1", "goal 2", "again")
     passing = [Goal(joints=AWAY, velocity="free", duration=1.0), Goal(joints=HOME, duration=1.0)]
     assert not isinstance(plan(ARM, passing, start=HOME, scene=False), SequencePlan)
+    timed = [Goal(joints=[0.1, 0.0], duration=1.0), Goal(joints=[0.0, 0.0], duration=1.0)]
+    among_moving = plan(slider(), timed, start=[0.0, 0.0], scene=MOVING)  # whose obstacle needs one clock
+    assert not isinstance(among_moving, SequencePlan)
+    assert among_moving.audit().feasible
 
 
 def test_a_goal_at_the_start_of_the_seam_takes_its_configuration() -> None:
