@@ -114,8 +114,8 @@ def mount_on_rail(
         velocity: Speed limit, m/s.
         name: Name of the new root link.
     """
-    link, limits = Link(name), {"lower": lower, "upper": upper, "velocity": velocity}
-    rail = Joint(f"{name}_joint", "prismatic", name, _robot(robot).root, axis=axis, **limits)
+    link, root = Link(name), _robot(robot).root
+    rail = Joint(f"{name}_joint", "prismatic", name, root, axis=axis, lower=lower, upper=upper, velocity=velocity)
     return replace(robot, links=(link, *robot.links), joints=(rail, *robot.joints))
 
 
