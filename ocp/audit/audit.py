@@ -140,12 +140,11 @@ class Audit:
             where = "" if worst.time is None else f" at {worst.time:.4g} s"
             return f"must not be run: {worst.name} is {worst.value:.3g}{where}, {worst.limit:.3g} allowed"
         if self.optimal is None:
-            return f"may be run; whether it is a local minimum is not decided: {self.undecided}"
+            return f"may be run; whether a better motion is nearby is undetermined: {self.undecided}"
         if not self.optimal:
             worst = next(f for f in self.failures if f.verdict == "optimal")
             return f"may be run, but is no local minimum: {worst.name} is {worst.value:.3g}, {worst.limit:.3g} allowed"
-        share = self[COST_LOST].value
-        return f"may be run; a local minimum; at most {share:.2g} of its cost above that of the nearest extremal"
+        return "may be run; no better motion is nearby (a local minimum, certified to second order)"
 
     def __repr__(self) -> str:
         return f"<Audit of {self.name!r}: {self._word}; {len(self.findings)} findings, {len(self.failures)} failed>"

@@ -144,7 +144,7 @@ def test_a_report_stands_alone(capsys: Any) -> None:
     assert "url(http" not in text
     assert "@import" not in text
     assert "Seam &lt;4&gt;" in text
-    assert "may be run; a local minimum" in text
+    assert "may be run; no better motion is nearby" in text
     assert "integration error, relative" in text
     assert len(text) < 2_000_000
 
