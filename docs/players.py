@@ -18,15 +18,31 @@ __all__ = ["command", "setup"]
 
 ROOT = Path(__file__).resolve().parents[1]
 PLANS = ROOT / "results" / "gallery"
+GALLERY = ROOT / "docs" / "gallery.md"
 FOLDER = "players"
 NOT_PASSED = 1
 """Exit status where the audit of what is shown does not pass, which its page says."""
 
 
+def title(name: str) -> str:
+    """Title of the player of a plan: the heading of its entry in the gallery.
+
+    Raises:
+        ValueError: The gallery does not show the plan.
+    """
+    heading = ""
+    for line in GALLERY.read_text(encoding="utf-8").splitlines():
+        if line.startswith("## "):
+            heading = line[3:]
+        if line == f"```{{player}} {name}":
+            return heading
+    raise ValueError(f"{GALLERY} does not show {name}")
+
+
 def command(plan: Path, file: Path) -> list[str]:
     """What writes the page of a plan, and of what it is compared with."""
     beside = plan.with_name(f"{plan.stem}.local.csv")
-    names = ["--name", "plan"]
+    names = ["--title", title(plan.stem), "--name", "plan"]
     if beside.exists():
         names += ["--name", "local resolution"]
     motions = [str(plan), *([str(beside)] if beside.exists() else [])]
@@ -44,8 +60,9 @@ class Player(Directive):  # type: ignore[misc]
             raise self.error(f"there is no plan {name} in {PLANS}")
         depth = self.state.document.settings.env.docname.count("/")
         page = f"{'../' * depth}{FOLDER}/{name}.html"
-        frame = f'<iframe class="player" src="{page}" title="{name}" loading="lazy"></iframe>'
-        return [nodes.raw("", f'{frame}\n<p><a href="{page}">{name}, on a page of its own</a></p>', format="html")]
+        frame = f'<iframe class="player" src="{page}" title="{title(name)}" loading="lazy"></iframe>'
+        link = f'<p><a href="{page}">{title(name)}: the player on a page of its own</a></p>'
+        return [nodes.raw("", f"{frame}\n{link}", format="html")]
 
 
 def setup(app: Any) -> dict[str, bool]:
