@@ -429,14 +429,14 @@ def test_the_table_shows_every_finding_under_its_verdict() -> None:
             assert line == line.rstrip()
         at += 1 + len(findings)
     assert len(lines) == at + 1
-    assert lines[-1].startswith("The plan may be run; a local minimum; at most ")
+    assert lines[-1].startswith("The plan may be run; no better motion is near it")
     assert "reported 1.047" in str(audit)
 
 
 @pytest.mark.parametrize(
     ("how", "marked", "titles", "sentence"),
     [
-        (lambda s: s.audit(), set(), ("yes", "yes"), "may be run; a local minimum; at most"),
+        (lambda s: s.audit(), set(), ("yes", "yes"), "may be run; no better motion is near it"),
         (
             lambda s: replace(s, success=False, status=SolverStatus.RESTORATION_FAILED).audit(),
             set(),
