@@ -98,7 +98,8 @@ def plan(
             "segments": as "global"; if no single motion does the tasks, in the fewest segments, between which an arm on
             a fixed base moves to another configuration while the tasks wait.
         seed: Seed of all random numbers.
-        time_limit: Seconds after which planning ends with a SolveError; None for no limit.
+        time_limit: Seconds after which planning ends with a SolveError. None: no limit while motions are found,
+            but if all motions fail, planning along tasks ends after about 20 s.
         progress: Function that is called with the name of each stage; True: a line shows it; False: nothing is shown;
             None: a line after two seconds on a terminal or in a notebook.
 
