@@ -170,7 +170,7 @@ seam.toml:
   tip = "tool0"
   [path]
   points = [[0.4, -0.2, 0.3], [0.4, 0.2, 0.3]]    # m; or file = "seam.csv"
-  speed = 0.05                                    # m/s
+  speed = 0.05                                    # m/s; starts and ends at rest
   direction = [0, 0, -1]                          # of the tool's z axis; its roll is free
   [[obstacle]]
   shape = "halfspace"
@@ -179,7 +179,14 @@ seam.toml:
   [output]
   plan = "seam.npz"
   csv = "seam.csv"
-  report = "seam.html\""""
+  report = "seam.html"
+
+A motion to a goal has in place of [path]:
+  [goal]
+  position = [0.5, 0.1, 0.3]                      # m; or joints = { elbow_joint = 1.2, ... }
+  direction = [0, 0, -1]
+  [search]
+  start = { shoulder_pan_joint = 0.0, ... }       # all joints, rad or m"""
 EXPORT = """Write a plan in the format of the file's suffix: .csv, .json and .yaml (the fields of a ROS 2
 JointTrajectory), .mcap (joint states and the tip's path, for ROS 2 and Foxglove), .script, .src and .mod (programs in
 URScript of Universal Robots, KRL of KUKA and RAPID of ABB), .urdf (the robot of the plan).
@@ -242,7 +249,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
             "missing='skip'": '[scene] meshes = "skip"',
             "folders=[": "[scene] folders = [",
             "search='segments'": '[search] kind = "segments"',
-            "horizon='free'": '[search] pace = "free"',
+            "horizon='free'": '[search] horizon = "free"',
         }
     )
     _file(plan, "task", "TOML file")

@@ -23,7 +23,8 @@ from ocp.app.check.verdict import CheckTolerances, Interpretation, check_traject
 from ocp.app.files import RawTrajectory, read_trajectory, read_waypoints, write_mcap, write_robot_program
 from ocp.app.files.exchange import ROBOT_LANGUAGES
 from ocp.app.files.safe_files import MARK, SUFFIXES, checked_output, missing_package
-from ocp.app.files.task_file import Task, read_obstacles, read_task
+from ocp.app.files.settings import read_obstacles
+from ocp.app.files.task_file import Task, read_task
 from ocp.console import Progress
 from ocp.errors import ProblemError, require
 from ocp.motion.plan import Plan, plan
@@ -279,7 +280,7 @@ def run_task(
 
     for kind, file in outputs.items():  # check the outputs before the user waits for the plan
         checked(kind, file)
-    result = plan(task.machine, task.task, **task.options, progress=progress)
+    result = plan(task.machine, task.tasks, **task.options, progress=progress)
     check_period(result, task.period)
     progress("audit")
     audit = result.audit()
@@ -301,7 +302,7 @@ def run_task(
         **_segments(result),
         "written": {kind: str(file) for kind, file in outputs.items()},
     }
-    return (0 if audit.passed else 1), "\n".join(lines), data
+    return (0 if audit.feasible else 1), "\n".join(lines), data
 
 
 def _segments(result: Plan) -> dict[str, Any]:

@@ -74,6 +74,7 @@ class Audit:
         name: Name of the problem.
         findings: Results of the checks, one for every check.
         undecided: Why it is undetermined whether the plan is a local minimum, or "".
+        remarks: What whoever runs the plan should know, although it changes no verdict.
         constraints: Largest violation of every bound and constraint on the fine grid by name; 0 if it is satisfied.
         integration_error: Largest difference of the plan's states from the re-integrated ones over the whole horizon,
             relative to the size of each state.
@@ -97,6 +98,7 @@ class Audit:
     controls: dict[str, np.ndarray] = field(default_factory=dict)
     clearances: dict[str, Clearance] = field(default_factory=dict)
     optimality: Optimality = field(default=None)  # type: ignore[assignment]
+    remarks: tuple[str, ...] = ()
 
     @property
     def feasible(self) -> bool:
@@ -135,16 +137,20 @@ class Audit:
     @property
     def sentence(self) -> str:
         """Verdict of the audit in words that complete a sentence which begins with "The plan"."""
+        return "; ".join([self._verdict, *self.remarks])
+
+    @property
+    def _verdict(self) -> str:
         if not self.feasible:
             worst = next(f for f in self.failures if f.verdict == "feasible")
             where = "" if worst.time is None else f" at {worst.time:.4g} s"
             return f"must not be run: {worst.name} is {worst.value:.3g}{where}, {worst.limit:.3g} allowed"
         if self.optimal is None:
-            return f"may be run; whether a better motion is nearby is undetermined: {self.undecided}"
+            return f"may be run; whether it is a local minimum is not decided: {self.undecided}"
         if not self.optimal:
             worst = next(f for f in self.failures if f.verdict == "optimal")
             return f"may be run, but is no local minimum: {worst.name} is {worst.value:.3g}, {worst.limit:.3g} allowed"
-        return "may be run; no better motion is nearby (a local minimum, certified to second order)"
+        return "may be run; no better motion is near it (certified to second order)"
 
     def __repr__(self) -> str:
         return f"<Audit of {self.name!r}: {self._word}; {len(self.findings)} findings, {len(self.failures)} failed>"

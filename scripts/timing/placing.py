@@ -20,7 +20,7 @@ def placed(task: Any) -> Plan:
     """A seam of 0.2 m that begins at x, y (m), with the tool pointing down and its roll free."""
     corners = [(task["x"], task["y"], 0.3), (task["x"], task["y"] + 0.2, 0.3)]
     path = smooth(Path.through(corners), deviation=0.002)
-    return plan(cached(arm, "ur5"), TipTask.along(path, 0.05, direction=(0.0, 0.0, -1.0)), search="start")
+    return plan(cached(arm, "ur5"), TipTask.along(path, 0.05, steady=True, direction=(0.0, 0.0, -1.0)), search="start")
 
 
 def nothing(task: Any) -> float:

@@ -32,7 +32,7 @@ def raster(lanes: int, length: float, width: float) -> Array:
 def lanes(count: int, length: float, width: float, **options: Any) -> TipTask:
     """Lanes with corners rounded to 2 mm, the tool pointing down."""
     path = smooth(models.Path.through(raster(count, length, width)), deviation=0.002)
-    return TipTask.along(path, SPEED, direction=(0.0, 0.0, -1.0), **options)
+    return TipTask.along(path, SPEED, steady=True, direction=(0.0, 0.0, -1.0), **options)
 
 
 def poses() -> TipTask:
@@ -41,7 +41,7 @@ def poses() -> TipTask:
     cosine, sine = np.cos(0.2), np.sin(0.2)
     down, tilted, rolled = (0.0, 1.0, 0.0, 0.0), (-sine, cosine, 0.0, 0.0), (0.0, cosine, sine, 0.0)
     path = smooth(models.Path.through(points, [down, rolled, tilted, down]), deviation=0.005)
-    return TipTask.along(path, 0.1, roll="given")
+    return TipTask.along(path, 0.1, steady=True, roll="given")
 
 
 def in_space(robot: Robot) -> tuple[Machine, TipTask, Array]:
@@ -51,7 +51,7 @@ def in_space(robot: Robot) -> tuple[Machine, TipTask, Array]:
     at = np.array(models.tip_pose(robot, start).position, dtype=float).ravel()
     corners = at + np.array([(0, 0, 0), (0, 0.1, 0.02), (0.06, 0.12, 0.05)])
     path = smooth(models.Path.through(corners), deviation=0.003)
-    return machine, TipTask.along(path, 0.01), start
+    return machine, TipTask.along(path, 0.01, steady=True), start
 
 
 CASES: dict[str, Callable[[], tuple[Machine, TipTask, Array | None]]] = {

@@ -30,7 +30,12 @@ def test_paths_tasks_and_scenes_are_printed_on_a_few_lines() -> None:
     assert "99 segments and 98" in printed(rounded)
     timed = schedule(rounded, LineLimits(0.05, 1.0, 20.0))
     box = Box((0.1, 0.1, 0.1), (1.0, 1.0, 1.0))
-    shown = [machine, TipTask.along(rounded, 0.05, direction=(0, 0, -1)), timed, timed.at(np.linspace(0, 1, 500))]
+    shown = [
+        machine,
+        TipTask.along(rounded, 0.05, steady=True, direction=(0, 0, -1)),
+        timed,
+        timed.at(np.linspace(0, 1, 500)),
+    ]
     shown += [
         Goal(position=(0.3, 0.5, 0.35)),
         Limits(acceleration=3.0),

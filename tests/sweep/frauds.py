@@ -134,7 +134,9 @@ def arm(fast: float = 10.0) -> Problem:
     robot = Robot.from_urdf(urdf, tip="panda_hand_tcp", lock={"panda_finger_joint1": 0.02})
     start = np.array([0.0, -0.6, 0.1, -2.2, 0.2, 1.7, 0.7])
     begin = np.array(ca.DM(FixedBase(robot).tip_pose(np.zeros(0), start).position)).ravel()
-    task = TipTask.along(smooth(Line.through([begin, begin + np.array([0.1, 0.12, -0.06])]), deviation=1e-3), 0.1)
+    task = TipTask.along(
+        smooth(Line.through([begin, begin + np.array([0.1, 0.12, -0.06])]), deviation=1e-3), 0.1, steady=True
+    )
     request: dict[str, Any] = {"start": start, "horizon": task.duration}
     return minimum_velocity_problem(FixedBase(robot), tasks=task, **request)
 
@@ -147,7 +149,7 @@ def gantry(fast: float = 10.0) -> Problem:
         for k, axis in enumerate([(1, 0, 0), (0, 1, 0), (1, 0, 0), (0, 0, 1)])
     ]
     machine = FixedBase(Robot(tuple(Link(name, mass=1.0) for name in names), tuple(joints), tip="tool"))
-    task = TipTask.along(smooth(Line.through([(0, 0, 0), (10, 2, 0)]), deviation=1e-3), 1.0, gain=0.0)
+    task = TipTask.along(smooth(Line.through([(0, 0, 0), (10, 2, 0)]), deviation=1e-3), 1.0, steady=True, gain=0.0)
     return minimum_velocity_problem(machine, tasks=task, start=np.zeros(4), horizon=task.duration)
 
 

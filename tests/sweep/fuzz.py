@@ -43,7 +43,8 @@ from models.shapes.pairs import checked_pairs
 from ocp import AuditError, Collocation, Plan, Problem, ProblemError, Scene, Solution, SolveError, TipTask, plan, solve
 from ocp.app.files import read_gcode, read_trajectory, read_waypoints, write_robot_program
 from ocp.app.files.exchange import DEFINITIONS, STATE
-from ocp.app.files.task_file import read_obstacles, read_task
+from ocp.app.files.settings import read_obstacles
+from ocp.app.files.task_file import read_task
 from ocp.motion.schedule import JointTrajectory
 from tests.ocp.app.motions import NAMES, URDF, smooth
 from tests.ocp.motion.plan.test_path_plan import path

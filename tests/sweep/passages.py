@@ -31,6 +31,8 @@ COUNTS = {"pose": 20, "place": 20, "beyond": 10}
 of both by turns that lead out of reach."""
 BEYOND, SOON = 4.0, 10.0
 """m out of reach, and s of processor time until that is said."""
+PATIENCE = 300.0
+"""s, for a path that can be done. Without a limit, planning ends after 20 s if all motions fail."""
 SECONDS = 5.0
 LOSS = 30.0
 """Factor of manipulability that the pseudo-inverse loses."""
@@ -134,7 +136,7 @@ def result(kind: str, seed: int) -> Row:
     beyond = kind == "beyond"
     task = passage(seed if beyond else 2 * seed + (kind == "place"), BEYOND * beyond)
     begun = time.process_time()
-    outcome = planned(task)
+    outcome = planned(task, time_limit=None if beyond else PATIENCE)
     row: Row = {"seconds": time.process_time() - begun, "made_with": task.cost}
     if isinstance(outcome, str):
         late = row["seconds"] > SOON

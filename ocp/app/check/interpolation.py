@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from models.checks import Array
 from ocp.errors import ProblemError
+from ocp.tolerances import LIMIT_SHARE
 
 __all__ = ["Indices", "Motion", "MotionQuantity", "PiecewisePolynomial", "Rule", "half_digits", "polynomial_maxima"]
 
@@ -184,6 +185,18 @@ class Motion:
     def velocity(self) -> PiecewisePolynomial:
         """Velocities as piecewise polynomials of time; piecewise constant if the file has only positions."""
         return self.position.derivative()
+
+    def end_speeds(self) -> Array:
+        """Return the speeds of the joints at both ends, 0 for a joint that is at rest there. Shape (2, n).
+
+        A motion of which only positions are known counts as at rest at an end if its mean speed in the interval there
+        is at most the change of speed to the next interval, as under any constant acceleration or jerk from rest.
+        """
+        rates = np.diff(self.q, axis=0) / np.diff(self.t)[:, None] if self.v is None else self.v
+        speeds, tolerated = np.abs(rates[[0, -1]]), LIMIT_SHARE * np.abs(rates).max(initial=0.0)
+        if self.v is None and len(rates) > 1:
+            tolerated = np.maximum(tolerated, np.abs(rates[[0, -1]] - rates[[1, -2]]))
+        return np.where(speeds > tolerated, speeds, 0.0)
 
     @cached_property
     def acceleration(self) -> PiecewisePolynomial | None:

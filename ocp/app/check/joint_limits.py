@@ -25,9 +25,9 @@ from models.robot.dynamics import GRAVITY
 from models.spatial import cross, rotation_from_quaternion
 from ocp.app.check.data_checks import CleanedTrajectory, Fault
 from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
-from ocp.audit.audit import Audit
 from ocp.console import check_time
 from ocp.errors import ProblemError, require
+from ocp.motion.result.plan import ENDS
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.values import Sampler
 from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
@@ -36,7 +36,6 @@ __all__ = [
     "ORDERS",
     "Row",
     "RowVerdict",
-    "audit_rows",
     "effort_rows",
     "floating_base_rows",
     "floating_torques",
@@ -150,13 +149,19 @@ def limit_rows(
     return rows, faults, unchecked
 
 
-def audit_rows(audit: Audit) -> list[Row]:
-    """Return the findings of an audit as table rows."""
-    verdicts = [RowVerdict.INFO if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
-    return [
-        Row(f.name, f.value, f.limit, f.unit, f.time, verdict, f.note)
-        for f, verdict in zip(audit.findings, verdicts, strict=True)
-    ]
+def rest_row(motion: Motion, robot: Robot, joints: Indices) -> Row:
+    """Return the row about the speed of the joints at both ends of a motion; the verdict is OK if they are at rest."""
+    speeds, texts = motion.end_speeds(), []
+    for verb, row in zip(("starts", "ends"), speeds, strict=True):
+        if row.any():
+            name = robot.joint_names[joints[int(row.argmax())]]
+            texts.append(f"{verb} at {row.max():.3g} {robot.joint(name).unit}/s ({name!r})")
+    end, column = np.unravel_index(int(speeds.argmax()), speeds.shape)
+    unit, time = robot.joint(robot.joint_names[joints[int(column)]]).unit, float(motion.t[[0, -1][int(end)]])
+    verdict, note = RowVerdict.OK if not texts else RowVerdict.INFO, "at rest"
+    if texts:
+        note = f"{' and '.join(texts)}, not at rest"
+    return Row(ENDS, float(speeds[end, column]), None, f"{unit}/s", time, verdict, note)
 
 
 class _Side(NamedTuple):

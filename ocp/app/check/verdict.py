@@ -21,6 +21,7 @@ from ocp.app.check.joint_limits import (
     effort_rows,
     floating_base_rows,
     limit_rows,
+    rest_row,
     standing_rows,
     torque_rows,
 )
@@ -32,6 +33,7 @@ from ocp.console import check_time, interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.plan import Plan, PlanSample
 from ocp.motion.result.path_plan import PathPlan
+from ocp.motion.result.plan import ENDS
 from ocp.motion.result.segmented_plan import ConsecutivePlans, Piece
 from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import Limits, unknown_limits
@@ -45,6 +47,7 @@ __all__ = [
     "Interpretation",
     "PlanVerdict",
     "Row",
+    "audit_rows",
     "check_trajectory",
     "verdict_of",
 ]
@@ -95,7 +98,8 @@ class Check:
         but = f"; undetermined: {', '.join(names[:3])}{' ...' if len(names) > 3 else ''}" if names else ""
         unchecked = f"; not checked: {'; '.join(self.unchecked)}" if self.unchecked else ""
         if self.passed:
-            return f"meets all checked requirements{but}{unchecked}"
+            moving = [row.note for row in self.rows if row.name == ENDS and row.verdict is RowVerdict.INFO]
+            return "; ".join([f"meets all checked requirements{but}{unchecked}", *(f"it {note}" for note in moving)])
         if not self.faults:
             return f"is undetermined: {'; '.join(one.text for one in self.suspicions)}{unchecked}"
         count = len(self.faults)
@@ -278,7 +282,7 @@ def check_trajectory(
     limit_table, limit_faults, unlimited_orders = limit_rows(
         motion, robot, cleaned.joints, bounds, share=tolerances.share
     )
-    add((limit_table, limit_faults))
+    add(([*limit_table, rest_row(motion, robot, cleaned.joints)], limit_faults))
     unchecked += unlimited_orders
     add(effort_rows(cleaned, robot, bounds, tolerances.share))
     if not complete:
@@ -339,6 +343,15 @@ def check_trajectory(
         (*cleaned.notes, *notes),
         cleaned,
     )
+
+
+def audit_rows(audit: Audit) -> list[Row]:
+    """Return the findings of an audit as table rows."""
+    verdicts = [RowVerdict.INFO if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
+    return [
+        Row(f.name, f.value, f.limit, f.unit, f.time, verdict, f.note)
+        for f, verdict in zip(audit.findings, verdicts, strict=True)
+    ]
 
 
 def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:

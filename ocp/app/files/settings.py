@@ -1,4 +1,12 @@
-"""Read settings: TOML files, by name and expected type, with errors that name the line, and joint limits of MoveIt.
+"""Read settings: TOML files, by name and expected type, with errors that name the line; obstacles; limits of MoveIt.
+
+A file of obstacles has the shapes in world, each under [[obstacle]]:
+
+[[obstacle]]
+shape = "box"                       # or sphere, capsule, cylinder, halfspace, mesh
+size = [0.06, 0.06, 0.3]            # m
+position = [0.55, 0.0, 0.45]        # m
+rpy = [0, 0, 0.5]                   # rad, optional: rotations about the world's x, then y, then z axis
 
 `joint_limits.yaml` is the file in which MoveIt keeps the limits that a URDF cannot state.
 """
@@ -9,25 +17,35 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 from warnings import warn
 
 import numpy as np
 
-from models import ModelWarning, Robot
+from models import Box, Capsule, Cylinder, HalfSpace, Mesh, ModelError, ModelWarning, Robot, Sphere
 from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats, real
 from models.files import INPUT_LIMITS
+from models.shapes.shapes import Shape
+from models.spatial import rotation_from_rpy
 from ocp.app.files.safe_files import FileName, checked_depth, line_error, read_lines, read_tree
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.limits import Limits
 
-__all__ = ["TomlTable", "read_joint_limits", "read_toml"]
+__all__ = [
+    "REQUIRED", "TomlTable", "obstacles_of", "read_joint_limits", "read_obstacles", "read_shape",
+    "read_toml", "rotation_of",
+]  # fmt: skip
 
 TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
 BETWEEN = re.compile(r"[,=\[\]{}#]")
 ERROR_LINE = re.compile(r"\(at line (\d+)")
 Place = tuple[Any, ...]
+
+
+REQUIRED = object()
+"""Default value that marks an entry as required."""
 
 
 class TomlTable:
@@ -196,10 +214,6 @@ class TomlTable:
                 raise self.error(name, f"unknown entry {name}; {hint}")
 
 
-REQUIRED = object()
-"""Default value that marks an entry as required."""
-
-
 def read_toml(file: FileName) -> TomlTable:
     """Return the root table of a TOML file.
 
@@ -258,6 +272,68 @@ LIMIT_KEYS = [key for kind in LIMIT_KINDS for key in (f"has_{kind}_limits", f"ma
 UNUSED_KEYS = {"max_position": "position", "min_position": "position", "max_deceleration": "deceleration"}
 """Known keys that `Limits` has no field for, and the kind of limit that they belong to."""
 OTHER_KEYS = {"has_position_limits", "has_deceleration_limits", "angle_wraparound", "has_soft_limits", *UNUSED_KEYS}
+
+
+SHAPES = ("box", "sphere", "capsule", "cylinder", "halfspace", "mesh")
+
+
+def read_obstacles(file: FileName) -> tuple[Shape, ...]:
+    """Read a file of obstacles and return their shapes in the order of the file.
+
+    Raises:
+        ProblemError: The file is invalid; names the line and what was expected.
+    """
+    entries = read_toml(file)
+    shapes = obstacles_of(entries, Path(file).parent)
+    entries.done()
+    if not shapes:
+        raise entries.missing("obstacle", 'tables headed [[obstacle]], each with shape = "box" or another')
+    return shapes
+
+
+def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
+    """Return the shapes of the [[obstacle]] entries; paths of mesh files are relative to `folder`."""
+    shapes = []
+    for table in entries.tables("obstacle"):
+        shape = table.choice("shape", SHAPES, REQUIRED)
+        try:
+            shapes.append(read_shape(table, shape, folder))
+        except ModelError as error:
+            name = error.name if error.name is not None and error.name in table else None
+            raise table.error(name, str(error)) from error
+        table.done()
+    return tuple(shapes)
+
+
+def rotation_of(entries: TomlTable) -> Array:
+    """Return the rotation matrix of the entry `rpy` (roll, pitch, yaw); the identity if it is missing. Shape (3, 3)."""
+    angles = entries.vector("rpy", 3, "three angles, rad", (0.0, 0.0, 0.0))
+    return np.array(rotation_from_rpy(*(float(angle) for angle in angles)), dtype=float)
+
+
+def read_shape(table: TomlTable, shape: str, folder: Path = Path()) -> Shape:
+    """Read a shape of a kind in SHAPES from a table; names of mesh files are relative to `folder`."""
+
+    def place(name: str = "position") -> Any:
+        return table.vector(name, 3, "three numbers, m", REQUIRED)
+
+    def length(name: str) -> Any:
+        return table.number(name, "a number above 0, m", REQUIRED, least=0.0)
+
+    if shape == "box":
+        return Box(table.vector("size", 3, "three lengths, m", REQUIRED), place(), rotation_of(table))
+    if shape == "sphere":
+        return Sphere(length("radius"), place())
+    if shape == "capsule":
+        return Capsule(length("radius"), place("start"), place("end"))
+    if shape == "cylinder":
+        return Cylinder(length("radius"), length("length"), place(), rotation_of(table))
+    if shape == "halfspace":
+        return HalfSpace(table.vector("normal", 3, "three numbers: out of what is solid", REQUIRED), place("point"))
+    name = table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)
+    scale = table.number("scale", "a number above 0: m for each unit of the file", 1.0, least=0.0)
+    position = table.vector("position", 3, "three numbers, m", (0.0, 0.0, 0.0))
+    return Mesh(file=folder / name, position=position, rotation=rotation_of(table), scale=scale)
 
 
 def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> Limits:

@@ -1,4 +1,4 @@
-"""Read task files, which describe a planning problem in TOML, and files of obstacles.
+"""Read task files, which describe a planning problem in TOML.
 
 Names of files are relative to the folder of the task file.
 
@@ -12,17 +12,22 @@ tip = "tool0"                       # link that carries the tip
 [path]
 file = "seam.csv"                   # waypoints; or points = [[0.4, -0.2, 0.3], [0.4, 0.2, 0.3]], m
 rounding = 0.002                    # largest deviation of rounded corners, m
-speed = 0.05                        # m/s; with acceleration and jerk it starts and ends at rest
+speed = 0.05                        # m/s; the tool starts and ends at rest
+# acceleration = 1.0                # m/s^2; jerk = 10, m/s^3; centripetal = 0.5, m/s^2: slower in tight curves
+# steady = true                     # the speed is constant from the beginning to the end, without rest
 # direction = [0, 0, -1]            # of the tool's z axis, if the file gives none; its roll is free
 # tool = "given"                    # the whole orientation of the file; or "free": position only
 [limits]
 velocity = 2.0                      # for all joints, rad/s or m/s, or { elbow = 1.5 }
-# torque = { elbow = 40 }           # N m or N; acceleration, jerk, power (W) likewise
+# torque = { elbow = 40 }           # N m or N; acceleration, jerk, power (W) likewise; friction of the ground
 [cost]
-weights = { elbow = 4 }             # of squared joint rates; 1 of all others; time = 1.0 costs a second of a free pace
+weights = { elbow = 4 }             # of squared joint rates; 1 of all others
+# time = 1.0                        # cost of a second; velocity, effort, length, energy, acceleration, jerk, turning
 [search]
 kind = "configurations"             # or "start", "global"; "segments": the fewest motions, if one is not enough
-# start = { elbow = 1.2 }           # joints at the start, all of them; cyclic = true; seed = 1; pace = "free"
+# start = { elbow = 1.2 }           # joints at the start, all of them
+# horizon = "free"                  # the duration is planned; or a duration, s
+# cyclic = true                     # the motion ends where it starts; seed = 1; time_limit = 60, s
 [scene]
 clearance = 0.01                    # m; ignored = [["link1", "link3"]]; srdf = "..."; folders = ["..."]
 [[obstacle]]
@@ -32,13 +37,20 @@ position = [0.55, 0.0, 0.45]
 [output]
 plan = "seam.npz"                   # csv, json, yaml, mcap, urdf, report likewise; period = 0.01
 
-A file of obstacles has the shapes in world, each under [[obstacle]]:
+In place of [path], a file has one of these tables, or several motions one after the other, [[task]], each with
+path = {...} or goal = {...}:
 
-[[obstacle]]
-shape = "box"                       # or sphere, capsule, cylinder, halfspace, mesh
-size = [0.06, 0.06, 0.3]            # m
-position = [0.55, 0.0, 0.45]        # m
-rpy = [0, 0, 0.5]                   # rad, optional: rotations about the world's x, then y, then z axis
+[goal]                              # needs the start; see ocp.Goal
+joints = { elbow = 1.2 }            # the others are free; or a pose:
+# position = [0.5, 0.1, 0.3]        # m; or region = { shape = "box", size = [...], position = [...] }, or "sphere"
+# orientation = [1, 0, 0, 0]        # quaternion w x y z; or rpy = [0, 3.14, 0], rad; or a direction of the tool's axis:
+# direction = [0, 0, -1]            # within = 0.2, rad, makes it a cone; tool_axis = [0, 0, 1] in the frame of the tip
+# tip = "left_hand"                 # link whose pose is meant
+# velocity = "free"                 # or { elbow = 0.5 }, rad/s or m/s; at rest if left out
+# duration = 2.0                    # s, of this motion
+[waypoints]
+file = "poses.csv"                  # with orientations; step = 0.2: largest joint displacement between two, rad or m
+# reconfigurations = "counted"
 """
 
 from __future__ import annotations
@@ -53,18 +65,12 @@ from typing import Any
 import numpy as np
 
 from models import (
-    Box,
-    Capsule,
-    Cylinder,
     FixedBase,
     FreeFloating,
-    HalfSpace,
     Machine,
-    Mesh,
     ModelError,
     Robot,
     SmoothPath,
-    Sphere,
     Standing,
     footprint,
     lock_joints,
@@ -75,79 +81,17 @@ from models import (
 from models import Path as ToolPath
 from models.checks import NOT_NUMBERS, Array, floats
 from models.shapes.shapes import Shape
-from models.spatial import rotation_from_rpy
 from ocp.app.files.safe_files import SUFFIXES, FileName, checked_output
-from ocp.app.files.settings import REQUIRED, TomlTable, read_toml
+from ocp.app.files.settings import REQUIRED, TomlTable, obstacles_of, read_shape, read_toml, rotation_of
 from ocp.app.files.waypoints import read_waypoints
 from ocp.errors import ProblemError
 from ocp.motion.schedule import LineLimits, schedule
-from ocp.motion.tasks.goals import Cost, Scene
+from ocp.motion.tasks.goals import Cost, Goal, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
+from ocp.motion.tasks.tracks import ramp_limits
 
-__all__ = ["OUTPUTS", "Task", "obstacles_of", "read_obstacles", "read_task", "rotation_of"]
-
-SHAPES = ("box", "sphere", "capsule", "cylinder", "halfspace", "mesh")
-
-
-def read_obstacles(file: FileName) -> tuple[Shape, ...]:
-    """Read a file of obstacles and return their shapes in the order of the file.
-
-    Raises:
-        ProblemError: The file is invalid; names the line and what was expected.
-    """
-    entries = read_toml(file)
-    shapes = obstacles_of(entries, Path(file).parent)
-    entries.done()
-    if not shapes:
-        raise entries.missing("obstacle", 'tables headed [[obstacle]], each with shape = "box" or another')
-    return shapes
-
-
-def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
-    """Return the shapes of the [[obstacle]] entries; paths of mesh files are relative to `folder`."""
-    shapes = []
-    for table in entries.tables("obstacle"):
-        shape = table.choice("shape", SHAPES, REQUIRED)
-        try:
-            shapes.append(_shape(table, shape, folder))
-        except ModelError as error:
-            name = error.name if error.name is not None and error.name in table else None
-            raise table.error(name, str(error)) from error
-        table.done()
-    return tuple(shapes)
-
-
-def rotation_of(entries: TomlTable) -> Array:
-    """Return the rotation matrix of the entry `rpy` (roll, pitch, yaw); the identity if it is missing. Shape (3, 3)."""
-    angles = entries.vector("rpy", 3, "three angles, rad", (0.0, 0.0, 0.0))
-    return np.array(rotation_from_rpy(*(float(angle) for angle in angles)), dtype=float)
-
-
-def _shape(table: TomlTable, shape: str, folder: Path) -> Shape:
-    """Read the shape of an [[obstacle]] table."""
-
-    def place(name: str = "position") -> Any:
-        return table.vector(name, 3, "three numbers, m", REQUIRED)
-
-    def length(name: str) -> Any:
-        return table.number(name, "a number above 0, m", REQUIRED, least=0.0)
-
-    if shape == "box":
-        return Box(table.vector("size", 3, "three lengths, m", REQUIRED), place(), rotation_of(table))
-    if shape == "sphere":
-        return Sphere(length("radius"), place())
-    if shape == "capsule":
-        return Capsule(length("radius"), place("start"), place("end"))
-    if shape == "cylinder":
-        return Cylinder(length("radius"), length("length"), place(), rotation_of(table))
-    if shape == "halfspace":
-        return HalfSpace(table.vector("normal", 3, "three numbers: out of what is solid", REQUIRED), place("point"))
-    name = table.text("file", "the name of an STL, OBJ or DAE file", REQUIRED)
-    scale = table.number("scale", "a number above 0: m for each unit of the file", 1.0, least=0.0)
-    position = table.vector("position", 3, "three numbers, m", (0.0, 0.0, 0.0))
-    return Mesh(file=folder / name, position=position, rotation=rotation_of(table), scale=scale)
-
+__all__ = ["OUTPUTS", "Task", "read_task"]
 
 OUTPUTS = tuple(SUFFIXES)
 LIMIT_UNITS = {
@@ -166,7 +110,7 @@ class Task:
 
     Attributes:
         machine: Robot on its base.
-        task: Task of the robot's tip.
+        tasks: What `ocp.plan` takes as its tasks.
         options: Keyword arguments of `ocp.plan`.
         outputs: Files to write, by kind of OUTPUTS, all in or below `output_folder`.
         period: Sampling period of the outputs, s.
@@ -174,7 +118,7 @@ class Task:
     """
 
     machine: Machine
-    task: TipTask
+    tasks: Any
     options: dict[str, Any]
     outputs: dict[str, Path]
     period: float
@@ -195,17 +139,14 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
         ProblemError: The file is invalid; names the line and what was expected.
     """
     root = read_toml(file)
-    root.only("robot", "path", "limits", "cost", "search", "scene", "obstacle", "output")
+    root.only("robot", "path", "goal", "waypoints", "task", "limits", "cost", "search", "scene", "obstacle", "output")
     folder = Path(file).parent
     robot = root.table("robot", "a table [robot] with urdf and tip", REQUIRED)
     assert robot is not None
     urdf = folder / robot.text("urdf", "the name of a URDF file", REQUIRED)
     machine = _machine(robot, urdf)
     robot.done()
-    path = root.table("path", "a table [path] with file or points, and speed", REQUIRED)
-    assert path is not None
-    task = _task(path, folder)
-    path.done()
+    tasks = _tasks(root, folder, machine.robot.joint_names)
     options: dict[str, Any] = {}
     obstacles = obstacles_of(root, folder)
     names = machine.robot.joint_names
@@ -223,18 +164,19 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
     root.done()
     options.setdefault("scene", Scene(obstacles=obstacles))
     cost = options.get("cost")
-    if options.get("horizon") == "free" and cost is not None and not cost.time:
+    if options.get("horizon") == "free" and isinstance(tasks, TipTask) and cost is not None and not cost.time:
         options["cost"] = replace(cost, time=1.0)
-    return Task(machine, task, options, outputs, period, str(file), urdf, outputs_in)
+    return Task(machine, tasks, options, outputs, period, str(file), urdf, outputs_in)
 
 
 @contextmanager
-def _located_errors(entries: TomlTable, name: str | None) -> Iterator[None]:
-    """Add the file and the entry of a task file to errors raised inside the block."""
+def _located_errors(entries: TomlTable, name: str | None = None) -> Iterator[None]:
+    """Add the file and an entry to errors raised inside the block: the named entry, or the one that the error names."""
     try:
         yield
     except (ModelError, ProblemError) as error:
-        located = entries.error(name if name is not None and name in entries else None, str(error))
+        entry = error.name if name is None else name
+        located = entries.error(entry if entry is not None and entry in entries else None, str(error))
         located.value, located.limit = error.value, error.limit
         raise located from error
 
@@ -271,21 +213,100 @@ def _machine(entries: TomlTable, urdf: Path) -> Machine:
         return Standing(robot=robot, support=contact.support, translation=contact.translation, rotation=rotation)
 
 
+def _tasks(root: TomlTable, folder: Path, names: tuple[str, ...]) -> Any:
+    """Read the motions of a task file, and return the tasks, goals or waypoints of the planner."""
+    kinds = ("path", "goal", "waypoints", "task")
+    named = [kind for kind in kinds if kind in root]
+    if len(named) != 1:
+        why = "has no motion" if not named else f"has {' and '.join(named)}, which are different motions"
+        words = f"the file {why}: give one table [path], [goal] or [waypoints], or a list of them under [[task]]"
+        raise root.error(named[1] if named else None, words) if named else root.missing("path", words)
+    if named == ["task"]:
+        parts = []
+        for table in root.tables("task"):
+            table.only("path", "goal")
+            if ("path" in table) == ("goal" in table):
+                raise table.error(None, "a [[task]] has either path = {...} or goal = {...}")
+            parts.append(_motion(table, "path" if "path" in table else "goal", folder, names))
+        return parts
+    return _motion(root, named[0], folder, names)
+
+
+def _motion(root: TomlTable, kind: str, folder: Path, names: tuple[str, ...]) -> Any:
+    """Read one table of a motion, "path", "goal" or "waypoints"."""
+    entries = root.table(kind, f"a table [{kind}]", REQUIRED)
+    assert entries is not None
+    if kind == "path":
+        motion: Any = _task(entries, folder)
+    else:
+        motion = _goal(entries, names) if kind == "goal" else _waypoints(entries, folder, names)
+    entries.done()
+    return motion
+
+
+def _goal(entries: TomlTable, names: tuple[str, ...]) -> Goal:
+    """Read the table [goal]."""
+    values: dict[str, Any] = {
+        name: entries.vector(name, size, expected)
+        for name, size, expected in (
+            ("position", 3, "three numbers, m"),
+            ("orientation", 4, "four numbers: a quaternion w, x, y, z"),
+            ("direction", 3, "three numbers: where the tool axis points"),
+            ("tool_axis", 3, "three numbers: the tool axis in the frame of the tip"),
+        )
+    }
+    if "rpy" in entries:
+        if values["orientation"] is not None:
+            raise entries.error("rpy", "a goal has orientation or rpy, not both; remove one")
+        values["orientation"] = rotation_of(entries)
+    values["within"] = entries.number("within", "largest angle between tool axis and direction, rad", least=0.0)
+    values["tip"] = entries.text("tip", "the name of a link")
+    values["duration"] = entries.number("duration", "a number above 0, s", least=0.0)
+    if "joints" in entries:
+        values["joints"] = _by_joint(entries, "joints", names)
+    if "velocity" in entries:
+        is_word = isinstance(entries.raw("velocity"), str)
+        words = ("rest", "free")
+        values["velocity"] = entries.choice("velocity", words) if is_word else _by_joint(entries, "velocity", names)
+    if (region := entries.table("region", "a box or a sphere")) is not None:
+        values["region"] = read_shape(region, region.choice("shape", ("box", "sphere"), REQUIRED))
+        region.done()
+    with _located_errors(entries):
+        return Goal(**{name: value for name, value in values.items() if value is not None})
+
+
+def _by_joint(entries: TomlTable, name: str, names: tuple[str, ...]) -> Array:
+    """Read numbers by joint, and return one for each joint, nan where the file gives none. Shape (n,)."""
+    by_joint = entries.numbers_by_name(name, f"a table of joints and numbers: {name} = {{ elbow = 1.2 }}")
+    _check_joints(entries, name, by_joint, names)
+    return np.array([by_joint.get(joint, np.nan) for joint in names])
+
+
+def _waypoints(entries: TomlTable, folder: Path, names: tuple[str, ...]) -> Waypoints:
+    """Read the table [waypoints]."""
+    poses = _read_waypoints(entries, folder)
+    if poses.orientations is None or poses.free_roll:
+        words = "waypoints without a path need whole orientations: quaternions in columns qw, qx, qy, qz"
+        raise entries.error("file", words)
+    rule = entries.choice("reconfigurations", ("forbidden", "counted"), "forbidden")
+    step = _each(entries, "step", names, np.inf, "a number above 0, rad or m, or { joint = number }")
+    return Waypoints(poses.positions, poses.orientations, np.inf if step is None else step, rule)
+
+
+def _read_waypoints(entries: TomlTable, folder: Path) -> Any:
+    """Read the file of waypoints that the entry `file` names."""
+    name = entries.text("file", "the name of a file of waypoints", REQUIRED)
+    if not (folder / name).is_file():
+        raise entries.error("file", f"there is no file {folder / name}; name it from the task file's folder")
+    with _located_errors(entries, "file"):
+        return read_waypoints(folder / name)
+
+
 def _task(entries: TomlTable, folder: Path) -> TipTask:
     """Read the table [path] and return the task of the tip."""
     path = _read_path(entries, folder)
     speed = _path_limit(entries, "speed", "m/s", REQUIRED)
-    acceleration = _path_limit(entries, "acceleration", "m/s^2")
-    jerk, centripetal = (
-        _path_limit(entries, "jerk", "m/s^3", np.inf),
-        _path_limit(entries, "centripetal", "m/s^2", np.inf),
-    )
-    timing: Any = speed
-    if acceleration is not None:
-        with _located_errors(entries, "acceleration"):
-            timing = schedule(path, LineLimits(speed, acceleration, jerk, centripetal))
-    elif "jerk" in entries or "centripetal" in entries:
-        raise entries.missing("acceleration", "a schedule needs it: acceleration = 1.0, in m/s^2")
+    timing, pace = _pace(entries, path, speed)
     tool = entries.choice("tool", ("free roll", "given", "free"), "free roll")
     direction = entries.vector("direction", 3, "three numbers: where the tool's z axis points")
     within = entries.number("within", "largest angle between the tool's z axis and its direction, rad", least=0.0)
@@ -301,8 +322,24 @@ def _task(entries: TomlTable, folder: Path) -> TipTask:
         if value is not None:
             options[name] = value
     with _located_errors(entries, "speed"):
-        task = TipTask.along(path, timing, roll="given" if tool == "given" else "free", **options)
+        task = TipTask.along(path, timing, roll="given" if tool == "given" else "free", **pace, **options)
         return replace(task, rows=(3, 4, 5), direction=None, orientation=None) if tool == "free" else task
+
+
+def _pace(entries: TomlTable, path: SmoothPath, speed: float) -> tuple[Any, dict[str, Any]]:
+    """Read how the speed along the path changes; return the speed or a schedule, and arguments of `TipTask.along`."""
+    limits = {name: _path_limit(entries, name, unit) for name, unit in (("acceleration", "m/s^2"), ("jerk", "m/s^3"))}
+    centripetal = _path_limit(entries, "centripetal", "m/s^2")
+    if entries.flag("steady", False):
+        for name, value in {**limits, "centripetal": centripetal}.items():
+            if value is not None:
+                raise entries.error(name, f"steady = true has constant speed, without ramps: remove {name} or steady")
+        return speed, {"steady": True}
+    if centripetal is None:
+        return speed, limits
+    acceleration, jerk = ramp_limits(**limits)
+    with _located_errors(entries, "centripetal"):
+        return schedule(path, LineLimits(speed, acceleration, jerk, centripetal)), {}
 
 
 def _path_limit(entries: TomlTable, name: str, unit: str, default: Any = None) -> Any:
@@ -313,15 +350,13 @@ def _path_limit(entries: TomlTable, name: str, unit: str, default: Any = None) -
 def _read_path(entries: TomlTable, folder: Path) -> SmoothPath:
     """Read the path of a task file and return it with rounded corners."""
     deviation = entries.number("rounding", "a number above 0, m: largest deviation of rounded corners", 1e-3, least=0.0)
-    name = entries.text("file", "the name of a file of waypoints")
     points = entries.raw("points")
-    if (name is None) == (points is None):
+    if ("file" in entries) == (points is not None):
         raise entries.missing("file", 'give waypoints, file = "seam.csv", or points = [[x, y, z], ...] in m, not both')
-    if name is not None:
-        if not (folder / name).is_file():
-            raise entries.error("file", f"there is no file {folder / name}; name it from the task file's folder")
+    if points is None:
+        poses = _read_waypoints(entries, folder)
         with _located_errors(entries, "file"):
-            return read_waypoints(folder / name).smooth(deviation)
+            return poses.smooth(deviation)  # type: ignore[no-any-return]
     try:
         corners = floats(points)
     except NOT_NUMBERS:
@@ -340,22 +375,32 @@ def _limits(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[st
         with _located_errors(entries, quantity):
             limits[quantity] = _each(entries, quantity, names, np.inf, expected)
             Limits(**{quantity: limits[quantity]})
-    return {"limits": Limits(**limits, joints=entries.flag("positions", True))}
+    friction = entries.number("friction", "a number above 0: the friction coefficient of the ground", np.inf, least=0.0)
+    return {"limits": Limits(**limits, joints=entries.flag("positions", True), friction=friction)}
 
 
 def _cost(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """Read the weights of the cost and return them as an option of the planner."""
-    weights = _each(entries, "weights", names, 1.0, "numbers above 0 by joint: { elbow = 4 }")
-    time = entries.number("time", "a number above 0, 1/s: cost of a second with a free pace", least=0.0)
-    return {"cost": Cost(time=time or 0.0, weights=weights)}
+    expected = "a number of 0 or more, or { joint = number }"
+    values: dict[str, Any] = {
+        "weights": _each(entries, "weights", names, 1.0, "numbers above 0 by joint: { elbow = 4 }")
+    }
+    for name in ("effort", "acceleration"):
+        values[name] = _each(entries, name, names, 0.0, expected, least=-1e-300)
+    for name in ("velocity", "time", "length", "energy", "jerk", "turning"):
+        values[name] = entries.number(name, "a number of 0 or more: the weight of this term", least=-1e-300)
+    with _located_errors(entries):
+        return {"cost": Cost(**{name: value for name, value in values.items() if value is not None})}
 
 
-def _each(entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str) -> Any:
+def _each(
+    entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str, *, least: float = 0.0
+) -> Any:
     """Return an entry as one number for all joints or an array with a number for each joint; None if it is missing."""
     if name not in entries:
         return None
     if not isinstance(entries.raw(name), dict):
-        return entries.number(name, expected, least=0.0)
+        return entries.number(name, expected, least=least)
     by_joint = entries.numbers_by_name(name, expected)
     _check_joints(entries, name, by_joint, names)
     return np.array([by_joint.get(joint, default) for joint in names])
@@ -373,15 +418,16 @@ def _check_joints(entries: TomlTable, name: str, by_joint: dict[str, float], nam
 def _read_search(entries: TomlTable, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """Read the search settings of a task file and return them as options of the planner."""
     kind = entries.choice("kind", ("configurations", "start", "global", "segments"), "configurations")
-    cyclic, pace = entries.flag("cyclic"), entries.choice("pace", ("given", "free"), "given")
+    cyclic, horizon = entries.flag("cyclic"), entries.raw("horizon")
+    if horizon is not None and not isinstance(horizon, str):
+        horizon = entries.number("horizon", 'a number above 0, s, or "free"', least=0.0)
+    elif horizon is not None:
+        horizon = entries.choice("horizon", ("free",))
     options: dict[str, Any] = {"seed": entries.count("seed", "a whole number, 0 or more", 0)}
-    if kind == "segments":
-        for name, is_set in (("cyclic", cyclic), ("pace", pace == "free")):
-            if is_set:
-                raise entries.error(name, f'kind = "segments" does not support {name}; remove it')
-    options |= {"search": kind, "cyclic": cyclic}
-    if pace == "free":
-        options["horizon"] = "free"
+    if kind == "segments" and cyclic:
+        raise entries.error("cyclic", 'kind = "segments" does not support cyclic; remove it')
+    options |= {"search": kind, "cyclic": cyclic, "horizon": horizon}
+    options["time_limit"] = entries.number("time_limit", "a number above 0, s", least=0.0)
     if "start" in entries:
         positions = entries.numbers_by_name("start", "a table of joints and positions: start = { elbow = 1.2 }")
         _check_joints(entries, "start", positions, names)

@@ -18,8 +18,8 @@ from models.checks import Array
 from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
 from ocp.app.check.data_checks import clean_trajectory
-from ocp.app.check.joint_limits import Row, audit_rows, floating_torques, integrate_base
-from ocp.app.check.verdict import PlanVerdict, verdict_of
+from ocp.app.check.joint_limits import Row, floating_torques, integrate_base
+from ocp.app.check.verdict import PlanVerdict, audit_rows, verdict_of
 from ocp.app.files import RawTrajectory
 from ocp.app.view.appearance import Obstacle, obstacles_of, obstacles_of_plan
 from ocp.audit.audit import Audit

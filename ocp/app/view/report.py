@@ -17,8 +17,8 @@ import numpy as np
 from models import Machine
 from models.checks import Array
 from ocp.app.check.interpolation import Motion
-from ocp.app.check.joint_limits import Row, RowVerdict, audit_rows
-from ocp.app.check.verdict import Check, verdict_of
+from ocp.app.check.joint_limits import Row, RowVerdict
+from ocp.app.check.verdict import Check, audit_rows, verdict_of
 from ocp.app.view.appearance import (
     PLAN,
     SCENE,

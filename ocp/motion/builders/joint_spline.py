@@ -22,7 +22,7 @@ from models.checks import NOT_NUMBERS, floats
 from models.robot.dynamics import GRAVITY, inverse_dynamics
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule import PathLike
-from ocp.motion.schedule.profile import Array
+from ocp.motion.tasks.speed_profile import Array
 from ocp.solution import Solution
 
 __all__ = ["PlannedJoints", "joint_path"]
@@ -53,10 +53,14 @@ class SplineSettings:
 
     Attributes:
         path_tolerance: Largest distance of a task from its path, as a share of the path's length.
+        path_samples: Number of points of a path to which targets are compared, to find those that belong to the path.
+        projections: Number of Newton steps by which targets are projected onto the path.
         batch: Number of path points whose torques are computed together.
     """
 
     path_tolerance: float = 1e-6
+    path_samples: int = 200
+    projections: int = 8
     batch: int = 1024
 
 
@@ -152,19 +156,19 @@ def joint_path(
     samples: int = 400,
     names: Sequence[str] | None = None,
 ) -> PlannedJoints:
-    """Return a spline of joint positions over the distance along a path, from a plan at constant speed or from samples.
+    """Return a spline of joint positions over the distance along a path, from a plan along the path or from samples.
 
     Args:
         machine: Machine of the joints.
-        plan: A `Plan` of tasks that run along the whole path at constant speed, in one part or several, with a fixed or
+        plan: A `Plan` of tasks that run along the whole path without a pause, in one part or several, with a fixed or
             free horizon. Or a solution with states "joints" at distances proportional to time. Or a tuple of distances
             (M,) from 0 to the path's length and joint positions (M, n).
         path: Path of the tool.
-        samples: Number of samples of a plan or a solution, evenly spaced in time.
+        samples: Number of samples of a plan, or of a solution, where they are evenly spaced in time.
         names: Names of the joints; the robot's if None.
 
     Raises:
-        ProblemError: The plan has no joints, or its tasks do not run along the path at constant speed; the samples have
+        ProblemError: The plan has no joints, or its tasks do not run along the path; the samples have
             other shapes, are too few, do not increase, or do not reach both ends.
     """
     require.count("samples", samples, 2 * DEGREE + 3)
@@ -190,26 +194,67 @@ def joint_path(
 
 
 def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
-    """Return path distances (M,) and joint positions (M, n) of a plan whose tasks follow the path at constant speed.
+    """Return path distances (M,) and joint positions (M, n) of a plan whose tasks run along the path.
+
+    The times are chosen so that the distances are nearly evenly spaced, also where the tool speeds up from rest.
 
     Raises:
-        ProblemError: They do not follow the path at constant speed.
+        ProblemError: The tasks leave the path, stand still on it, or do not cover it.
     """
-    if plan.targets and hasattr(path, "at"):
-        t = plan.targets[0].t
-        along = path.at(np.clip(length * plan.task_share(t), 0.0, length)).position
-        offsets = np.array([target.position - along for target in plan.targets])
-        fixed = np.isfinite(offsets).any(axis=2)
-        distance = np.where(fixed, np.linalg.norm(np.nan_to_num(offsets), axis=2), np.inf).min(axis=0)
-        worst = int(distance.argmax())
-        if fixed.any() and not distance[worst] <= SPLINE.path_tolerance * length:
-            position = f"are {distance[worst]:.3g} m off the path" if distance[worst] < np.inf else "have no position"
-            words = f"the plan's tasks {position} at {t[worst]:.6g} s, but must run along all of it at constant speed; "
-            words += "give (distances, joints) instead of the plan"
-            details = {"value": float(distance[worst]), "limit": SPLINE.path_tolerance * length}
-            raise ProblemError(words, name="plan", time=float(t[worst]), **details)
     times = np.linspace(0.0, plan.horizon, samples)
-    return length * plan.task_share(times), plan.at(times)["joints"]
+    if not (plan.targets and hasattr(path, "at")):
+        return length * plan.task_share(times), plan.at(times)["joints"]
+    distances = _distances_of_targets(plan, path, length, times)
+    times = np.interp(np.linspace(0.0, length, samples), distances, times)
+    return _distances_of_targets(plan, path, length, times), plan.at(times)["joints"]
+
+
+def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> Array:
+    """Return the path distances (M,) at which the targets of a plan are at times (M,), from 0 to the path's length.
+
+    Raises:
+        ProblemError: As in `_samples_of_plan`.
+    """
+
+    def fail(what: str, at: int, value: float) -> ProblemError:
+        words = f"the plan's tasks {what} at {times[at]:.6g} s, but must run along all of the path, without a pause; "
+        words += "give (distances, joints) instead of the plan"
+        limit = SPLINE.path_tolerance * length
+        return ProblemError(words, name="plan", value=value, limit=limit, time=float(times[at]))
+
+    positions = np.array([target.position for target in plan.targets_at(times)])
+    known = np.isfinite(positions)
+    if not known.any(axis=(0, 2)).all():
+        raise fail("have no position", int(known.any(axis=(0, 2)).argmin()), np.inf)
+    line = path.at(np.linspace(0.0, length, SPLINE.path_samples)).position
+
+    def gaps(to: Array, of: Array) -> Array:
+        return np.asarray(np.linalg.norm(np.nan_to_num(of - to), axis=-1))
+
+    # of targets at once, such as those of two arms, the nearest to the path counts
+    nearest = np.array([np.min([gaps(point, target) for point in line], axis=0) for target in positions])
+    chosen = np.where(known.any(axis=2), nearest, np.inf).argmin(axis=0)
+    position = positions[chosen, np.arange(len(times))]
+    covered = np.append(0.0, np.cumsum(gaps(position[1:], position[:-1])))
+    distance = covered * (length / max(float(covered[-1]), np.finfo(float).tiny))
+    for _ in range(SPLINE.projections):
+        along = path.at(distance)
+        step = np.nansum((position - along.position) * along.tangent, axis=1)
+        step /= np.maximum(
+            (np.where(np.isfinite(position), along.tangent, 0.0) ** 2).sum(axis=1), SPLINE.path_tolerance
+        )
+        distance = np.clip(distance + step, 0.0, length)
+    off = gaps(path.at(distance).position, position)
+    worst = int(off.argmax())
+    if not off[worst] <= SPLINE.path_tolerance * length:
+        raise fail(f"are {off[worst]:.3g} m off the path", worst, float(off[worst]))
+    for end, expected in ((0, 0.0), (-1, length)):
+        if abs(distance[end] - expected) > SPLINE.path_tolerance * length:
+            raise fail(f"are {distance[end]:.6g} m from the beginning of the path", end, float(distance[end]))
+    distance[0], distance[-1] = 0.0, length
+    if (still := np.diff(distance) <= 0).any():
+        raise fail("stand still or go back", int(still.argmax()), 0.0)
+    return np.asarray(distance)
 
 
 def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, Array]:

@@ -37,7 +37,7 @@ from ocp.motion.builders.timing_tables import (
 )
 from ocp.motion.schedule.limits import JointPath, LineLimits, PathLike, check_line, check_smooth
 from ocp.motion.schedule.planner import Schedule
-from ocp.motion.schedule.profile import Array, SpeedProfile, integrate_jerk
+from ocp.motion.tasks.speed_profile import Array, SpeedProfile, integrate_jerk
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 

@@ -28,7 +28,7 @@ from ocp.motion.schedule.limits import (
     rates_along,
 )
 from ocp.motion.schedule.planner import schedule
-from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, segment_index
+from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, segment_index
 
 __all__ = [
     "Columns",

@@ -123,12 +123,15 @@ class Actuation:
     Attributes:
         cost: Weights of all terms but the time; None for half the squared rates.
         rests: Whether the joints are at rest at the start and at the end; else they are free to move there.
+        end_rows: Rows (k, n) that make the product with the velocities zero at an end at rest; None: all velocities are
+            zero. Where tasks bring the tip to rest, rows for the other directions avoid dependent constraints.
         smoothing: Duration in which a control passes from limit to limit instead of jumping, as a share of the horizon.
             A small term of the cost, half the squared accelerations or jerks, smooths them.
     """
 
     cost: Cost | None = None
     rests: tuple[bool, bool] = (False, False)
+    end_rows: Any = None
     smoothing: float = 1e-3
 
 
@@ -165,7 +168,12 @@ def declare_actuators(
     cost = Cost() if actuation.cost is None else actuation.cost
     smoothing, (initial, terminal) = actuation.smoothing * horizon, (0.0 if rest else None for rest in actuation.rests)
     limits: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity, "unit": robot.unit("/s")}
-    rates = problem.state(f"velocities{suffix}", n, initial=initial, terminal=terminal, **limits)
+    if terminal is None or actuation.end_rows is None:
+        rates = problem.state(f"velocities{suffix}", n, initial=initial, terminal=terminal, **limits)
+    else:
+        rates = problem.state(f"velocities{suffix}", n, initial=initial, **limits)
+        if len(actuation.end_rows):
+            problem.end(f"rest{suffix}", ca.mtimes(ca.DM(actuation.end_rows), rates), 0, 0, unit=robot.unit("/s")[0])
     limits = {"lower": -bounds.acceleration, "upper": bounds.acceleration, "unit": robot.unit("/s^2")}
     jerks: Any = ca.DM(0, 1)
     if np.isfinite(bounds.jerk).any() or cost.jerk:

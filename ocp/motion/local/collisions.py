@@ -20,6 +20,7 @@ from models.checks import Array
 from ocp.errors import ProblemError, require
 from ocp.problem.hulls import BodyPairs, Hull, frames_of
 from ocp.problem.values import Sampler
+from ocp.tolerances import STANDSTILL
 
 __all__ = [
     "Collision",
@@ -110,13 +111,13 @@ def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Ar
 def worst_collisions(
     scene: CollisionScene, base: Array, joints: Array, times: Array, *, pairs: Sequence[int] | None = None
 ) -> list[Collision | None]:
-    """Return for each sample the closest pair of bodies if it violates the clearance, else None.
+    """Return for each sample the closest pair of bodies if it violates the clearance by more than rounding, else None.
 
     The arguments are those of `distances_along`.
     """
     distances = distances_along(scene, base, joints, times, cutoff=scene.clearance, pairs=pairs)
     worst = list[Collision | None]([None] * len(joints))
-    for sample in np.flatnonzero(distances.min(axis=1, initial=np.inf) < scene.clearance).tolist():
+    for sample in np.flatnonzero(distances.min(axis=1, initial=np.inf) < scene.clearance - STANDSTILL).tolist():
         place = sample, int(distances[sample].argmin())
         worst[sample] = _collision_at(scene, place, distances[place], base, joints, times)
     return worst

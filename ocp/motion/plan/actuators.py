@@ -32,6 +32,7 @@ from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
+from ocp.tolerances import RESOLVED_SHARE
 
 __all__ = [
     "ActuatorDemand",
@@ -162,7 +163,7 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     def solve_from(initial: Array) -> Solution:
         def declare(constraints: ClearanceConstraints | None) -> Problem:
             guess: dict[str, Any] = {"start": initial, "reference": reference}
-            actuation = Actuation(request.cost, request.rests)
+            actuation = Actuation(request.cost, request.rests, _undetermined_rows(request, unlimited))
             motion = declared_motion(request, **guess, constraints=constraints, actuation=actuation)
             _set_guess(motion, unlimited)
             return motion.problem
@@ -182,6 +183,17 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
             raise
         raise _with_demand(error, ActuatorDemand.of(unlimited, limits)) from error
     return solution
+
+
+def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan) -> Array:
+    """Return orthogonal rows (k, n) of the joint velocities that the tasks leave undetermined at the end."""
+    last = request.stretches[-1]
+    if last.equations is None:
+        return np.eye(request.machine.joint_size)
+    names = [f"{kind}{last.suffix}" for kind in ("base", "joints")]
+    base, joints = (unlimited.solution[name][-1] if name in unlimited.solution.states else () for name in names)
+    _, sizes, rows = np.linalg.svd(np.array(last.equations.jacobian_function(joints, base)))
+    return np.asarray(rows[int((sizes > RESOLVED_SHARE * sizes.max(initial=0.0)).sum()) :])
 
 
 def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError:

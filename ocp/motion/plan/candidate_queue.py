@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ocp.console import report
+from ocp.console import report, time_left
 from ocp.errors import SolveError
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import SolvedPlan
@@ -121,7 +121,12 @@ class CandidateQueue:
 
     @property
     def exhausted(self) -> bool:
-        """Whether no candidate has passed or collided, although failed candidates have used up the allowed time."""
+        """Whether no candidate has passed or collided, although failed candidates have used up the allowed time.
+
+        An explicit time limit of the caller takes the place of the allowed time.
+        """
+        if np.isfinite(time_left()):
+            return False
         seconds = time.thread_time() - self._began
         return seconds > self.settings.refusal_time and bool(self.candidates) and not (self.passed or self.collided)
 

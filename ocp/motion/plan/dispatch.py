@@ -86,7 +86,7 @@ def plan(
             path through waypoints, the squared torques of a motion to several goals.
         limits: Limits of joint positions and rates; the robot's own if None. Limits of acceleration, jerk, torque or
             power, if given, hold at all times together with the robot's own torque limits, at the same cost (see
-            `plan.actuators`). Rates are then continuous. A machine starts or ends at rest only if its tasks require it.
+            `plan.actuators`). Rates are then continuous, and the joints rest at the start or the end if the tips do.
         scene: Obstacles, the clearance that is kept from them and between links, and external wrenches; None: the links
             of the machine do not touch. False: collisions are not checked.
         search: "start": from the given start, or from the best conditioned solution of inverse kinematics.
@@ -98,7 +98,8 @@ def plan(
             "segments": as "global"; if no single motion does the tasks, in the fewest segments, between which an arm on
             a fixed base moves to another configuration while the tasks wait.
         seed: Seed of all random numbers.
-        time_limit: Seconds after which planning ends with a SolveError; None for no limit.
+        time_limit: Seconds after which planning ends with a SolveError. None: no limit while motions are found,
+            but if all motions fail, planning along tasks ends after about 20 s.
         progress: Function that is called with the name of each stage; True: a line shows it; False: nothing is shown;
             None: a line after two seconds on a terminal or in a notebook.
 

@@ -22,7 +22,7 @@ from models.checks import Array
 from ocp.console import report
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.tool_motion import stretches_of
+from ocp.motion.builders.tool_motion import Stretch, stretches_of
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.local.rates import LocalMotion
@@ -51,7 +51,7 @@ from ocp.motion.search.held_joints import (
 )
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
-from ocp.motion.tasks.checks import checked_tasks, clip_to_limits, horizon_of
+from ocp.motion.tasks.checks import check_rest, checked_tasks, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Start
 from ocp.motion.tasks.limits import Limits
@@ -419,13 +419,29 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
         names, hint = machine.robot.joint_names, "start inside them"
         joints = clip_to_limits(joints, bounds.lower, bounds.upper, label="start", names=names, hint=hint)
     squares = own_cost if own_cost.velocity else replace(own_cost, velocity=1.0)
-    return PlanRequest(
+    request = PlanRequest(
         *(machine, all_tasks, duration, stretches, joints, base, squares.joint_weights(machine.joint_size)),
         *(without_actuators(checked_limits), options.cyclic, int(options.seed), float(own_cost.time) if free else None),
         search=search,
         cost=None if own_cost.velocity and set(own_cost.terms) <= {"velocity", "time"} else own_cost,
         actuator_limits=checked_limits if limits_actuators(checked_limits) else None,
     )
+    smooth = limits_actuators(checked_limits) or weights_actuators(own_cost)
+    return replace(request, rests=_rests(request)) if smooth else request
+
+
+def _rests(request: PlanRequest) -> tuple[bool, bool]:
+    """Return whether the tips are at rest at the start and at the end of a motion along tasks."""
+
+    def rest(stretch: Stretch, time: float) -> bool:
+        try:
+            if stretch.equations is not None:
+                check_rest(stretch.equations, time)
+        except ProblemError:
+            return False
+        return True
+
+    return rest(request.stretches[0], 0.0), rest(request.stretches[-1], request.horizon)
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:

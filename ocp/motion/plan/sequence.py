@@ -23,7 +23,7 @@ from models import FixedBase, Machine
 from models.checks import Array, floats
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.tool_motion import Stretch, stretches_of
+from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.actuators import limits_actuators, weights_actuators
@@ -36,7 +36,6 @@ from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.configurations import PlanRequest, local_motions_from
 from ocp.motion.search.held_joints import fix_ignorable_joints, hold_idle_joints, place_held_joints
 from ocp.motion.search.task_search import TaskSearch
-from ocp.motion.tasks.checks import check_rest
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start
 from ocp.motion.tasks.limits import Limits
@@ -189,8 +188,7 @@ class _Sequence:
         if machine.base_size or (near is not None and _is_at_start(machine, tasks, near)):
             options["start"] = Start(near, self.state.base if machine.base_size else None)
         checked = checked_request(machine, tasks, horizon, PlanOptions(**options))
-        rests = _rests(checked) if request.smooth else (False, False)
-        checked = replace(checked, clearance_constraints=self._constraints(), rests=rests)
+        checked = replace(checked, clearance_constraints=self._constraints())
         if options["start"] is None and near is not None:
             if request.search != "global":  # its bound is that of the task alone
                 checked = replace(checked, near=near)
@@ -257,20 +255,6 @@ def _led_to(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goa
     passes = isinstance(goal.velocity, str) and goal.velocity == "free"
     velocity = _velocity(first["rates"], smooth) if passes else goal.velocity
     return replace(with_joints(goal, first["joints"]), velocity=velocity)
-
-
-def _rests(request: PlanRequest) -> tuple[bool, bool]:
-    """Return whether the tips are at rest at the start and at the end of a motion along tasks."""
-
-    def rest(stretch: Stretch, time: float) -> bool:
-        try:
-            if stretch.equations is not None:
-                check_rest(stretch.equations, time)
-        except ProblemError:
-            return False
-        return True
-
-    return rest(request.stretches[0], 0.0), rest(request.stretches[-1], request.horizon)
 
 
 def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:

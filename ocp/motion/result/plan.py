@@ -11,6 +11,7 @@ import io
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -29,8 +30,10 @@ from ocp.solution_data import call_registered
 from ocp.storage import table_head, write_arrays, write_text
 from ocp.tolerances import LIMIT_SHARE
 
-__all__ = ["CHECKED_TIMES", "Plan", "PlanSample"]
+__all__ = ["CHECKED_TIMES", "ENDS", "Plan", "PlanSample"]
 
+ENDS = "speed at both ends"
+"""Name of the audit finding that tells whether a motion starts and ends at rest."""
 CHECKED_TIMES = 2001
 """Number of samples at which joint limits are checked, besides the times of the plan."""
 TIME_TOLERANCE = 1e-9
@@ -179,14 +182,37 @@ class Plan(ABC):
     def audit(self, **settings: Any) -> Audit:
         """Check the motion independently of its solver; see `ocp.audit.audit.audit`. Results are cached by settings."""
         key = audit_key(**settings)
-        if key not in self._audits:
-            self._audits[key] = self._audit(**settings)
-        audit: Audit = self._audits[key]
+        audit: Audit = self._audits.get(key) or self._audit(**settings)
+        if all(finding.name != ENDS for finding in audit.findings):  # a planner's audit of the solution has no such row
+            audit = self._with_rest_finding(audit)
+        self._audits[key] = audit
         return audit
 
     @abstractmethod
     def _audit(self, **settings: Any) -> Audit:
         """Audit the motion without using the cache of earlier audits."""
+
+    def _with_rest_finding(self, audit: Audit) -> Audit:
+        """Add to an audit how fast the joints move at both ends; a controller expects a motion that starts at rest."""
+        ends = np.array([0.0, self.horizon])
+        speeds, largest = np.abs(self.at(ends)["rates"]), float(np.abs(self._values("rates")).max(initial=0.0))
+        texts = []
+        for verb, row in zip(("starts", "ends"), speeds, strict=True):
+            joint = int(np.argmax(row))
+            if row[joint] > LIMIT_SHARE * largest:
+                texts.append(f"{verb} at {row[joint]:.3g} {self._unit(joint)}/s ({self.names[joint]!r})")
+        place = np.unravel_index(int(np.argmax(speeds)), speeds.shape)
+        note = "not at rest" if texts else "starts and ends at rest"
+        unit = f"{self._unit(int(place[1]))}/s"
+        finding = Finding(ENDS, float(speeds[place]), None, float(ends[place[0]]), note, unit=unit)
+        remarks = (f"it {' and '.join(texts)}, not at rest",) if texts else ()
+        feasible = sum(each.verdict == "feasible" for each in audit.findings)
+        findings = (*audit.findings[:feasible], finding, *audit.findings[feasible:])
+        return replace(audit, findings=findings, remarks=(*audit.remarks, *remarks))
+
+    def _unit(self, joint: int) -> str:
+        """Return the unit of a joint's position."""
+        return ("rad", "m")[self.machine.robot.moving_joints[joint].kind == "prismatic"]
 
     @property
     def audits(self) -> tuple[Audit, ...]:
@@ -204,7 +230,7 @@ class Plan(ABC):
             excess = np.maximum(values - upper, lower - values)
             row, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
             size = max(abs(float(lower[joint])), abs(float(upper[joint])))
-            unit = ("rad", "m")[robot.moving_joints[joint].kind == "prismatic"] + ("/s" if name == "rates" else "")
+            unit = self._unit(int(joint)) + ("/s" if name == "rates" else "")
             label = f"{name} of the machine, {self.names[joint]!r}"
             value = max(float(excess[row, joint]), 0.0)
             limit = LIMIT_SHARE * (size if np.isfinite(size) else 1.0)

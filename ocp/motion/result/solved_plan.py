@@ -142,15 +142,17 @@ class SolvedPlan(Plan):
 
     def with_targets(self, tasks: Sequence[TipTask]) -> SolvedPlan:
         """Return the plan with the target poses of its tasks, sampled at TARGET_TIMES times."""
-        times = np.linspace(0.0, self.horizon, TARGET_TIMES)
-        clock = times
-        if CLOCK in self.solution.states:
-            clock = self.task_share(times) * self.solution.horizon
+        return replace(self, targets=self._targets_of(tasks, np.linspace(0.0, self.horizon, TARGET_TIMES)))
+
+    def targets_at(self, times: Any) -> tuple[Target, ...]:
+        """Return the target poses of the tasks at times (M,), s; none if the tasks are unknown."""
+        return () if self.request is None else self._targets_of(self.request.tasks, self._checked_times(times))
+
+    def _targets_of(self, tasks: Sequence[TipTask], times: Array) -> tuple[Target, ...]:
+        clock = self.task_share(times) * self.solution.horizon if CLOCK in self.solution.states else times
         at = self.at(times)
-        base = at["base"] if "base" in at else np.zeros((TARGET_TIMES, 0))
-        return replace(
-            self, targets=targets_along(self.machine, tasks, clock, base=base, joints=at["joints"], shown_times=times)
-        )
+        base = at["base"] if "base" in at else np.zeros((len(times), 0))
+        return targets_along(self.machine, tasks, clock, base=base, joints=at["joints"], shown_times=times)
 
     # ---- files -------------------------------------------------------------------------------------------------------
 

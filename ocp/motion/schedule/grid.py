@@ -26,7 +26,7 @@ from ocp.motion.schedule.limits import (
     limit_names,
     limit_rows,
 )
-from ocp.motion.schedule.profile import Array, segment_index
+from ocp.motion.tasks.speed_profile import Array, segment_index
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Grid", "coarse_grid", "make_grid", "reachable_bounds"]

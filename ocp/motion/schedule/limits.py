@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from models.checks import NOT_NUMBERS, floats
 from ocp.errors import ProblemError, require
-from ocp.motion.schedule.profile import Array, LineMotion
+from ocp.motion.tasks.speed_profile import Array, LineMotion
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [

@@ -28,10 +28,10 @@ from ocp.motion.schedule.limits import (
     curvature_along,
     limit_names,
 )
-from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, join_profiles, segment_index
-from ocp.motion.schedule.ramps import Zones, plan_zones, ramp_distance
+from ocp.motion.schedule.ramps import Zones, plan_zones
 from ocp.motion.schedule.stretch import ACTIVE_SHARE, fastest_profile
 from ocp.motion.schedule.window import Stretch
+from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, join_profiles, ramp_distance, segment_index
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["Dip", "Schedule", "plan_below_velocity_curve", "schedule"]

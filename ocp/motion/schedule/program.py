@@ -32,7 +32,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ocp.errors import SolveError
-from ocp.motion.schedule.profile import Array
+from ocp.motion.tasks.speed_profile import Array
 from ocp.tolerances import SOLVER_SHARE
 
 __all__ = ["INTERIOR", "Program", "ProgramSettings", "Spline", "SplineRows", "least_time"]

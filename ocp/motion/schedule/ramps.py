@@ -1,9 +1,7 @@
-"""Jerk-limited changes of the speed along a path, and time-optimal passes for motions without jerk limits.
+"""Fastest motions through zones of constant limits, and time-optimal passes for motions without jerk limits.
 
-A ramp changes the speed with zero acceleration at both ends. This module has its time and distance, its inverse (the
-speed within reach), and the fastest motion between two speeds over a distance. A zone is a stretch with constant limits
-of speed, acceleration and jerk; `plan_zones` finds the speeds at their bounds and joins the fastest motions between
-them.
+A zone is a stretch of the path with constant limits of speed, acceleration and jerk; `plan_zones` finds the speeds at
+their bounds and joins the fastest motions between them.
 
 Without jerk limits the fastest motion follows from a backward and a forward pass in (s, v^2). With x = v^2 at the nodes
 and one acceleration u in each interval of width h, x grows by 2 h u, and each row is linear in (u, x). Backward, the
@@ -15,23 +13,28 @@ Time-Optimal Path Parameterization Based on Reachability Analysis, 2018; the row
 from __future__ import annotations
 
 from collections.abc import MutableMapping
-from math import cbrt, hypot, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from ocp.errors import ProblemError, require
-from ocp.motion.schedule.profile import Array, SpeedProfile, integrate_jerk
+from ocp.motion.tasks.speed_profile import (
+    Array,
+    Phases,
+    SpeedProfile,
+    integrate_jerk,
+    ramp_distance,
+    ramp_phases,
+    reachable_speed,
+)
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
-    "Memory", "Phases", "Zones", "fastest_motion", "peak_acceleration", "plan_zones", "ramp_distance", "ramp_time",
-    "reachability_passes", "reachable_speed",
+    "Memory", "Zones", "fastest_motion", "peak_acceleration", "plan_zones", "reachability_passes",
 ]  # fmt: skip
 
-Phases = tuple[tuple[float, float], ...]
-"""Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
 Memory = MutableMapping[tuple[float, ...], Phases]
 """Cache of computed motions, keyed by distance, end speeds and limits."""
 
@@ -51,45 +54,6 @@ class Zones(NamedTuple):
     speed: Array
     acceleration: Array
     jerk: Array
-
-
-def ramp_time(change: float, acceleration: float, jerk: float) -> float:
-    """Return the shortest time (s) in which the speed changes by `change` (m/s), with zero acceleration at both ends.
-
-    Raises:
-        ProblemError: The change is negative, or a limit is not positive.
-    """
-    require.nonnegative("ramp: change", change)
-    for name, value in (("acceleration", acceleration), ("jerk", jerk)):
-        require.positive(f"ramp: {name}", value)
-    if change * jerk >= acceleration**2:
-        return change / acceleration + acceleration / jerk
-    return 2 * sqrt(change / jerk)
-
-
-def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
-    """Return the distance (m) covered while the speed changes in the shortest time; raise the errors of `ramp_time`."""
-    for name, value in (("first", first), ("last", last)):
-        require.nonnegative(f"ramp: {name}", value)
-    return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
-
-
-def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Return the greatest speed (m/s) that can be reached within a distance (m), with zero acceleration at both ends.
-
-    This is the inverse of ramp_distance; the same holds for slowing down from that speed.
-    """
-    # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance, by Cardano's
-    # formula as a quotient without cancellation
-    half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)
-    root = cbrt(half + hypot(half, third**1.5))
-    x = 2 * half / (root * root + third + (third / root) ** 2)
-    if jerk * x <= acceleration:
-        return float(speed + jerk * x * x)
-    # with it: v^2 + v A^2/J = speed^2 - speed A^2/J + 2 A distance
-    b = acceleration**2 / jerk
-    root = sqrt(b * b + 4 * (speed * speed - speed * b + 2 * acceleration * distance))
-    return float(max(speed, (root - b) / 2))
 
 
 def peak_acceleration(mean: float, speed: float, jerk: float) -> float:
@@ -169,24 +133,10 @@ def _two_ramps(distance: float, first: float, last: float, top: float, accelerat
         low, high = (middle, high) if needed(middle) <= distance else (low, middle)
     rest = max(distance - needed(low), 0.0)
     return (
-        *_ramp(low - first, acceleration, jerk),
+        *ramp_phases(low - first, acceleration, jerk),
         *(((rest / low, 0.0),) if rest > 0 and low > 0 else ()),
-        *_ramp(last - low, acceleration, jerk),
+        *ramp_phases(last - low, acceleration, jerk),
     )
-
-
-def _ramp(change: float, acceleration: float, jerk: float) -> Phases:
-    """Return the phases of constant jerk that change the speed by a given amount (m/s) in the least time."""
-    size, sign = abs(change), 1.0 if change > 0 else -1.0
-    if size == 0:
-        return ()
-    if size * jerk < acceleration**2:
-        t = sqrt(size / jerk)
-        return ((t, sign * jerk), (t, -sign * jerk))
-    t = acceleration / jerk
-    middle = size / acceleration - t
-    flat = ((middle, 0.0),) if middle > 0 else ()
-    return ((t, sign * jerk), *flat, (t, -sign * jerk))
 
 
 def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from ocp.errors import ProblemError, SolveError
 from ocp.motion.schedule.grid import reachable_bounds
 from ocp.motion.schedule.limits import Rows
-from ocp.motion.schedule.profile import Array, SpeedProfile, join_profiles
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.motion.schedule.ramps import reachability_passes
 from ocp.motion.schedule.window import (
@@ -34,6 +33,7 @@ from ocp.motion.schedule.window import (
     motion_profile,
 )
 from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
+from ocp.motion.tasks.speed_profile import Array, SpeedProfile, join_profiles
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["ACTIVE_SHARE", "fastest_profile"]

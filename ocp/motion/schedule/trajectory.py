@@ -14,7 +14,7 @@ from models.files import read_regular
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule.limits import JointPath, check_joints, rates_along
 from ocp.motion.schedule.planner import Schedule
-from ocp.motion.schedule.profile import Array, LineMotion
+from ocp.motion.tasks.speed_profile import Array, LineMotion
 from ocp.storage import checked_path, column_name, joint_name, write_text
 
 __all__ = ["JointTrajectory", "joint_motion", "joint_trajectory"]

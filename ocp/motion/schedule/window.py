@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ocp.motion.schedule.grid import Grid
 from ocp.motion.schedule.limits import Rows, limit_rows, torque_rows
-from ocp.motion.schedule.profile import Array, LineMotion, SpeedProfile, profile_through
+from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, profile_through
 
 __all__ = [
     "HELD", "INSIDE", "Ends", "EnforcedRows", "Margins", "Motion", "Stretch", "Window", "limit_usage", "motion_profile",

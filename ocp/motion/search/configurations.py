@@ -67,7 +67,7 @@ class PlannerSettings:
         max_failures: Number of failed candidates of a batch after which no further one is repaired; also of sorted
             initial guesses that are tried, and of motions that are audited if all are requested.
         refusal_time: Processor time after which no further candidate is tried if those before failed for other reasons
-            than collisions, s.
+            than collisions, s. A time limit of the caller takes its place.
         batch: Number of initial guesses that are solved before the best is audited, if each takes seconds.
         max_separations: Largest number of solves of one candidate with more, or wider, separation constraints.
         max_cost_ratio: A local motion whose cost exceeds that of the best solve by this factor is not solved.

@@ -20,7 +20,7 @@ from models.checks import Array, ArrayInput, short_repr
 from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, rotation_from_quaternion, skew
 from ocp.errors import ProblemError, require
-from ocp.motion.tasks.tracks import Track, path_tracks, reparametrize
+from ocp.motion.tasks.tracks import Track, path_tracks, reparametrize, rest_to_rest_speed
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
 __all__ = ["Axes", "Roll", "TipTask", "Velocity", "retime_task"]
@@ -141,35 +141,50 @@ class TipTask:
         path: SmoothPath,
         speed: Any,
         *,
+        acceleration: float | None = None,
+        jerk: float | None = None,
+        steady: bool = False,
         roll: Roll = "free",
-        tool_axis: ArrayInput = (0.0, 0.0, 1.0),
         **others: Any,
     ) -> Self:
         """Return the task of moving along a path, with the tool orientation that the path specifies.
 
-        If the path has no tool orientation, only the position is prescribed, unless `direction` or `orientation` is
-        given. Duration and breaks are those of the path.
+        The tip starts and ends at rest, because robots do, and moves at the requested speed in between. If the path has
+        no tool orientation, only the position is prescribed, unless `direction` or `orientation` is given. Duration and
+        breaks are those of the path.
 
         Args:
             path: Path from `models.smooth`.
-            speed: Constant, m/s, or a Schedule of the path.
+            speed: Speed between the two ramps, m/s, or a Schedule of the path, which specifies the whole motion.
+            acceleration: Largest acceleration along the path, m/s^2; None: 1 m/s^2.
+            jerk: Largest jerk along the path, m/s^3; None: the one that builds up the acceleration in 0.1 s.
+            steady: Whether the tip moves at the requested speed from the beginning of the path to its end, as in a pass
+                that is part of a longer motion. The motion then does not start at rest.
             roll: "free": the tool axis points as the path says and the roll about it is free (within a cone if `within`
                 is given); "given": the path prescribes the whole orientation.
-            tool_axis: Tool axis in the tool frame. Shape (3,).
-            others: Further attributes of the task: `link`, `gain`, `within`, `begin`, ...; `direction` or `orientation`
-                replace those of the path.
+            others: Further attributes of the task: `tool_axis`, `link`, `gain`, `within`, `begin`, ...; `direction` or
+                `orientation` replace those of the path.
 
         Raises:
-            ProblemError: `path` is not a path, the speed is not positive, or an attribute is invalid.
+            ProblemError: `path` is not a path, a number is not positive, an attribute is invalid, or acceleration and
+                jerk are given for a steady motion or beside a Schedule.
         """
         require.choice("roll", roll, get_args(Roll))
+        if hasattr(speed, "profile"):
+            _refuse_ramps(
+                "the Schedule specifies the speed", acceleration=acceleration, jerk=jerk, steady=steady or None
+            )
+        elif steady:
+            _refuse_ramps("a steady motion has no ramps", acceleration=acceleration, jerk=jerk)
+        else:
+            speed = rest_to_rest_speed(path, speed, acceleration, jerk)
         tracks = path_tracks(path, speed)
         attributes: dict[str, Any] = {"position": tracks.position, "duration": tracks.duration, "breaks": tracks.breaks}
         if path.path.oriented and not {"direction", "orientation"} & set(others):
-            axis = require.array("tip task: tool_axis", tool_axis, (3,))
+            axis = require.array("tip task: tool_axis", others.get("tool_axis", (0.0, 0.0, 1.0)), (3,))
             whole = roll == "given"
             attributes |= {"orientation": tracks.orientation} if whole else {"direction": tracks.axis(axis)}
-        return cls(tool_axis=tool_axis, **{**attributes, **others})
+        return cls(**{**attributes, **others})
 
     def _checked_breaks(self) -> Array:
         times = np.unique(require.array("tip task: breaks", self.breaks, ("times",), least=0))
@@ -229,6 +244,13 @@ class TipTask:
     def end(self) -> float:
         """End time of the task, s; infinite if the task lasts to the end of the motion."""
         return np.inf if self.duration is None else float(self.begin + self.duration)
+
+
+def _refuse_ramps(reason: str, **arguments: Any) -> None:
+    """Raise ProblemError if an argument of `TipTask.along` that would have no effect is given."""
+    for name, value in arguments.items():
+        if value is not None:
+            raise ProblemError(f"{name}={value!r} has no effect: {reason}; remove it", name=name, value=value)
 
 
 def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:

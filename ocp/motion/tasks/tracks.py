@@ -20,10 +20,11 @@ from models.paths.functions import exponential, path_function, turn_function
 from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError, require
+from ocp.motion.tasks.speed_profile import SpeedProfile, rest_profile
 
 __all__ = [
-    "PathTracks", "PoseLine", "Track", "TrackWithRate", "on_symbols", "path_tracks", "pose_line", "reparametrize",
-    "track_expression",
+    "PathTracks", "PoseLine", "Track", "TrackWithRate", "on_symbols", "path_tracks", "pose_line", "ramp_limits",
+    "reparametrize", "rest_to_rest_speed", "track_expression",
 ]  # fmt: skip
 
 Track: TypeAlias = Any
@@ -34,6 +35,11 @@ _Result = TypeVar("_Result")
 
 MAX_ROTATION_RAD = np.pi - 1e-3
 """Largest rotation between the two poses of a `pose_line`, because the sense of half a turn is ambiguous."""
+PATH_ACCELERATION = 1.0
+"""Default acceleration along a path, m/s^2. Controllers of robot arms have defaults of about this size for motions on
+straight lines (Universal Robots: 1.2 m/s^2)."""
+RISE_TIME_S = 0.1
+"""Time in which the default jerk builds up the acceleration along a path, s."""
 
 
 class PoseLine(NamedTuple):
@@ -126,6 +132,35 @@ class PathTracks(NamedTuple):
         return TrackWithRate(direction, lambda time: ca.cross(angular_velocity(time), direction(time)))
 
 
+def ramp_limits(acceleration: float | None, jerk: float | None) -> tuple[float, float]:
+    """Return acceleration and jerk along a path (m/s^2, m/s^3); None stands for the defaults of `TipTask.along`."""
+    if acceleration is None:
+        acceleration = PATH_ACCELERATION
+    require.positive("acceleration", acceleration)
+    return acceleration, acceleration / RISE_TIME_S if jerk is None else jerk
+
+
+def rest_to_rest_speed(path: SmoothPath, speed: Any, acceleration: Any = None, jerk: Any = None) -> SpeedProfile:
+    """Return the speed of a tool that starts and ends at rest and moves at the given speed, m/s, in between.
+
+    Raises the errors of `TipTask.along`.
+    """
+    _checked_path(path)
+    return rest_profile(path.length, _checked_speed(speed), *ramp_limits(acceleration, jerk))
+
+
+def _checked_path(path: Any) -> None:
+    if not isinstance(path, SmoothPath):
+        raise ProblemError(f"path must be a SmoothPath, as smooth makes it, not {path!r}", name="path", value=path)
+
+
+def _checked_speed(speed: Any) -> float:
+    if not 0 < real(speed) < np.inf:
+        words = f"speed must be a positive number of m/s, or a Schedule of the path, not {speed!r}"
+        raise ProblemError(words, name="speed", value=speed, limit=0.0)
+    return float(speed)
+
+
 def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
     """Return the functions of time that describe the motion of a tool along a path.
 
@@ -133,32 +168,30 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
 
     Args:
         path: Path from `models.smooth`, with the orientation of the tool.
-        speed: Constant, m/s, or a Schedule of the path (`ocp.motion.schedule.schedule`).
+        speed: Constant, m/s; or the speed over time as a SpeedProfile or a Schedule of the path
+            (`ocp.motion.schedule.schedule`).
 
     Raises:
-        ProblemError: `path` is not a path, the speed is not positive, or the schedule is of another path.
+        ProblemError: `path` is not a path, the speed is not positive, or the profile is of another path.
     """
-    if not isinstance(path, SmoothPath):
-        raise ProblemError(f"path must be a SmoothPath, as smooth makes it, not {path!r}", name="path", value=path)
+    _checked_path(path)
     position_of, orientation_of = path_function(path), turn_function(path)
     pace: Callable[[Any], tuple[Any, Any]]
-    if callable(getattr(speed, "time_at", None)) and not isinstance(speed, type):
-        length = float(speed.path.length)
+    profile = getattr(speed, "profile", speed)
+    if isinstance(profile, SpeedProfile):
+        length = float(profile.distance[-1])
         if abs(length - path.length) > 1e-9 * path.length:
             words = f"the schedule is for a path of {length:g} m, this one has {path.length:g} m"
             raise ProblemError(words, name="speed", value=length, limit=path.length)
-        motion, duration = speed.function(), float(speed.duration)
-        breaks = np.union1d(speed.profile.t, speed.time_at(path.bounds))
+        motion, duration = profile.function(), profile.duration
+        breaks = np.union1d(profile.t, profile.at_distance(np.minimum(path.bounds, length)).t)
 
         def pace(time: Any) -> tuple[Any, Any]:
             distance, rate, *_ = motion(time)
             return distance, rate
 
     else:
-        if not 0 < real(speed) < np.inf:
-            words = f"speed must be a positive number of m/s, or a Schedule of the path, not {speed!r}"
-            raise ProblemError(words, name="speed", value=speed, limit=0.0)
-        constant = float(speed)
+        constant = _checked_speed(speed)
         duration, breaks = path.length / constant, path.bounds / constant
 
         def pace(time: Any) -> tuple[Any, Any]:

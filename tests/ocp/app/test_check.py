@@ -14,6 +14,7 @@ from ocp import Plan
 from ocp.app import Check, Fault, check_trajectory
 from ocp.app.files import read_trajectory, read_waypoints
 from ocp.errors import ProblemError
+from ocp.motion.result.plan import ENDS
 from tests.ocp.app.motions import MIDDLE, NAMES, SWING, TURNS, URDF, check_motion, smooth, write_table
 
 AT = 1.7
@@ -47,7 +48,29 @@ def test_a_sound_motion_is_not_accused(tmp_path: Path, with_rates: int) -> None:
     check = checked(tmp_path, t, *values[:with_rates], acceleration=8.0, jerk=40.0)
     assert check.passed, check
     assert check.rule == ("linear", "cubic", "quintic")[with_rates - 1]
-    assert {row.verdict for row in check.rows} == {"ok"}
+    assert {row.verdict for row in check.rows if row.name != ENDS} == {"ok"}
+
+
+@pytest.mark.parametrize("with_rates", [1, 2, 3])
+@pytest.mark.parametrize(("turns", "text"), [(2.0, "at rest"), (1.5, "at rest"), (1.75, "ends at"), (-1.75, "starts")])
+def test_whether_a_motion_starts_and_ends_at_rest_is_a_row_and_part_of_the_verdict(
+    tmp_path: Path, with_rates: int, turns: float, text: str
+) -> None:
+    """A cosine is at rest after whole and half turns; backwards in time its end is its start."""
+    t, sign = np.linspace(0.0, 4.0, 401), np.sign(turns)
+    rate = 2 * np.pi * abs(turns) / 4
+    phase = rate * t[:: int(sign), None]
+    swing = 0.5 * SWING
+    values = MIDDLE - swing * np.cos(phase), sign * swing * rate * np.sin(phase), swing * rate**2 * np.cos(phase)
+    check = checked(tmp_path, t, *values[:with_rates])
+    assert check.passed
+    row = next(row for row in check.rows if row.name == ENDS)
+    assert row.note.startswith(text)
+    assert row.verdict == ("ok" if text == "at rest" else "info")
+    assert (text in check.sentence) == (text != "at rest")
+    assert row.value == pytest.approx(swing.max() * rate if text != "at rest" else 0.0, rel=1e-3)
+    if text != "at rest":
+        assert row.time == (4.0 if sign > 0 else 0.0)
 
 
 def test_a_position_limit_passed_between_two_samples(tmp_path: Path) -> None:

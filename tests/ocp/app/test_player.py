@@ -464,7 +464,7 @@ def test_solutions_and_files_are_shown_as_plans_are(
             np.testing.assert_allclose(one.t, wanted.t, atol=1e-12)
             np.testing.assert_allclose(one.joints, wanted.joints, atol=1e-4)
             np.testing.assert_allclose(one.base, wanted.base, atol=1e-4)
-        assert shown[0].verdict == wanted.verdict
+        assert wanted.verdict.startswith(shown[0].verdict.rstrip("."))
         assert shown[0].passed is wanted.passed is True
         assert shown[1].passed is None
         report, _ = unpack_page(build_page([wanted, *shown], title="three").text)
@@ -535,7 +535,7 @@ def test_the_command_writes_a_page_or_serves_it(
     ]
     again = ["view", str(tmp_path / "bare.npz"), "--robot", str(folder / "arm.urdf"), "--tip", "finger"]
     assert main([*again, "--lock", "grip=0.05", "--page", str(target), "--quiet", "--no-meshes"]) == 0
-    assert "local minimum" in capsys.readouterr().out
+    assert "no better motion is near it" in capsys.readouterr().out
     assert main(["view", str(tmp_path / "bare.npz"), "--page", str(target)]) == 2
     assert "no plan" in capsys.readouterr().err
     assert main([*again, "--page", str(target), "--quiet"]) == 2  # the plan does not move the grip

@@ -35,7 +35,7 @@ def along(length: float, tolerance: tuple[float, float] | None = None) -> Soluti
     path = smooth(Path.through(corners), deviation=0.05 * length)
     speed = path.length / SECONDS
     report: dict[str, Any] = {} if tolerance is None else {"tolerance": tolerance}
-    task = TipTask.along(path, speed, gain=0.0, **report)
+    task = TipTask.along(path, speed, steady=True, gain=0.0, **report)
     problem = minimum_velocity_problem(gantry(length), tasks=task, start=np.zeros(4), horizon=task.duration)
     return solve(problem, Collocation(12, 4).with_nodes_at(np.asarray(task.breaks) / task.duration))
 

@@ -429,19 +429,19 @@ def test_the_table_shows_every_finding_under_its_verdict() -> None:
             assert line == line.rstrip()
         at += 1 + len(findings)
     assert len(lines) == at + 1
-    assert lines[-1].startswith("The plan may be run; no better motion is nearby")
+    assert lines[-1].startswith("The plan may be run; no better motion is near it")
     assert "reported 1.047" in str(audit)
 
 
 @pytest.mark.parametrize(
     ("how", "marked", "titles", "sentence"),
     [
-        (lambda s: s.audit(), set(), ("yes", "yes"), "may be run; no better motion is nearby"),
+        (lambda s: s.audit(), set(), ("yes", "yes"), "may be run; no better motion is near it"),
         (
             lambda s: replace(s, success=False, status=SolverStatus.RESTORATION_FAILED).audit(),
             set(),
             ("yes", "not decided"),
-            "may be run; whether a better motion is nearby is undetermined: the solver says Restoration_Failed.",
+            "may be run; whether it is a local minimum is not decided: the solver says Restoration_Failed.",
         ),
         (
             lambda s: s.audit(lost=0.0),

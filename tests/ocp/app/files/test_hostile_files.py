@@ -25,7 +25,8 @@ from models.shapes.pairs import checked_pairs
 from ocp import ProblemError, Solution
 from ocp.app.files import read_gcode, read_joint_limits, read_trajectory, read_waypoints, safe_files
 from ocp.app.files.safe_files import read_tree
-from ocp.app.files.task_file import read_obstacles, read_task
+from ocp.app.files.settings import read_obstacles
+from ocp.app.files.task_file import read_task
 from ocp.motion.schedule import JointTrajectory
 
 READERS: dict[str, tuple[str, Callable[[Any], Any]]] = {

@@ -11,7 +11,7 @@ import pytest
 
 from models import Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere
 from models.spatial import rotation_from_rpy
-from ocp.app.files.task_file import SHAPES, read_obstacles
+from ocp.app.files.settings import SHAPES, read_obstacles
 
 TURN = np.array(rotation_from_rpy(0.1, -0.2, 0.3), dtype=float)
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], dtype=float)

@@ -106,13 +106,16 @@ def halves() -> list[TipTask]:
     middle = (0.45, 0.0, 0.275)
     ends = [(0.4, 0.0, 0.2), middle], [middle, (0.5, 0.0, 0.35)]
     lines = [smooth(Path.through(pair), 0.05) for pair in ends]
-    return [TipTask.along(line, SPEED, rows=(3, 5), begin=begin) for line, begin in zip(lines, (0.0, 1.0), strict=True)]
+    return [
+        TipTask.along(line, SPEED, steady=True, rows=(3, 5), begin=begin)
+        for line, begin in zip(lines, (0.0, 1.0), strict=True)
+    ]
 
 
-@pytest.mark.parametrize("kind", ["one task", "parts", "free horizon", "corner", "loaded"])
+@pytest.mark.parametrize("kind", ["one task", "from rest", "parts", "free horizon", "corner", "loaded"])
 def test_a_plan_of_tasks_along_a_path_is_scheduled(kind: str, tmp_path: File) -> None:
     path = PATH if kind == "corner" else LINE
-    task = TipTask.along(path, SPEED, rows=(3, 5))
+    task = TipTask.along(path, SPEED, steady=kind != "from rest", rows=(3, 5))
     result = planned(
         halves() if kind == "parts" else task, path, **({"horizon": "free"} if kind == "free horizon" else {})
     )
@@ -130,13 +133,11 @@ def test_a_plan_of_tasks_along_a_path_is_scheduled(kind: str, tmp_path: File) ->
 
 
 def test_a_plan_whose_tasks_do_not_run_along_the_path_is_refused() -> None:
-    slow = schedule(LINE, LineLimits(SPEED, 0.2, 2.0))
-    later = TipTask.along(LINE, SPEED, rows=(3, 5), begin=0.5)
+    later = TipTask.along(LINE, SPEED, steady=True, rows=(3, 5), begin=0.5)
     held = TipTask(position=(0.4, 0.0, 0.2), rows=(3, 5), duration=0.5)
     for tasks, path, words in (
-        (TipTask.along(LINE, SPEED, rows=(3, 5)), PATH, r"m off the path at 2 s"),
-        (TipTask.along(LINE, slow, rows=(3, 5)), LINE, r"m off the path at"),
-        ([held, later], LINE, r"m off the path at"),
+        (TipTask.along(LINE, SPEED, steady=True, rows=(3, 5)), PATH, r"m off the path at"),
+        ([held, later], LINE, "stand still"),
         (later, LINE, "have no position at 0 s"),
     ):
         with pytest.raises(ProblemError, match=words) as caught:

@@ -20,7 +20,7 @@ LINE = smooth(Path.through([(0.45, -0.15, 0.3), (0.45, 0.1, 0.3), (0.55, 0.15, 0
 
 
 def task(**options: Any) -> TipTask:
-    return TipTask.along(LINE, 0.1, **{"direction": DOWN, **options})
+    return TipTask.along(LINE, 0.1, steady=True, **{"direction": DOWN, **options})
 
 
 def followed(
@@ -101,7 +101,7 @@ def test_a_joint_at_its_limit_stays_there_and_the_others_do_the_task() -> None:
     start = np.array([0.3, 0.5, 0.4, 0.3])
     place = numeric(arm.tip_pose((), start).position).ravel()
     line = smooth(Path.through([place, place + np.array([0.1, -0.5, 0.0])]), deviation=0.01)
-    request = TipTask.along(line, 0.2, rows=(3, 4))
+    request = TipTask.along(line, 0.2, steady=True, rows=(3, 4))
     free = followed(arm, request, start[None], lower=np.full(4, -np.inf), upper=np.full(4, np.inf))
     assert free.pose_error[0] < 1e-6
     lower, upper = np.full(4, -np.inf), np.full(4, np.inf)
@@ -120,7 +120,7 @@ def test_the_end_of_the_reach_along_a_path_is_reported() -> None:
     """A line that leaves the reach of 2.4 m after some time, and comes back."""
     arm = FixedBase(planar_chain([1.0, 0.8, 0.6], [1.0] * 3))
     line = smooth(Path.through([(1.5, -1.0, 0.0), (2.6, 0.0, 0.0), (1.5, 1.0, 0.0)]), deviation=0.01)
-    request = TipTask.along(line, 0.5, rows=(3, 4))
+    request = TipTask.along(line, 0.5, steady=True, rows=(3, 4))
     result = followed(arm, request, start_configurations(arm, request, starts=4), damping=0.05)
     assert (result.pose_error > 0.1).all()
     distance = np.linalg.norm(line.at(np.clip(0.5 * result.worst_time, 0, line.length)).position, axis=1)
@@ -132,7 +132,7 @@ def test_axes_that_may_lean_are_turned_back_only_where_they_lean_too_far() -> No
     request = task(within=0.2)
     start = start_configurations(panda(), task())[:6]
     result = followed(panda(), request, start, damping=0.01)
-    free = followed(panda(), TipTask.along(LINE, 0.1), start, damping=0.01)
+    free = followed(panda(), TipTask.along(LINE, 0.1, steady=True), start, damping=0.01)
     follows = (result.pose_error < 1e-5) & (free.pose_error < 1e-5)
     assert follows.any()
     equations, within = bind(panda(), task(within=1e-6)), 0.2
@@ -148,7 +148,7 @@ def test_a_floating_base_goes_where_its_momentum_says(momentum: Any) -> None:
     machine = floating_panda(momentum)
     _, place = pose(machine, machine.base_home(), PANDA_START)
     line = smooth(Path.through([place, place + np.array([0.05, -0.08, 0.06])]), deviation=0.01)
-    request = TipTask.along(line, 0.05)
+    request = TipTask.along(line, 0.05, steady=True)
     result = followed(machine, request, PANDA_START[None], steps=256)
     local = resolve(machine, request, request.duration, start=PANDA_START, samples=257)
     assert result.pose_error[0] < 1e-6

@@ -146,40 +146,46 @@ def space_tip() -> tuple[Array, Array]:
 @plan_case
 def three_lanes_panda() -> PlanCase:
     path = raster(3)
-    return PlanCase(panda(), TipTask.along(path, 0.05, direction=DOWN), panda_peer(), path, 0.05, DOWN)
+    return PlanCase(panda(), TipTask.along(path, 0.05, steady=True, direction=DOWN), panda_peer(), path, 0.05, DOWN)
 
 
 @plan_case
 def three_lanes_ur5() -> PlanCase:
     """The tool's axis is that of the last joint, whose roll is free."""
     path = raster(3)
-    return PlanCase(ur5(), TipTask.along(path, 0.05, direction=DOWN), Arm.of("ur5", "tool0"), path, 0.05, DOWN)
+    return PlanCase(
+        ur5(), TipTask.along(path, 0.05, steady=True, direction=DOWN), Arm.of("ur5", "tool0"), path, 0.05, DOWN
+    )
 
 
 @plan_case
 def three_lanes_space_arm() -> PlanCase:
     position, rotation = space_tip()
     path, axis = raster(3, position, (0.06, 0.1)), rotation[:, 2]
-    task = TipTask.along(path, 0.02, direction=axis)
+    task = TipTask.along(path, 0.02, steady=True, direction=axis)
     return PlanCase(floating_manipulator(), task, space_peer(), path, 0.02, axis, options={"start": SPACE_START})
 
 
 @plan_case
 def five_lanes_ur5() -> PlanCase:
     path = raster(5)
-    return PlanCase(angled_ur5(), TipTask.along(path, 0.05, direction=DOWN), angled_ur5_arm(), path, 0.05, DOWN)
+    return PlanCase(
+        angled_ur5(), TipTask.along(path, 0.05, steady=True, direction=DOWN), angled_ur5_arm(), path, 0.05, DOWN
+    )
 
 
 @plan_case
 def seam_ur5() -> PlanCase:
     path, tilted = curved_seam(), (0.0, 0.3, -1.0)
-    return PlanCase(angled_ur5(), TipTask.along(path, 0.03, direction=tilted), angled_ur5_arm(), path, 0.03, tilted)
+    return PlanCase(
+        angled_ur5(), TipTask.along(path, 0.03, steady=True, direction=tilted), angled_ur5_arm(), path, 0.03, tilted
+    )
 
 
 @plan_case
 def seam_panda() -> PlanCase:
     path, tilted = curved_seam(), (0.0, 0.3, -1.0)
-    return PlanCase(panda(), TipTask.along(path, 0.03, direction=tilted), panda_peer(), path, 0.03, tilted)
+    return PlanCase(panda(), TipTask.along(path, 0.03, steady=True, direction=tilted), panda_peer(), path, 0.03, tilted)
 
 
 @plan_case
@@ -187,20 +193,22 @@ def seam_space_arm() -> PlanCase:
     position, rotation = space_tip()
     corners = position + np.array([[0, 0, 0], [0, 0.1, 0.02], [0.06, 0.12, 0.05]])
     path, axis = smooth(Path.through(corners), deviation=0.003), rotation[:, 2]
-    return PlanCase(floating_manipulator(), TipTask.along(path, 0.01, direction=axis), space_peer(), path, 0.01, axis)
+    return PlanCase(
+        floating_manipulator(), TipTask.along(path, 0.01, steady=True, direction=axis), space_peer(), path, 0.01, axis
+    )
 
 
 @plan_case
 def contour_panda() -> PlanCase:
     path = circle((0.5, 0.0, 0.3), 0.1)
-    task = TipTask.along(path, 0.1, direction=DOWN)
+    task = TipTask.along(path, 0.1, steady=True, direction=DOWN)
     return PlanCase(panda(), task, panda_peer(), path, 0.1, DOWN, options={"cyclic": True})
 
 
 @plan_case
 def contour_ur5() -> PlanCase:
     path = circle((0.5, 0.1, 0.3), 0.08)
-    task = TipTask.along(path, 0.1, direction=DOWN)
+    task = TipTask.along(path, 0.1, steady=True, direction=DOWN)
     return PlanCase(angled_ur5(), task, angled_ur5_arm(), path, 0.1, DOWN, options={"cyclic": True})
 
 
@@ -214,7 +222,7 @@ def blended_poses() -> SmoothPath:
 @plan_case
 def poses_panda() -> PlanCase:
     path = blended_poses()
-    task = TipTask.along(path, 0.1, roll="given")
+    task = TipTask.along(path, 0.1, steady=True, roll="given")
     return PlanCase(panda(), task, panda_peer(), path, 0.1, looks="orientation")
 
 
@@ -222,21 +230,21 @@ def poses_panda() -> PlanCase:
 def poses_ur5() -> PlanCase:
     """Six rows of six joints: nothing is left but the branch."""
     path = blended_poses()
-    task = TipTask.along(path, 0.1, roll="given")
+    task = TipTask.along(path, 0.1, steady=True, roll="given")
     return PlanCase(angled_ur5(), task, angled_ur5_arm(), path, 0.1, looks="orientation")
 
 
 @plan_case
 def finishing_ur5() -> PlanCase:
     path = raster(3)
-    task = TipTask.along(path, 0.05, direction=DOWN, within=CONE)
+    task = TipTask.along(path, 0.05, steady=True, direction=DOWN, within=CONE)
     return PlanCase(angled_ur5(), task, angled_ur5_arm(), path, 0.05, DOWN, looks="cone")
 
 
 @plan_case
 def finishing_panda() -> PlanCase:
     path = raster(3)
-    task = TipTask.along(path, 0.05, direction=DOWN, within=CONE)
+    task = TipTask.along(path, 0.05, steady=True, direction=DOWN, within=CONE)
     return PlanCase(panda(), task, panda_peer(), path, 0.05, DOWN, looks="cone")
 
 
@@ -245,7 +253,7 @@ def two_arms() -> PlanCase:
     """The left hand holds, the right one moves."""
     path = smooth(Path.through([(0.45, 0.0, 0.4), (0.45, -0.2, 0.4), (0.55, -0.2, 0.4)]), deviation=0.002)
     hold = TipTask(link="left_panda_hand", position=HELD, orientation=quaternion((1, 0, 0), np.pi))
-    move = replace(TipTask.along(path, 0.05, direction=(0, 1, 0)), link="right_panda_hand")
+    move = replace(TipTask.along(path, 0.05, steady=True, direction=(0, 1, 0)), link="right_panda_hand")
     arm = panda_peer(prefix="right_", place=(0.0, -0.3, 0.0))
     return PlanCase(pair(), [hold, move], arm, path, 0.05, (0, 1, 0))
 
@@ -253,20 +261,24 @@ def two_arms() -> PlanCase:
 @plan_case
 def helix_ur5() -> PlanCase:
     path = helix((0.5, 0.1, 0.2), 0.06, 0.08, 1.5)
-    return PlanCase(angled_ur5(), TipTask.along(path, 0.1, direction=DOWN), angled_ur5_arm(), path, 0.1, DOWN)
+    return PlanCase(
+        angled_ur5(), TipTask.along(path, 0.1, steady=True, direction=DOWN), angled_ur5_arm(), path, 0.1, DOWN
+    )
 
 
 @plan_case
 def helix_panda() -> PlanCase:
     path = helix((0.45, 0.0, 0.3), 0.06, 0.08, 1.5)
-    return PlanCase(panda(), TipTask.along(path, 0.1, direction=DOWN), panda_peer(), path, 0.1, DOWN)
+    return PlanCase(panda(), TipTask.along(path, 0.1, steady=True, direction=DOWN), panda_peer(), path, 0.1, DOWN)
 
 
 def on_board(path: SmoothPath, speed: float, looks: str = "axis", **report: Any) -> PlanCase:
     """The space arm along a path from where its tip is, its tool as it is then but for what is told."""
     axis = space_tip()[1][:, 2]
     direction = None if looks == "orientation" else axis
-    task = TipTask.along(path, speed, **({"roll": "given"} if direction is None else {"direction": axis}), **report)
+    task = TipTask.along(
+        path, speed, steady=True, **({"roll": "given"} if direction is None else {"direction": axis}), **report
+    )
     start = {"start": SPACE_START}
     return PlanCase(floating_manipulator(), task, space_peer(), path, speed, direction, looks=looks, options=start)
 

@@ -81,7 +81,7 @@ ARM = FixedBase(CHAIN)
 START = [0.3, 0.6, 0.9]
 REACHED = numeric(ARM.tip_pose((), START).position).ravel()
 LINE = smooth(Path.through([REACHED, REACHED + np.array([0.1, -0.2, 0.0])]), deviation=0.01)
-GOOD = TipTask.along(LINE, 0.2, rows=(3, 4))
+GOOD = TipTask.along(LINE, 0.2, steady=True, rows=(3, 4))
 assert GOOD.duration is not None
 PLANNED: dict[str, Any] = {"machine": ARM, "tasks": GOOD, "start": START, "search": "start"}
 AROUND = CollisionScene(FixedBase(armoured_arm()))
@@ -416,7 +416,7 @@ def test_a_schedule_of_another_path_is_refused() -> None:
 
 def test_a_cone_needs_an_axis() -> None:
     with pytest.raises(ProblemError, match="direction") as caught:
-        TipTask.along(LINE, 0.2, within=0.1)
+        TipTask.along(LINE, 0.2, steady=True, within=0.1)
     assert caught.value.name == "within"
 
 
@@ -424,7 +424,7 @@ def test_a_cone_needs_an_axis() -> None:
 
 
 def leads_to(points: Any, speed: float = 0.5, **options: Any) -> TipTask:
-    return TipTask.along(smooth(Path.through(points), deviation=0.01), speed, **options)
+    return TipTask.along(smooth(Path.through(points), deviation=0.01), speed, steady=True, **options)
 
 
 def test_a_start_that_is_too_far_says_by_how_much() -> None:
@@ -442,7 +442,7 @@ LEAVING = smooth(Path.through([(1.0, -1.5, 0.0), (2.6, 0.0, 0.0), (1.0, 1.5, 0.0
 @pytest.mark.parametrize("search", ["start", "configurations"])
 def test_a_path_out_of_reach_is_reported_with_time_and_place(search: Any) -> None:
     """Out by 0.2 m in the middle of its 4 m, at 4 of 8 s, inside again at the end."""
-    task = TipTask.along(LEAVING, 0.5, rows=(3, 4))
+    task = TipTask.along(LEAVING, 0.5, steady=True, rows=(3, 4))
     with pytest.raises(Unreachable) as caught:
         plan(ARM, task, search=search)
     result = caught.value
@@ -478,7 +478,7 @@ def test_a_later_task_out_of_reach_is_named_with_its_time() -> None:
 def test_an_orientation_out_of_reach_says_so() -> None:
     """A tool that has to look away from an arm stretched to its end."""
     places: Array = np.array([(0.9, 0.0, 0.2), (0.9, 0.1, 0.2)])
-    task = TipTask.along(smooth(Path.through(places), deviation=0.01), 0.1, direction=(-1, 0, 0))
+    task = TipTask.along(smooth(Path.through(places), deviation=0.01), 0.1, steady=True, direction=(-1, 0, 0))
     for machine in (ur5(), angled_ur5()):
         with pytest.raises(Unreachable) as caught:
             plan(machine, task)

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ocp import SolveError
+from ocp.console import time_limited
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage
 from ocp.motion.search.configurations import PlannerSettings
@@ -259,10 +260,12 @@ def test_after_the_refusal_time_the_rest_is_not_tried(seconds: float, monkeypatc
             clock[0] += seconds
             return super().advance(candidate)
 
-    slow = Slow([1.0, 1.1, 1.2, 1.3], [2.0] * 4, [False] * 4)
-    queue = CandidateQueue(slow, replace(SETTINGS, max_failures=9, refusal_time=8.5))
-    queue.run(seeds(range(4)))
-    kinds = [each.reason.kind for each in queue.candidates if each.reason is not None]
-    assert len(kinds) == 4
-    assert Rejection.AUDIT in kinds
-    assert (Rejection.NOT_TRIED in kinds) == (seconds > 0)
+    for limit in (None, 1e6):
+        slow = Slow([1.0, 1.1, 1.2, 1.3], [2.0] * 4, [False] * 4)
+        with time_limited(limit):
+            queue = CandidateQueue(slow, replace(SETTINGS, max_failures=9, refusal_time=8.5))
+            queue.run(seeds(range(4)))
+        kinds = [each.reason.kind for each in queue.candidates if each.reason is not None]
+        assert len(kinds) == 4
+        assert Rejection.AUDIT in kinds
+        assert (Rejection.NOT_TRIED in kinds) == (seconds > 0 and limit is None)  # its place is taken

@@ -288,7 +288,7 @@ def test_every_motion_along_a_seam_is_clear_or_names_the_collision() -> None:
     machine = torch_ur5()
     around = CollisionScene(machine)
     assert any("tool0" in pair[1] and "upper_arm" in pair[0] for pair in around.labels)
-    result = plan(machine, TipTask.along(curved_seam(), 0.03, direction=DOWN))
+    result = plan(machine, TipTask.along(curved_seam(), 0.03, steady=True, direction=DOWN))
     assert result.audit().passed
     assert result.audit().clearances["clearance"].settled
     reasons = [one.reason for one in result.candidates if one.reason is not None]
@@ -305,7 +305,7 @@ def test_every_motion_along_a_seam_is_clear_or_names_the_collision() -> None:
         if one.solution is not None and (one.reason is None or one.reason.kind is not Rejection.COLLISION):
             at = one.solution.at_fraction(np.linspace(0, 1, 2001))
             assert distances_along(around, np.zeros(0), at["joints"], np.zeros(2001)).min() >= -1e-6
-    bare = plan(machine, TipTask.along(curved_seam(), 0.03, direction=DOWN), scene=False)
+    bare = plan(machine, TipTask.along(curved_seam(), 0.03, steady=True, direction=DOWN), scene=False)
     assert bare.cost <= result.cost * (1 + 1e-6)
 
 

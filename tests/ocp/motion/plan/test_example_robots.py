@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import cache
 from typing import Any
 
@@ -9,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from models import CollisionScene, FixedBase, Robot
+from models import CollisionScene, FixedBase, ModelWarning, Robot
 from models.machines.machine import hold_joints
 from ocp import Limits, ProblemError, Scene, TipTask, plan
 from ocp.motion.local.collisions import distances_along
@@ -41,7 +42,10 @@ CASES = [(name, search) for name in ARMS for search in ("configurations", "globa
 @cache
 def robot(name: str) -> Robot:
     file, tip, *_ = ARMS[name]
-    return Robot.from_urdf(urdf_file(DATA, file), tip=tip, inertia="as_given")
+    with warnings.catch_warnings():
+        # limits of mimic joints leave two fingers of the PR2 no room, which its file is right to be warned of
+        warnings.filterwarnings("ignore", "joints .* cannot move", ModelWarning)
+        return Robot.from_urdf(urdf_file(DATA, file), tip=tip, inertia="as_given")
 
 
 def seam(whole: Robot, seed: int = 0) -> TipTask:

@@ -22,6 +22,6 @@ def test_a_ball_that_darts_through_the_forearm_is_no_proven_clearance(half: floa
         return ca.vertcat(0.4, 0, 0.3 + 0.6 * ca.if_else(away < half, away / half, 1))
 
     seam = smooth(Path.through([(0.4, -0.2, 0.3), (0.4, 0.2, 0.3)]), deviation=0.002)
-    task = TipTask.along(seam, 0.05, direction=(0, 0, -1))
+    task = TipTask.along(seam, 0.05, steady=True, direction=(0, 0, -1))
     with pytest.raises(SolveError, match=r"obstacle 0"):
         plan(ur5(), task, scene=Scene(obstacles=[MovingObstacle(Sphere(0.05, (0, 0, 0)), position)]), search="start")

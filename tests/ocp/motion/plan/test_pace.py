@@ -28,7 +28,7 @@ UNLIMITED = Limits(velocity=np.full(6, 1e3))
 
 
 def task_at(speed: float, **options: Any) -> TipTask:
-    return TipTask.along(CURVED_PATH, speed, direction=DOWN, **options)
+    return TipTask.along(CURVED_PATH, speed, steady=True, direction=DOWN, **options)
 
 
 @cache

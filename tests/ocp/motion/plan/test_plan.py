@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from models import FixedBase, Path, smooth
+from models import FixedBase, Path, example_robot, smooth
 from ocp import Cost, Limits, TipTask
+from ocp.motion.local.inverse_kinematics import inverse_kinematics
 from ocp.motion.plan import Plan
 from ocp.motion.schedule import LineLimits, schedule
 from tests.families import some
@@ -134,11 +135,13 @@ def assert_same_motion(result: Plan, other: Plan, *, back: bool = False) -> None
 
 SHORT = smooth(Path.through([(0.45, -0.1, 0.25), (0.45, 0.1, 0.25), (0.55, 0.1, 0.3)]), deviation=0.004)
 START: dict[str, Any] = {"search": "start"}
+RAMPS = {"speed": 0.1, "acceleration": 0.2, "jerk": 2.0}
 
 
 def short_motion(machine: Any = None, path: Any = SHORT, speed: Any = 0.05, **arguments: Any) -> Plan:
     options = {key: arguments.pop(key) for key in ("cost", "limits", "start") if key in arguments}
-    task = TipTask.along(path, speed, **{"direction": DOWN, **arguments})
+    steady = not (hasattr(speed, "profile") or "acceleration" in arguments)
+    task = TipTask.along(path, speed, steady=steady, **{"direction": DOWN, **arguments})
     return plan_bare(angled_ur5() if machine is None else machine, task, search="start", **options)
 
 
@@ -200,7 +203,7 @@ def test_more_freedom_never_costs_more() -> None:
     costs = [held.cost]
     for options in ({"within": np.radians(2)}, {"within": np.radians(5)}, {}):
         request: dict[str, Any] = {"direction": DOWN, **options} if options else {}
-        task = TipTask.along(raster(3), 0.05, **request)
+        task = TipTask.along(raster(3), 0.05, steady=True, **request)
         costs.append(plan_bare(panda(), task, start=start, search="start").cost)
     assert (np.diff(costs) < 0).all()
 
@@ -216,7 +219,7 @@ def test_a_cone_costs_less_than_a_fixed_axis_and_is_used_to_its_edge(robot: str)
     held = (
         planned(name)
         if name
-        else plan_bare(angled_ur5(), TipTask.along(raster(3), 0.05, direction=DOWN), search="start")
+        else plan_bare(angled_ur5(), TipTask.along(raster(3), 0.05, steady=True, direction=DOWN), search="start")
     )
     assert cone.cost < 0.9 * held.cost
     what = PLAN_CASES[f"finishing_{robot}"]()
@@ -228,10 +231,12 @@ def test_a_cone_costs_less_than_a_fixed_axis_and_is_used_to_its_edge(robot: str)
 # ---- schedules and intervals -----------------------------------------------------------------------------------------
 
 
-def test_a_schedule_begins_and_ends_at_rest_on_its_path() -> None:
+@pytest.mark.parametrize("by_schedule", [True, False])
+def test_a_schedule_begins_and_ends_at_rest_on_its_path(by_schedule: bool) -> None:
     path = curved_seam()
     timing = schedule(path, LineLimits(speed=0.1, acceleration=0.2, jerk=2.0))
-    result = short_motion(path=path, speed=timing)
+    result = short_motion(path=path, **({"speed": timing} if by_schedule else RAMPS))
+    assert result.audit().remarks == ()
     assert result.audit().passed
     assert result.horizon == pytest.approx(timing.duration)
     ends = result.at([0.0, result.horizon])["rates"]
@@ -247,12 +252,30 @@ def test_a_schedule_begins_and_ends_at_rest_on_its_path() -> None:
     assert max(off.position, off.axis) < CLOSE
 
 
+def test_joints_that_no_task_moves_rest_at_both_ends_if_their_accelerations_are_limited() -> None:
+    """From a given start, a redundant arm begins to move at once, unless its velocities must be continuous."""
+    machine = FixedBase(example_robot("seven_axis"))
+    path = smooth(Path.through([(0.45, -0.1, 0.4), (0.45, 0.1, 0.4)]), deviation=0.002)
+    task = TipTask.along(path, 0.1, direction=DOWN)
+    start = inverse_kinematics(machine, [task], time=0.0, seed=3)[5].joints
+    free, limited = (
+        plan_bare(machine, task, start=start, limits=limits) for limits in (None, Limits(acceleration=5.0))
+    )
+    assert "starts at" in free.audit().sentence
+    assert "at rest" in free.audit().sentence
+    audit = limited.audit()
+    assert audit.passed
+    assert audit.remarks == ()
+    assert np.abs(limited.at([0.0, limited.horizon])["rates"]).max() < 1e-6
+    assert free.cost <= limited.cost * (1 + 1e-6) < 1.01 * free.cost
+
+
 def two_lines(pause: float = 2.0) -> tuple[list[TipTask], list[Any]]:
     """Two straight lines and nothing asked between them."""
     first = smooth(Path.through([(0.45, -0.2, 0.3), (0.45, 0.0, 0.3)]), deviation=0.001)
     second = smooth(Path.through([(0.6, 0.2, 0.4), (0.6, 0.2, 0.2)]), deviation=0.001)
-    tasks = [TipTask.along(first, 0.1, direction=DOWN)]
-    tasks.append(TipTask.along(second, 0.1, direction=(1, 0, -1), begin=tasks[0].end + pause))
+    tasks = [TipTask.along(first, 0.1, steady=True, direction=DOWN)]
+    tasks.append(TipTask.along(second, 0.1, steady=True, direction=(1, 0, -1), begin=tasks[0].end + pause))
     return tasks, [first, second]
 
 
@@ -283,7 +306,7 @@ def test_between_two_tasks_joints_go_straight_at_constant_rate() -> None:
 def test_a_task_in_two_segments_is_the_same_motion() -> None:
     """One task over the whole time, and two that follow each other: their union asks for the same."""
     path = smooth(Path.through([(0.45, -0.1, 0.25), (0.45, 0.1, 0.25)]), deviation=0.004)
-    whole = TipTask.along(path, 0.05, direction=DOWN)
+    whole = TipTask.along(path, 0.05, steady=True, direction=DOWN)
     assert whole.duration is not None
     half = whole.duration / 2
 

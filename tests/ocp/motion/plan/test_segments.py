@@ -158,7 +158,7 @@ def test_a_reconfiguration_avoids_obstacles(angle: float) -> None:
 
 def test_a_part_of_a_task_asks_for_the_same_at_its_times() -> None:
     path = smooth(Path.through([[0.4, -0.3, 0.0], [0.6, 0.0, 0.0], [0.4, 0.3, 0.0]]), deviation=0.02)
-    task = TipTask.along(path, 0.4, rows=(3, 4), begin=0.5)
+    task = TipTask.along(path, 0.4, steady=True, rows=(3, 4), begin=0.5)
     end = task.end
     for first, last in ((0.0, 0.9), (0.9, 1.3), (1.3, end), (0.0, end)):
         part = _task_between(task, first, last)

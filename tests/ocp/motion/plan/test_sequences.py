@@ -77,7 +77,7 @@ def test_the_start_of_a_task_is_chosen_for_the_way_to_it_and_the_task_together()
     """A wrist that may be turned about: the task costs the same from several starts, the way to them does not."""
     machine, home = FixedBase(example_robot("six_axis")), np.array([0.0, -0.6, 1.2, 0.0, 0.9, 0.0])
     path = smooth(Path.through([(0.4, -0.1, 0.3), (0.4, 0.1, 0.3)]), deviation=0.002)
-    task = TipTask.along(path, 0.1, direction=(0, 0, -1))
+    task = TipTask.along(path, 0.1, steady=True, direction=(0, 0, -1))
     planned = plan(machine, [task, Goal(joints=home)], start=home, scene=False)
     alone = plan(machine, task, scene=False)
     to_alone = plan(machine, Goal(joints=alone.at(0.0)["joints"]), start=home, scene=False)

@@ -32,7 +32,7 @@ def chain(links: int, length: float = 0.5) -> FixedBase:
 
 
 def in_the_plane(*points: Any, speed: float = 0.1, **options: Any) -> TipTask:
-    return TipTask.along(line(*points, **options), speed, rows=(3, 4))
+    return TipTask.along(line(*points, **options), speed, steady=True, rows=(3, 4))
 
 
 def no_freedom_left() -> PlanCase:
@@ -62,26 +62,30 @@ def kinova() -> PlanCase:
     machine = FixedBase(lock_joints(whole, {n: 0.0 for n in whole.joint_names if not n.startswith("j2s6")}))
     turn, at = pose(machine, (), [0.3, 2.5, 1.5, 0.4, 1.0, 0.2])
     corners = at, at + np.array([0.0, 0.1, 0.05]), at + np.array([0.05, 0.15, 0.0])
-    return machine, TipTask.along(line(*corners), 0.05, direction=turn[:, 2]), {}
+    return machine, TipTask.along(line(*corners), 0.05, steady=True, direction=turn[:, 2]), {}
 
 
 def over_the_shoulder() -> PlanCase:
-    return angled_ur5(), TipTask.along(line((0.4, 0, 0.5), (-0.4, 0, 0.5)), 0.1, direction=DOWN), {}
+    return angled_ur5(), TipTask.along(line((0.4, 0, 0.5), (-0.4, 0, 0.5)), 0.1, steady=True, direction=DOWN), {}
 
 
 def momentum_on_board() -> PlanCase:
     machine = floating_panda((0.05, -0.03, 0.04, 0.1, -0.2, 0.15))
     _, at = pose(machine, machine.base_home(), PANDA_START)
-    return machine, TipTask.along(line(at, at + np.array([0.05, -0.08, 0.06])), 0.05), {"start": PANDA_START}
+    return (
+        machine,
+        TipTask.along(line(at, at + np.array([0.05, -0.08, 0.06])), 0.05, steady=True),
+        {"start": PANDA_START},
+    )
 
 
 def nothing_until_it_begins() -> PlanCase:
-    task = TipTask.along(line((0.45, -0.1, 0.3), (0.45, 0.1, 0.3)), 0.1, direction=DOWN, begin=2.0)
+    task = TipTask.along(line((0.45, -0.1, 0.3), (0.45, 0.1, 0.3)), 0.1, steady=True, direction=DOWN, begin=2.0)
     return panda(), task, {"start": PANDA_START}
 
 
 def rest_afterwards() -> PlanCase:
-    task = TipTask.along(line((0.45, -0.1, 0.3), (0.45, 0.1, 0.3)), 0.1, direction=DOWN)
+    task = TipTask.along(line((0.45, -0.1, 0.3), (0.45, 0.1, 0.3)), 0.1, steady=True, direction=DOWN)
     return panda(), task, {"horizon": 4.0}
 
 
@@ -91,7 +95,7 @@ def back_to_the_start_afterwards() -> PlanCase:
 
 
 def one_begins_while_another_goes_on() -> PlanCase:
-    first = TipTask.along(line((0.45, -0.1, 0.3), (0.45, 0.1, 0.3)), 0.1)
+    first = TipTask.along(line((0.45, -0.1, 0.3), (0.45, 0.1, 0.3)), 0.1, steady=True)
     return panda(), [first, TipTask(direction=DOWN, begin=1.0, duration=1.0)], {}
 
 

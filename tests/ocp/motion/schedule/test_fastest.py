@@ -30,8 +30,8 @@ from ocp.motion.schedule import (
 )
 from ocp.motion.schedule import grid as grids
 from ocp.motion.schedule import stretch as stretches
-from ocp.motion.schedule.profile import integrate_jerk, profile_through
 from ocp.motion.schedule.ramps import reachability_passes
+from ocp.motion.tasks.speed_profile import integrate_jerk, profile_through
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.families import some
 from tests.models.paths.task_paths import random_arm_path, seeds, turned

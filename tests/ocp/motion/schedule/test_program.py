@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.schedule.grid import make_grid
 from ocp.motion.schedule.limits import limit_rows
-from ocp.motion.schedule.profile import LineMotion, profile_through
 from ocp.motion.schedule.program import INTERIOR, Program, Spline, SplineRows, _Constraints, least_time
 from ocp.motion.schedule.stretch import _jerk_place
 from ocp.motion.schedule.window import SETTINGS, Stretch, Window, limit_usage, motion_profile
+from ocp.motion.tasks.speed_profile import LineMotion, profile_through
 from scripts.timing.schedules import JOINTS, panda_path
 from tests.models.paths.task_paths import seeds
 

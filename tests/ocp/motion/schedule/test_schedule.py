@@ -29,6 +29,7 @@ from ocp.motion.schedule import (
     schedule,
 )
 from ocp.motion.schedule.planner import SETTINGS
+from ocp.motion.tasks.speed_profile import reachable_speed
 from tests.models.paths.task_paths import random_path, seeds
 from tests.models.paths.test_paths import example
 
@@ -134,7 +135,7 @@ def test_the_speed_within_reach_is_the_inverse_of_the_ramps_distance(
     speed: float, gain: float, x: float, y: float
 ) -> None:
     distance = ramp_distance(speed, speed + gain, 10**x, 10**y)
-    assert ramps.reachable_speed(speed, distance, 10**x, 10**y) == pytest.approx(speed + gain, rel=1e-9)
+    assert reachable_speed(speed, distance, 10**x, 10**y) == pytest.approx(speed + gain, rel=1e-9)
 
 
 @given(seeds, st.integers(1, 6))

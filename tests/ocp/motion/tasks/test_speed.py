@@ -92,5 +92,9 @@ def test_a_tool_turns_no_faster_than_all_joints_together(turn: TipTask) -> None:
 def test_a_plan_whose_rates_cannot_suffice_is_refused_before_anything_is_searched() -> None:
     path = smooth(Path.through([(0.45, -0.1, 0.25), (0.45, 0.1, 0.25)]), deviation=0.004)
     with pytest.raises(ProblemError, match=r"0\.5 m/s") as caught:
-        plan(angled_ur5(), TipTask.along(path, 0.5, direction=DOWN), limits=Limits(velocity=np.full(6, 0.05)))
+        plan(
+            angled_ur5(),
+            TipTask.along(path, 0.5, steady=True, direction=DOWN),
+            limits=Limits(velocity=np.full(6, 0.05)),
+        )
     assert (caught.value.name, caught.value.value) == ("tool0", pytest.approx(0.5))

@@ -29,7 +29,7 @@ def circle(count: int) -> SmoothPath:
 
 def along(path: SmoothPath) -> tuple[TipTask, TaskEquations, Array]:
     """A task along a path in the plane of the arm, its equations, and the times where segments meet."""
-    task = TipTask.along(path, SPEED, rows=(3, 4))
+    task = TipTask.along(path, SPEED, steady=True, rows=(3, 4))
     return task, bind(MACHINE, task), np.asarray(task.breaks)
 
 

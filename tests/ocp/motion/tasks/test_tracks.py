@@ -10,12 +10,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ruckig import InputParameter, Result, Ruckig, Trajectory
 from scipy.spatial.transform import Rotation
 
 from models import Arc, Line, Path, SmoothPath, smooth
-from ocp import TipTask
+from ocp import ProblemError, TipTask
 from ocp.motion.schedule import LineLimits, schedule
 from ocp.motion.tasks.equations import bind
+from ocp.motion.tasks.speed_profile import rest_profile
 from ocp.motion.tasks.tip_task import retime_task
 from ocp.motion.tasks.tracks import PathTracks, path_tracks
 from tests.models.robot.trees import Array
@@ -112,8 +116,8 @@ def test_the_line_speed_is_the_requested_one_and_breaks_are_at_segment_ends(kind
 
 def test_a_task_run_by_a_clock_moves_at_the_clocks_pace() -> None:
     """The chain rule for tracks that know their rates: position, axis and orientation."""
-    task = TipTask.along(PATH, SPEED, roll="given")
-    free = TipTask.along(PATH, SPEED, tool_axis=AXIS)
+    task = TipTask.along(PATH, SPEED, steady=True, roll="given")
+    free = TipTask.along(PATH, SPEED, steady=True, tool_axis=AXIS)
     for one in (task, free):
         ran = retime_task(one, lambda t: t**2)
         times = np.array([0.3, 0.7, 0.9])
@@ -126,7 +130,7 @@ def test_a_task_run_by_a_clock_moves_at_the_clocks_pace() -> None:
 
 
 def test_a_task_that_begins_later_is_the_same_later() -> None:
-    task = TipTask.along(PATH, SPEED)
+    task = TipTask.along(PATH, SPEED, steady=True)
     later = replace(task, begin=1.5)
     now, then = (bind(panda(), one).target_function() for one in (task, later))
     for time in (0.0, 0.4, 1.1):
@@ -136,10 +140,70 @@ def test_a_task_that_begins_later_is_the_same_later() -> None:
 
 def test_the_task_of_a_path_has_its_tool_orientation() -> None:
     plain = smooth(Path.through([(0, 0, 0), (1, 0, 0)]), deviation=0.01)
-    bare, held = TipTask.along(plain, 0.1), TipTask.along(plain, 0.1, direction=(0, 0, -1))
-    free, options = TipTask.along(PATH, 0.1), TipTask.along(PATH, 0.1, roll="given")
-    lean = TipTask.along(PATH, 0.1, within=0.2)
+    bare, held = TipTask.along(plain, 0.1, steady=True), TipTask.along(plain, 0.1, steady=True, direction=(0, 0, -1))
+    free, options = TipTask.along(PATH, 0.1, steady=True), TipTask.along(PATH, 0.1, steady=True, roll="given")
+    lean = TipTask.along(PATH, 0.1, steady=True, within=0.2)
     assert [task.size for task in (bare, held, free, options, lean)] == [3, 5, 5, 6, 3]
     assert (bare.direction, bare.orientation) == (None, None)
     assert free.orientation is None
     assert options.direction is None
+
+
+sizes = st.floats(-3, 2).map(lambda power: 10**power)
+
+
+@given(sizes, sizes, sizes, sizes)
+def test_a_motion_from_rest_to_rest_takes_the_least_time_within_its_limits(
+    length: float, speed: float, acceleration: float, jerk: float
+) -> None:
+    """Against ruckig's time, and against the limits at every instant at which a quantity has its maximum."""
+    profile = rest_profile(length, speed, acceleration, jerk)
+    request = InputParameter(1)
+    request.target_position, request.max_velocity = [1.0], [speed / length]
+    request.max_acceleration, request.max_jerk = [acceleration / length], [jerk / length]
+    trajectory = Trajectory(1)
+    assert Ruckig(1).calculate(request, trajectory) == Result.Working
+    assert profile.duration == pytest.approx(trajectory.duration, rel=1e-6)
+    peaks = profile.peaks()
+    for values, limit in ((peaks.speed, speed), (peaks.acceleration, acceleration), (profile.jerk, jerk)):
+        assert np.abs(values).max() <= limit * (1 + 1e-9)
+    ends = profile.at([0.0, profile.duration])
+    np.testing.assert_allclose(ends.distance, [0.0, length], rtol=1e-9)
+    assert not ends.speed.any()
+    np.testing.assert_allclose(profile.acceleration[[0, -1]], 0.0, atol=1e-9 * acceleration)
+
+
+def test_a_task_along_a_path_starts_and_ends_at_rest_unless_it_is_steady() -> None:
+    task, steady = TipTask.along(PATH, SPEED), TipTask.along(PATH, SPEED, steady=True)
+    middle = 0.5 * float(task.duration or 0.0)
+    speeds = [float(np.linalg.norm(numbers(rate_of(task.position), t))) for t in (0.0, middle, task.duration)]
+    np.testing.assert_allclose(speeds, [0.0, SPEED, 0.0], atol=1e-9)
+    assert float(np.linalg.norm(numbers(rate_of(steady.position), 0.0))) == pytest.approx(SPEED)
+    # each ramp takes v/a + a/j, and half of it is lost
+    assert float(task.duration or 0) - float(steady.duration or 0) == pytest.approx(SPEED / 1.0 + 0.1, rel=1e-9)
+    slow = TipTask.along(PATH, SPEED, acceleration=0.5, jerk=4.0)
+    assert slow.duration == pytest.approx(TIMING.duration, rel=1e-9)
+    np.testing.assert_allclose(
+        numbers(slow.position, [0.2, 1.0, 2.0]),
+        numbers(TipTask.along(PATH, TIMING).position, [0.2, 1.0, 2.0]),
+        atol=1e-9,
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ({"speed": TIMING, "steady": True}, "steady"),
+        ({"speed": TIMING, "acceleration": 1.0}, "acceleration"),
+        ({"speed": SPEED, "steady": True, "jerk": 1.0}, "jerk"),
+        ({"speed": SPEED, "acceleration": 0.0}, "acceleration"),
+        ({"speed": SPEED, "jerk": -1.0}, "jerk"),
+        ({"speed": 0.0}, "speed"),
+    ],
+)
+def test_arguments_about_the_speed_that_have_no_effect_or_no_meaning_are_refused(
+    arguments: dict[str, Any], name: str
+) -> None:
+    with pytest.raises(ProblemError) as caught:
+        TipTask.along(PATH, **arguments)
+    assert caught.value.name == name

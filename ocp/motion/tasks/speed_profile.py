@@ -1,9 +1,15 @@
-"""Distance and speed along a path as functions of time, in segments of constant jerk."""
+"""Distance and speed along a path as functions of time, in segments of constant jerk.
+
+A ramp changes the speed with zero acceleration at both ends. Its time, its distance, and the inverse (the speed within
+reach) have closed forms, and so has the fastest motion from rest to rest, which consists of two ramps and a stretch of
+constant speed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import cbrt, hypot, sqrt
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
@@ -11,11 +17,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from models.checks import NOT_NUMBERS, floats, short_repr
-from ocp.errors import ProblemError
+from ocp.errors import ProblemError, require
+from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Array", "LineMotion", "SpeedProfile", "integrate_jerk", "join_profiles", "profile_through", "segment_index"]
+__all__ = [
+    "Array", "LineMotion", "Phases", "SpeedProfile", "integrate_jerk", "join_profiles", "profile_through",
+    "ramp_distance", "ramp_phases", "ramp_time", "reachable_speed", "rest_profile", "segment_index",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+Phases = tuple[tuple[float, float], ...]
+"""Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
 
 
 class LineMotion(NamedTuple):
@@ -233,3 +245,80 @@ def join_profiles(parts: Sequence[SpeedProfile]) -> SpeedProfile:
         for kind in ("distance", "speed", "acceleration")
     )
     return SpeedProfile(t, s, v, a, np.concatenate([part.jerk for part in parts]))
+
+
+def ramp_time(change: float, acceleration: float, jerk: float) -> float:
+    """Return the shortest time (s) in which the speed changes by `change` (m/s), with zero acceleration at both ends.
+
+    Raises:
+        ProblemError: The change is negative, or a limit is not positive.
+    """
+    require.nonnegative("ramp: change", change)
+    for name, value in (("acceleration", acceleration), ("jerk", jerk)):
+        require.positive(f"ramp: {name}", value)
+    if change * jerk >= acceleration**2:
+        return change / acceleration + acceleration / jerk
+    return 2 * sqrt(change / jerk)
+
+
+def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
+    """Return the distance (m) covered while the speed changes in the shortest time; raise the errors of `ramp_time`."""
+    for name, value in (("first", first), ("last", last)):
+        require.nonnegative(f"ramp: {name}", value)
+    return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
+
+
+def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
+    """Return the greatest speed (m/s) that can be reached within a distance (m), with zero acceleration at both ends.
+
+    This is the inverse of ramp_distance; the same holds for slowing down from that speed.
+    """
+    # without constant acceleration x = sqrt((v - speed)/jerk) solves jerk x^3 + 2 speed x = distance, by Cardano's
+    # formula as a quotient without cancellation
+    half, third = distance / (2 * jerk), 2 * speed / (3 * jerk)
+    root = cbrt(half + hypot(half, third**1.5))
+    x = 2 * half / (root * root + third + (third / root) ** 2)
+    if jerk * x <= acceleration:
+        return float(speed + jerk * x * x)
+    # with it: v^2 + v A^2/J = speed^2 - speed A^2/J + 2 A distance
+    b = acceleration**2 / jerk
+    root = sqrt(b * b + 4 * (speed * speed - speed * b + 2 * acceleration * distance))
+    return float(max(speed, (root - b) / 2))
+
+
+def ramp_phases(change: float, acceleration: float, jerk: float) -> Phases:
+    """Return the phases of constant jerk that change the speed by a given amount (m/s) in the least time."""
+    size, sign = abs(change), 1.0 if change > 0 else -1.0
+    if size == 0:
+        return ()
+    if size * jerk < acceleration**2:
+        t = sqrt(size / jerk)
+        return ((t, sign * jerk), (t, -sign * jerk))
+    t = acceleration / jerk
+    middle = size / acceleration - t
+    flat = ((middle, 0.0),) if middle > 0 else ()
+    return ((t, sign * jerk), *flat, (t, -sign * jerk))
+
+
+def rest_profile(length: float, speed: float, acceleration: float, jerk: float) -> SpeedProfile:
+    """Return the fastest motion from rest to rest over a length (m) within limits of speed, acceleration and jerk.
+
+    Where the length is too short for the speed, the largest speed that can be reached takes its place.
+
+    Raises:
+        ProblemError: An argument is not positive or not finite.
+    """
+    for name, value in (("length", length), ("speed", speed), ("acceleration", acceleration), ("jerk", jerk)):
+        require.positive(name, value)
+    peak = min(speed, reachable_speed(0.0, length / 2, acceleration, jerk))
+    rest = max(length - 2 * ramp_distance(0.0, peak, acceleration, jerk), 0.0)
+    even = ((rest / peak, 0.0),) if rest > ROUNDING_SHARE * length else ()
+    phases = (*ramp_phases(peak, acceleration, jerk), *even, *ramp_phases(-peak, acceleration, jerk))
+    nodes = [(0.0, 0.0, 0.0, 0.0)]
+    for time, change in phases:
+        t, s, v, a = nodes[-1]
+        covered, v, a = integrate_jerk(v, a, change, time)
+        nodes.append((t + time, s + covered, max(v, 0.0), a))
+    nodes[-1] = (nodes[-1][0], length, 0.0, 0.0)
+    t, distance, speeds, accelerations = np.array(nodes).T
+    return SpeedProfile(t, distance, speeds, accelerations, np.array([change for _, change in phases]))

@@ -1,0 +1,143 @@
+"""Task files state what `plan` takes: goals, waypoints and sequences of motions, with errors that name the line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models import Box, Sphere
+from ocp import Goal, Plan, ProblemError, TipTask, Waypoints
+from ocp.app.command import main
+from ocp.app.files.task_file import Task, read_task
+from tests.ocp.app.motions import NAMES, write_robot
+
+START = "start = { shoulder = 0.3, elbow = 0.8, wrist = -0.5, slide = 0.15 }"
+ROBOT = '[robot]\nurdf = "robot.urdf"\ntip = "finger"\n'
+PATH = "points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]\nspeed = 0.1\n"
+
+
+def read(folder: Path, text: str) -> Task:
+    write_robot(folder)
+    (folder / "poses.csv").write_text("x,y,z,qw,qx,qy,qz\n0.7,0,0.3,1,0,0,0\n0.7,0.1,0.3,1,0,0,0\n")
+    (folder / "axes.csv").write_text("x,y,z,ax,ay,az\n0.7,0,0.3,0,0,1\n0.7,0.1,0.3,0,0,1\n")
+    (folder / "task.toml").write_text(ROBOT + text)
+    return read_task(folder / "task.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("joints = { elbow = 1.2, slide = 0.1 }", {"joints": [np.nan, 1.2, np.nan, 0.1]}),
+        (
+            "position = [0.7, 0, 0.3]\ndirection = [0, 0, -1]\nwithin = 0.2\nduration = 2.0",
+            {"position": [0.7, 0, 0.3], "direction": [0, 0, -1], "within": 0.2, "duration": 2.0},
+        ),
+        (
+            'position = [0.7, 0, 0.3]\norientation = [0, 1, 0, 0]\ntip = "hand"\nvelocity = "free"',
+            {"position": [0.7, 0, 0.3], "orientation": [0, 1, 0, 0], "tip": "hand", "velocity": "free"},
+        ),
+        (
+            "position = [0.7, 0, 0.3]\nrpy = [0, 0, 1.5707963267948966]\nvelocity = { elbow = 0.5 }",
+            {"orientation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "velocity": [np.nan, 0.5, np.nan, np.nan]},
+        ),
+    ],
+)
+def test_a_goal_has_the_values_of_its_table(tmp_path: Path, text: str, expected: dict[str, Any]) -> None:
+    goal = read(tmp_path, f"[goal]\n{text}\n[search]\n{START}\n").tasks
+    assert isinstance(goal, Goal)
+    for name, value in expected.items():
+        if isinstance(value, str):
+            assert getattr(goal, name) == value
+        else:
+            np.testing.assert_allclose(np.asarray(getattr(goal, name), dtype=float), value, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "size"),
+    [('"box", size = [0.1, 0.2, 0.3]', Box, [0.1, 0.2, 0.3]), ('"sphere", radius = 0.2', Sphere, 0.2)],
+)
+def test_a_goal_may_be_a_region(tmp_path: Path, text: str, kind: Any, size: Any) -> None:
+    goal: Any = read(tmp_path, f"[goal]\nregion = {{ shape = {text}, position = [0.7, 0, 0.3] }}\n").tasks
+    assert isinstance(goal.region, kind)
+    np.testing.assert_allclose(goal.region.size if kind is Box else goal.region.radius, size)
+    np.testing.assert_allclose(goal.region.position, [0.7, 0, 0.3])
+
+
+def test_waypoints_sequences_costs_and_horizons_are_those_of_plan(tmp_path: Path) -> None:
+    waypoints = read(tmp_path, '[waypoints]\nfile = "poses.csv"\nstep = { elbow = 0.2 }\n').tasks
+    assert isinstance(waypoints, Waypoints)
+    np.testing.assert_allclose(waypoints.positions, [[0.7, 0, 0.3], [0.7, 0.1, 0.3]])
+    np.testing.assert_allclose(waypoints.step, [np.inf, 0.2, np.inf, np.inf])
+    task = read(
+        tmp_path,
+        f"[[task]]\npath = {{ points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]], speed = 0.1 }}\n"
+        f"[[task]]\ngoal = {{ joints = {{ elbow = 1.2 }} }}\n"
+        f'[search]\n{START}\nhorizon = "free"\ntime_limit = 60\n'
+        "[cost]\neffort = { elbow = 2e-3 }\nvelocity = 0.5\nlength = 0.25\n[limits]\nfriction = 0.6\n",
+    )
+    seam, goal = task.tasks
+    assert isinstance(seam, TipTask)
+    assert isinstance(goal, Goal)
+    assert (task.options["horizon"], task.options["time_limit"]) == ("free", 60.0)
+    cost = task.options["cost"]
+    assert (cost.velocity, cost.length, cost.time) == (0.5, 0.25, 0.0)
+    np.testing.assert_allclose(cost.effort, [0, 2e-3, 0, 0])
+    assert task.options["limits"].friction == 0.6
+    assert read(tmp_path, "[goal]\njoints = { elbow = 1.2 }\n[search]\nhorizon = 3\n").options["horizon"] == 3.0
+
+
+def test_a_tool_on_a_path_starts_and_ends_at_rest_unless_the_file_says_steady(tmp_path: Path) -> None:
+    """A steady pass takes length / speed, ramps take half of v/a + a/j more at each end."""
+    durations = [
+        read(tmp_path, f"[path]\n{PATH}{more}").tasks.duration
+        for more in ("steady = true", "", "acceleration = 0.5", "acceleration = 0.5\njerk = 2.0")
+    ]
+    np.testing.assert_allclose(durations, [2.0, 2.0 + 0.1 / 1.0 + 0.1, 2.0 + 0.1 / 0.5 + 0.1, 2.0 + 2 * np.sqrt(0.05)])
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "expected"),
+    [
+        (f"[path]\n{PATH}[goal]\njoints = {{ elbow = 1 }}\n", 7, "path and goal"),
+        ("[goal]\njoints = { elbov = 1.2 }\n", 5, "elbov"),
+        ("[goal]\njoints = { elbow = 1.2 }\nposition = [0, 0, 1]\n", 5, "not both"),
+        ("[goal]\nposition = [0, 0]\n", 5, "three numbers"),
+        ("[goal]\nposition = [0, 0, 1]\nrpy = [0, 0, 0]\norientation = [1, 0, 0, 0]\n", 6, "remove one"),
+        ('[goal]\nregion = { shape = "cone" }\n', 5, '"box", "sphere"'),
+        ('[goal]\nposition = [0, 0, 1]\nvelocity = "slow"\n', 6, '"rest", "free"'),
+        ("[goal]\nposition = [0, 0, 1]\nspeed = 2\n", 6, "unknown entry speed"),
+        ('[waypoints]\nfile = "axes.csv"\n', 5, "quaternions"),
+        ('[waypoints]\nfile = "none.csv"\n', 5, "there is no file"),
+        ("[[task]]\npath = { speed = 1 }\ngoal = { tip = 1 }\n", 4, "either path"),
+        ("[[task]]\nwaypoints = {}\n", 5, "unknown entry waypoints"),
+        (f"[path]\n{PATH}steady = true\njerk = 1\n", 8, "steady"),
+        (f"[path]\n{PATH}[search]\nhorizon = -1\n", 8, "above 0"),
+        (f"[path]\n{PATH}[cost]\nvelocity = 0\n", 7, "at least one weight"),
+        (f"[path]\n{PATH}[cost]\neffort = {{ knee = 1 }}\n", 8, "knee"),
+    ],
+)
+def test_errors_name_the_line(tmp_path: Path, text: str, line: int, expected: str) -> None:
+    with pytest.raises(ProblemError) as caught:
+        read(tmp_path, text)
+    assert f"task.toml, line {line}," in str(caught.value), str(caught.value)
+    assert expected in str(caught.value)
+
+
+def test_a_file_without_a_motion_says_which_tables_describe_one(tmp_path: Path) -> None:
+    with pytest.raises(ProblemError, match=r"give one table \[path\], \[goal\] or \[waypoints\]") as caught:
+        read(tmp_path, "[search]\nseed = 1\n")
+    assert caught.value.name == "path"
+
+
+def test_a_goal_is_planned_by_the_command(tmp_path: Path, capsys: Any) -> None:
+    text = f'[goal]\njoints = {{ elbow = 1.2 }}\n[search]\n{START}\n[output]\nplan = "goal.npz"\n'
+    read(tmp_path, text)
+    assert main(["plan", str(tmp_path / "task.toml"), "--quiet"]) == 0
+    plan = Plan.load(tmp_path / "goal.npz")
+    ends = plan.at(np.array([0.0, plan.horizon]))["joints"]
+    np.testing.assert_allclose(ends[0], [0.3, 0.8, -0.5, 0.15], atol=1e-9)
+    assert ends[1, NAMES.index("elbow")] == pytest.approx(1.2)
+    assert plan.audit().feasible
