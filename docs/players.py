@@ -30,7 +30,7 @@ def command(plan: Path, file: Path) -> list[str]:
     if beside.exists():
         names += ["--name", "local resolution"]
     motions = [str(plan), *([str(beside)] if beside.exists() else [])]
-    return [sys.executable, "-m", "ocp.app.command", "view", *motions, "--page", str(file), "--quiet", *names]
+    return [sys.executable, "-m", "ocp", "view", *motions, "--page", str(file), "--quiet", *names]
 
 
 class Player(Directive):  # type: ignore[misc]

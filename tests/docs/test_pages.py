@@ -16,7 +16,7 @@ from docs.docstrings import prepared
 from docs.executed import blocks, executed
 from docs.numbers import MARK, listed
 from docs.players import command
-from ocp.app.command import parser
+from ocp.__main__ import parser
 from scripts.papers.reproduced import read_tables
 
 SITE = Path(__file__).resolve().parents[2] / "docs"

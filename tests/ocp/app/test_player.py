@@ -53,7 +53,7 @@ from ocp import (
     minimum_velocity_problem,
     solve,
 )
-from ocp.app import main
+from ocp.__main__ import main
 from ocp.app.files import read_trajectory
 from ocp.app.view import appearance, player
 from ocp.app.view.animation import (

@@ -1,4 +1,4 @@
-"""Command line of `selfmotion`: its arguments, its output and its exit status.
+"""Command line of `selfmotion`, also run by `python -m ocp`: its arguments, its output and its exit status.
 
 The status is 0 if all requirements hold, 1 if a check fails or is undetermined or there is no plan, 2 for bad input,
 and 130 after Ctrl-C.
@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from models import ModelError, ModelWarning
+from models.errors import ModelError, ModelWarning
 from ocp.app.files.safe_files import SUFFIXES
 from ocp.app.subcommands import (
     EXPORT_KINDS,
