@@ -199,19 +199,17 @@ def draw(example: CaptureExample, folder: Path, *, animation: bool = True) -> No
     row, scenes = example.summary(), scenes_of(example)
     title = (
         f"A tumbling body is grasped without impact and stopped in {row['duration_s']:.0f} s; reaction wheels absorb "
-        "its "
-        "momentum"
+        "its momentum"
     )
     spin = np.degrees(np.linalg.norm(SPIN))
     note = (
         f"{SPACE_ARM.name} of {example.chaser.robot.total_mass:.0f} kg, a body of {MASS:.0f} kg that turns by "
         f"{spin:.1f} degrees per second ({row['target_momentum_Nms']:.1f} N m s); earlier configurations are pale. "
-        f"Wheels of {MOMENTUM:g} N m s and {TORQUE:g} N m each, "
-        f"joints of {np.degrees(RATE):.0f} degrees per second and {JOINT_TORQUE:g} N m, a hand of {GRASP.force:g} N "
-        "and "
-        f"{GRASP.moment:g} N m, a cone of {np.degrees(CONE.half_angle):.0f} degrees over the last {CONE.length:g} m. "
-        "Both durations are free and planned with the motion, at the lowest weighted effort; at the end the arm is as "
-        "at the start, and nothing but the wheels turns. Masses of the target, wheels and limits are our own choice."
+        f"Wheels of {MOMENTUM:g} N m s and {TORQUE:g} N m each, joints of {np.degrees(RATE):.0f} degrees per second "
+        f"and {JOINT_TORQUE:g} N m, a hand of {GRASP.force:g} N and {GRASP.moment:g} N m, a cone of "
+        f"{np.degrees(CONE.half_angle):.0f} degrees over the last {CONE.length:g} m. Both durations are free and "
+        "planned with the motion, at the lowest weighted effort; at the end the arm is as at the start, and nothing "
+        "but the wheels turns. Masses of the target, wheels and limits are our own choice."
     )
     with page(folder / "capture.png", scenes, 4, height=6.0, share=1.4, note=note, title=title) as axes:
         _momenta(axes[0], example)

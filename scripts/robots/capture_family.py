@@ -97,13 +97,13 @@ def draw(members: Sequence[Member], path: Path) -> None:
     most = max(100 * (member.chain / member.together - 1) for member in members)
     title = f"Planning approach and detumbling one after the other costs up to {most:.1f} % more than together"
     note = (
-        "An arm of three joints on a body of 60 kg catches one of "
-        f"{MASS:g} kg and {INERTIA:g} kg m² in the plane, in {DURATION:g} s, and stops it in {DURATION:g} s. "
-        "Cost: squared torques and accelerations of the joints, torques of the wheel. The target has the same "
-        "attitude at the grasp at each spin. One after the other: the approach has its own lowest cost, and the "
-        "detumbling the lowest from there. A wheel absorbs the momentum, or the chaser brings the opposite one, as in "
-        "Virgili-Llop and Romano 2019, whose masses, lengths and times were not at hand: these are our own choice. "
-        "Plans are local optima, by their audits; those of the fastest spins lie on other branches than the rest."
+        f"An arm of three joints on a body of 60 kg catches one of {MASS:g} kg and {INERTIA:g} kg m² in the plane, in "
+        f"{DURATION:g} s, and stops it in {DURATION:g} s. Cost: squared torques and accelerations of the joints, "
+        "torques of the wheel. The target has the same attitude at the grasp at each spin. One after the other: the "
+        "approach has its own lowest cost, and the detumbling the lowest from there. A wheel absorbs the momentum, or "
+        "the chaser brings the opposite one, as in Virgili-Llop and Romano 2019, whose masses, lengths and times were "
+        "not at hand: these are our own choice. Plans are local optima, by their audits; those of the fastest spins "
+        "lie on other branches than the rest."
     )
     with sheet(path, (1, 1), (7.0, 3.2), note, title=title) as (_, axes):
         ax = axes[0, 0]

@@ -81,10 +81,9 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
         f"TIAGo of {result.robot.total_mass:.0f} kg moves {standing.LOAD:g} kg along a circle in {standing.SECONDS:g} "
         f"s while a rope pulls its hand forward with {standing.PULL:g} N; earlier configurations are pale; disc: zero "
         "moment point, grey: inside the footprint. Footprint, inertias and limits from its URDF (example-robot-data); "
-        "both motions have the same hand "
-        f"path and force. Plan: zero moment point {1000 * standing.MARGIN:g} mm inside, {100 * standing.SHARE:g} % of "
-        f"the limits of velocity and torque; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
-        f"{1000 * nearest.distance:.1f} mm (in the animation: purple)."
+        f"both motions have the same hand path and force. Plan: zero moment point {1000 * standing.MARGIN:g} mm "
+        f"inside, {100 * standing.SHARE:g} % of the limits of velocity and torque; {nearest.bodies[0]} and "
+        f"{nearest.bodies[1]} come nearest, {1000 * nearest.distance:.1f} mm (in the animation: purple)."
     )
     speed = float((np.abs(result.local.joint_velocities) / result.robot.velocity).max())
     title = f"By local resolution TIAGo tips over, at {speed:.1f} times a speed limit; the plan keeps all limits"

@@ -100,8 +100,7 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         f"{np.degrees(np.arctan(TILT)):.0f}° outwards; the arm at the start of each lap (pale) and after {SHOWN} laps. "
         "The base is fixed, the fingers are locked; the pose of the tool is given, and seven joints move it. Cost: "
         "integral of half the squared joint velocities. The pseudo-inverse starts in the solution of inverse "
-        "kinematics "
-        "near the arm's ready configuration."
+        "kinematics near the arm's ready configuration."
     )
     left_at = example.facts["first_leaves_limits_local_s"]
     leaves = "" if left_at is None else f" and exceeds the joint limits after {left_at:.0f} s"

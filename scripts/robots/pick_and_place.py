@@ -235,11 +235,10 @@ def draw(example: PickAndPlace, folder: Path, *, animation: bool = True) -> None
     )
     note = (
         f"{PANDA.name}: over a load of {LOAD:g} kg, down, up with it, across, down, and home in {len(ROUTE)} legs and "
-        f"{example.motions['planned with the load'].t[-1]:g} s, from rest to rest on each; earlier configurations "
-        "are pale. The load is a "
-        "block of steel, heavier than the 3 kg for which the arm is specified. Limits of "
-        f"torque, from its description: {', '.join(f'{value:g}' for value in robot.effort)} N m. Both plans minimise "
-        f"the squared torques plus {EFFORT.acceleration:g} (N m)² s⁴/rad² times the squared accelerations, within the "
+        f"{example.motions['planned with the load'].t[-1]:g} s, from rest to rest on each; earlier configurations are "
+        "pale. The load is a block of steel, heavier than the 3 kg for which the arm is specified. Limits of torque, "
+        f"from its description: {', '.join(f'{value:g}' for value in robot.effort)} N m. Both plans minimise the "
+        f"squared torques plus {EFFORT.acceleration:g} (N m)² s⁴/rad² times the squared accelerations, within the "
         "limits of positions, velocities and torques. One of them is planned for an empty hand; the figure shows the "
         "torques that its motion requires with the load. Durations are given; joints have no friction."
     )

@@ -38,7 +38,7 @@ BOW = 0.1  # m, of the seam to the side
 TILT = np.radians(40.0)  # of the tool, leaning back along the seam
 COSTS = ListedColormap(VIRIDIS(np.linspace(0.95, 0.25, 256)))
 """The cheapest brightest."""
-SAMPLE_COUNT = 97
+SAMPLE_COUNT = 49
 STARTS = 24
 """Of inverse kinematics at each instant."""
 MOST = 3.0
@@ -144,18 +144,16 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     note = (
         f"A UR5, its tool at {np.degrees(TOOL_ANGLE):.0f}° to the flange, follows a bowed seam of "
         f"{np.linalg.norm(END - BEGIN):.1f} m in {DURATION:g} s with free roll; coloured: all configurations that "
-        "perform "
-        "the task. No motion leads from one family to another. Joints are within their limits, links do not collide. "
-        "Each column holds all configurations at one time, found by continuation. The colour of a configuration is a "
-        "lower bound of the cost of all motions through it"
-        f"{f'; {left} costlier families are left out' if left else ''}. Cost: integral of half the "
-        f"squared joint velocities, rad²/s; no motion costs less than {best.bound:.4g}."
+        "perform the task. No motion leads from one family to another. Joints are within their limits, links do not "
+        "collide. Each column holds all configurations at one time, found by continuation. The colour of a "
+        "configuration is a lower bound of the cost of all motions through "
+        f"it{f'; {left} costlier families are left out' if left else ''}. Cost: integral of half the squared joint "
+        f"velocities, rad²/s; no motion costs less than {best.bound:.4g}."
     )
     excess = 100 * (ways[-2][3] / best.cost - 1)
     title = (
         f"The start configuration decides: from the best-conditioned one, the best motion costs {excess:.0f} % more "
-        "than "
-        "from the start that the search finds"
+        "than from the start that the search finds"
     )
     size = (3.0 * len(shown) + 1.2, 4.2)
     with sheet(folder / "posture_set.png", (1, len(shown)), size, note, title=title) as (figure, axes):

@@ -118,13 +118,12 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
     result, nearest = example.results, example.nearest
     force = float(np.linalg.norm(PUSH))
     note = (
-        f"ANYmal of {result.robot.total_mass - LOAD:.0f} kg, legs locked, pushes to its right with {force:g} N "
-        f"and {LOAD:g} kg in its hand; earlier configurations are pale; disc: zero moment point, grey: inside the "
+        f"ANYmal of {result.robot.total_mass - LOAD:.0f} kg, legs locked, pushes to its right with {force:g} N and "
+        f"{LOAD:g} kg in its hand; earlier configurations are pale; disc: zero moment point, grey: inside the "
         f"footprint. The reaction on its hand acts to its left, and the hand moves to the left by {STEP[1]:g} m in "
-        f"{SECONDS:g} s. Feet, inertias and limits from its "
-        "URDF (example-robot-data); both motions have the same path and force. Plan: zero moment point "
-        f"{1000 * MARGIN:g} mm inside; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
-        f"{1000 * nearest.distance:.1f} mm (in the animation: purple)."
+        f"{SECONDS:g} s. Feet, inertias and limits from its URDF (example-robot-data); both motions have the same path "
+        f"and force. Plan: zero moment point {1000 * MARGIN:g} mm inside; {nearest.bodies[0]} and {nearest.bodies[1]} "
+        f"come nearest, {1000 * nearest.distance:.1f} mm (in the animation: purple)."
     )
     title = "By local resolution the push tips the robot over; the plan keeps it on its feet"
     look: dict[str, Any] = {"view": VIEW, "prefix": "j2s6s200_"}

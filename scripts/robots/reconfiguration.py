@@ -185,12 +185,11 @@ def draw(example: InPieces, folder: Path, *, animation: bool = True) -> None:
     far = np.degrees(abs(change.after[joint] - change.before[joint]))
     note = (
         f"The hand of a Panda moves along a ring of radius {RADIUS:g} m around its base in {DURATION:g} s, pointing "
-        "down "
-        "with constant heading. Each column of the diagram shows all configurations at one time; one degree of "
-        "freedom "
-        "is redundant. Joints are within their limits of position and velocity, links do not collide. No plan has "
-        f"fewer segments than two. With the change at {change.time:.3g} s their cost is lowest: {segmented.cost:.3f} "
-        "rad²/s together, the integral of half the squared joint velocities, without the motion between them."
+        "down with constant heading. Each column of the diagram shows all configurations at one time; one degree of "
+        "freedom is redundant. Joints are within their limits of position and velocity, links do not collide. No plan "
+        f"has fewer segments than two. With the change at {change.time:.3g} s their cost is lowest: "
+        f"{segmented.cost:.3f} rad²/s together, the integral of half the squared joint velocities, without the motion "
+        "between them."
     )
     title = f"No single motion follows the ring: on the way, joint {joint + 1} has to turn back by {far:.0f}°"
     with sheet(folder / "reconfiguration.png", (2, 2), (7.6, 6.4), note, title=title, height_ratios=(1, 1)) as (

@@ -63,9 +63,8 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     note = (
         f"{example.file.name} of {robot.total_mass - base:.0f} kg on a free base of {base:.0f} kg, no momentum; "
         "earlier configurations are pale. The pose of the tool is given, and seven joints move it; the base reacts. "
-        "Both "
-        "motions begin in the same configuration. Cost: integral of half the squared joint velocities, which need not "
-        "begin at zero."
+        "Both motions begin in the same configuration. Cost: integral of half the squared joint velocities, which need "
+        "not begin at zero."
     )
     path, saved, calmer = folder / "space_arm.png", 1 - solution.cost / local.cost[-1], example.facts
     title = (

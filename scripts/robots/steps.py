@@ -229,20 +229,18 @@ def draw(example: StepsExample, folder: Path, *, animation: bool = True) -> None
     out, fallen = -whole.summary()["com_margin_min_m"], -example.local.summary()["zmp_margin_min_m"]
     title = (
         f"Two steps take {whole.t[-1]:.1f} s instead of {careful.t[-1]:.1f} s if the centre of mass may leave the "
-        "feet, "
-        f"here by {1000 * out:.0f} mm"
+        f"feet, here by {1000 * out:.0f} mm"
     )
     note = (
-        f"A planar biped of {whole.steps.robot.total_mass:.0f} kg takes two steps of {LENGTH:g} m; earlier configurations "
-        "are pale; disc: zero moment point. It is drawn up to the middle of the second step. In the static walk, the "
-        "centre of mass "
-        f"stays {2000 * MARGIN:g} mm inside the soles on the ground; in the dynamic walk, only the zero moment point "
-        f"stays inside, by {1000 * MARGIN:g} mm. Friction at most "
-        f"{FRICTION:g}, torques at most 200 N m, feet land at rest; the durations are given, and both walks have the "
-        "lowest cost by the same weights. Dotted: the same steps in the same time with the least joint velocities, "
-        f"by the pseudo-inverse; its zero moment point is up to {1000 * fallen:.0f} mm outside the soles, and in a "
-        "contact simulation it falls. Masses and limits are our own; the legs move in one plane and are "
-        "drawn beside each other."
+        f"A planar biped of {whole.steps.robot.total_mass:.0f} kg takes two steps of {LENGTH:g} m; earlier "
+        "configurations are pale; disc: zero moment point. It is drawn up to the middle of the second step. In the "
+        f"static walk, the centre of mass stays {2000 * MARGIN:g} mm inside the soles on the ground; in the dynamic "
+        f"walk, only the zero moment point stays inside, by {1000 * MARGIN:g} mm. Friction at most {FRICTION:g}, "
+        "torques at most 200 N m, feet land at rest; the durations are given, and both walks have the lowest cost by "
+        "the same weights. Dotted: the same steps in the same time with the least joint velocities, by the "
+        f"pseudo-inverse; its zero moment point is up to {1000 * fallen:.0f} mm outside the soles, and in a contact "
+        "simulation it falls. Masses and limits are our own; the legs move in one plane and are drawn beside each "
+        "other."
     )
     low, high = SOLE[0][0], SOLE[0][1] + 2 * LENGTH
     scenes = scenes_of(example, VIEW, np.array([[low, -0.15], [high, -0.15], [high, 0.15], [low, 0.15]]))

@@ -70,21 +70,18 @@ def draw(example: Walks, folder: Path, *, animation: bool = True) -> None:
     careful, whole = (example.motions[name] for name in KINDS)
     out = -whole.summary()["com_margin_min_m"]
     title = (
-        f"TALOS takes two steps in {whole.t[-1]:.1f} s instead of {careful.t[-1]:.1f} s if its centre of mass may "
-        "leave "
-        f"its feet, here by {1000 * out:.0f} mm"
+        f"TALOS needs {whole.t[-1]:.1f} s instead of {careful.t[-1]:.1f} s if its centre of mass may "
+        f"leave its feet, here by {1000 * out:.0f} mm"
     )
     note = (
         f"TALOS, {whole.steps.robot.total_mass:.0f} kg, takes two steps; earlier configurations are pale; disc: zero "
         f"moment point. Its arms are held still, its legs have twelve joints; steps of {LENGTH:g} and {2 * LENGTH:g} "
-        "m, soles "
-        f"of 210 by 130 mm. In the static walk, its centre of mass stays "
+        "m, soles of 210 by 130 mm. In the static walk, its centre of mass stays "
         f"{1000 * KINDS['static walk']['margin']:g} mm inside the soles on the ground; in the dynamic walk, only the "
-        "zero "
-        f"moment point stays inside, by {1000 * KINDS['dynamic walk']['margin']:g} mm. Friction at most {FRICTION:g}, "
-        "torques and velocities within its "
-        f"description, soles {1000 * CLEARANCE:g} mm above the ground in the middle of their way, feet land at rest; "
-        "the durations are given, and both walks have the lowest cost found by the same weights."
+        f"zero moment point stays inside, by {1000 * KINDS['dynamic walk']['margin']:g} mm. Friction at most "
+        f"{FRICTION:g}, torques and velocities within its description, soles {1000 * CLEARANCE:g} mm above the ground "
+        "in the middle of their way, feet land at rest; the durations are given, and both walks have the lowest cost "
+        "found by the same weights."
     )
     scenes = scenes_of(example, VIEW)
     with page(folder / "talos.png", scenes, 4, height=6.8, share=1.55, note=note, title=title) as (above, loads, mass):

@@ -179,17 +179,12 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     costs = [row["cost_local"] for row in tried if row["local_arrives"]] or [float(local.cost[-1])]
     note = (
         f"A UR5 sands {LANES} lanes; earlier configurations are pale; the pseudo-inverse starts from the "
-        "best-conditioned "
-        f"of {len(tried)} configurations (solid line) or from the one with the lowest cost (dotted). The tool is at "
-        f"{np.degrees(TOOL_ANGLE):.0f}° to the flange, the panel has a radius of {CURVE:g} m, the base is fixed. "
-        "Position "
-        "and axis of the tool are given, its roll is free. Cost: integral of half the squared joint velocities, "
-        "rad²/s; "
-        f"{min(costs):.3f} to {max(costs):.3f} by the pseudo-inverse from the {len(tried)} configurations. From the "
-        "best "
-        f"of them it costs {100 * (best / solution.cost - 1):.1f} % more than the plan, which chooses its start and "
-        "its "
-        "roll together. Collisions are not checked."
+        f"best-conditioned of {len(tried)} configurations (solid line) or from the one with the lowest cost (dotted). "
+        f"The tool is at {np.degrees(TOOL_ANGLE):.0f}° to the flange, the panel has a radius of {CURVE:g} m, the base "
+        "is fixed. Position and axis of the tool are given, its roll is free. Cost: integral of half the squared joint "
+        f"velocities, rad²/s; {min(costs):.3f} to {max(costs):.3f} by the pseudo-inverse from the {len(tried)} "
+        f"configurations. From the best of them it costs {100 * (best / solution.cost - 1):.1f} % more than the plan, "
+        "which chooses its start and its roll together. Collisions are not checked."
     )
     title = (
         f"Choosing start and roll together, the plan costs {100 * (1 - solution.cost / first):.0f} % less than the "
