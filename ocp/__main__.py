@@ -202,7 +202,7 @@ robot as `selfmotion check` reads them. A solution of your own problem (Solution
 --page the page is served on this machine until Ctrl-C; with it it is one file that plays anywhere, without a server."""
 VIEW_EXAMPLES = """examples:
   selfmotion view seam.npz
-  selfmotion view seam.npz --page seam.html
+  selfmotion view seam.npz --page seam.html --workpiece part.stl
   selfmotion view optimum.npz pseudo_inverse.csv --page both.html
   selfmotion view circle.npz --robot panda.urdf --tip panda_hand_tcp --lock panda_finger_joint1=0.02"""
 CACHE = """Results that are costly to compute and depend only on their input (covers of meshes, pairs that never
