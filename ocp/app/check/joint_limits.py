@@ -94,10 +94,9 @@ class Row:
     @property
     def urgency(self) -> float:
         """Order of the row in a table: 2 if it is not ok, else how near the value is to its limit, 0 to 1."""
-        if self.verdict in (RowVerdict.FAILED, RowVerdict.UNDECIDED):
-            return 2.0
         small, large = sorted(abs(one) for one in (self.value, self.limit or 0.0))
-        return small / large if large > 0 else 0.0
+        nearness = small / large if large > 0 else 0.0
+        return 2.0 if self.verdict in (RowVerdict.FAILED, RowVerdict.UNDECIDED) else nearness
 
 
 def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> Limits:
@@ -159,13 +158,12 @@ def limit_rows(
 
 
 def audit_rows(audit: Audit) -> list[Row]:
-    """Return the findings of an audit as table rows, the most urgent first."""
+    """Return the findings of an audit as table rows."""
     verdicts = [RowVerdict.INFO if f.limit is None else RowVerdict.of(not f.passed) for f in audit.findings]
-    rows = [
+    return [
         Row(f.name, f.value, f.limit, f.unit, f.time, verdict, f.note)
         for f, verdict in zip(audit.findings, verdicts, strict=True)
     ]
-    return sorted(rows, key=lambda row: -row.urgency)
 
 
 class _Side(NamedTuple):
