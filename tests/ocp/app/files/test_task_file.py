@@ -10,7 +10,7 @@ import pytest
 
 from models import Box, ModelWarning, Sphere
 from ocp import Goal, Plan, ProblemError, TipTask, Waypoints
-from ocp.app.command import main
+from ocp.__main__ import main
 from ocp.app.files.task_file import Task, read_task
 from tests.ocp.app.motions import NAMES, write_robot
 
