@@ -1,11 +1,19 @@
-"""Docstrings as they are written here, plain sentences, made fit for reStructuredText before napoleon reads them."""
+"""The reference: lists of names become their documentation, and docstrings are made fit for reStructuredText.
+
+A block fenced as `{names} PACKAGE` lists public names of a package, separated by commas. On the site, the signatures
+and docstrings of these names take its place, in the order of the list.
+"""
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import re
 from typing import Any
 
-__all__ = ["escaped", "prepared", "setup"]
+__all__ = ["documented", "escaped", "names", "prepared", "setup"]
+
+NAMES = re.compile(r"^```\{names\} ([\w.]+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 QUOTED = re.compile(r"(``.+?``|:\w+:`[^`]+`|`[^`]+`)")
 """What is marked as code, or as a reference, is left as it is."""
@@ -19,8 +27,33 @@ def escaped(line: str) -> str:
     return "".join(part if number % 2 else MARKS.sub(r"\\\1", part) for number, part in enumerate(QUOTED.split(line)))
 
 
+def names(text: str) -> list[tuple[str, str]]:
+    """Packages and names that a page of the reference lists, in their order."""
+    lists = NAMES.findall(text)
+    return [(package, name) for package, listed in lists for name in re.split(r"[,\s]+", listed.strip())]
+
+
+def documented(text: str) -> str:
+    """The page with the documentation of the names that it lists."""
+
+    def directives(block: re.Match[str]) -> str:
+        lines = []
+        for package, name in names(block[0]):
+            value = getattr(importlib.import_module(package), name)
+            kind = "class" if inspect.isclass(value) else "function" if callable(value) else "data"
+            lines += [f".. auto{kind}:: {package}.{name}", *(["   :members:"] if kind == "class" else []), ""]
+        return "\n".join(["```{eval-rst}", *lines, "```"])
+
+    return NAMES.sub(directives, text)
+
+
+def _read(app: Any, name: str, content: list[str]) -> None:
+    content[0] = documented(content[0])
+
+
 def setup(app: Any) -> dict[str, bool]:
     """For Sphinx."""
+    app.connect("source-read", _read)
     app.connect("autodoc-process-docstring", _process, priority=100)  # before napoleon
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 

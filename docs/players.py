@@ -20,6 +20,7 @@ __all__ = ["command", "setup"]
 
 ROOT = Path(__file__).resolve().parents[1]
 PLANS = ROOT / "results" / "gallery"
+GALLERY = ROOT / "docs" / "gallery.md"
 FOLDER = "players"
 NOT_PASSED = 1
 """Exit status where the audit of what is shown does not pass, which its page says."""
@@ -28,7 +29,7 @@ NOT_PASSED = 1
 def titles() -> dict[str, str]:
     """The heading of the gallery above each player, by the player's name."""
     result, heading = {}, ""
-    for line in (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8").splitlines():
+    for line in GALLERY.read_text(encoding="utf-8").splitlines():
         if line.startswith("#"):
             heading = line.strip("# ")
         elif match := re.match(r"```\{player\} (\w+)", line):

@@ -1,4 +1,4 @@
-"""Changes of robots: lock joints, attach tools and loads, join arms, remove branches, change the root or the tip.
+"""Changes of robots: lock joints, attach tools and loads, mount on rails, join arms, prune, change the root or the tip.
 
 Every function leaves its robot unchanged and returns a new one. Poses are translations of shape (3,), m, and rotations
 of shape (3, 3) whose columns are axes, the identity if None. All raise ModelError for an unknown name, with similar
@@ -99,6 +99,24 @@ def attach_tool(
     mount = Joint(f"{added.root}_mount", "fixed", robot.link(link).name, added.root, shift, turn)
     links, joints = (*robot.links, *added.links), (*robot.joints, mount, *added.joints)
     return replace(robot if keep_tip else added, links=links, joints=joints, name=robot.name)
+
+
+def mount_on_rail(
+    robot: Robot, axis: ArrayInput, lower: float, upper: float, *, velocity: float = np.inf, name: str = "rail"
+) -> Robot:
+    """Mount a robot on a linear axis, such as a rail or a lift: a prismatic joint that moves its root link.
+
+    The joint is called "NAME_joint" and comes first. The rail itself, the new root link, has neither mass nor shape.
+
+    Args:
+        axis: Direction of the rail in the frame of the robot's root link, of any length. Shape (3,).
+        lower, upper: Position limits, m. At position 0 the root link has the pose of the rail.
+        velocity: Speed limit, m/s.
+        name: Name of the new root link.
+    """
+    link, root = Link(name), _robot(robot).root
+    rail = Joint(f"{name}_joint", "prismatic", name, root, axis=axis, lower=lower, upper=upper, velocity=velocity)
+    return replace(robot, links=(link, *robot.links), joints=(rail, *robot.joints))
 
 
 def merge_robots(

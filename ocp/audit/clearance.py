@@ -139,6 +139,9 @@ class Clearance:
     reason: str = ""
     assumed: Mapping[str, str] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return f"<Clearance of {len(self.pairs)} pairs of bodies: {self}>"
+
     @property
     def worst(self) -> ClosestPair | None:
         """Pair whose distance has the smallest margin over the required distance; None if there are no pairs."""

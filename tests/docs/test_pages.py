@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import pytest
 from latex2mathml.converter import convert
 
-from docs.docstrings import prepared
+from docs.docstrings import documented, names, prepared
 from docs.executed import blocks, executed
 from docs.numbers import MARK, listed
 from docs.players import command, titles
@@ -21,7 +21,10 @@ from scripts.papers.reproduced import read_tables
 
 SITE = Path(__file__).resolve().parents[2] / "docs"
 PAGES = sorted(SITE.rglob("*.md"))
-FACE = re.compile(r"\.\. automodule:: ([\w.]+)")
+COLUMN = 88
+"""Characters of a line of code that the site shows without scrolling."""
+NEEDS = {"example-robot-data": "gallery", "spartpy": "gallery", "run_batch": "cluster", "read_joint_limits": "yaml"}
+"""Names that need an extra, by a word of a block."""
 FORMULAS = re.compile(r"\$\$(.+?)\$\$|(?<![\w$])\$([^$\n]+?)\$(?![\w$])", re.DOTALL)
 
 
@@ -36,6 +39,20 @@ def test_imports_of_pages_exist(page: Path) -> None:
                 assert not missing, f"{page}:{line} imports {missing} of {node.module}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(SITE)))
+def test_lines_of_code_fit_the_column_of_the_site(page: Path) -> None:
+    sources = re.findall(r"^```py\w*\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    assert not [line for source in sources for line in source.splitlines() if len(line) > COLUMN]
+
+
+def test_blocks_name_the_extra_that_they_need_in_their_first_line() -> None:
+    for page in PAGES:
+        for line, alone, source in blocks(page.read_text(encoding="utf-8")):
+            for word, extra in NEEDS.items():
+                needed = f'# needs pip install ".[{extra}]" in a clone\n'
+                assert not alone or word not in source or source.startswith(needed), f"{page}:{line}"
+
+
 def test_every_page_is_in_the_index() -> None:
     index = (SITE / "index.md").read_text(encoding="utf-8")
     listed = {
@@ -47,19 +64,28 @@ def test_every_page_is_in_the_index() -> None:
     assert listed == {str(page.relative_to(SITE).with_suffix("")) for page in PAGES} - {"index"}
 
 
-def test_every_face_has_its_reference() -> None:
-    shown = {name for page in PAGES for name in FACE.findall(page.read_text(encoding="utf-8"))}
-    assert shown == {
-        "models",
-        "models.paths",
-        "ocp",
-        "ocp.app",
-        "ocp.app.batch",
-        "ocp.app.files",
-        "ocp.motion.schedule",
-    }
-    for name in shown:
-        assert importlib.import_module(name).__all__
+def test_every_public_name_is_in_the_reference_once() -> None:
+    listed = [entry for page in PAGES for entry in names(page.read_text(encoding="utf-8"))]
+    faces = ("models", "models.paths", "ocp", "ocp.app", "ocp.app.batch", "ocp.app.files", "ocp.motion.schedule")
+    shared = set(importlib.import_module("models").__all__)
+    public = [
+        (face, name)
+        for face in faces
+        for name in importlib.import_module(face).__all__
+        if face != "models.paths" or name not in shared
+    ]
+    assert sorted(listed) == sorted(public)
+
+
+def test_listed_names_become_directives_of_their_kind_in_the_order_of_the_list() -> None:
+    report = documented("Before.\n```{names} models\nsmooth, Path,\nSTANDING_STARTS\n```\nAfter.")
+    assert re.findall(r"^\.\. (\w+):: (\S+)$", report, re.MULTILINE) == [
+        ("autofunction", "models.smooth"),
+        ("autoclass", "models.Path"),
+        ("autodata", "models.STANDING_STARTS"),
+    ]
+    assert report.startswith("Before.\n```{eval-rst}\n")
+    assert report.endswith("\n```\nAfter.")
 
 
 def test_every_formula_becomes_mathml() -> None:
@@ -177,6 +203,7 @@ def test_every_plan_of_the_gallery_is_played_beside_its_comparison() -> None:
         beside = [file for file in [plan.with_name(f"{plan.stem}.local.csv")] if file.exists()]
         assert options.beside == beside
         assert len(options.name) == 1 + len(beside)
+        assert f"## {options.title}\n" in text
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(SITE)))

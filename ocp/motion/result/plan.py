@@ -22,7 +22,7 @@ from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats
 from ocp.audit.audit import Audit, Finding
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require, sample_times
-from ocp.motion.result.candidate import Candidate
+from ocp.motion.result.candidate import Candidate, Stage
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.solution import MAX_LINES, Solution
@@ -250,17 +250,21 @@ class Plan(ABC):
             held = [f"{name} at {position:.4g}" for name, position in self.held.items()]
             more = f" and {len(held) - MAX_LISTED} more" if len(held) > MAX_LISTED else ""
             lines.append(f"  held: {', '.join(held[:MAX_LISTED])}{more}")
-        most, costs_by_reason = MAX_LINES - 1 - len(lines), dict[str, list[float]]()
+        most, by_reason = MAX_LINES - 1 - len(lines), dict[str, list[Candidate]]()
         for candidate in self.candidates:
-            costs_by_reason.setdefault(str(candidate.reason or "the plan"), []).append(candidate.cost)
-        for reason, costs in list(costs_by_reason.items())[:most]:
-            finite = [cost for cost in costs if np.isfinite(cost)] or [np.nan]
-            low, high = min(finite), max(finite)
-            span = f"{low:10.6g}" + (f" to {high:.6g}" if low < high else "")
-            prefix = "" if len(costs) == 1 else f"{len(costs)} motions: "
+            by_reason.setdefault(str(candidate.reason or "the plan"), []).append(candidate)
+        for reason, candidates in list(by_reason.items())[:most]:
+            finite = [each for each in candidates if np.isfinite(each.cost)]
+            costs = [each.cost for each in finite] or [np.nan]
+            low, high = min(costs), max(costs)
+            if any(each.stage < Stage.FINE for each in finite):  # costs are estimates
+                span = f"about {low:.3g}" + (f" to {high:.3g}" if low < high else "")
+            else:
+                span = f"{low:10.6g}" + (f" to {high:.6g}" if low < high else "")
+            prefix = "" if len(candidates) == 1 else f"{len(candidates)} motions: "
             lines.append(f"  {span:<23}  {prefix}{reason}")
-        if len(costs_by_reason) > most:
-            remaining = sum(len(costs) for costs in list(costs_by_reason.values())[most:])
+        if len(by_reason) > most:
+            remaining = sum(len(each) for each in list(by_reason.values())[most:])
             lines.append(f"  {remaining} more, see `candidates`")
         return "\n".join(lines)
 

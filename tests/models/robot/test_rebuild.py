@@ -20,8 +20,10 @@ from models import (
     inverse_dynamics,
     link_frames,
     lock_joints,
+    mass_matrix,
     merge_robots,
     momentum_matrix,
+    mount_on_rail,
     move_tip,
     planar_chain,
     prune,
@@ -233,6 +235,22 @@ def test_a_load_without_inertia_is_a_point() -> None:
     loaded = with_load(planar_chain([2.0], [1.0], [0.5]), "link1", 1.0, (2.0, 0.0, 0.0)).link("link1")
     np.testing.assert_allclose(loaded.center_of_mass, [1.5, 0, 0])
     assert loaded.inertia[2, 2] == pytest.approx(0.5 + 0.25 + 0.25)
+
+
+@given(seeds, st.integers(1, 4))
+@fewer_still
+def test_a_rail_carries_the_whole_mass_along_its_axis(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot, axis = random_robot(rng, size), rng.normal(size=3)
+    railed = mount_on_rail(robot, axis, -2.0, 3.0, velocity=0.5)
+    q, along = rng.normal(size=robot.dof), axis / np.linalg.norm(axis)
+    assert (railed.root, railed.joint_names) == ("rail", ("rail_joint", *robot.joint_names))
+    assert (railed.lower[0], railed.upper[0], railed.velocity[0]) == (-2.0, 3.0, 0.5)
+    there, here = numeric(tip_pose(railed, [1.5, *q]).position), numeric(tip_pose(robot, q).position)
+    np.testing.assert_allclose((there - here).ravel(), 1.5 * along, atol=1e-12)
+    inertia = numeric(mass_matrix(railed, [1.5, *q]))
+    np.testing.assert_allclose(inertia[1:, 1:], numeric(mass_matrix(robot, q)), **NEAR)
+    assert inertia[0, 0] == pytest.approx(sum(link.mass for link in robot.links))
 
 
 def test_two_arms_on_one_base_move_as_each_does_alone() -> None:

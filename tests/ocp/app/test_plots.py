@@ -32,6 +32,7 @@ from ocp import (
 from ocp.app.view.appearance import COMPARED, LIMIT, PLAN
 from ocp.motion.local.rates import LocalSolution
 from ocp.motion.plan import Candidate, Reason, Rejection
+from ocp.motion.result.candidate import Stage
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.solved_plan import SolvedPlan
 
@@ -243,6 +244,15 @@ def test_a_plan_of_many_candidates_is_printed_in_fifteen_lines_that_count_every_
         more = [int(line.split()[0]) for line in report if "more" in line]
         alone = [line for line in report[1:] if " motions: " not in line and "more" not in line]
         assert sum(counts) + sum(more) + len(alone) == 181
+
+
+def test_costs_of_motions_that_are_not_solved_to_the_end_are_printed_as_estimates() -> None:
+    plan = motion()
+    for stage in (Stage.SEED, Stage.COARSE, Stage.FINE):
+        other = Candidate(START, 0.5 * plan.cost, Reason(Rejection.DUPLICATE), stage)
+        first, second = str(replace(plan, candidates=(plan.candidates[0], other))).splitlines()[1:]
+        assert "about" not in first
+        assert ("about" in second) == (stage < Stage.FINE)
 
 
 def test_failed_solutions_are_printed_without_cost() -> None:
