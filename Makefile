@@ -110,8 +110,10 @@ format: $(VENV)/check.stamp ## reformat the code and apply safe corrections of i
 dev: $(VENV)/dev.stamp ## install everything that a developer needs, and the pre-commit hooks
 	$(BIN)/pre-commit install
 
-build: $(VENV)/run.stamp ## build the wheel into dist/
-	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+build: $(VENV)/build.stamp ## build the source distribution and the wheel into dist/ and check their metadata
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
 
 clean: ## remove .venv, caches and build output (never results/)
 	rm -rf $(VENV) dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

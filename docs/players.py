@@ -1,13 +1,15 @@
 """Players in pages: ```` ```{player} panda ```` shows results/gallery/panda.npz as `selfmotion view --page` writes it.
 
-Beside the plan plays what it is compared with, NAME.local.csv, where there is one. The pages are written while the site
-is read, into its folder players/.
+Beside the plan plays what it is compared with, NAME.local.csv, where there is one, and NAME.obj is the workpiece. The
+title is the heading above the player. The pages are written while the site is read, into its folder players/.
 """
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -24,33 +26,31 @@ NOT_PASSED = 1
 """Exit status where the audit of what is shown does not pass, which its page says."""
 
 
-def title(name: str) -> str:
-    """Title of the player of a plan: the heading of its entry in the gallery.
-
-    Raises:
-        ValueError: The gallery does not show the plan.
-    """
-    heading = ""
+def titles() -> dict[str, str]:
+    """The heading of the gallery above each player, by the player's name."""
+    result, heading = {}, ""
     for line in GALLERY.read_text(encoding="utf-8").splitlines():
-        if line.startswith("## "):
-            heading = line[3:]
-        if line == f"```{{player}} {name}":
-            return heading
-    raise ValueError(f"{GALLERY} does not show {name}")
+        if line.startswith("#"):
+            heading = line.strip("# ")
+        elif match := re.match(r"```\{player\} (\w+)", line):
+            result[match[1]] = heading
+    return result
 
 
-def command(plan: Path, file: Path) -> list[str]:
+def command(plan: Path, file: Path, title: str = "") -> list[str]:
     """What writes the page of a plan, and of what it is compared with."""
     beside = plan.with_name(f"{plan.stem}.local.csv")
-    names = ["--title", title(plan.stem), "--name", "plan"]
+    names = ["--name", "plan"]
     if beside.exists():
         names += ["--name", "local resolution"]
     motions = [str(plan), *([str(beside)] if beside.exists() else [])]
-    return [sys.executable, "-m", "ocp.app.command", "view", *motions, "--page", str(file), "--quiet", *names]
+    if (workpiece := plan.with_suffix(".obj")).exists():
+        names += ["--workpiece", str(workpiece)]
+    return [sys.executable, "-m", "ocp", "view", *motions, "--page", str(file), "--quiet", "--title", title, *names]
 
 
 class Player(Directive):  # type: ignore[misc]
-    """A frame that plays a plan of the gallery, and a link to it alone."""
+    """A frame that plays a plan of the gallery, and a link to it alone, below its picture, which can be printed."""
 
     required_arguments = 1
 
@@ -60,9 +60,11 @@ class Player(Directive):  # type: ignore[misc]
             raise self.error(f"there is no plan {name} in {PLANS}")
         depth = self.state.document.settings.env.docname.count("/")
         page = f"{'../' * depth}{FOLDER}/{name}.html"
-        frame = f'<iframe class="player" src="{page}" title="{title(name)}" loading="lazy"></iframe>'
-        link = f'<p><a href="{page}">{title(name)}: the player on a page of its own</a></p>'
-        return [nodes.raw("", f"{frame}\n{link}", format="html")]
+        title = escape(titles().get(name, name))
+        frame = f'<iframe class="player" src="{page}" title="{title}" loading="lazy"></iframe>'
+        link = f'<p><a href="{page}">{title}, on a page of its own</a></p>'
+        picture = nodes.image(uri=f"{'../' * (depth + 1)}results/gallery/{name}.png", alt=title)
+        return [picture, nodes.raw("", f"{frame}\n{link}", format="html")]
 
 
 def setup(app: Any) -> dict[str, bool]:
@@ -72,8 +74,9 @@ def setup(app: Any) -> dict[str, bool]:
     def begin(app: Any) -> None:
         folder = Path(app.outdir) / FOLDER
         folder.mkdir(parents=True, exist_ok=True)
+        headings = titles()
         for plan in sorted(PLANS.glob("*.npz")):
-            words = command(plan, folder / f"{plan.stem}.html")
+            words = command(plan, folder / f"{plan.stem}.html", headings.get(plan.stem, plan.stem))
             running[plan.stem] = subprocess.Popen(
                 words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
             )

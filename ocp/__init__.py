@@ -1,5 +1,17 @@
 """Optimal control: declaration, transcription, solution and audit of problems, and motion planning of machines."""
 
+from importlib.util import find_spec as _find_spec
+from pathlib import Path as _Path
+
+if _Path(_file := getattr(_find_spec("models"), "origin", None) or "").parent != _Path(__file__).parents[1] / "models":
+    raise ImportError(
+        f"`import models` finds {_file or 'no module'}, not the package that selfmotion installs beside {__file__}. "
+        "Rename that file or folder, or exclude the folder of the script from the search for modules: "
+        "python -P SCRIPT, or the environment variable PYTHONSAFEPATH=1",
+        name="models",
+        path=_file,
+    )
+
 from ocp.audit.audit import Audit, Finding
 from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.errors import (

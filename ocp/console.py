@@ -94,7 +94,7 @@ class _Call(threading.Thread):
 
 
 _CALL: contextvars.ContextVar[_Call | None] = contextvars.ContextVar("call", default=None)
-_DEADLINE: contextvars.ContextVar[float] = contextvars.ContextVar("deadline", default=np.inf)
+_DEADLINES: contextvars.ContextVar[tuple[float, float]] = contextvars.ContextVar("deadlines", default=(np.inf, np.inf))
 
 
 def interruptible(function: Callable[P, T]) -> Callable[P, T]:
@@ -157,19 +157,29 @@ def reason_to_stop() -> SolverStatus | None:
 
 
 @contextmanager
-def time_limited(seconds: float | None) -> Iterator[None]:
-    """Limit the total wall time of the solves in a ``with`` block; None keeps the limit of an enclosing block."""
-    outer = _DEADLINE.get()
-    token = _DEADLINE.set(outer if seconds is None else min(outer, time.monotonic() + seconds))
+def time_limited(seconds: float | None, *, processor: bool = False) -> Iterator[None]:
+    """Limit the total time of the solves in a ``with`` block; None keeps the limit of an enclosing block.
+
+    The limit is on the wall time or, if `processor` is set, on the processor time of the program, so that what is found
+    within it does not depend on other programs.
+    """
+    clocks = time.monotonic(), time.process_time()
+    limits = (
+        np.inf if processor or seconds is None else seconds,
+        seconds if processor and seconds is not None else np.inf,
+    )
+    ends = [min(outer, now + limit) for outer, now, limit in zip(_DEADLINES.get(), clocks, limits, strict=True)]
+    token = _DEADLINES.set((ends[0], ends[1]))
     try:
         yield
     finally:
-        _DEADLINE.reset(token)
+        _DEADLINES.reset(token)
 
 
 def time_left() -> float:
     """Return the time that remains until the time limit, s; infinite without a limit, negative after the limit."""
-    return _DEADLINE.get() - time.monotonic()
+    wall, processor = _DEADLINES.get()
+    return min(wall - time.monotonic(), processor - time.process_time())
 
 
 class TimeLimitReached(Exception):

@@ -165,6 +165,11 @@ class Solution:
     def _verdict(self) -> str:
         return "solved" if self.success else self.message or str(self.status)
 
+    @property
+    def has_no_multipliers(self) -> bool:
+        """Whether the motion comes from a method without multipliers, so that its optimality cannot be judged."""
+        return not (self.success or self.multipliers.size)
+
     def plot(self, against: Any = None, *, figure: Any = None) -> Any:
         """Plot states and controls over time, with their bounds; see :func:`ocp.app.view.plots.plot_solution`.
 

@@ -70,10 +70,9 @@ STYLE: Any = {
 
 TITLE_SIZE = 10.0
 TITLE_CHARACTERS_PER_INCH = 13.0
-ASSUMING = "What the paper does not print is assumed; the caption beside this file says how"
-"""First sentence of the notes of papers' figures."""
 NOTE_SIZE = 7.0
 NOTE_CHARACTERS_PER_INCH = 19.0  # of the note's font
+NOTE_LINE = 0.2  # inches
 
 
 @contextmanager
@@ -139,6 +138,8 @@ def add_note(figure: Figure, note: str) -> None:
         text = textwrap.fill(f"{line}.", int(figure.get_figwidth() * NOTE_CHARACTERS_PER_INCH))
         for legend in figure.legends:
             if getattr(legend, "_outside_loc", None) == "lower":  # the layout leaves no room for both
+                low = NOTE_LINE * (1 + 0.6 * text.count("\n")) / figure.get_figheight()
+                legend.set_bbox_to_anchor((0.0, low, 1.0, 1.0 - low))
                 rows = -(-len(legend.get_texts()) // getattr(legend, "_ncols", 1))
                 text = "\n" * (2 * rows) + text
         figure.supxlabel(text, x=0.01, ha="left", fontsize=NOTE_SIZE, color=COLORS["grey"])
@@ -158,10 +159,8 @@ def draw_arm(ax: Any, arm: Any, color: Any, width: float = 4.0) -> None:
 
 
 def legend_below(figure: Figure, handles: Any, ncols: int) -> None:
-    """A legend under all axes, above the note's line."""
-    line = 0.2 / figure.get_figheight()
-    place = (0.0, line, 1.0, 1.0 - line)
-    figure.legend(handles=handles, loc="outside lower center", ncols=ncols, fontsize=7.5, bbox_to_anchor=place)
+    """A legend under all axes, above the note, which moves it."""
+    figure.legend(handles=handles, loc="outside lower center", ncols=ncols, fontsize=7.5)
 
 
 def dots(ax: Any, values: Sequence[float], names: Sequence[str], colors: Sequence[str]) -> None:

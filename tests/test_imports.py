@@ -42,9 +42,10 @@ LAYERS = {
         ["refinement", "tightening"],
         ["motion"],
         ["app"],
+        ["__main__"],
     ],
     "ocp.motion": [["tasks"], ["local", "schedule"], ["builders"], ["sampling", "search"], ["result"], ["plan"]],
-    "ocp.app": [["files", "batch"], ["check"], ["view"], ["subcommands"], ["command"]],
+    "ocp.app": [["files", "batch"], ["check"], ["view"], ["subcommands"]],
 }
 """Packages and single modules of each package, from the lowest layer up: each may import from lower layers only."""
 MACHINES = {"ocp.motion", "ocp.app"}

@@ -113,7 +113,7 @@ def test_the_readme_runs_with_its_stated_requirements(tmp_path: Path) -> None:
     home = tmp_path / "home"
     home.mkdir()
     there = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "hiding"), str(ROOT)]), "MPLBACKEND": "Agg"}
-    command = [sys.executable, "-c", "import sys; from ocp.app.command import main; sys.exit(main(sys.argv[1:]))"]
+    command = [sys.executable, "-c", "import sys; from ocp.__main__ import main; sys.exit(main(sys.argv[1:]))"]
     programs = {"python": [sys.executable], "selfmotion": command}
 
     def run(extras: str, *words: str) -> subprocess.CompletedProcess[str]:

@@ -4,6 +4,5 @@ No other package draws.
 """
 
 from ocp.app.check.verdict import Check, CheckTolerances, Fault, Interpretation, Row, check_trajectory
-from ocp.app.command import main
 
-__all__ = ["Check", "CheckTolerances", "Fault", "Interpretation", "Row", "check_trajectory", "main"]
+__all__ = ["Check", "CheckTolerances", "Fault", "Interpretation", "Row", "check_trajectory"]

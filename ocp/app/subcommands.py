@@ -16,6 +16,7 @@ import numpy as np
 from models import FixedBase, FreeFloating, Machine, Robot, Standing, footprint, lock_joints, rectangle, with_load
 from models.checks import Array
 from models.files import INPUT_LIMITS, cache_files, cache_folder
+from models.shapes.mesh_files import read_mesh
 from models.spatial import rotation_from_rpy
 from ocp.app.check.data_checks import PLANAR_BASE, clean_trajectory
 from ocp.app.check.joint_limits import limits_by_name
@@ -153,7 +154,11 @@ def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
     motions = motions_of(options)
     progress("drawing")
     html, missing = build_page(
-        motions, title=options.title or options.plan.name, folders=options.folder, meshes=not options.no_meshes
+        motions,
+        title=options.title or f"{motions[0].machine.robot.name}: {options.plan.stem}",
+        folders=options.folder,
+        meshes=not options.no_meshes,
+        workpiece=None if options.workpiece is None else read_mesh(options.workpiece),
     )
     for name, reason in missing.items():
         progress.say(f"{name} is not shown: {reason}")

@@ -274,14 +274,14 @@ def audit(
     is_sound = all(finding.passed for finding in findings)
     optimum: Any = None
     undecided = "the optimality was not checked"
-    if not only_feasible:
+    if not solution.success:
+        undecided = f"the solver says {solution.message or solution.status}"
+    if not (only_feasible or solution.has_no_multipliers):
         # an infeasible plan does not need the best multipliers
         optimum = optimality(form, solution, p, bounds, along=along, allowed=lost if is_sound else np.inf)
         excess = cost.value if cost.passed and solution.cost > running + final else 0.0
         findings += optimality_findings(form, optimum, excess, lost, costates=costates)
-        undecided = optimum.curvature.flat
-        if not solution.success:
-            undecided = f"the solver says {solution.message or solution.status}"
+        undecided = undecided if not solution.success else optimum.curvature.flat
     return Audit(
         form.name,
         tuple(findings),

@@ -26,6 +26,7 @@ from scripts.robots import capture_family
 from scripts.robots.capture_family import SPINS, Member
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.robots import SPACE_ARM
+from scripts.robots.space_arm import SATELLITE
 
 __all__ = ["CaptureExample", "draw", "plan", "request"]
 
@@ -185,7 +186,8 @@ def scenes_of(example: CaptureExample, count: int = 161) -> list[Scene]:
                 {**frames.positions, "target": own.positions["target"]},
             )
         times = begin + np.linspace(0.0, duration, count)
-        result.append(Scene(f"{title}: {begin:.0f} to {times[-1]:.0f} s", pair.robot, frames, times, color, view=VIEW))
+        title = f"{title}: {begin:.0f} to {times[-1]:.0f} s"
+        result.append(Scene(title, pair.robot, frames, times, color, view=VIEW, root_color=SATELLITE))
         begin = times[-1]
     return result
 
@@ -196,17 +198,18 @@ def draw(example: CaptureExample, folder: Path, *, animation: bool = True) -> No
     capture_family.draw(example.family, folder / "capture_family.png")
     row, scenes = example.summary(), scenes_of(example)
     title = (
-        f"A tumbling body is caught without a shock and stopped in {row['duration_s']:.0f} s; wheels take its "
-        f"{row['target_momentum_Nms']:.1f} N m s"
+        f"A tumbling body is grasped without impact and stopped in {row['duration_s']:.0f} s; reaction wheels absorb "
+        "its momentum"
     )
     spin = np.degrees(np.linalg.norm(SPIN))
     note = (
         f"{SPACE_ARM.name} of {example.chaser.robot.total_mass:.0f} kg, a body of {MASS:.0f} kg that turns by "
-        f"{spin:.1f} degrees a second; earlier postures pale. Wheels of {MOMENTUM:g} N m s and {TORQUE:g} N m each, "
-        f"joints of {np.degrees(RATE):.0f} degrees a second and {JOINT_TORQUE:g} N m, a hand of {GRASP.force:g} N and "
-        f"{GRASP.moment:g} N m, a cone of {np.degrees(CONE.half_angle):.0f} degrees over the last {CONE.length:g} m. "
-        "Both durations are free and planned with the motion at the least weighted effort; at the end the arm is as "
-        "at the start, and nothing but the wheels turns. Masses of the target, wheels and limits are our own choice."
+        f"{spin:.1f} degrees per second ({row['target_momentum_Nms']:.1f} N m s); earlier configurations are pale. "
+        f"Wheels of {MOMENTUM:g} N m s and {TORQUE:g} N m each, joints of {np.degrees(RATE):.0f} degrees per second "
+        f"and {JOINT_TORQUE:g} N m, a hand of {GRASP.force:g} N and {GRASP.moment:g} N m, a cone of "
+        f"{np.degrees(CONE.half_angle):.0f} degrees over the last {CONE.length:g} m. Both durations are free and "
+        "planned with the motion, at the lowest weighted effort; at the end the arm is as at the start, and nothing "
+        "but the wheels turns. Masses of the target, wheels and limits are our own choice."
     )
     with page(folder / "capture.png", scenes, 4, height=6.0, share=1.4, note=note, title=title) as axes:
         _momenta(axes[0], example)
@@ -224,7 +227,7 @@ def _whole(example: CaptureExample, one: Scene, other: Scene) -> Scene:
         {name: np.concatenate([places, other.frames.positions[name]]) for name, places in one.frames.positions.items()},
     )
     title = f"caught at {one.t[-1]:.0f} s, at rest at {other.t[-1]:.0f} s"
-    return Scene(title, one.robot, frames, np.concatenate([one.t, other.t]), "blue", view=VIEW)
+    return Scene(title, one.robot, frames, np.concatenate([one.t, other.t]), "blue", view=VIEW, root_color=SATELLITE)
 
 
 def _timed(example: CaptureExample, count: int = 201) -> tuple[Array, Array]:
@@ -241,9 +244,10 @@ def _momenta(ax: Any, example: CaptureExample) -> None:
             ax.plot(times, held[:, i], color=color, ls=dash, label=f"wheel {name}" if not k else None)
     for side in (-MOMENTUM, MOMENTUM):
         ax.axhline(side, color=COLORS["grey"], lw=0.8)
-    ax.axvline(_timed(example)[0][-1], color="black", lw=0.6)
-    ax.set(xlabel="time, s", ylabel="momentum of wheels, N m s")
-    ax.legend(loc="lower left", fontsize=6.5)
+    ax.text(0.98, MOMENTUM - 0.2, "limit", transform=ax.get_yaxis_transform(), fontsize=7, ha="right", va="top")
+    _grasp(ax, example)
+    ax.set(title="momentum of the wheels", xlabel="time, s", ylabel="N m s")
+    ax.legend(loc="lower left", fontsize=6.5, bbox_to_anchor=(0.0, 0.06))
 
 
 def _hand(ax: Any, example: CaptureExample) -> None:
@@ -251,8 +255,9 @@ def _hand(ax: Any, example: CaptureExample) -> None:
     force, moment = bearing(example, example.samples("detumble", len(times)))
     ax.plot(times, np.linalg.norm(force, axis=1), color=COLORS["blue"], label="force, N")
     ax.plot(times, np.linalg.norm(moment, axis=1), color=COLORS["orange"], ls="--", label="moment, N m")
-    ax.set(xlabel="time, s", ylabel="what the hand bears", xlim=(0, times[-1]))
-    ax.axvline(times[0], color="black", lw=0.6)
+    ax.set(title="load on the hand", xlabel="time, s", ylabel="N and N m", xlim=(0, times[-1]))
+    ax.axvspan(0.0, times[0], color=COLORS["grey"], alpha=0.15, lw=0)
+    ax.text(times[0] / 2, 0.6, "no contact", rotation=90, fontsize=7, ha="center", va="center")
     ax.legend(loc="upper right", fontsize=6.5)
 
 
@@ -261,5 +266,12 @@ def _rates(ax: Any, example: CaptureExample) -> None:
         rates = example.samples(("approach", "detumble")[k], len(times))["velocities"][:, :7]
         options: dict[str, Any] = {} if k else {"ncols": 2, "fontsize": 6.0, "loc": "upper right"}
         joint_curves(ax, times, rates, [f"{i + 1}" for i in range(7)], **options)
-    ax.axvline(_timed(example)[0][-1], color="black", lw=0.6)
-    ax.set(xlabel="time, s", ylabel="joint rates, rad/s")
+    _grasp(ax, example)
+    ax.set(title="joint velocities", xlabel="time, s", ylabel="rad/s")
+
+
+def _grasp(ax: Any, example: CaptureExample) -> None:
+    """A line at the time of the grasp."""
+    at = _timed(example)[0][-1]
+    ax.axvline(at, color="black", lw=0.6)
+    ax.text(at + 1.0, 0.98, "grasp", transform=ax.get_xaxis_transform(), fontsize=7, va="top")

@@ -37,6 +37,8 @@ GHOSTS = (0.16, 0.34)
 """Opacity of the first and of the last of the earlier postures."""
 FILM = 80_000
 """Faces of a robot in an animation."""
+LEGEND: Any = {"fontsize": 6.3, "loc": "lower center", "handlelength": 1.6, "columnspacing": 0.8, "borderpad": 0.1}
+"""Of many curves, in small letters."""
 LOOKS = 9
 """Times at which a scene is measured."""
 
@@ -58,6 +60,7 @@ class Scene:
         nearest_points: Of two bodies, where they come nearest to each other along the motion. Shape (2, 3), m.
         solids: What stands around, in world.
         detail: Faces of the robot, at most.
+        root_color: Of the root link, red, green, blue and opacity; None: that of its description.
     """
 
     title: str
@@ -73,12 +76,16 @@ class Scene:
     nearest_points: Array | None = None
     solids: tuple[Part, ...] = ()
     detail: int = SURFACE_STYLE.max_faces
+    root_color: tuple[float, float, float, float] | None = None
 
     @cached_property
     def looks(self) -> Appearance:
         """Of the robot; without the zones of its description that are no bodies."""
         looks = appearance_of(self.robot, most=self.detail)
-        return Appearance(tuple(part for part in looks.parts if part.color != SURFACE_STYLE.zone), looks.missing)
+        parts = [part for part in looks.parts if part.color != SURFACE_STYLE.zone]
+        if self.root_color is not None:
+            parts = [replace(p, color=self.root_color) if p.link == self.robot.root else p for p in parts]
+        return Appearance(tuple(parts), looks.missing)
 
     @cached_property
     def corners(self) -> Array:
@@ -168,7 +175,7 @@ def draw_scene(
 def page(
     path: Path,
     scenes: Sequence[Scene],
-    moments: int | Sequence[float],
+    moments: int | Sequence[float] | Sequence[Array],
     *,
     height: float,
     share: float,
@@ -179,7 +186,7 @@ def page(
 
     Args:
         path: PNG file, saved when the block ends, with what `sheet` puts beside it.
-        moments: Number of instants, or times, s; see draw_scene.
+        moments: Number of instants, or times, s; see draw_scene. Also times of each scene.
         height: Of the figure, inches. share: Height of the scenes over that of the diagrams.
         note: What is assumed; its first sentence stands below the figure.
         title: What the figure shows, a sentence.
@@ -191,8 +198,9 @@ def page(
         wide = 3.75
         tall = (height - 1.5) * share / (1 + share)
         size = round(SHARPER * 150 * wide), round(SHARPER * 150 * tall)
-        for scene, place in zip(scenes, (slice(0, 3), slice(3, 6)), strict=True):
-            draw_scene(figure.add_subplot(grid[0, place]), scene, moments, size, scenes)
+        own: Any = moments if np.ndim(moments) == 2 else [moments] * len(scenes)
+        for scene, times, place in zip(scenes, own, (slice(0, 3), slice(3, 6)), strict=True):
+            draw_scene(figure.add_subplot(grid[0, place]), scene, times, size, scenes)
         first, second, third = (figure.add_subplot(grid[1, place : place + 2]) for place in (0, 2, 4))
         yield first, second, third
 

@@ -78,14 +78,15 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
     """mobile_manipulator.png, .gif and .npz."""
     result, nearest = example.results, example.nearest
     note = (
-        f"TIAGo of {result.robot.total_mass:.0f} kg leads {standing.LOAD:g} kg round a circle in {standing.SECONDS:g} "
-        f"s while a rope pulls its hand forward with {standing.PULL:g} N; earlier postures pale, disc: zero moment "
-        "point. Footprint, inertias and limits from its URDF (example-robot-data); both motions have the same hand "
-        f"path and force. Plan: zero moment point {1000 * standing.MARGIN:g} mm inside, {100 * standing.SHARE:g} % of "
-        f"the limits of velocity and torque; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
-        f"{1000 * nearest.distance:.1f} mm (in the animation: purple)."
+        f"TIAGo of {result.robot.total_mass:.0f} kg moves {standing.LOAD:g} kg along a circle in {standing.SECONDS:g} "
+        f"s while a rope pulls its hand forward with {standing.PULL:g} N; earlier configurations are pale; disc: zero "
+        "moment point, grey: inside the footprint. Footprint, inertias and limits from its URDF (example-robot-data); "
+        f"both motions have the same hand path and force. Plan: zero moment point {1000 * standing.MARGIN:g} mm "
+        f"inside, {100 * standing.SHARE:g} % of the limits of velocity and torque; {nearest.bodies[0]} and "
+        f"{nearest.bodies[1]} come nearest, {1000 * nearest.distance:.1f} mm (in the animation: purple)."
     )
-    title = "Resolved instant by instant the robot tips over; planned as a whole it stands, within all limits"
+    speed = float((np.abs(result.local.joint_velocities) / result.robot.velocity).max())
+    title = f"By local resolution TIAGo tips over, at {speed:.1f} times a speed limit; the plan keeps all limits"
     standing.figure(folder / "mobile_manipulator.png", result, note=note, title=title)
     save(folder / "mobile_manipulator.npz", example)
     if animation:
@@ -94,7 +95,7 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
 
 
 def save(path: Path, example: StandingExample) -> None:
-    """Both motions: the plan, and beside it the one instant by instant as NAME.local.csv."""
+    """Both motions: the plan, and beside it the one by local resolution as NAME.local.csv."""
     result, local = example.results, example.results.local
     save_plan(path, result.machine, result.solution, [example.task])
     names = result.machine.robot.joint_names

@@ -13,7 +13,7 @@ from models.checks import Array
 from ocp import Collocation, TipTask, VelocitySetup, inverse_kinematics, minimum_velocity_problem, resolve, solve
 from ocp.app.view.appearance import frames_along
 from scripts.drawing import COLORS
-from scripts.robots.drawing import Scene, animate, joint_curves, page
+from scripts.robots.drawing import LEGEND, Scene, animate, joint_curves, page
 from scripts.robots.results import Example
 from scripts.robots.robots import PANDA
 
@@ -26,6 +26,8 @@ TILT = 0.4
 LAP = 6.0  # s
 LAPS = 6
 SAMPLES = 100  # a lap
+SHOWN = 3
+"""Laps of which the arm is drawn; later it looks as at the start again, although its joints are half a turn away."""
 VIEW = (20.0, -50.0)
 
 
@@ -95,37 +97,36 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     ]
     note = (
         f"{example.file.name}: a circle of radius {RADIUS:g} m in {LAP:g} s, the tool leaning "
-        f"{np.degrees(np.arctan(TILT)):.0f}° outwards; the arm at the start of each of {laps} laps (pale) and at their "
-        "end. Fixed base, fingers locked; six task rows, seven joints. Cost: integral of half the squared joint rates. "
-        "The pseudo-inverse begins where the inverse kinematics from the arm's ready posture end."
+        f"{np.degrees(np.arctan(TILT)):.0f}° outwards; the arm at the start of each lap (pale) and after {SHOWN} laps. "
+        "The base is fixed, the fingers are locked; the pose of the tool is given, and seven joints move it. Cost: "
+        "integral of half the squared joint velocities. The pseudo-inverse starts in the solution of inverse "
+        "kinematics near the arm's ready configuration."
     )
     left_at = example.facts["first_leaves_limits_local_s"]
-    title = "Lap after lap the pseudo-inverse drifts" + (
-        f" and leaves the joints' limits after {left_at:.0f} s" if left_at is not None else ""
-    )
-    title += "; the cyclic plan comes back to where it began"
+    leaves = "" if left_at is None else f" and exceeds the joint limits after {left_at:.0f} s"
+    title = f"The pseudo-inverse drifts{leaves}; the cyclic plan does not drift"
     each = example.facts["cost_by_lap_local"]
     note += (
         f" A lap of the cyclic plan costs {example.plan.cost:.2f} rad²/s, the laps of the pseudo-inverse, which need "
         f"not return, {each.min():.2f} to {each.max():.2f}."
     )
-    path, starts = folder / "panda.png", [lap * LAP for lap in range(laps + 1)]
+    path, starts = folder / "panda.png", [lap * LAP for lap in range(SHOWN + 1)]
     with page(path, scenes, starts, height=6.2, share=1.6, note=note, title=title) as (drift, left, right):
         for name, values, color, mark in (
             ("pseudo-inverse", drifts(local.joints), "orange", "o"),
             ("cyclic plan", drifts(again), "blue", "D"),
         ):
             drift.plot(np.arange(laps + 1), values, "-" + mark, color=COLORS[color], ms=4, label=name)
-        drift.set(xlabel="laps", ylabel="largest |q − q(0)|, rad", xticks=range(laps + 1))
+        drift.set(xlabel="laps", ylabel="largest change of a joint, rad", xticks=range(laps + 1))
         drift.legend(loc="upper left", fontsize=7)
         middle, half = (robot.upper + robot.lower) / 2, (robot.upper - robot.lower) / 2
         for ax, joints, title in ((left, local.joints, scenes[0].title), (right, again, scenes[1].title)):
             joint_curves(ax, local.t / LAP, (joints - middle) / half, map(str, range(1, robot.dof + 1)))
             ax.axhspan(1, 3, color=COLORS["grey"], alpha=0.25, lw=0)
             ax.axhspan(-3, -1, color=COLORS["grey"], alpha=0.25, lw=0)
-            ax.set(xlabel="laps", title=title, ylim=(-1.9, 1.6))
+            ax.set(xlabel="laps", title=title, ylim=(-2.2, 1.6))
         left.set_ylabel("joint position, limits = ±1")
-        right.legend(ncols=4, fontsize=6.3, loc="lower center", handlelength=1.6, columnspacing=0.8, borderpad=0.1)
+        right.legend(ncols=4, title="joint", **LEGEND)
     example.save(folder / "panda.npz")
     if animation:
         animate(folder / "panda.gif", scenes, frames=6 * laps, seconds=0.18, note=note)

@@ -2,7 +2,7 @@
 
 Seven legs, each a phase of one problem: over the load, down to it, up with it, across, down, up without it, home. The
 arm is at rest at the end of each, so that the load changes hands at rest. The same motion is planned
-with a hand that is taken to be empty, and shown with the torques that the load asks for then.
+without the load, and shown with the torques that the load requires then.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from models.checks import Array
 from ocp import Audit, Cost, Goal, Solution, TipTask, inverse_kinematics, joint_torques
 from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from scripts.drawing import COLORS
-from scripts.robots.drawing import Scene, animate, joint_curves, page
+from scripts.robots.drawing import LEGEND, Scene, animate, page
 from scripts.robots.panda import HOME
 from scripts.robots.robots import PANDA
 
@@ -37,8 +37,10 @@ EFFORT = Cost(velocity=0.0, effort=1.0, acceleration=2.0)
 FINE = 81  # times of a leg
 HANDED = ("lift", "carry", "set down")
 """Legs with the load in hand."""
-KINDS = {"hand taken to be empty": "orange", "load known": "blue"}
+KINDS = {"planned without the load": "orange", "planned with the load": "blue"}
 VIEW = (20.0, 12.0)  # deg
+LOADED: dict[int, tuple[str, Any]] = {1: ("purple", "-"), 5: ("green", "--")}
+"""Colour and line of the joints whose torques the load changes most; their numbers from 0."""
 STEEL, SHELF = (0.55, 0.35, 0.20, 1.0), (0.72, 0.72, 0.70, 1.0)
 
 
@@ -94,7 +96,7 @@ class PickAndPlace:
     @property
     def audit(self) -> Audit:
         """Of the plan that is not sound, if one is not, else of the one that knows the load."""
-        return next((audit for audit in self.audits.values() if not audit.passed), self.audits["load known"])
+        return next((audit for audit in self.audits.values() if not audit.passed), self.audits["planned with the load"])
 
     def share(self, name: str) -> Array:
         """Largest torque of each joint over its limit, of a plan. Shape (7,)."""
@@ -102,20 +104,20 @@ class PickAndPlace:
 
     def summary(self) -> dict[str, Any]:
         """A row of the summary."""
-        known = self.motions["load known"]
+        known = self.motions["planned with the load"]
         return {
             "robot": PANDA.name,
             "dof": arm().joint_size,
             "task_rows": None,
             "duration_s": float(known.t[-1]),
             "cost_local": None,
-            "cost_optimal": float(self.plans["load known"].cost),
+            "cost_optimal": float(self.plans["planned with the load"].cost),
             "tip_error": None,
             "joint_return_rad": float(np.abs(known.joints[-1] - known.joints[0]).max()),
             "audit_passed": all(audit.passed for audit in self.audits.values()),
             "load_kg": LOAD,
-            "torque_share_load_known": self.share("load known").tolist(),
-            "torque_share_hand_taken_to_be_empty": self.share("hand taken to be empty").tolist(),
+            "torque_share_with_the_load": self.share("planned with the load").tolist(),
+            "torque_share_without_the_load": self.share("planned without the load").tolist(),
         }
 
 
@@ -160,7 +162,7 @@ def plan(coarse: bool = False) -> PickAndPlace:
     """Both plans, audited; `coarse` changes nothing."""
     plans, motions, audits = {}, {}, {}
     for name in KINDS:
-        goals = legs(name == "load known")
+        goals = legs(name == "planned with the load")
         plans[name] = ocp.plan(arm(), goals, start=HOME, cost=EFFORT, scene=False).solution
         motions[name], audits[name] = motion_of(plans[name]), plans[name].audit()
     return PickAndPlace(plans, motions, audits)
@@ -228,17 +230,17 @@ def draw(example: PickAndPlace, folder: Path, *, animation: bool = True) -> None
     """pick_and_place.png and pick_and_place.gif."""
     robot, blind, known = arm().robot, *(example.share(name) for name in KINDS)
     title = (
-        f"Planned for an empty hand, a load of {LOAD:g} kg asks {100 * blind.max():.0f} % of what joint "
-        f"{blind.argmax() + 1} can give; planned with the load, at most {100 * known.max():.0f} %"
+        f"Planned without the load of {LOAD:g} kg, joint {blind.argmax() + 1} needs {100 * blind.max():.0f} % of its "
+        f"torque limit; planned with it, {100 * known.max():.0f} %"
     )
     note = (
         f"{PANDA.name}: over a load of {LOAD:g} kg, down, up with it, across, down, and home in {len(ROUTE)} legs and "
-        f"{example.motions['load known'].t[-1]:g} s, from rest to rest on each; earlier postures pale. The load is a "
-        "block of steel, more than the 3 kg that the arm is sold for. Limits of torque: "
-        f"{', '.join(f'{value:g}' for value in robot.effort)} N m, of its description. Both plans are the cheapest by "
-        f"the squared torques, and {EFFORT.acceleration:g} (N m)² s⁴/rad² of the squared accelerations, within the "
-        "limits of joints, velocities and torques; one knows the load, the other was planned as if there were none, "
-        "and its torques are those that the load asks for. Durations are given, no friction in the joints."
+        f"{example.motions['planned with the load'].t[-1]:g} s, from rest to rest on each; earlier configurations are "
+        "pale. The load is a block of steel, heavier than the 3 kg for which the arm is specified. Limits of torque, "
+        f"from its description: {', '.join(f'{value:g}' for value in robot.effort)} N m. Both plans minimise the "
+        f"squared torques plus {EFFORT.acceleration:g} (N m)² s⁴/rad² times the squared accelerations, within the "
+        "limits of positions, velocities and torques. One of them is planned for an empty hand; the figure shows the "
+        "torques that its motion requires with the load. Durations are given; joints have no friction."
     )
     scenes = [scene_of(name, example) for name in KINDS]
     ends = np.cumsum([0.0, *(horizon for *_, horizon in ROUTE)])
@@ -251,23 +253,24 @@ def draw(example: PickAndPlace, folder: Path, *, animation: bool = True) -> None
         note=note,
         title=title,
     ) as axes:
-        names = [str(k + 1) for k in range(robot.dof)]
         for ax, name in zip(axes, KINDS, strict=False):
             motion = example.motions[name]
-            joint_curves(ax, motion.t, motion.torques / robot.effort, names)
+            shares = motion.torques / robot.effort
+            ax.plot(motion.t, np.delete(shares, list(LOADED), axis=1), color=COLORS["grey"], lw=0.6)
+            ax.lines[0].set_label("other joints")
+            for k, (color, dashes) in LOADED.items():
+                ax.plot(motion.t, shares[:, k], color=COLORS[color], ls=dashes, label=f"joint {k + 1}")
             _limits(ax, motion)
-            ax.set(title=name, xlabel="time, s", ylabel="torque with the load, limits = ±1")
-        axes[0].legend(ncols=4, fontsize=6.3, loc="lower center", handlelength=1.6, columnspacing=0.8, borderpad=0.1)
-        motion = example.motions["load known"]
-        for k, color in ((1, "orange"), (5, "purple")):
-            lifted = np.where(motion.in_hand, motion.torques[:, k], np.nan)
-            axes[2].plot(motion.t, lifted / robot.effort[k], color=COLORS[color], label=f"{k + 1}, with load")
-            axes[2].plot(
-                motion.t, motion.empty[:, k] / robot.effort[k], color=COLORS[color], ls=":", label=f"{k + 1}, without"
-            )
+            ax.set(title=name, xlabel="time, s")
+        axes[0].set_ylabel("torque, limits = ±1")
+        axes[0].legend(ncols=2, **LEGEND)
+        motion = example.motions["planned with the load"]
+        for k, (color, dashes) in LOADED.items():
+            part = motion.torques[:, k] - motion.empty[:, k]
+            axes[2].plot(motion.t, part / robot.effort[k], color=COLORS[color], ls=dashes)
         _limits(axes[2], motion)
-        axes[2].set(title="what the load asks", xlabel="time, s", ylabel="torque, limits = ±1")
-        axes[2].legend(fontsize=6.3, loc="lower center", ncols=2, handlelength=1.6, columnspacing=0.8)
+        axes[2].set(title="due to the load alone", xlabel="time, s")
+        axes[2].text(motion.t[motion.in_hand].mean(), -0.96, "load in hand", ha="center", fontsize=7)
     if animation:
         animate(folder / "pick_and_place.gif", scenes, frames=48, seconds=0.12, note=note)
 
@@ -277,5 +280,5 @@ def _limits(ax: Any, motion: Motion) -> None:
     for low, high in ((-9.0, -1.0), (1.0, 9.0)):
         ax.axhspan(low, high, color=COLORS["grey"], alpha=0.25, lw=0)
     held = motion.t[motion.in_hand]
-    ax.axvspan(held[0], held[-1], color=COLORS["yellow"], alpha=0.15, lw=0)
-    ax.set_ylim(-1.6, 1.2)  # with room for a legend
+    ax.fill_between(held[[0, -1]], -1.0, 1.0, color=COLORS["yellow"], alpha=0.15, lw=0)
+    ax.set_ylim(-1.5, 1.2)  # with room for a legend

@@ -38,7 +38,7 @@ BOW = 0.1  # m, of the seam to the side
 TILT = np.radians(40.0)  # of the tool, leaning back along the seam
 COSTS = ListedColormap(VIRIDIS(np.linspace(0.95, 0.25, 256)))
 """The cheapest brightest."""
-SAMPLE_COUNT = 33
+SAMPLE_COUNT = 49
 STARTS = 24
 """Of inverse kinematics at each instant."""
 MOST = 3.0
@@ -133,8 +133,8 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     t = np.linspace(0.0, DURATION, FINE)
     ways = [("pseudo-inverse", local.joints, "orange", float(local.cost[-1]))]
     if near is not None:
-        ways.append(("best from the same branch", near.at(t)["joints"], "green", near.cost))
-    ways.append(("cheapest of all", best.at(t)["joints"], "blue", best.cost))
+        ways.append(("best from the same start", near.at(t)["joints"], "green", near.cost))
+    ways.append(("plan", best.at(t)["joints"], "blue", best.cost))
     space = JointSpace(example.machine, robot.lower, robot.upper, np.ones(robot.dof))
     homes = [family[_nearest(space, charts, joints[[0, FINE // 2]], (0, count // 2))] for _, joints, _, _ in ways]
     least = {number: through[family == number].min() for number in np.unique(family[np.isfinite(through)]).tolist()}
@@ -142,16 +142,19 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     shown.sort(key=lambda number: least[number])
     left = len(least) - len(shown)
     note = (
-        f"All postures of a UR5, its tool at {np.degrees(TOOL_ANGLE):.0f}° to the flange, along a bowed seam of "
-        f"{np.linalg.norm(END - BEGIN):.1f} m in {DURATION:g} s, position and axis told, roll free; one panel a family "
-        "that no motion leaves. Joints within their limits, links clear of each other. Each column holds all postures "
-        "of one time, found by continuation; colour: the least that any motion through a posture costs, a bound, of "
-        "the plan's cost"
-        f"{f'; {left} dearer families are left out' if left else ''}. Costs: integral of half the "
-        f"squared joint rates, rad²/s; no motion costs less than {best.bound:.4g}."
+        f"A UR5, its tool at {np.degrees(TOOL_ANGLE):.0f}° to the flange, follows a bowed seam of "
+        f"{np.linalg.norm(END - BEGIN):.1f} m in {DURATION:g} s with free roll; coloured: all configurations that "
+        "perform the task. No motion leads from one family to another. Joints are within their limits, links do not "
+        "collide. Each column holds all configurations at one time, found by continuation. The colour of a "
+        "configuration is a lower bound of the cost of all motions through "
+        f"it{f'; {left} costlier families are left out' if left else ''}. Cost: integral of half the squared joint "
+        f"velocities, rad²/s; no motion costs less than {best.bound:.4g}."
     )
     excess = 100 * (ways[-2][3] / best.cost - 1)
-    title = f"The best motion from where the arm is best conditioned is {excess:.0f} % dearer than another family's"
+    title = (
+        f"The start configuration decides: from the best-conditioned one, the best motion costs {excess:.0f} % more "
+        "than from the start that the search finds"
+    )
     size = (3.0 * len(shown) + 1.2, 4.2)
     with sheet(folder / "posture_set.png", (1, len(shown)), size, note, title=title) as (figure, axes):
         for ax, number in zip(np.ravel(axes), shown, strict=True):
@@ -175,12 +178,12 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
                     ax.plot(t, angles, color="white", lw=3.6)
                     ax.plot(t, angles, color=COLORS[color], lw=1.8, label=f"{name}: {cost:.3f}")
             ax.set(xlim=(0, DURATION), ylim=(-180, 180), yticks=range(-180, 181, 90), xlabel="time, s")
-            ax.set_title(f"at least {least[number]:.3f} rad²/s")
+            ax.set_title(f"family {shown.index(number) + 1}: cost ≥ {least[number]:.3f}")
             ax.grid(visible=False)
             if ax.get_legend_handles_labels()[0]:
                 ax.legend(loc="lower left", fontsize=7)
         np.ravel(axes)[0].set_ylabel("roll of the tool, deg")
-        figure.colorbar(collection, ax=axes, label="cost of the best motion through, of the plan's", pad=0.01)
+        figure.colorbar(collection, ax=axes, label="lower bound / cost of the plan", pad=0.01)
     example.save(folder / "posture_set.npz")
 
 

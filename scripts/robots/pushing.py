@@ -2,8 +2,8 @@
 
 ANYmal with a Kinova arm (the URDF of example-robot-data) stands on its four feet, legs locked, 1 kg in its hand. It
 pushes to its right with 60 N; the reaction, 60 N on its hand, acts to its left, +y. In 2.5 s the hand gives way to the
-left, backwards and up. Resolved instant by instant, the zero moment point leaves the feet; planned as a whole it stays
-inside, within all limits.
+left, backwards and up. By local resolution, the zero moment point leaves the support polygon of the feet; in the plan
+it stays inside, within all limits.
 """
 
 from __future__ import annotations
@@ -118,15 +118,15 @@ def draw(example: StandingExample, folder: Path, *, animation: bool = True) -> N
     result, nearest = example.results, example.nearest
     force = float(np.linalg.norm(PUSH))
     note = (
-        f"ANYmal of {result.robot.total_mass - LOAD:.0f} kg, legs locked, pushes to its right (-y) with {force:g} N "
-        f"and {LOAD:g} kg in its hand; earlier postures pale, disc: zero moment point. The reaction on its hand acts "
-        f"to its left, where the hand gives way by {STEP[1]:g} m in {SECONDS:g} s. Feet, inertias and limits from its "
-        "URDF (example-robot-data); both motions have the same path and force. Plan: zero moment point "
-        f"{1000 * MARGIN:g} mm inside; {nearest.bodies[0]} and {nearest.bodies[1]} come nearest, "
-        f"{1000 * nearest.distance:.1f} mm (in the animation: purple)."
+        f"ANYmal of {result.robot.total_mass - LOAD:.0f} kg, legs locked, pushes to its right with {force:g} N and "
+        f"{LOAD:g} kg in its hand; earlier configurations are pale; disc: zero moment point, grey: inside the "
+        f"footprint. The reaction on its hand acts to its left, and the hand moves to the left by {STEP[1]:g} m in "
+        f"{SECONDS:g} s. Feet, inertias and limits from its URDF (example-robot-data); both motions have the same path "
+        f"and force. Plan: zero moment point {1000 * MARGIN:g} mm inside; {nearest.bodies[0]} and {nearest.bodies[1]} "
+        f"come nearest, {1000 * nearest.distance:.1f} mm (in the animation: purple)."
     )
-    title = "Resolved instant by instant the push lifts the robot off its feet; planned as a whole it stays on them"
-    look: dict[str, Any] = {"view": VIEW, "prefix": "j2s6s200_", "inset": (0.36, 0.1, 0.5, 0.5)}
+    title = "By local resolution the push tips the robot over; the plan keeps it on its feet"
+    look: dict[str, Any] = {"view": VIEW, "prefix": "j2s6s200_"}
     standing.figure(folder / "pushing.png", result, note=note, title=title, **look)
     save(folder / "pushing.npz", example)
     if animation:

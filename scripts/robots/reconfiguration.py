@@ -15,7 +15,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from matplotlib.collections import LineCollection
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -179,19 +179,19 @@ def _led(graph: ChartGraph, order: range) -> NDArray[np.bool_]:
 
 def draw(example: InPieces, folder: Path, *, animation: bool = True) -> None:
     """reconfiguration.png and .gif."""
-    segmented, machine = example.segmented, example.machine
+    segmented = example.segmented
     change = segmented.reconfigurations[0]
     joint = int(np.abs(change.after - change.before).argmax())
     far = np.degrees(abs(change.after[joint] - change.before[joint]))
     note = (
-        f"All postures of a Panda whose hand goes round a ring of {RADIUS:g} m about its foot in {DURATION:g} s, "
-        f"pointing down with one heading: at each time a column, one direction being free. Blue: those that motions "
-        "from the beginning reach; green: those from which motions lead to the end; grey: neither. Joints within their "
-        "limits of position and velocity, links clear of each other. The pieces, of which no plan has fewer, are the "
-        f"cheapest where one gives way to the other at {change.time:.3g} s: {segmented.cost:.3f} rad²/s together, the "
-        "integral of half the squared joint rates, the way between them not counted."
+        f"The hand of a Panda moves along a ring of radius {RADIUS:g} m around its base in {DURATION:g} s, pointing "
+        "down with constant heading. Each column of the diagram shows all configurations at one time; one degree of "
+        "freedom is redundant. Joints are within their limits of position and velocity, links do not collide. No plan "
+        f"has fewer segments than two. With the change at {change.time:.3g} s their cost is lowest: "
+        f"{segmented.cost:.3f} rad²/s together, the integral of half the squared joint velocities, without the motion "
+        "between them."
     )
-    title = f"No one motion does the ring: {machine.robot.joint_names[joint]} turns back by {far:.0f}° on the way"
+    title = f"No single motion follows the ring: on the way, joint {joint + 1} has to turn back by {far:.0f}°"
     with sheet(folder / "reconfiguration.png", (2, 2), (7.6, 6.4), note, title=title, height_ratios=(1, 1)) as (
         figure,
         axes,
@@ -207,7 +207,7 @@ def draw(example: InPieces, folder: Path, *, animation: bool = True) -> None:
             draw_scene(figure.add_subplot(grid[0, place]), scene, 1, (790, 560), scenes)
         _landscape(figure.add_subplot(grid[1, :]), example, change, joint)
     if animation:
-        scene = _scene(example, f"a ring in {len(segmented.segments)} pieces", "blue", *_motion(segmented))
+        scene = _scene(example, f"a ring in {len(segmented.segments)} segments", "blue", *_motion(segmented))
         options = f"The ring waits at {change.time:.2f} s, for {change.duration:.2g} s, while the arm reconfigures"
         animate(folder / "reconfiguration.gif", [scene], frames=FRAMES, seconds=PACE, note=options)
 
@@ -217,15 +217,17 @@ def _landscape(ax: Any, example: InPieces, change: Reconfiguration, joint: int) 
     segmented, reached, robot = example.segmented, example.reached, example.machine.robot
     charts, times = reached.charts, reached.times[reached.charts.layer]
     ends = [charts.centers[:, joint] + charts.tangents[:, joint, 0] * end[:, 0] for end in (charts.low, charts.high)]
-    bars = np.stack([np.column_stack([times, np.degrees(end)]) for end in ends], axis=1)
+    half = np.diff(reached.times).mean() / 2
+    corners = [(times + side, ends[end]) for side, end in ((-half, 0), (half, 0), (half, 1), (-half, 1))]
+    bars = np.stack([np.column_stack([t, np.degrees(angles)]) for t, angles in corners], axis=1)
     ahead, back = reached.from_the_beginning, reached.to_the_end
     for own, color in ((~ahead & ~back, NEITHER), (ahead, FROM_THE_BEGINNING), (back, TO_THE_END)):
-        lines = LineCollection(list(bars[own]), colors=PALE[color], linewidths=72 * 6.2 / len(reached.times))
-        lines.set_rasterized(True)  # thousands of them
-        ax.add_collection(lines)
+        columns = PolyCollection(list(bars[own]), facecolors=PALE[color], edgecolors="face", linewidths=0.3)
+        columns.set_rasterized(True)  # thousands of them
+        ax.add_collection(columns)
     for name, color, piece, begin in (
-        ("first piece", FROM_THE_BEGINNING, segmented.segments[0], segmented.start_times[0]),
-        ("last piece", TO_THE_END, segmented.segments[-1], segmented.start_times[-1]),
+        ("first segment", FROM_THE_BEGINNING, segmented.segments[0], segmented.start_times[0]),
+        ("last segment", TO_THE_END, segmented.segments[-1], segmented.start_times[-1]),
     ):
         t = np.linspace(0.0, piece.horizon, FINE)
         angle = np.degrees(piece.at(t)["joints"][:, joint])
@@ -235,16 +237,16 @@ def _landscape(ax: Any, example: InPieces, change: Reconfiguration, joint: int) 
     arrow = {"arrowstyle": "-|>", "color": COLORS["black"], "lw": 1.2, "shrinkA": 4, "shrinkB": 4}
     ax.annotate("", (change.time, after), (change.time, before), arrowprops=arrow)
     ax.text(
-        change.time - 0.15, 0.0, f"the arm reconfigures,\n{change.duration:.2g} s", ha="right", va="center", fontsize=8
+        change.time + 0.15, 0.0, f"the arm reconfigures,\n{change.duration:.2g} s", ha="left", va="center", fontsize=8
     )
     for limit in (robot.lower[joint], robot.upper[joint]):
         ax.axhline(np.degrees(limit), color=COLORS["black"], lw=0.8, ls=DASHES[1])
     ax.set(xlim=(0, DURATION), ylim=(-180, 180), yticks=range(-180, 181, 90), xlabel="time of the task, s")
-    ax.set_ylabel(f"{robot.joint_names[joint]}, deg")
-    ax.set_title("All postures that do the task, dashed the joint's limits")
+    ax.set_ylabel(f"angle of joint {joint + 1}, deg")
+    ax.set_title("All configurations that perform the task; dashed: limits of the joint")
     ax.grid(visible=False)
     handles, labels = ax.get_legend_handles_labels()
-    names = ("reached from the beginning", "lead to the end", "neither")
+    names = ("can be reached from the start", "can reach the end", "neither")
     for color, label in zip((FROM_THE_BEGINNING, TO_THE_END, NEITHER), names, strict=True):
         handles.append(Patch(color=PALE[color]))
         labels.append(label)

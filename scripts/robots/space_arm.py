@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -23,6 +24,8 @@ TURN = (0.4, 0.3, 0.8)  # roll, pitch, yaw in the axes of the tip, rad
 DURATION = 20.0  # s
 SNAPSHOTS = 4
 VIEW = (24.0, -48.0)  # deg
+SATELLITE = (0.72, 0.74, 0.78, 1.0)
+"""Colour of its body, which is black in its description."""
 
 
 def plan(coarse: bool = False) -> Example:
@@ -51,26 +54,28 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
     machine, local, solution = example.machine, example.local, example.plan
     robot = machine.robot
     at = solution.at(local.t)
+    look: dict[str, Any] = {"view": VIEW, "root_color": SATELLITE}
     scenes = [
-        Scene("pseudo-inverse", robot, frames_along(machine, local.joints, local.base), local.t, "orange", view=VIEW),
-        Scene("plan", robot, frames_along(machine, at["joints"], at["base"]), local.t, "blue", view=VIEW),
+        Scene("pseudo-inverse", robot, frames_along(machine, local.joints, local.base), local.t, "orange", **look),
+        Scene("plan", robot, frames_along(machine, at["joints"], at["base"]), local.t, "blue", **look),
     ]
     base = robot.link(robot.root).mass
     note = (
         f"{example.file.name} of {robot.total_mass - base:.0f} kg on a free base of {base:.0f} kg, no momentum; "
-        "earlier postures pale. Six task rows, seven joints; the base reacts. Both motions begin in the same posture. "
-        "Cost: integral of half the squared joint rates, which need not begin at zero."
+        "earlier configurations are pale. The pose of the tool is given, and seven joints move it; the base reacts. "
+        "Both motions begin in the same configuration. Cost: integral of half the squared joint velocities, which need "
+        "not begin at zero."
     )
     path, saved, calmer = folder / "space_arm.png", 1 - solution.cost / local.cost[-1], example.facts
     title = (
-        f"A free-flying arm turns a part by {100 * saved:.0f} % less effort than by the pseudo-inverse, and its base "
-        f"turns by {calmer['base_turn_optimal_deg']:.0f}° instead of {calmer['base_turn_local_deg']:.0f}°"
+        f"The plan costs {100 * saved:.0f} % less than the pseudo-inverse, and the satellite turns by "
+        f"{calmer['base_turn_optimal_deg']:.0f}° instead of {calmer['base_turn_local_deg']:.0f}°"
     )
     with page(path, scenes, SNAPSHOTS, height=6.0, share=1.5, note=note, title=title) as (turn, rates, best):
         for scene, poses, dash in zip(scenes, (local.base, at["base"]), DASHES, strict=False):
             angle = np.degrees(turning_angle(poses))
             turn.plot(local.t, angle, color=COLORS[scene.color], ls=dash, label=scene.title)
-        turn.set(xlabel="time, s", ylabel="turn of the base, deg")
+        turn.set(xlabel="time, s", ylabel="rotation of the satellite, deg")
         turn.legend(loc="upper left", fontsize=7)
         turn.set_ylim(top=1.35 * turn.get_ylim()[1])  # room for the legend
         names = [name.split("_")[-1] for name in robot.joint_names]
@@ -78,7 +83,7 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
         joint_curves(best, local.t, at["rates"], names, ncols=4, fontsize=6.5, title="joint")
         for ax, scene in zip((rates, best), scenes, strict=True):
             ax.set(xlabel="time, s", title=scene.title)
-        rates.set_ylabel("joint rates, rad/s")
+        rates.set_ylabel("joint velocities, rad/s")
         best.sharey(rates)
         low, high = rates.get_ylim()
         rates.set_ylim(low - 0.35 * (high - low), high)

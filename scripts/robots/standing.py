@@ -1,8 +1,8 @@
 """Gallery: a mobile manipulator stirs against a rope that would tip it over.
 
 TIAGo (PAL Robotics; the URDF of example-robot-data) stands on its wheels and casters, carries 1 kg in its hand and
-leads it round a circle in 2.5 s while a rope pulls the hand forward with 62 N. Resolved instant by instant, its zero
-moment point leaves the footprint and joints pass their limits; planned as a whole it stays inside, within all limits.
+leads it round a circle in 2.5 s while a rope pulls the hand forward with 62 N. By local resolution, its zero
+moment point leaves the footprint and joints exceed their limits; in the plan it stays inside, within all limits.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def scenes_of(results: Results, view: tuple[float, float], nearest_points: Array
     """
     result = []
     feet = np.asarray(results.footprint.support.vertices)
-    for title, motion, color in (("instant by instant", results.local, "orange"), ("plan", results.motion, "blue")):
+    for title, motion, color in (("local resolution", results.local, "orange"), ("plan", results.motion, "blue")):
         frames = frames_along(results.machine, motion.joints)
         about: dict[str, Any] = {"view": view, "floor": 0.0, "footprint": feet, "mark": motion.zero_moment_point}
         points = nearest_points if motion is results.motion else None
@@ -203,63 +203,47 @@ def scenes_of(results: Results, view: tuple[float, float], nearest_points: Array
 
 
 def figure(
-    path: Path,
-    results: Results,
-    *,
-    note: str,
-    title: str,
-    prefix: str = "",
-    view: tuple[float, float] = (14.0, -50.0),
-    inset: tuple[float, float, float, float] = (0.1, 0.27, 0.46, 0.46),
+    path: Path, results: Results, *, note: str, title: str, prefix: str = "", view: tuple[float, float] = (14.0, -50.0)
 ) -> None:
-    """The local motion and the plan above: zero moment point from above, its distance from the edge, limits.
+    """The local motion and the plan above: zero moment point near the edge, its distance from the edge, limits.
 
     Args:
         path: PNG file.
         note, title: As of sheet.
         prefix: Of joint names, left out.
         view: Elevation and azimuth, deg.
-        inset: Left, bottom, width and height of the enlarged part, in shares of the picture from above.
     """
-    kinds = (("instant by instant", results.local, "orange", 1), ("plan", results.motion, "blue", 0))
+    kinds = (("local resolution", results.local, "orange", 1), ("plan", results.motion, "blue", 0))
     span = (0.0, results.solution.horizon)
     scenes = scenes_of(results, view)
     with page(path, scenes, 4, height=7.4, share=1.45, note=note, title=title) as (above, edge, shares):
-        _from_above(above, results, kinds, inset)
+        _from_above(above, results, kinds)
         for label, motion, color, dash in kinds:
             edge.plot(motion.t, 1000 * motion.foot_margin, color=COLORS[color], ls=DASHES[dash], label=label)
         edge.axhline(0.0, color=COLORS["black"], lw=0.8)
         low = 1.5 * 1000 * min(0.0, float(results.local.foot_margin.min()), float(results.motion.foot_margin.min()))
-        edge.axhspan(low, 0.0, color=COLORS["grey"], alpha=0.2, lw=0)
+        edge.axhspan(0.0, 1000.0, color=COLORS["grey"], alpha=0.2, lw=0)
         edge.annotate("tips over", (0.03, low), xycoords=("axes fraction", "data"), fontsize=7, va="bottom")
-        edge.set_ylim(bottom=low)
-        edge.set(xlabel="time, s", ylabel="zero moment point\ninside the footprint, mm", xlim=span)
+        edge.set(title="its distance to the edge", xlabel="time, s", ylabel="mm", xlim=span)
         edge.legend(fontsize=7, loc="upper left")
-        edge.set_ylim(top=1.25 * edge.get_ylim()[1])
+        edge.set_ylim(low, 1.3 * 1000 * max(results.local.foot_margin.max(), results.motion.foot_margin.max()))
         _shares(shares, results, kinds, prefix)
 
 
-def _from_above(ax: Any, results: Results, kinds: Any, inset: tuple[float, float, float, float]) -> None:
-    """The footprint, and the place of interest enlarged."""
-    corners = results.footprint.support.vertices
+def _from_above(ax: Any, results: Results, kinds: Any) -> None:
+    """The zero moment points and the edge of the footprint near to them, cm from where the plan begins."""
+    corners, origin = np.asarray(results.footprint.support.vertices), results.motion.zero_moment_point[0]
     points = np.vstack([motion.zero_moment_point for _, motion, _, _ in kinds])
-    least, most = points.min(axis=0), points.max(axis=0)
-    middle, half = (least + most) / 2, 0.6 * float((most - least).max())
-    window = {"xlim": (middle[0] - half, middle[0] + half), "ylim": (middle[1] - half, middle[1] + half)}
-    enlarged = ax.inset_axes(inset, xticks=[], yticks=[], **window)
-    for part in (ax, enlarged):
-        part.fill(*corners.T, color=COLORS["grey"], alpha=0.18, lw=0)
-        part.plot(*np.vstack([corners, corners[:1]]).T, color=COLORS["grey"], lw=1)
-        for _, motion, color, dash in kinds:
-            part.plot(*motion.zero_moment_point.T, color=COLORS[color], ls=DASHES[dash])
-        part.set_aspect("equal")
-    for _, motion, color, _ in kinds:
-        enlarged.plot(*motion.zero_moment_point[0], "o", color=COLORS[color], ms=4)
-    for spine in enlarged.spines.values():
-        spine.set_visible(True)
-    ax.indicate_inset_zoom(enlarged, edgecolor=COLORS["black"])
-    ax.plot(*corners.T, "o", color=COLORS["grey"], ms=3)
-    ax.set(xlabel=f"x, forward, m; inset {200 * half:.0f} cm wide", ylabel="y, m")
+    least, most = (100 * (values - origin) for values in (points.min(axis=0), points.max(axis=0)))
+    middle, half = (least + most) / 2, 0.65 * float((most - least).max())
+    ax.fill(*(100 * (corners - origin)).T, color=COLORS["grey"], alpha=0.2, lw=0)
+    ax.plot(*(100 * (np.vstack([corners, corners[:1]]) - origin)).T, color=COLORS["black"], lw=1, label="edge")
+    for _, motion, color, dash in kinds:
+        path = 100 * (motion.zero_moment_point - origin)
+        ax.plot(*path.T, color=COLORS[color], ls=DASHES[dash])
+        ax.plot(*path[0], "o", color=COLORS[color], ms=4)
+    ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
+    ax.set(xlabel="forward, cm", ylabel="to the left, cm", title="zero moment point")
 
 
 def _shares(ax: Any, results: Results, kinds: Any, prefix: str) -> None:
@@ -276,4 +260,4 @@ def _shares(ax: Any, results: Results, kinds: Any, prefix: str) -> None:
     ax.set_yticks(rows, names)
     ax.invert_yaxis()
     ax.tick_params(axis="y", labelsize=7)
-    ax.set(xlabel="peak over its limit:\nbars torque, ◆ velocity")
+    ax.set(title="largest share of a limit", xlabel="bars: torque, ◆: velocity")

@@ -1,7 +1,7 @@
-"""Gallery: a planar biped takes two steps, in balance all the way and dynamically.
+"""Gallery: a planar biped takes two steps, statically and dynamically.
 
 53 kg on two legs of hip, knee and ankle; its left foot stays while the right one is set forward, then the other way
-round. In balance, its center of mass never leaves the soles that are held, so that it could stop anywhere. Dynamically,
+round. Statically, its center of mass never leaves the soles that are held, so that it could stop anywhere. Dynamically,
 only the zero moment point stays there: it falls forward from foot to foot, in a fraction of the time. The pseudo-
 inverse sets the feet as far with the least joint rates; its zero moment point leaves the soles, and the biped falls.
 """
@@ -39,17 +39,17 @@ FRICTION = 0.6
 MARGIN = 0.01  # m
 CLEARANCE = 0.02  # of a sole in the middle of its way, m
 KINDS: dict[str, dict[str, Any]] = {
-    "in balance": {"balance": "static", "margin": 2 * MARGIN, "times": (1.5, 1.5), "color": "orange"},
-    "as a whole": {"balance": "dynamic", "margin": MARGIN, "times": (0.5, 0.6), "color": "blue"},
+    "static walk": {"balance": "static", "margin": 2 * MARGIN, "times": (1.5, 1.5), "color": "orange"},
+    "dynamic walk": {"balance": "dynamic", "margin": MARGIN, "times": (0.5, 0.6), "color": "blue"},
 }
-"""What is asked of the walk in balance and of the dynamic one; durations of both feet held and of one in the air, s."""
+"""Requirements on the static and on the dynamic walk; durations of both feet held and of one in the air, s."""
 VIEW = (9.0, -74.0)  # deg
 METAL, DARK = (0.80, 0.82, 0.86, 1.0), (0.25, 0.27, 0.31, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Walks:
-    """Two walks over the same footholds, one in balance and one as a whole.
+    """Two walks over the same footholds, a static and a dynamic one.
 
     Attributes:
         plans, motions, audits: By the walks' names, as in KINDS.
@@ -77,7 +77,7 @@ class Walks:
             "duration_s": fast["duration_s"],
             "duration_static_s": slow["duration_s"],
             "cost_local": None,
-            "cost_optimal": float(self.plans["as a whole"].cost),
+            "cost_optimal": float(self.plans["dynamic walk"].cost),
             "tip_error": None,
             "joint_return_rad": None,
             "audit_passed": all(audit.passed for audit in self.audits.values()),
@@ -179,7 +179,7 @@ def crouched(steps: Steps, knee: float = 0.8) -> Array:
 def plan(coarse: bool = False) -> StepsExample:
     """Both walks, audited; on one mesh only, `coarse` or not."""
     walks = walks_of(planar_steps, KINDS, CLEARANCE)
-    steps = walks.motions["as a whole"].steps
+    steps = walks.motions["dynamic walk"].steps
     return StepsExample(**vars(walks), local=resolve_steps(steps, start=crouched(steps)))
 
 
@@ -228,29 +228,34 @@ def draw(example: StepsExample, folder: Path, *, animation: bool = True) -> None
     careful, whole = (example.motions[name] for name in KINDS)
     out, fallen = -whole.summary()["com_margin_min_m"], -example.local.summary()["zmp_margin_min_m"]
     title = (
-        f"With its center of mass up to {1000 * out:.0f} mm outside its feet a biped walks in {whole.t[-1]:.1f} s "
-        f"instead of {careful.t[-1]:.1f} s"
+        f"Two steps take {whole.t[-1]:.1f} s instead of {careful.t[-1]:.1f} s if the centre of mass may leave the "
+        f"feet, here by {1000 * out:.0f} mm"
     )
     note = (
-        f"A planar biped of {whole.steps.robot.total_mass:.0f} kg takes two steps of {LENGTH:g} m; earlier postures "
-        f"pale, disc: zero moment point. In balance, its center of mass stays {2000 * MARGIN:g} mm inside the soles "
-        f"that are held; as a whole only the zero moment point does, by {1000 * MARGIN:g} mm. Friction at most "
-        f"{FRICTION:g}, torques at most 200 N m, feet land at rest; the durations are given, and both walks are the "
-        "cheapest in theirs by the same weights. Dotted: the same steps in the same time with the least joint rates, "
-        f"by the pseudo-inverse; its zero moment point is up to {1000 * fallen:.0f} mm outside the soles, and in a "
-        "contact simulation it falls. Masses and limits are our own; the legs move in one plane and are "
-        "drawn beside each other."
+        f"A planar biped of {whole.steps.robot.total_mass:.0f} kg takes two steps of {LENGTH:g} m; earlier "
+        "configurations are pale; disc: zero moment point. It is drawn up to the middle of the second step. In the "
+        f"static walk, the centre of mass stays {2000 * MARGIN:g} mm inside the soles on the ground; in the dynamic "
+        f"walk, only the zero moment point stays inside, by {1000 * MARGIN:g} mm. Friction at most {FRICTION:g}, "
+        "torques at most 200 N m, feet land at rest; the durations are given, and both walks have the lowest cost by "
+        "the same weights. Dotted: the same steps in the same time with the least joint velocities, by the "
+        f"pseudo-inverse; its zero moment point is up to {1000 * fallen:.0f} mm outside the soles, and in a contact "
+        "simulation it falls. Masses and limits are our own; the legs move in one plane and are drawn beside each "
+        "other."
     )
     low, high = SOLE[0][0], SOLE[0][1] + 2 * LENGTH
     scenes = scenes_of(example, VIEW, np.array([[low, -0.15], [high, -0.15], [high, 0.15], [low, 0.15]]))
-    with page(folder / "steps.png", scenes, 6, height=6.0, share=1.15, note=note, title=title) as axes:
+    shown = [np.linspace(0.0, motion.t[motion.phase == 3].mean(), 5) for motion in (careful, whole)]
+    with page(folder / "steps.png", scenes, shown, height=6.0, share=1.15, note=note, title=title) as axes:
         for ax, name in zip(axes, KINDS, strict=False):
             _balance(ax, name, example.motions[name])
-        axes[0].legend(loc="upper left", fontsize=6.5)
         local = example.local
         line = axes[1].plot(local.t, local.zero_moment_point[:, 0], color="black", ls=":", lw=0.9)
-        axes[1].set_ylim(top=0.95)
-        axes[1].legend(line, ["pseudo-inverse"], loc="upper left", fontsize=6.5)
+        axes[1].sharex(axes[0])  # the same times and places: that the one walk is shorter is to be seen
+        axes[1].sharey(axes[0])
+        axes[0].set_ylim(-0.35, 1.15)
+        axes[0].legend(loc="upper left", fontsize=6.5)
+        axes[1].legend(line, ["zero moment point,\npseudo-inverse"], loc="upper right", fontsize=6.5)
+        axes[0].set_ylabel("forward, m; grey: support")
         _loads(axes[2], whole)
     if animation:
         animate(folder / "steps.gif", scenes, frames=44, seconds=0.1, note=note)
@@ -264,8 +269,8 @@ def _balance(ax: Any, name: str, motion: StepsMotion) -> None:
         at = [float(np.asarray(place.position)[0]) for place in phase.footholds.values()]
         ax.fill_between(motion.t[inside], min(at) + low, max(at) + high, color=COLORS["grey"], alpha=0.22, lw=0)
     ax.plot(motion.t, motion.zero_moment_point[:, 0], color=COLORS[KINDS[name]["color"]], label="zero moment point")
-    ax.plot(motion.t, motion.center_of_mass[:, 0], color="black", ls="--", lw=1.1, label="center of mass")
-    ax.set(title=name, xlabel="time, s", ylabel="along the way, m; support grey")
+    ax.plot(motion.t, motion.center_of_mass[:, 0], color="black", ls="--", lw=1.1, label="centre of mass")
+    ax.set(title=name, xlabel="time, s")
 
 
 def _loads(ax: Any, motion: StepsMotion) -> None:
@@ -273,5 +278,5 @@ def _loads(ax: Any, motion: StepsMotion) -> None:
     weight = motion.steps.stances[0].weight
     for side, dashes in zip(SIDES, ("-", "--"), strict=True):
         ax.plot(motion.t, motion.loads[side][:, 5] / weight, color=COLORS["blue"], ls=dashes, label=f"{side} foot")
-    ax.set(title="as a whole", xlabel="time, s", ylabel="load of a foot over the weight", ylim=(-0.05, 1.45))
+    ax.set(title="dynamic walk: load", xlabel="time, s", ylabel="load of a foot / weight", ylim=(-0.05, 1.45))
     ax.legend(loc="upper center", ncols=2, fontsize=6.5)

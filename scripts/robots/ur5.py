@@ -27,6 +27,7 @@ from ocp.app.view.appearance import TIP_FRAME, Frames, frames_along
 from ocp.motion.local.inverse_kinematics import IkSolution
 from ocp.motion.local.rates import LocalSolution
 from scripts.drawing import COLORS, DASHES
+from scripts.papers.run import write
 from scripts.robots.drawing import Scene, animate, joint_curves, page
 from scripts.robots.results import FINE, Example
 from scripts.robots.robots import TOOL_ANGLE, UR5
@@ -39,10 +40,10 @@ DURATION = 20.0  # s
 CLEARANCE = 0.05  # m, of elbow and wrist above the top of the panel at the start
 BRANCHES = 4
 """How many starts are tried, the best conditioned first."""
-CONDITIONED, BEST, PLANNED = "pseudo-inverse, best\nconditioned start", "pseudo-inverse, best start", "plan"
+CONDITIONED, BEST, PLANNED = "pseudo-inverse", f"from its best of {BRANCHES} starts", "plan"
 STYLES: Mapping[str, Any] = {
-    CONDITIONED: {"color": COLORS["orange"], "ls": DASHES[3], "lw": 1.2},
-    BEST: {"color": COLORS["orange"], "ls": DASHES[1]},
+    CONDITIONED: {"color": COLORS["orange"]},
+    BEST: {"color": COLORS["orange"], "ls": DASHES[3], "zorder": 3},
     PLANNED: {"color": COLORS["blue"]},
 }
 OVERHEAD = ("forearm_link", "wrist_1_link", "wrist_2_link", "wrist_3_link")
@@ -151,31 +152,43 @@ def panel() -> tuple[Array, Array, Array]:
     return CENTER[0] + across, along, CENTER[1] - CURVE + np.sqrt(CURVE**2 - along**2)
 
 
+def panel_mesh() -> str:
+    """The panel as a mesh in OBJ, for `selfmotion view --workpiece`."""
+    points = np.stack(panel(), axis=-1)
+    rows, columns = points.shape[:2]
+    corner = np.arange(rows * columns).reshape(rows, columns) + 1  # OBJ counts from 1
+    faces = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], axis=-1).reshape(-1, 4)
+    lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in points.reshape(-1, 3)]
+    return "\n".join([*lines, *(f"f {a} {b} {c} {d}" for a, b, c, d in faces)]) + "\n"
+
+
 def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
-    """ur5.png, ur5.gif and ur5.npz."""
+    """ur5.png, ur5.gif, ur5.npz, and ur5.obj, the panel."""
     robot, local, solution = example.machine.robot, example.local, example.plan
     at = solution.at(local.t)
+    first, best = (motion[-1][-1] for motion in example.more["motions"][:2])
     look: dict[str, Any] = {"surface": panel(), "view": (24.0, -40.0), "floor": 0.0}
     scenes = [
         Scene(title, robot, frames_along(example.machine, joints), local.t, color, **look)
         for title, joints, color in (
-            ("pseudo-inverse, from its best start", local.joints, "orange"),
-            ("plan, over roll and start", at["joints"], "blue"),
+            (f"pseudo-inverse: cost {first:.2f}", example.more["motions"][0][2], "orange"),
+            (f"plan: cost {solution.cost:.2f}", at["joints"], "blue"),
         )
     ]
     tried = example.facts["starts"]
     costs = [row["cost_local"] for row in tried if row["local_arrives"]] or [float(local.cost[-1])]
     note = (
-        f"UR5, its tool at {np.degrees(TOOL_ANGLE):.0f}° to the flange, sands {LANES} lanes over a panel of radius "
-        f"{CURVE:g} m; earlier postures pale. Fixed base; position and axis of the tool are told (five rows), its "
-        f"roll is free. Cost: integral of half the squared joint rates. {len(tried)} starts were tried, the best "
-        f"conditioned first: by the pseudo-inverse they cost {min(costs):.3f} to {max(costs):.3f} rad²/s. The plan is "
-        "the best of all, its roll there free. No collision checks."
+        f"A UR5 sands {LANES} lanes; earlier configurations are pale; the pseudo-inverse starts from the "
+        f"best-conditioned of {len(tried)} configurations (solid line) or from the one with the lowest cost (dotted). "
+        f"The tool is at {np.degrees(TOOL_ANGLE):.0f}° to the flange, the panel has a radius of {CURVE:g} m, the base "
+        "is fixed. Position and axis of the tool are given, its roll is free. Cost: integral of half the squared joint "
+        f"velocities, rad²/s; {min(costs):.3f} to {max(costs):.3f} by the pseudo-inverse from the {len(tried)} "
+        f"configurations. From the best of them it costs {100 * (best / solution.cost - 1):.1f} % more than the plan, "
+        "which chooses its start and its roll together. Collisions are not checked."
     )
-    (name, _, _, first), (_, _, _, best) = example.more["motions"][0], example.more["motions"][1]
     title = (
-        f"Where to begin decides: the pseudo-inverse costs {100 * (first[-1] / solution.cost - 1):.0f} % more than the "
-        f"plan from the best conditioned start, and {100 * (best[-1] / solution.cost - 1):.1f} % more from its best one"
+        f"Choosing start and roll together, the plan costs {100 * (1 - solution.cost / first):.0f} % less than the "
+        "pseudo-inverse"
     )
     path, motions = folder / "ur5.png", zip(example.more["motions"], example.more["rolls"], strict=True)
     with page(path, scenes, 4, height=6.2, share=1.5, note=note, title=title) as (rolling, spent, joints):
@@ -183,17 +196,16 @@ def draw(example: Example, folder: Path, *, animation: bool = True) -> None:
             style = STYLES[name]
             rolling.plot(t, np.degrees(angles - angles[0]), label=name, **style)
             spent.plot(t, cost, label=name, **style)
-        rolling.set(xlabel="time, s", ylabel="roll of the tool from its start, deg")
-        spent.set(xlabel="time, s", ylabel="cost so far, rad²/s")
-        spent.set_ylim(top=1.45 * spent.get_ylim()[1])
+        rolling.set(xlabel="time, s", ylabel="change of tool roll, deg")
+        spent.set(xlabel="time, s", ylabel="cost up to now, rad²/s")
+        spent.set_ylim(top=1.6 * spent.get_ylim()[1])
         spent.legend(loc="upper left", fontsize=7)
         names = [name.removesuffix("_joint").replace("_", " ") for name in robot.joint_names]
         joint_curves(joints, local.t, at["joints"] - at["joints"][0], names, ncols=2, fontsize=6.3)
         low, high = joints.get_ylim()
-        joints.set(
-            xlabel="time, s", ylabel="joints of the plan, less start, rad", ylim=(low - 0.45 * (high - low), high)
-        )
+        joints.set(xlabel="time, s", ylabel="change of joint angles, rad", ylim=(low - 0.45 * (high - low), high))
     example.save(folder / "ur5.npz")
+    write(folder / "ur5.obj", panel_mesh())
     if animation:
         animate(folder / "ur5.gif", scenes, frames=50, seconds=0.1, note=note)
 

@@ -15,8 +15,8 @@ from latex2mathml.converter import convert
 from docs.docstrings import documented, names, prepared
 from docs.executed import blocks, executed
 from docs.numbers import MARK, listed
-from docs.players import command
-from ocp.app.command import parser
+from docs.players import command, titles
+from ocp.__main__ import parser
 from scripts.papers.reproduced import read_tables
 
 SITE = Path(__file__).resolve().parents[2] / "docs"
@@ -190,13 +190,24 @@ def test_long_output_is_truncated_at_its_end() -> None:
 def test_every_plan_of_the_gallery_is_played_beside_its_comparison() -> None:
     text = (SITE / "gallery.md").read_text(encoding="utf-8")
     plans = sorted((SITE.parent / "results" / "gallery").glob("*.npz"))
+    assert titles().keys() == {plan.stem for plan in plans}
+    assert "## " + titles()["panda"] in text
     assert sorted(re.findall(r"```\{player\} (\w+)", text)) == [plan.stem for plan in plans]
     for plan in plans:
-        words = command(plan, SITE / "out.html")[3:]
+        words = command(plan, SITE / "out.html", titles()[plan.stem])[3:]
         options = parser().parse_args(words)
         assert options.plan == plan
+        assert options.title == titles()[plan.stem] != plan.name
+        assert (options.workpiece is not None) == plan.with_suffix(".obj").exists() == (plan.stem == "ur5")
         assert options.page == SITE / "out.html"
         beside = [file for file in [plan.with_name(f"{plan.stem}.local.csv")] if file.exists()]
         assert options.beside == beside
         assert len(options.name) == 1 + len(beside)
         assert f"## {options.title}\n" in text
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(SITE)))
+def test_code_fits_into_the_column_of_the_page(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    code = re.findall(r"^```[^\n]*\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert not [line for block in code for line in block.splitlines() if len(line) > 88]

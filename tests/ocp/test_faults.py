@@ -575,3 +575,20 @@ def test_a_silenced_thread_does_not_silence_another(capsys: pytest.CaptureFixtur
     thread.join()
     assert sys.stderr is real
     assert capsys.readouterr().err == "of the main thread\n"
+
+
+def test_a_limit_of_processor_time_passes_only_while_the_program_works() -> None:
+    """Other programs, for which sleep stands here, use up a limit of the wall time, but not of the processor time."""
+    with time_limited(0.1), time_limited(0.1, processor=True):
+        time.sleep(0.05)
+        assert time_left() < 0.06
+    with time_limited(0.1, processor=True):
+        time.sleep(0.15)
+        assert time_left() > 0
+        begun = time.process_time()
+        while time.process_time() < begun + 0.11:
+            pass
+        assert time_left() < 0
+        with pytest.raises(TimeLimitReached):
+            check_time()
+    assert time_left() == np.inf

@@ -19,14 +19,14 @@ from ocp.motion.builders.dynamics_plan import solve_dynamics
 LOW, HIGH = np.array([-0.0175, -2.0]), np.array([3.7525, 2.0])
 
 
-def time_limited() -> FixedBase:
+def limited_arm() -> FixedBase:
     arm = planar_chain([0.5, 0.4], [1.0, 1.0])
     bounds = zip(arm.joints, LOW, HIGH, strict=True)
     joints = [Joint(j.name, j.kind, j.parent, j.child, j.translation, lower=a, upper=b) for j, a, b in bounds]
     return FixedBase(Robot(arm.links, tuple(joints), tip_translation=arm.tip_translation))
 
 
-MACHINE = time_limited()
+MACHINE = limited_arm()
 
 
 def leaving(joints: Array) -> TipTask:

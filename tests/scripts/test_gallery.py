@@ -254,7 +254,7 @@ def test_talos_walks_in_balance_and_faster_without(tmp_path: Path) -> None:
     assert row["audit_feasible"]
     assert row["duration_s"] < row["duration_static_s"] / 2
     assert row["com_margin_optimal_m"] < 0 < row["com_margin_static_m"]
-    assert row["zmp_margin_optimal_m"] > 0.99 * talos.KINDS["as a whole"]["margin"]
+    assert row["zmp_margin_optimal_m"] > 0.99 * talos.KINDS["dynamic walk"]["margin"]
     assert row["peak_torque_share"] <= 1 + 1e-6
     with Image.open(tmp_path / "talos.png") as picture:
         assert min(picture.size) > 500
@@ -283,7 +283,7 @@ def test_the_load_that_is_known_stays_within_the_torques_of_another_library(tmp_
             result[k] = pinocchio.rnea(one, one.createData(), q, rates, second)[:7]
         np.testing.assert_allclose(motion.torques, result, atol=1e-8)
         most = (np.abs(result) / robots.PANDA.read().effort).max()
-        assert most < 1 + 1e-6 if name == "load known" else most > 1.01
+        assert most < 1 + 1e-6 if name == "planned with the load" else most > 1.01
     pick_and_place.draw(example, tmp_path, animation=False)
     with Image.open(tmp_path / "pick_and_place.png") as picture:
         assert min(picture.size) > 500

@@ -90,6 +90,13 @@ class Row:
     verdict: RowVerdict
     note: str = ""
 
+    @property
+    def urgency(self) -> float:
+        """Order of the row in a table: 2 if it is not ok, else how near the value is to its limit, 0 to 1."""
+        small, large = sorted(abs(one) for one in (self.value, self.limit or 0.0))
+        nearness = small / large if large > 0 else 0.0
+        return 2.0 if self.verdict in (RowVerdict.FAILED, RowVerdict.UNDECIDED) else nearness
+
 
 def limits_by_name(robot: Robot, limits: Mapping[str, Mapping[str, float]]) -> Limits:
     """Combine limits given by joint name with the limits of the robot for all other joints.

@@ -79,7 +79,7 @@ from models import (
     with_load,
 )
 from models import Path as ToolPath
-from models.checks import NOT_NUMBERS, Array, floats
+from models.checks import NOT_NUMBERS, Array, floats, warn_of_millimetres
 from models.shapes.shapes import Shape
 from ocp.app.files.safe_files import SUFFIXES, FileName, checked_output
 from ocp.app.files.settings import REQUIRED, TomlTable, obstacles_of, read_shape, read_toml, rotation_of
@@ -321,7 +321,7 @@ def _task(entries: TomlTable, folder: Path) -> TipTask:
     for name, value in (("within", within), ("link", link), ("tolerance", tolerance)):
         if value is not None:
             options[name] = value
-    with _located_errors(entries, "speed"):
+    with _located_errors(entries):
         task = TipTask.along(path, timing, roll="given" if tool == "given" else "free", **pace, **options)
         return replace(task, rows=(3, 4, 5), direction=None, orientation=None) if tool == "free" else task
 
@@ -363,6 +363,7 @@ def _read_path(entries: TomlTable, folder: Path) -> SmoothPath:
         corners = np.zeros(0)
     if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 2 or not np.isfinite(corners).all():
         raise entries.error("points", "points must be two or more triples of numbers, m: [[x, y, z], [x, y, z]]")
+    warn_of_millimetres(f"{entries.file}: an extent of the points of", np.ptp(corners, axis=0), "points")
     with _located_errors(entries, "points"):
         return smooth(ToolPath.through(corners), deviation=deviation)
 

@@ -431,7 +431,8 @@ def _audit_verdict(solutions: Sequence[Solution], judge: Callable[[], Audit | Pl
         return {"verdict": f"There is no audit, because the file has no problem: {lost}."}
     verdict = judge()
     audit = verdict.audit if isinstance(verdict, PlanVerdict) else verdict
-    return {"verdict": f"The plan {verdict.sentence}.", "passed": verdict.passed, "rows": tuple(audit_rows(audit))}
+    rows = sorted(audit_rows(audit), key=lambda row: -row.urgency)
+    return {"verdict": f"The plan {verdict.sentence}.", "passed": verdict.passed, "rows": tuple(rows)}
 
 
 def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[Curve]:

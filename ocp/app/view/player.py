@@ -70,7 +70,12 @@ class Page(NamedTuple):
 
 
 def build_page(
-    shown: Sequence[Animation], *, title: str = "", folders: Sequence[Any] = (), meshes: bool = True
+    shown: Sequence[Animation],
+    *,
+    title: str = "",
+    folders: Sequence[Any] = (),
+    meshes: bool = True,
+    workpiece: tuple[Array, NDArray[np.intp]] | None = None,
 ) -> Page:
     """Return the page that plays one motion, or a motion and others to compare it with.
 
@@ -79,6 +84,7 @@ def build_page(
         title: Title of the page; "": the name of the first motion.
         folders: Folders that are searched first for meshes.
         meshes: Whether mesh files are read; otherwise collision shapes are shown.
+        workpiece: Vertices in world, m, and triangles of a body that is shown as well. Shapes (k, 3) and (f, 3).
 
     Raises:
         ProblemError: There is no motion, or the page is too large.
@@ -97,6 +103,8 @@ def build_page(
             robots.append((robot, _robot(robot, appearance, buffers)))
             number = len(robots) - 1
         motions.append({**_motion(motion, buffers), "robot": number})
+        if workpiece is not None:
+            motions[-1]["around"].append({**_solid(*workpiece, buffers), "mover": None})
     name = title or shown[0].name
     description = {"title": name, "robots": [motion for _, motion in robots], "motions": motions, "missing": missing}
     head = json.dumps(description, allow_nan=False, separators=(",", ":")).encode()

@@ -40,6 +40,10 @@ __all__ = ["Report", "draw_scene", "report_of_check", "report_of_plan"]
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """Content security policy of a report, under which no script runs and nothing is loaded."""
+SHOWN_ROWS = 8
+"""Number of rows of a table that are shown at once, if not more are near their limits."""
+NEAR_LIMIT = 0.9
+"""Share of a limit from which a value counts as near it."""
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --soft: #f3f5f7; --line: #d5dae0;
   --good: #00734f; --bad: #b23b00 }
@@ -51,10 +55,10 @@ h1 { font-size: 1.5rem; margin: 1rem 0 .3rem } h2 { font-size: 1.1rem; margin: 2
 .verdict { font-size: 1.1rem; padding: .7rem 1rem; border-left: .4rem solid; background: var(--soft) }
 .good { color: var(--good) } .bad { color: var(--bad) }
 .facts { display: flex; flex-wrap: wrap; gap: .4rem 2rem; padding: 0; list-style: none }
-figure { margin: 0; background: #fff; border: 1px solid var(--line); padding: .3rem }
-figure img, figure svg { width: 100%;
-  height: auto; display: block }
-figcaption { font-size: .85rem; color: #444; padding: .2rem .4rem }
+figure { margin: 0; border: 1px solid var(--line); padding: .3rem }
+figure img, figure svg { width: 100%; height: auto; display: block; background: #fff }
+@media (prefers-color-scheme: dark) { figure svg { filter: invert(.9) hue-rotate(180deg) } }
+figcaption { font-size: .85rem; padding: .2rem .4rem } summary { cursor: pointer; padding: .3rem 0 }
 .scroll { overflow-x: auto } table { border-collapse: collapse; font-size: .85rem; width: 100% }
 th, td { text-align: left; padding: .25rem .6rem; border-bottom: 1px solid var(--line); vertical-align: top }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
@@ -109,7 +113,13 @@ class Report:
             f"<h2>The joints</h2><figure>{self.plots}<figcaption>Blue: the motion, interpolated between its samples as "
             "by a controller. Grey: limits, dashed or, if far, as text. Purple: violations.</figcaption></figure>"
         )
-        parts += [f"<h2>{escape(title)}</h2>{_table(rows)}" for title, rows in self.tables]
+        for heading, rows in self.tables:
+            ordered = sorted(rows, key=lambda row: -row.urgency)
+            count = max(SHOWN_ROWS, sum(row.urgency >= NEAR_LIMIT for row in rows))
+            parts.append(f"<h2>{escape(heading)}</h2>{_table(ordered[:count])}")
+            if len(ordered) > count:
+                more = f"{len(ordered) - count} more values, all within {NEAR_LIMIT:.0%} of their limits"
+                parts.append(f"<details><summary>{more}</summary>{_table(ordered[count:])}</details>")
         if self.notes:
             parts.append("<h2>Notes</h2><ul>" + "".join(f"<li>{escape(note)}</li>" for note in self.notes) + "</ul>")
         body = "\n".join(parts)

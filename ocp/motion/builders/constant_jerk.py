@@ -211,7 +211,7 @@ class ConstantJerkMotion:
             solver="path",
             success=False,
             status=SolverStatus.ACCEPTABLE,
-            message=f"it {method}, whose optimality no multipliers show",
+            message=f"it {method}, without multipliers that show whether it is optimal",
             cost=float(horizon * shares @ running + final),
             iterations=0,
             horizon=horizon,

@@ -482,7 +482,7 @@ def unreachable_error(
     distance, angle = misses
     return Unreachable(
         f"no joint positions put {names} where the task wants them: the nearest miss is {describe_miss(*misses)} at "
-        f"{np.round(joints, 6).tolist()}{where}; ask for a pose within reach, leave a row free, or raise starts",
+        f"{np.round(joints, 6).tolist()}{where}; ask for a pose within reach, or leave a row free",
         joints,
         pose_error,
         distance=distance,

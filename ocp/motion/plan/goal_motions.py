@@ -9,7 +9,7 @@ an optimal control problem. A motion that stops at the corners of the path is th
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -58,7 +58,7 @@ class GoalSettings:
 
     Attributes:
         search: Settings of the search for paths.
-        time_limit: Time after which a request without its own limit is refused, s.
+        time_limit: Processor time after which a request without its own limit is refused, s.
         search_share: Share of the time limit after which the search for further paths ends.
         unlimited_rate: Rate of joints without a rate limit, rad/s or m/s, where the planner chooses the horizon.
         spare: Horizon of a motion within actuator limits, where the planner chooses it, relative to the least time of a
@@ -106,7 +106,7 @@ class GoalRequest:
         start_velocity, end_velocity: "rest", "free", or the joint velocities there, shape (n,). For smooth motions.
         clearance_constraints: Collision scene; None if collisions are not checked.
         seed: Seed of the random searches.
-        time_limit: s; None for that of the settings.
+        time_limit: Wall time, s; None for the processor time of the settings.
         progress: Function that is called with a text at each stage; None for none.
         settings: Settings.
     """
@@ -124,6 +124,10 @@ class GoalRequest:
     time_limit: float | None = None
     progress: Callable[[str], None] | None = None
     settings: GoalSettings = field(default_factory=GoalSettings)
+
+    def limited(self, seconds: float) -> AbstractContextManager[None]:
+        """Return the context that limits the time of the request or of a part of it."""
+        return time_limited(seconds, processor=self.time_limit is None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +248,7 @@ def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate
     assert cost is not None
     try:
         for _ in range(task.request.settings.margins):
-            with time_limited(task.request.settings.search_share * time_left()):
+            with task.request.limited(task.request.settings.search_share * time_left()):
                 motion = optimal_motion_near(limits, path.joints, cost, horizon, settings=settings)
             candidate = _PathProblem(task, path, motion, horizon).candidate("is a locally optimal spline")
             task.report(f"path of length {path.length:.4g}: {candidate}")

@@ -15,7 +15,7 @@ import numpy as np
 
 from models import FixedBase
 from models.checks import Array
-from ocp.console import TimeLimitReached, interruptible, time_limited
+from ocp.console import TimeLimitReached, interruptible
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.constant_jerk import TorqueLimits
 from ocp.motion.local.inverse_kinematics import spread_points
@@ -51,7 +51,7 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
     """
     task = _check_request(request)
     seconds = request.settings.time_limit if request.time_limit is None else request.time_limit
-    with time_limited(require.positive("time_limit", seconds)):
+    with request.limited(require.positive("time_limit", seconds)):
         try:
             return _best(task, _candidates(task, seconds))
         except TimeLimitReached as error:
@@ -63,11 +63,11 @@ def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
     """Return all audited candidate motions to the goals that are found within the given time, s."""
     settings, candidates = task.request.settings, list[Candidate]()
     if task.is_fastest:
-        with suppress(TimeLimitReached), time_limited((1 - settings.search_share) * seconds):
+        with suppress(TimeLimitReached), task.request.limited((1 - settings.search_share) * seconds):
             candidates = synchronised_candidates(task)
     if not any(attains_bound(task, candidate) for candidate in candidates):
         try:
-            with time_limited(settings.search_share * seconds):
+            with task.request.limited(settings.search_share * seconds):
                 paths = _paths(task, seconds)
             task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
             candidates += motions_along(task, paths)

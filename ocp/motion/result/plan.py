@@ -206,6 +206,8 @@ class Plan(ABC):
         unit = f"{self._unit(int(place[1]))}/s"
         finding = Finding(ENDS, float(speeds[place]), None, float(ends[place[0]]), note, unit=unit)
         remarks = (f"it {' and '.join(texts)}, not at rest",) if texts else ()
+        if audit.optimal is None and self.gap is not None:
+            remarks = (f"its cost is at most {max(self.gap, 0.0):.2g} of itself above a lower bound", *remarks)
         feasible = sum(each.verdict == "feasible" for each in audit.findings)
         findings = (*audit.findings[:feasible], finding, *audit.findings[feasible:])
         return replace(audit, findings=findings, remarks=(*audit.remarks, *remarks))

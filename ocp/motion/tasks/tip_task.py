@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import FreeFloating, Machine, ModelError, SmoothPath, center_of_mass
-from models.checks import Array, ArrayInput, short_repr
+from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, short_repr
 from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, rotation_from_quaternion, skew
 from ocp.errors import ProblemError, require
@@ -127,6 +127,9 @@ class TipTask:
         if not np.linalg.norm(axis) > 0:
             raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
         object.__setattr__(self, "tool_axis", axis / np.linalg.norm(axis))
+        if self.direction is not None and not callable(self.direction) and _is_zero(self.direction):
+            words = f"direction {np.ravel(self.direction).tolist()} has no length; say where the tool axis shall point"
+            raise ProblemError(words, name="direction", value=self.direction)
         if not (pair > 0).all():
             words = f"tip task: tolerance must be two positive numbers, m and rad, not {self.tolerance!r}"
             raise ProblemError(words, name="tolerance", value=self.tolerance)
@@ -244,6 +247,13 @@ class TipTask:
     def end(self) -> float:
         """End time of the task, s; infinite if the task lasts to the end of the motion."""
         return np.inf if self.duration is None else float(self.begin + self.duration)
+
+
+def _is_zero(vector: Any) -> bool:
+    try:
+        return not floats(vector).any()
+    except NOT_NUMBERS:  # an expression
+        return False
 
 
 def _refuse_ramps(reason: str, **arguments: Any) -> None:

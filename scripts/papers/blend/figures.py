@@ -13,7 +13,7 @@ from models import SmoothPath
 from models.checks import Array
 from models.paths.blends import BlendKind, polynomial
 from ocp.motion.schedule import joint_motion
-from scripts.drawing import ASSUMING, COLORS, DASHES, add_note, caption, gif, legend_below, sheet
+from scripts.drawing import COLORS, DASHES, add_note, caption, gif, legend_below, sheet
 from scripts.papers.blend.example import (
     ARM,
     CENTRIPETAL,
@@ -218,7 +218,7 @@ def _joints(folder: Path, results: Results) -> None:
     for file, title, values, labels, quills in kinds:
         shape, size = (len(values), 2), (8.2, 2.9 * len(values))
         by_name: dict[str, Any] = {"title": title, "sharex": True, "xlabel": TIME}
-        with sheet(folder / file, shape, (size[0], size[1] + 0.3), f"{ASSUMING}. {NOTE}", **by_name) as (_, axes):
+        with sheet(folder / file, shape, (size[0], size[1] + 0.3), NOTE, **by_name) as (_, axes):
             for row, value, label, quill in zip(axes, values, labels, quills, strict=True):
                 for joint, dash in zip((0, 1, 3), DASHES, strict=False):
                     row[0].plot(t, np.degrees(value[:, joint]), ls=dash, label=JOINTS[joint])
@@ -409,4 +409,4 @@ def _animation(folder: Path, results: Results) -> None:
 
     artists = [picture, arm, *(dot for dot, _ in moving), title]
     gif(folder / "motion.gif", frames(), seconds=FRAME, moving=artists)
-    caption(folder / "motion.gif", "A SCARA runs the path with its two blends, in real time", f"{ASSUMING}. {NOTE}")
+    caption(folder / "motion.gif", "A SCARA runs the path with its two blends, in real time", NOTE)

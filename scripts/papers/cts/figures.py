@@ -17,7 +17,7 @@ from models.cts.clearance import rig_capsules
 from models.cts.rig import INCH
 from ocp.app.view.appearance import Part, part_of, rod
 from ocp.app.view.rendering import Camera, Layer, render, tube
-from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, draw_arm, gif, legend_below, sheet
+from scripts.drawing import COLORS, DASHES, TIME_COLORS, add_note, draw_arm, gif, legend_below, sheet
 from scripts.papers.cts.plan import draw_plan
 from scripts.papers.cts.results import GAINS, NOTE, SCALE, Results, corners, scene
 
@@ -58,7 +58,7 @@ def _joints(folder: Path, results: Results) -> None:
         path = folder / f"fig0{number}_joints_{name}.png"
         bounds = [f"{results.stability[name, gain]:.3g} with gain {gain:g}" for gain in GAINS]
         note = (
-            f"{ASSUMING}. {NOTE} The null-space step is stable while the largest gain n6² I'' is below 2: it is "
+            f"{NOTE} The null-space step is stable while the largest gain n6² I'' is below 2: it is "
             f"{' and '.join(bounds)}."
         )
         lost = [gain for gain in GAINS if not results.runs[name, "jacobian", gain].converged.all()]
@@ -86,7 +86,7 @@ def _joints(folder: Path, results: Results) -> None:
 
 def _iterations(path: Path, results: Results) -> None:
     z = results.targets[:, 2] / INCH
-    note = f"The closed form has no iterations. {ASSUMING}. {NOTE}"
+    note = f"The closed form has no iterations. {NOTE}"
     title = "Figure 8: iterations that a target takes, of each law"
     with sheet(path, (1, 2), (8.2, 3.9), note, title=title, sharey=True, xlabel="target z, in") as (_, axes):
         for ax, name in zip(axes[0], ("i1", "i2"), strict=True):
@@ -110,7 +110,7 @@ def _rig(path: Path, results: Results) -> None:
         "width_ratios": (5.5, 1),
         "sharey": True,
     }
-    with sheet(path, (1, 2), (9.6, 3.2), f"{ASSUMING}. {NOTE}", **by_name) as (_, axes):
+    with sheet(path, (1, 2), (9.6, 3.2), NOTE, **by_name) as (_, axes):
         for ax, (i, k) in zip(axes[0], ((0, 2), (1, 2)), strict=True):
             for number, (line, row) in enumerate(zip(lines, rows, strict=True)):
                 color = TIME_COLORS(number / (len(rows) - 1))

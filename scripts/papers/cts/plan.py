@@ -15,7 +15,7 @@ from models.cts.clearance import CollisionScene, clearances
 from models.cts.rig import INCH, inverse
 from models.cts.roll import index_harmonics
 from ocp import Collocation, Problem, RollObstacles, RollSettings, roll_problem, solve
-from scripts.drawing import ASSUMING, COLORS, DASHES, sheet
+from scripts.drawing import COLORS, DASHES, sheet
 
 HORIZON = 10.0  # s, the paper's sweep
 RATE_LIMIT, ACCELERATION_LIMIT = 0.37, 0.4  # rad/s, rad/s^2
@@ -128,7 +128,7 @@ def plan_summary(result: RollPlan) -> dict[str, Any]:
 def draw_plan(path: Path, result: RollPlan) -> None:
     """Roll, roll rate, I1 and clearance of the plan and of each target by itself."""
     note = (
-        f"{ASSUMING}. Least integral of I1 + {RATE_WEIGHT:g} rate² + {ACCELERATION_WEIGHT:g} acceleration² over "
+        f"Least integral of I1 + {RATE_WEIGHT:g} rate² + {ACCELERATION_WEIGHT:g} acceleration² over "
         f"the paper's sweep; rate at most {RATE_LIMIT:g} rad/s, acceleration {ACCELERATION_LIMIT:g} rad/s². Limits, "
         "weights and the obstacle, a block beside the goose-neck, are chosen; so are the link lengths."
     )

@@ -29,8 +29,8 @@ LONG = 0.5  # s; a longer run is timed once: what disturbs it is small beside it
 GAINS = (1.0, 20.0)
 SCALE, FALL = 0.25, 0.45  # size of the model; seconds of free fall
 NOTE = (
-    "The paper prints no link lengths. Chosen, in: Ly1 20, Ly2 20, Lm 4, Lp1 30, Lp2 20, Lg 10; target x 100, y 6, yaw "
-    "and pitch 0; tunnel centre (80, 0, 0), ranges (60, 48, 40). Nor the gain of the null-space term: here 1 and 20."
+    "Not printed in the paper, chosen, in: Ly1 20, Ly2 20, Lm 4, Lp1 30, Lp2 20, Lg 10; gain of the null-space term 1 "
+    "and 20. Target x 100, y 6, yaw and pitch 0; tunnel centre (80, 0, 0), ranges (60, 48, 40)."
 )
 
 

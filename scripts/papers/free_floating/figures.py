@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from models import FreeFloating
 from models.checks import Array
-from scripts.drawing import ASSUMING, COLORS, DASHES, TIME_COLORS, add_note, caption, draw_arm, gif, sheet, time_bar
+from scripts.drawing import COLORS, DASHES, TIME_COLORS, add_note, caption, draw_arm, gif, sheet, time_bar
 from scripts.papers.free_floating.extremals import CONFIRMED, NOT_GLOBAL, Search
 from scripts.papers.free_floating.false_optima import EXTREMAL, FALSE, HORIZON, Trial
 from scripts.papers.free_floating.motion import Motion, outline
@@ -52,7 +52,7 @@ def draw(results: Results, folder: Path) -> None:
 
 def _motions(folder: Path, machine: FreeFloating, local: Motion, optimal: Motion) -> None:
     """The figures of both motions, the paper's two of a kind side by side on equal axes."""
-    motions, note = (local, optimal), f"{ASSUMING}. {NOTE}"
+    motions, note = (local, optimal), NOTE
     costs = [float(np.trapezoid((m.joint_rates**2).sum(axis=1) / 2, m.t)) for m in motions]
     title = (
         f"On the same line the optimum needs {100 * costs[1] / costs[0]:.0f} % of the pseudo-inverse's integral of "
@@ -118,7 +118,7 @@ def _turn(motion: Motion) -> Array:
 
 def _convergence(folder: Path, rows: Sequence[Row]) -> None:
     """Distance of the cost from the reference against the number of intervals, one curve a method."""
-    title, note = "The cost converges with the order of each method", f"{ASSUMING}. {NOTE}"
+    title, note = "The cost converges with the order of each method", NOTE
     with sheet(folder / "convergence.png", (1, 1), (8.2, 4.0), note, title=title) as (_, axes):
         ax = axes[0, 0]
         direct = [row for row in rows if row["intervals"] and row["order"]]
@@ -138,7 +138,7 @@ def _convergence(folder: Path, rows: Sequence[Row]) -> None:
 
 def _false_optima(folder: Path, trials: Sequence[Trial]) -> None:
     """Cost and largest jump of every plan that the solver calls optimal, and what such a jump looks like."""
-    note = f"{ASSUMING}. {ASSUMED}; horizon {HORIZON:g} s (chosen, not printed)."
+    note = f"{ASSUMED}; horizon {HORIZON:g} s (chosen, not printed)."
     passed = [t for t in trials if t.audit]
     false = sorted((t for t in trials if t.verdict == FALSE), key=lambda t: t.cost)
     title = f"Of {len(trials)} plans that the solver calls optimal {len(false)} are none: the audit finds their jumps"
@@ -180,7 +180,7 @@ def _costates(folder: Path, result: Agreement) -> None:
     solved, reported = costates(indirect, fine), costates(direct)
     off = np.abs(costate_difference(direct, indirect))
     settings: dict[str, Any] = {"sharex": True, "sharey": "row", "height_ratios": (3, 2)}
-    note = f"Lines: minimum principle; markers: direct (Legendre 3, 100 intervals). {ASSUMING}. {NOTE}"
+    note = f"Lines: minimum principle; markers: direct (Legendre 3, 100 intervals). {NOTE}"
     title = f"The direct plan's costates are those of the minimum principle to {off.max():.1e} of the largest"
     with sheet(folder / "costates.png", (2, 2), (8.2, 5.6), note, title=title, **settings) as (_, axes):
         for part, (above, below, (title, names)) in enumerate(zip(*axes, PARTS, strict=True)):
@@ -206,7 +206,7 @@ def _costates(folder: Path, result: Agreement) -> None:
 def _hamiltonian(folder: Path, result: Agreement) -> None:
     """How far H strays from its mean along the solution of every method."""
     colors = ("black", "purple", "blue", "green", "yellow", "orange", "sky")
-    title, note = "Every method keeps the Hamiltonian constant, as far as its order allows", f"{ASSUMING}. {NOTE}"
+    title, note = "Every method keeps the Hamiltonian constant, as far as its order allows", NOTE
     with sheet(folder / "hamiltonian.png", (1, 1), (8.2, 4.6), note, title=title) as (figure, axes):
         ax = axes[0, 0]
         for k, ((name, (t, value)), color) in enumerate(zip(hamiltonians(result).items(), colors, strict=True)):
@@ -222,7 +222,7 @@ def _hamiltonian(folder: Path, result: Agreement) -> None:
 
 def _extremals(folder: Path, searches: Sequence[Search]) -> None:
     """Cost of every extremal against the horizon, above the joint velocities of the best of each."""
-    note = f"{ASSUMING}. {ASSUMED}; horizons chosen, not printed. {NOT_GLOBAL}."
+    note = f"{ASSUMED}; horizons chosen, not printed. {NOT_GLOBAL}."
     title = "Each horizon has several extremals: the best found is not the only minimum"
     settings: dict[str, Any] = {"sharey": "row", "height_ratios": (5, 4)}
     columns = len(searches)
@@ -291,7 +291,7 @@ def _animation(folder: Path, machine: FreeFloating, local: Motion, optimal: Moti
         names = [f"joint {i + 1}" for i in range(len(curves))]
         axes[1, 1].legend(curves, names, loc="upper right", fontsize=6, ncols=3, columnspacing=0.8, handlelength=1.8)
         title = figure.suptitle("time 0.00 s", fontsize=9)
-        add_note(figure, f"{ASSUMING}. {NOTE}")  # now, not when the block ends: the frames are drawn before
+        add_note(figure, NOTE)  # now, not when the block ends: the frames are drawn before
         figure.canvas.draw()
         figure.set_layout_engine("none")  # as laid out now: nothing that moves changes it, and it takes half the time
 
@@ -304,7 +304,7 @@ def _animation(folder: Path, machine: FreeFloating, local: Motion, optimal: Moti
 
         artists = [artist for mine, _ in moving for artist in mine]
         gif(folder / "motion.gif", frames(), seconds=FRAME, moving=[*artists, title])
-    caption(folder / "motion.gif", "The pseudo-inverse and the optimum in real time", f"{ASSUMING}. {NOTE}")
+    caption(folder / "motion.gif", "The pseudo-inverse and the optimum in real time", NOTE)
 
 
 def _pair(
@@ -313,7 +313,7 @@ def _pair(
     """Quantities of both motions over time, a row of axes each."""
     size = (8.2, height)
     by_name: dict[str, Any] = {"xlabel": "time, s", "sharex": True, "sharey": "row", "title": title}
-    with sheet(path, (len(rows), 2), size, f"{ASSUMING}. {NOTE}", **by_name) as (_, axes):
+    with sheet(path, (len(rows), 2), size, NOTE, **by_name) as (_, axes):
         for line, (label, names, of) in zip(axes, rows, strict=True):
             for ax, motion in zip(line, motions, strict=True):
                 _curves(ax, motion.t, of(motion), names)

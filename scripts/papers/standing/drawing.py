@@ -115,14 +115,14 @@ def axes_frame(ax: Any) -> None:
     ax.set(xlim=FRAME[0], ylim=FRAME[1], aspect="equal")
 
 
-def strobe(ax: Any, motion: StandingMotion, until: float, horizon: float) -> None:
-    """Postures from the start to `until`, coloured by their time out of the horizon."""
+def strobe(ax: Any, motion: StandingMotion, until: float, horizon: float, poses: int = POSES) -> None:
+    """Configurations from the start to `until`, later ones thicker, coloured by their time out of the horizon."""
     foot(ax)
-    for time in np.linspace(0.0, until, POSES):
+    for time, width in zip(np.linspace(0.0, until, poses), np.linspace(1.4, 3.6, poses), strict=True):
         k = nearest(motion.t, time)
         color = TIME_COLORS(time / horizon)
         arm = arm_points(motion.joints[k])
-        draw_arm(ax, arm, color, 3.4)
+        draw_arm(ax, arm, color, float(width))
         ax.plot(motion.center_of_mass[k, 1], motion.center_of_mass[k, 2], "+", color=color, ms=6, mew=1.2, zorder=6)
         ax.plot(motion.zero_moment_point[k, 1], 0.0, "D", color=color, ms=3.6, mec="white", mew=0.4, zorder=7)
     axes_frame(ax)

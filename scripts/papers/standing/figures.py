@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from models.machines.standing import StandingMotion
-from scripts.drawing import ASSUMING, COLORS, legend_below, sheet, time_bar
+from scripts.drawing import COLORS, legend_below, sheet, time_bar
 from scripts.papers.run import Row
 from scripts.papers.standing.animation import draw_animations
 from scripts.papers.standing.cases import ASSUMED, CHOSEN, GAINS, HORIZON, STIFFNESS, Local, machine, start_tip
@@ -138,7 +138,7 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
     plan, pinned = best["optimal_spring"], best["optimal_spring_pinned_points"]
     rest = start_tip(2)[1]
     title = f"Figure 9: the spring of {STIFFNESS:g} N/m pulls the tip back in proportion to its way"
-    with sheet(folder / "fig09_spring.png", (1, 2), (8.2, 3.5), f"{ASSUMING}. {ASSUMED}.", title=title) as (_, axes):
+    with sheet(folder / "fig09_spring.png", (1, 2), (8.2, 3.5), f"{ASSUMED}.", title=title) as (_, axes):
         left, right = axes[0]
         motion = plan.motion
         left.plot(motion.tip_in_world[:, 1] - rest, motion.external_force[:, 1], color=COLORS["blue"])
@@ -158,7 +158,7 @@ def _draw_spring(folder: Path, two: Mapping[str, Local], best: Mapping[str, Plan
         strobe(left, free.motion, HORIZON, HORIZON)
         left.set(xlabel="y, m", ylabel="z, m", title="pseudo-inverse")
         time_bar(fig, [left], HORIZON)
-        curves(right, [curve_of(free, "orange", 0), curve_of(bound, "yellow", 1)], lambda m: m.index[:, 1])
+        curves(right, [curve_of(free, "black", 0), curve_of(bound, "grey", 1)], lambda m: m.index[:, 1])
         right.axhline(0.0, color=COLORS["grey"], lw=0.8)
         right.set(xlabel="time, s", ylabel="stability index", xlim=(0.0, HORIZON), ylim=(-8.4, 3.4))
         right.legend(loc="upper left", fontsize=7.5)
@@ -207,7 +207,7 @@ def _draw_task(path: Path, title: str, shown: Sequence[Curve]) -> None:
         ("manipulability p2, m²", lambda m: m.manipulability, None),
     )
     title = f"{title} by optimal control: pinned, the joints turn fastest; without a rule the point leaves the foot"
-    _four(path, title, f"{ASSUMING}. {ASSUMED}. {SETTINGS}.", shown, kinds, HORIZON, 3)
+    _four(path, title, f"{ASSUMED}. {SETTINGS}.", shown, kinds, HORIZON, 3)
 
 
 def _four(
@@ -245,12 +245,14 @@ def _draw_lift(folder: Path, lifts: Mapping[str, Plan]) -> None:
     free, *kept = (plan.solution.horizon for plan in lifts.values())
     slower = " and ".join(f"{100 * (one / free - 1):.0f} %" for one in kept)
     title = f"To stay on its foot the fastest lift of 0.8 m takes {slower} longer"
-    _four(folder / "minimum_time.png", title, f"{ASSUMING}. {note}", shown, kinds, longest, 3)
+    _four(folder / "minimum_time.png", title, note, shown, kinds, longest, 3)
     note = f"{SYMBOLS}. {note}"
     by_name: dict[str, Any] = {"title": title, "sharey": True}
     with sheet(folder / "minimum_time_motion.png", (1, 3), (9.0, 4.7), note, **by_name) as (fig, axes):
         for ax, plan in zip(axes[0], lifts.values(), strict=True):
-            strobe(ax, plan.motion, plan.solution.horizon, longest)
+            strobe(ax, plan.motion, plan.solution.horizon, longest, poses=3)
+            ax.plot(plan.motion.zero_moment_point[:, 1], 0 * plan.motion.t - 0.1, color="black", lw=1.5)
+            ax.text(0.05, -0.2, "path of the zero moment point", fontsize=6.5, ha="center")
             ax.set_title(f"{plan.request.title}: {plan.solution.horizon:.4f} s")
             ax.set_xlabel("y, m")
         axes[0, 0].set_ylabel("z, m")

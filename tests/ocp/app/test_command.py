@@ -21,7 +21,7 @@ import pytest
 
 from models import files as kept
 from ocp import Plan, ProblemError, SolveError
-from ocp.app import main
+from ocp.__main__ import main
 from ocp.app.files.task_file import read_task
 from ocp.console import Progress
 from ocp.motion.result.segmented_plan import SegmentedPlan
@@ -387,7 +387,7 @@ def test_control_c_ends_with_its_status(tmp_path: Path) -> None:
     task = TASK.partition("[output]")[0].replace('kind = "start"', 'kind = "global"')
     (tmp_path / "long.toml").write_text(task)
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored by some shells
-    code += "from ocp.app import main; sys.exit(main())"
+    code += "from ocp.__main__ import main; sys.exit(main())"
     words = [sys.executable, "-c", code, "plan", str(tmp_path / "long.toml")]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {})
     assert process.stderr is not None

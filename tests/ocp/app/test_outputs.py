@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from models import Joint, Link, ModelError, Robot
 from ocp import Plan, ProblemError
-from ocp.app import main
+from ocp.__main__ import main
 from ocp.app.files import read_trajectory
 from ocp.app.files.safe_files import SUFFIXES, checked_output
 from ocp.app.view.player import PageServer

@@ -42,6 +42,7 @@ from models import (
 )
 from models.checks import Array
 from models.robot.kinematics import centers_of_mass
+from models.shapes.mesh_files import read_mesh
 from ocp import (
     ClearanceConstraints,
     Collocation,
@@ -53,7 +54,8 @@ from ocp import (
     minimum_velocity_problem,
     solve,
 )
-from ocp.app import main
+from ocp.__main__ import main
+from ocp.app.check.joint_limits import Row, RowVerdict
 from ocp.app.files import read_trajectory
 from ocp.app.view import appearance, player
 from ocp.app.view.animation import (
@@ -67,6 +69,7 @@ from ocp.app.view.animation import (
 )
 from ocp.app.view.appearance import appearance_of, frames_along
 from ocp.app.view.player import PageServer, build_page
+from ocp.app.view.report import SHOWN_ROWS, report_of_plan
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.tasks.targets import targets_along
@@ -492,6 +495,35 @@ def test_a_page_is_whole_small_the_same_again_and_asks_nobody(plans: dict[str, P
     assert {name for name, _ in surfaces(report, arrays)} == {"hull", "upper/arm", "fore", "hand", "finger"}
     rows = report["motions"][0]["rows"]
     assert {row[5] for row in rows} <= {"ok", "info"}
+
+
+def test_a_workpiece_stands_where_its_file_has_it(plans: dict[str, Plan], tmp_path: Path) -> None:
+    file = tmp_path / "part.obj"
+    file.write_text("v 0.1 0 0\nv 0.5 0 0.2\nv 0.5 0.3 0.2\nf 1 2 3\n")
+    shown = [animate_plan(plans["fixed"], "one"), animate_plan(plans["fixed"], "two")]
+    report, arrays = unpack_page(build_page(shown, workpiece=read_mesh(file)).text)
+    for motion in report["motions"]:
+        (part,) = motion["around"]
+        corners = part["low"] + arrays[part["vertices"]["at"]][:, :3] * np.array(part["step"])
+        assert part["mover"] is None
+        np.testing.assert_allclose(np.unique(corners, axis=0), [[0.1, 0, 0], [0.5, 0, 0.2], [0.5, 0.3, 0.2]], atol=1e-5)
+
+
+def test_rows_near_their_limits_come_first_and_the_others_are_folded(plans: dict[str, Plan]) -> None:
+    values = {"far": 0.1, "near": 0.95, "failed": 1.4, **{f"row {k}": 0.2 for k in range(8)}}
+    rows = [Row(name, v, 1.0, "m", None, RowVerdict.of(v > 1)) for name, v in values.items()]
+    rows.append(Row("clearance", 0.011, 0.01, "m", None, RowVerdict.OK))  # a least value, ten per cent above its limit
+    rows.append(Row("unknown", 0.0, 1.0, "m", None, RowVerdict.UNDECIDED))
+    report = report_of_plan(plans["fixed"], 0.1, "a plan")
+    text = replace(report, tables=(("Values", tuple(rows)),)).html()
+    names = re.findall(r"<tr><td>([\w ]+)</td>", text)
+    assert set(names) == {row.name for row in rows}
+    assert names[:4] == ["failed", "unknown", "near", "clearance"]
+    assert names[-1] == "far"
+    assert len(re.findall(r"<tr><td>", text.partition("<details>")[0])) == SHOWN_ROWS
+    urgencies = [row.urgency for row in animate_plan(plans["fixed"], "played").rows]
+    assert urgencies == sorted(urgencies, reverse=True)
+    assert len(urgencies) > 5
 
 
 def test_a_page_that_is_too_large_is_not_written(plans: dict[str, Plan], monkeypatch: pytest.MonkeyPatch) -> None:

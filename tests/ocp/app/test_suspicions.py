@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from models import FixedBase, Robot
-from ocp.app import Check, main
+from ocp.__main__ import main
+from ocp.app import Check
 from ocp.app.check.interpolation import Motion
 from ocp.app.check.suspicions import exchanged_joints
 from ocp.app.files import RawTrajectory

@@ -2,7 +2,8 @@
 
 const SPACE = "http://www.w3.org/2000/svg";
 const WIDE = 240, TALL = 96, LEFT = 42, RIGHT = 6, TOP = 6, BOTTOM = 14;
-const LEAST = 0.02;  // least range of a diagram relative to its largest value, so that rounding is not shown
+const LEAST = 0.2;  // least range of a diagram relative to the largest value of its unit in the group: what hardly
+// changes looks constant, and what is zero beside the other curves looks like zero
 const OPEN = ["Cost", "The motion", "Standing", "Momentum", "Joints"];
 
 function shape(kind, attributes, parent) {
@@ -31,8 +32,9 @@ function valueAt(times, values, time) {
 }
 
 class Chart {
-  constructor(name, curves, horizon, seek) {  // curves: {motion, unit, lower, upper, times, values, kind}
+  constructor(name, curves, least, horizon, seek) {  // curves: {motion, unit, lower, upper, times, values, kind}
     this.curves = curves;
+    this.least = least;
     this.horizon = horizon;
     this.figure = document.createElement("figure");
     this.figure.className = "chart";
@@ -60,11 +62,11 @@ class Chart {
       if (Number.isFinite(value)) { low = Math.min(low, value); high = Math.max(high, value); }
     if (!(low <= high)) { low = 0; high = 1; }
     const limits = new Set(this.curves.flatMap(({lower, upper}) => [lower, upper]).filter((one) => one !== null));
-    const reach = Math.max(high - low, 1e-9 + 1e-3 * Math.max(Math.abs(low), Math.abs(high)));
+    const reach = Math.max(high - low, this.least, 2e-5);  // 2e-5: zero alone has no size
     for (const limit of [...limits])  // limits far away would flatten the curve
       if (limit < low - 3 * reach || limit > high + 3 * reach) limits.delete(limit);
     for (const limit of limits) { low = Math.min(low, limit); high = Math.max(high, limit); }
-    const least = LEAST * Math.max(Math.abs(low), Math.abs(high), 1e-3), more = (least - (high - low)) / 2;
+    const more = (reach - (high - low)) / 2;
     if (more > 0) { low -= more; high += more; }
     const room = 0.05 * (high - low);
     low -= room;

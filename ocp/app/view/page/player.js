@@ -183,7 +183,7 @@ class Player {
     scene.begin();
     for (let k = 0; k < (side ? 2 : 1); k++) {
       scene.part(k, side ? 2 : 1);
-      this.drawPart(side ? [visible[k]] : visible, visible.length > 1);
+      this.drawPart(side ? [visible[k]] : visible);
     }
     element("labels").replaceChildren(...(visible.length > 1 ? visible : []).map(({motion, kind}, k) => {
       const label = document.createElement("span");
@@ -195,13 +195,13 @@ class Player {
     }));
   }
 
-  drawPart(visible, compared) {
+  drawPart(visible) {
     const {scene, shown} = this;
     if (this.grid && shown.floor) scene.drawLine(this.grid, COLORS.grid, 1);
     for (const [number, {motion, kind}] of visible.entries()) {
       const time = Math.min(this.time, motion.horizon), pose = motion.at(time), faint = number > 0;
       if (!faint)
-        this.drawRobot(motion, pose, (color) => compared ? this.tinted(color, COLORS[kind]) : color);
+        this.drawRobot(motion, pose, (color) => color);
       if (shown.paths) {
         const upto = this.motions.length ? motion.before(motion.t, time) : 0;
         scene.drawLine(motion.done, [...COLORS[kind], 0.35], 1.6);
@@ -319,7 +319,7 @@ class Player {
       choice("shown", [["alone", "alone"], ["over", "over each other"], ["side", "side by side"]], this.mode,
         (value) => { this.mode = value; });
     }
-    const keys = {paths: "paths", frames: "frames", ghosts: "ghosts", near: "nearest bodies", around: "obstacles", floor: "floor"};
+    const keys = {paths: "paths", frames: "frames", ghosts: "ghosts", near: "nearest bodies", around: "obstacles and workpiece", floor: "floor"};
     const there = {near: this.motions.some((one) => one.near), around: this.motions.some((one) => one.around.length),
       floor: this.grid, ghosts: true, frames: this.motions.some((one) => one.data.tip), paths: this.motions.some((one) => one.data.tip)};
     for (const [name, text] of Object.entries(keys)) {
@@ -348,8 +348,11 @@ class Player {
       details.open = open.has(group) ? open.get(group) : OPEN.includes(group);
       summary.textContent = group;
       box.className = "charts";
+      const sizes = {};  // of each unit the largest value in the group
+      for (const {unit, values} of [...charts.values()].flat()) for (const value of values)
+        if (Number.isFinite(value)) sizes[unit] = Math.max(sizes[unit] || 0, Math.abs(value));
       for (const [name, curves] of charts) {
-        const chart = new Chart(name, curves, this.horizon, (time) => { this.stop(); this.seek(time); });
+        const chart = new Chart(name, curves, LEAST * (sizes[curves[0].unit] || 0), this.horizon, (time) => { this.stop(); this.seek(time); });
         chart.hidden = () => !details.open;
         this.charts.push(chart);
         box.append(chart.figure);

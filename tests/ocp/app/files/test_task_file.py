@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import Box, Sphere
+from models import Box, ModelWarning, Sphere
 from ocp import Goal, Plan, ProblemError, TipTask, Waypoints
-from ocp.app.command import main
+from ocp.__main__ import main
 from ocp.app.files.task_file import Task, read_task
 from tests.ocp.app.motions import NAMES, write_robot
 
@@ -113,6 +113,7 @@ def test_a_tool_on_a_path_starts_and_ends_at_rest_unless_the_file_says_steady(tm
         ('[waypoints]\nfile = "none.csv"\n', 5, "there is no file"),
         ("[[task]]\npath = { speed = 1 }\ngoal = { tip = 1 }\n", 4, "either path"),
         ("[[task]]\nwaypoints = {}\n", 5, "unknown entry waypoints"),
+        (f"[path]\n{PATH}direction = [0, 0, 0]\n", 7, "has no length"),
         (f"[path]\n{PATH}steady = true\njerk = 1\n", 8, "steady"),
         (f"[path]\n{PATH}[search]\nhorizon = -1\n", 8, "above 0"),
         (f"[path]\n{PATH}[cost]\nvelocity = 0\n", 7, "at least one weight"),
@@ -124,6 +125,11 @@ def test_errors_name_the_line(tmp_path: Path, text: str, line: int, expected: st
         read(tmp_path, text)
     assert f"task.toml, line {line}," in str(caught.value), str(caught.value)
     assert expected in str(caught.value)
+
+
+def test_points_in_millimetres_are_suspected(tmp_path: Path) -> None:
+    with pytest.warns(ModelWarning, match="is it in millimetres"):
+        read(tmp_path, "[path]\npoints = [[400, -200, 300], [400, 100, 300]]\nspeed = 50\n")
 
 
 def test_a_file_without_a_motion_says_which_tables_describe_one(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from models import FixedBase, FreeFloating, Link, Machine, planar_chain
 from models.checks import Array
 from ocp import Limits, Plan, SolveError, TipTask, plan
-from ocp.app import main
+from ocp.__main__ import main
 from ocp.motion.plan.actuators import ActuatorDemand
 from ocp.motion.result.solved_plan import SolvedPlan
 from tests.ocp.app.motions import write_robot

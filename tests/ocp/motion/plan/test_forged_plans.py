@@ -13,8 +13,8 @@ import pytest
 
 from models import Box, FixedBase, MovingObstacle, Sphere, planar_chain
 from ocp import Collocation, Limits, Plan, Problem, ProblemError, Scene, StorageWarning, TipTask, plan, solve
+from ocp.__main__ import main
 from ocp.app.check.verdict import verdict_of
-from ocp.app.command import main
 from ocp.app.view.animation import animate_plan
 from ocp.app.view.report import report_of_plan
 from ocp.motion.result.solved_plan import Part, SolvedPlan

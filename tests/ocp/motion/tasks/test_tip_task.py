@@ -251,6 +251,7 @@ def test_errors_are_reported_for_any_motion() -> None:
         ({"position": (0.0, 0.0, 0.0), "gain": -1.0}, "gain must be"),
         ({"position": (0.0, 0.0, 0.0), "point": (0.0, 0.0, 1.0)}, "name the link"),
         ({"direction": (0, 0, 1), "tool_axis": (0, 0, 0)}, "tool_axis .* has no direction"),
+        ({"direction": (0.0, 0.0, 0.0)}, "direction .* has no length"),
     ],
 )
 def test_tasks_that_are_none_are_refused(fields: dict[str, Any], message: str) -> None:
@@ -268,7 +269,6 @@ def test_tasks_that_are_none_are_refused(fields: dict[str, Any], message: str) -
         ([TipTask(rows=(3, 4), velocity=(0, 0))] * 2, "linearly dependent in every configuration"),
         ([TipTask(rows=range(6), velocity=np.zeros(6)), TipTask(rows=(0, 1), velocity=(0, 0))], "fixes 8 rows"),
         (TipTask(rows=(3,), velocity=(0.0,), link="base_link"), "no joint moves the tip"),
-        (TipTask(direction=(0.0, 0.0, 0.0)), "not finite"),
         (TipTask(rows=(3,), velocity=(0.0,), relative_to="moon"), "moon"),
     ],
 )

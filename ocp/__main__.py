@@ -1,4 +1,4 @@
-"""Command line of `selfmotion`: its arguments, its output and its exit status.
+"""Command line of `selfmotion`, also run by `python -m ocp`: its arguments, its output and its exit status.
 
 The status is 0 if all requirements hold, 1 if a check fails or is undetermined or there is no plan, 2 for bad input,
 and 130 after Ctrl-C.
@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from models import ModelError, ModelWarning
+from models.errors import ModelError, ModelWarning
 from ocp.app.files.safe_files import SUFFIXES
 from ocp.app.subcommands import (
     EXPORT_KINDS,
@@ -209,7 +209,7 @@ robot as `selfmotion check` reads them. A solution of your own problem (Solution
 --page the page is served on this machine until Ctrl-C; with it it is one file that plays anywhere, without a server."""
 VIEW_EXAMPLES = """examples:
   selfmotion view seam.npz
-  selfmotion view seam.npz --page seam.html
+  selfmotion view seam.npz --page seam.html --workpiece part.stl
   selfmotion view optimum.npz pseudo_inverse.csv --page both.html
   selfmotion view circle.npz --robot panda.urdf --tip panda_hand_tcp --lock panda_finger_joint1=0.02"""
 CACHE = """Results that are costly to compute and depend only on their input (covers of meshes, pairs that never
@@ -274,7 +274,8 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     _file(view, "beside", "plans, or trajectories of the same robot, to compare with it", nargs="*", default=[])
     _file(view, "--page", "write one HTML file instead of serving the page")
     _force(view)
-    view.add_argument("--title", help="title of the page (default: the plan's file)")
+    view.add_argument("--title", help="title of the page (default: the robot and the plan's file)")
+    _file(view, "--workpiece", "mesh (STL or OBJ; in world, m) that is shown as well")
     view.add_argument("--name", action="append", default=[], help="name of a motion; repeatable, in order of the files")
     view.add_argument("--port", type=int, default=8080, help="port, or the next free one (default: 8080)")
     view.add_argument("--open", action="store_true", help="open the page in this machine's browser")
