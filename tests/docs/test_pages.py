@@ -74,7 +74,7 @@ def test_listed_names_become_directives_of_their_kind_in_the_order_of_the_list()
     assert re.findall(r"^\.\. (\w+):: (\S+)$", report, re.MULTILINE) == [
         ("autofunction", "models.smooth"),
         ("autoclass", "models.Path"),
-        ("autodata", "models.STANDING_STARTS"),
+        ("autodata", "models.examples.STANDING_STARTS"),
     ]
     assert report.startswith("Before.\n```{eval-rst}\n")
     assert report.endswith("\n```\nAfter.")
