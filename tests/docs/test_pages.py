@@ -21,8 +21,6 @@ from scripts.papers.reproduced import read_tables
 
 SITE = Path(__file__).resolve().parents[2] / "docs"
 PAGES = sorted(SITE.rglob("*.md"))
-COLUMN = 88
-"""Characters of a line of code that the site shows without scrolling."""
 NEEDS = {"example-robot-data": "gallery", "spartpy": "gallery", "run_batch": "cluster", "read_joint_limits": "yaml"}
 """Names that need an extra, by a word of a block."""
 FORMULAS = re.compile(r"\$\$(.+?)\$\$|(?<![\w$])\$([^$\n]+?)\$(?![\w$])", re.DOTALL)
@@ -37,12 +35,6 @@ def test_imports_of_pages_exist(page: Path) -> None:
                 module = importlib.import_module(str(node.module))
                 missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
                 assert not missing, f"{page}:{line} imports {missing} of {node.module}"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(SITE)))
-def test_lines_of_code_fit_the_column_of_the_site(page: Path) -> None:
-    sources = re.findall(r"^```py\w*\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    assert not [line for source in sources for line in source.splitlines() if len(line) > COLUMN]
 
 
 def test_blocks_name_the_extra_that_they_need_in_their_first_line() -> None:
