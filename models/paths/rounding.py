@@ -337,7 +337,8 @@ def _distance_to_curve(path: Path, index: NDArray[np.intp], points: Array, first
         values = path.at(np.repeat(index, s.shape[1]), s.ravel())
         return [value.reshape(*s.shape, 3) for value in values]
 
-    turns = float((np.hypot(path.curvature, path.torsion)[index] * (last - first)).max()) / FULL_TURN
+    rate = np.where(path.is_spline, 0.0, np.hypot(path.curvature, path.torsion))  # at its end a spline is nearly a line
+    turns = float((rate[index] * (last - first)).max()) / FULL_TURN
     share = np.linspace(0, 1, int(SETTINGS.samples * (1 + turns)))
     places = first[:, None] + (last - first)[:, None] * share
     origin = path.start[index][:, None]

@@ -121,6 +121,9 @@ class SmoothPath:
 
     def __repr__(self) -> str:
         counts = f"{len(self.path.segments)} segments and {int((self.piece_blend >= 0).sum())} {self.kind} blends"
+        if self.splines:
+            pieces = int((self.piece_curve >= 0).sum() - (self.piece_blend >= 0).sum())
+            counts += f"; {len(self.splines)} of the segments are splines, of {pieces} pieces"
         return f"<SmoothPath of {self.length:.6g} m: {counts}>"
 
     @property

@@ -306,7 +306,7 @@ def _least_squares(x: Array, values: Array, knots: Array) -> BSpline:
     degree, weights = FIT.degree, np.ones(len(x))
     weights[[0, -1]] = FIT.end_weight
     whole = np.concatenate([np.repeat(knots[0], degree), knots, np.repeat(knots[-1], degree)])
-    curve = make_lsq_spline(x, values, whole, k=degree, w=weights)
+    curve = make_lsq_spline(x, values, whole, k=degree, w=weights, method="norm-eq")
     curve.c[[0, -1]] = values[[0, -1]]
     return curve
 
@@ -480,7 +480,13 @@ def simplified(points: Array, deviation: float) -> NDArray[np.intp]:
         if distances[middle - first] > deviation:
             kept.add(middle)
             pending += [(first, middle), (middle, last)]
-    return np.array(sorted(kept))
+    chain, i = sorted(kept), 1
+    while i < len(chain) - 1:  # of two neighbours at a corner with noise, one suffices
+        if distances_from_chord(points[chain[i - 1] : chain[i + 1] + 1]).max() <= deviation:
+            del chain[i]
+        else:
+            i += 1
+    return np.array(chain)
 
 
 def distances_from_chord(points: Array) -> Array:
