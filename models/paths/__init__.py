@@ -1,4 +1,4 @@
-"""Task paths of lines, arcs and helices with tool orientation and rounded corners, as functions of distance."""
+"""Task paths of lines, arcs, helices and splines with tool orientation and rounded corners, by distance."""
 
 from models.paths.blends import gamma, rest_to_rest
 from models.paths.functions import gauss_newton, march, path_function, predictor_corrector, turn_function

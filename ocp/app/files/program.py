@@ -190,11 +190,12 @@ class Program:
         return Program(tuple(sections), start, self.notes)
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> tuple[SmoothPath, ...]:
-        """Return the paths of all cuts with rounded corners.
+        """Return the paths of all cuts with rounded corners; splines replace runs of short segments of equal feed.
 
         Args:
-            tolerance: Largest deviation from the path, m. A smaller tolerance in the file (G64 P) takes precedence.
-                None: that of the file, or 0.05 mm.
+            tolerance: Largest deviation from the path, m. A smaller tolerance in the file (G64 P) takes precedence; the
+                smallest one of a cut applies to its splines, see `models.paths.fit_splines`. None: that of the file, or
+                0.05 mm.
             options: `kind`, `shape`, `overlap` of models.smooth.
 
         Raises:

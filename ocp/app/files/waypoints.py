@@ -143,10 +143,10 @@ class Waypoints:
     def smooth(
         self, tolerance: float = DEFAULT_TOLERANCE_M, *, reversal: Reversal | None = None, **options: Any
     ) -> SmoothPath:
-        """Return the path through the waypoints with rounded corners.
+        """Return the path through the waypoints with rounded corners; splines replace runs of short lines.
 
         Args:
-            tolerance: Largest deviation from the path, m.
+            tolerance: Largest deviation from the path, m; see `models.paths.fit_splines` for the splines.
             reversal: As in `path`.
             options: `kind`, `shape`, `overlap` of models.smooth.
 

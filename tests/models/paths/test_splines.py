@@ -200,10 +200,10 @@ def test_the_tool_turns_as_along_the_given_path(points: Array) -> None:
     path = fitted(task)
     s = np.linspace(0, path.length, 4001)
     nearest = cKDTree(points).query(path.at(s).position, k=1)[1]
-    given = Rotation.from_quat(np.vstack([task.orientation, path.turn([path.length]).quaternion]), scalar_first=True)
+    expected = Rotation.from_quat(np.vstack([task.orientation, path.turn([path.length]).quaternion]), scalar_first=True)
     actual = Rotation.from_quat(path.turn(s).quaternion, scalar_first=True)
-    per_point = (given[:-1].inv() * given[1:]).magnitude().max()
-    assert (given[nearest].inv() * actual).magnitude().max() <= 1e-3 + 2 * per_point
+    per_point = (expected[:-1].inv() * expected[1:]).magnitude().max()
+    assert (expected[nearest].inv() * actual).magnitude().max() <= 1e-3 + 2 * per_point
     inner, h = s[1:-1], 1e-6
     before, here, after = (path.turn(inner + k * h) for k in (-1, 0, 1))
     rate = Rotation.from_quat(after.quaternion, scalar_first=True)
@@ -224,11 +224,11 @@ def test_orientation_tolerance_is_kept_at_every_point() -> None:
     path = smooth(spline, deviation=DEVIATION)
     share = np.concatenate([[0.0], np.cumsum(task.lengths)]) / task.length
     turns = np.vstack([task.orientation, path.turn([path.length]).quaternion])
-    given = Slerp(share, Rotation.from_quat(turns, scalar_first=True))
+    expected = Slerp(share, Rotation.from_quat(turns, scalar_first=True))
     s = np.linspace(0, 1, 2001)
     actual = Rotation.from_quat(path.turn(s * path.length).quaternion, scalar_first=True)
     # shares of the two lengths differ slightly, by which the tool turns at most 20 rad/m
-    assert (given(s).inv() * actual).magnitude().max() <= 1e-4 + 20 * DEVIATION
+    assert (expected(s).inv() * actual).magnitude().max() <= 1e-4 + 20 * DEVIATION
 
 
 def test_functions_of_casadi_are_those_of_numpy() -> None:
