@@ -120,10 +120,11 @@ class SmoothPath:
     cells: Cells
 
     def __repr__(self) -> str:
-        counts = f"{len(self.path.segments)} segments and {int((self.piece_blend >= 0).sum())} {self.kind} blends"
-        if self.splines:
-            pieces = int((self.piece_curve >= 0).sum() - (self.piece_blend >= 0).sum())
-            counts += f"; {len(self.splines)} of the segments are splines, of {pieces} pieces"
+        segments, blends = len(self.path.segments), int((self.piece_blend >= 0).sum())
+        splines = len(self.splines)
+        of_splines = f" ({splines} spline{'s'[: splines != 1]} of {int((self.piece_curve >= 0).sum()) - blends} pieces)"
+        counts = f"{segments} segment{'s'[: segments != 1]}{of_splines if splines else ''}"
+        counts += f" and {blends} {self.kind} blend{'s'[: blends != 1]}"
         return f"<SmoothPath of {self.length:.6g} m: {counts}>"
 
     @property
