@@ -29,8 +29,18 @@ from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import cost_of_motion, solve_with_accelerations
 from ocp.motion.plan.candidate_queue import Solver
-from ocp.motion.plan.singular import MotionSample, describe_shortfall, is_nearly_singular, limit_reason
-from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
+from ocp.motion.result.candidate import (
+    Candidate,
+    MotionSample,
+    Reason,
+    Rejection,
+    Seed,
+    Stage,
+    collision_reason,
+    describe_shortfall,
+    is_nearly_singular,
+    reversal_reason,
+)
 from ocp.motion.result.plan import audit_key
 from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan, parts_of
@@ -124,7 +134,7 @@ class CandidateSolver(Solver):
     def _may_relax(self, candidate: Candidate) -> bool:
         """Return whether relaxed tasks may save a rejected candidate; they cannot resolve collisions."""
         seed, reason = candidate.seed, candidate.reason
-        if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or _is_separated(candidate):
+        if reason is None or reason.kind in (Rejection.COLLISION, Rejection.ACTUATORS) or candidate.is_separated:
             return False
         return self._can_relax and seed.thorough and not seed.relaxed
 
@@ -136,21 +146,7 @@ class CandidateSolver(Solver):
         solution = candidate.solution
         if solution is not None and candidate.seed.relaxed:
             samples = self._motion_samples(solution)
-        return limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
-
-    def _turned_over(self, solution: Solution) -> Reason | None:
-        """Return a rejection reason if the tool at a free start is turned by more than 90 degrees from its target."""
-        if self.request.start is not None:
-            return None
-        for sample in self._motion_samples(solution):
-            equations = sample.stretch.equations
-            if equations is not None and equations.pose_rows.any():
-                targets = np.array(equations.target_function()(sample.t[0])).ravel()
-                angle = equations.misses(sample.base[0], sample.joints[0], targets)[1]
-                if angle > np.pi / 2:
-                    words = f"at {sample.t[0]:.4g} s the tool is turned by {angle:.3g} rad from its target"
-                    return Reason(Rejection.UNTRACKED, words, "task", angle, np.pi / 2, float(sample.t[0]))
-        return None
+        return describe_shortfall(self.request, samples)
 
     def _motion_samples(self, solution: Solution) -> list[MotionSample]:
         fractions = self._samples(solution)
@@ -165,7 +161,7 @@ class CandidateSolver(Solver):
     # ---- stages ------------------------------------------------------------------------------------------------------
 
     def _solve_seed(self, candidate: Candidate) -> Candidate:
-        seed, separated = candidate.seed, _is_separated(candidate)
+        seed, separated = candidate.seed, candidate.is_separated
         if seed.direct:
             return self._solve(candidate, Stage.FINE, seed.guess)
         return self._solve(candidate, Stage.SEPARATED if separated else Stage.COARSE, seed.guess)
@@ -186,9 +182,10 @@ class CandidateSolver(Solver):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
         assert candidate.solution is not None
-        if (reason := self._turned_over(candidate.solution)) is not None:
+        is_free = self.request.start is None
+        if is_free and (reason := reversal_reason(self._motion_samples(candidate.solution))) is not None:
             return candidate.with_rejection(reason)
-        solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not _is_separated(candidate))
+        solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not candidate.is_separated)
         if (deviation := self._deviations(motion, solution).max()) > self.settings.max_deviation:
             words = (
                 f"tips deviate, or joints exceed their limits, by {deviation:.2g} (m or rad) on finer meshes as well"
@@ -206,7 +203,7 @@ class CandidateSolver(Solver):
         motion, mesh, _ = self.prepared(candidate, fine=True)
         constraints, joints_name = candidate.constraints, f"joints{motion.stretches[0].suffix}"
         assert candidate.solution is not None
-        solution, audit = self._audit_and_refine(motion, mesh, candidate.solution, check=not _is_separated(candidate))
+        solution, audit = self._audit_and_refine(motion, mesh, candidate.solution, check=not candidate.is_separated)
         if np.isnan(self._start(candidate)).any() and audit.feasible and audit.optimal is None:
             start = solution[joints_name][0]
             fixed = self._declare(candidate, start, self.reference)
@@ -231,7 +228,7 @@ class CandidateSolver(Solver):
         worst = audit.failures[0]
         if candidate.seed.relaxed and not audit.feasible:
             samples = self._motion_samples(solution)
-            reason = limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
+            reason = describe_shortfall(self.request, samples)
             return candidate.with_rejection(replace(reason, kind=Rejection.AUDIT))
         words = f"{worst.name} {worst.value:.2g}"
         return candidate.with_rejection(
@@ -280,7 +277,7 @@ class CandidateSolver(Solver):
         self, candidate: Candidate, fine: bool, cost: float = np.inf
     ) -> tuple[ToolMotion, Collocation, Prepared]:
         """Return the problem of a candidate, its first mesh, and a solver set up for guesses that cost about `cost`."""
-        settings, separated = self.settings, _is_separated(candidate)
+        settings, separated = self.settings, candidate.is_separated
         margins: tuple[Any, ...] = ()
         if candidate.constraints is not None and separated:
             margins = tuple(sorted(candidate.constraints.margins.items()))
@@ -489,10 +486,6 @@ class CandidateSolver(Solver):
         audits = {} if best.audit is None else {audit_key(): best.audit}
         plan = SolvedPlan(whole, best.solution, parts, tuple(extended), held=request.held, _audits=audits)
         return plan.with_targets(request.tasks)
-
-
-def _is_separated(candidate: Candidate) -> bool:
-    return candidate.constraints is not None and bool(candidate.constraints.margins)
 
 
 def _refinable_failures(audit: Audit) -> list[Finding]:
