@@ -27,7 +27,8 @@ from models import (
     mass_matrix,
     tip_pose,
 )
-from tests.models.robot.trees import numeric, refused
+from tests.models.robot.oracles import mjcf_text, with_masses
+from tests.models.robot.trees import numeric, random_robot, refused, seeds
 
 GRAVITY = np.array([0.3, -0.2, -9.81])
 ARM = """<mujoco model="arm"><compiler angle="degree" meshdir="meshes" autolimits="true"/>
@@ -109,10 +110,22 @@ def jacobian_names(model: mujoco.MjModel) -> set[str]:
 
 
 @pytest.mark.parametrize("text", [ARM, WRIST], ids=["arm", "wrist"])
-@given(seed=st.integers(0, 2**32 - 1))
+@given(seed=seeds)
 @settings(max_examples=8)
 def test_frames_mass_matrix_and_gravity_torques_are_those_of_mujoco(text: str, seed: int) -> None:
     assert_same_mechanics(quietly(text), mujoco.MjModel.from_xml_string(text), seed)
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_a_random_robot_is_that_of_mujoco(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot = with_masses(random_robot(rng, 6), rng)
+    text = mjcf_text(robot, fixed=True)
+    result = Robot.from_mjcf(text, tip=robot.tip)
+    assert result.joint_names == robot.joint_names
+    assert_same_mechanics(result, mujoco.MjModel.from_xml_string(text), seed)
+    assert_same_mechanics(robot, mujoco.MjModel.from_xml_string(text), seed)
 
 
 def test_limits_couplings_and_shapes_are_those_of_the_file() -> None:
