@@ -22,6 +22,7 @@ import numpy as np
 from models.checks import Array, require
 from models.errors import ModelError, ModelWarning
 from models.robot.parts import Joint, Kind, Link, Mimic
+from models.spatial import least_rotation
 
 
 def require_unique(names: Iterable[str], kind: str) -> None:
@@ -286,9 +287,7 @@ def planar_joint(place: Joint, axis: Array | None) -> JointChain:
     """
     normal = Z if axis is None or not np.any(axis) else axis / np.linalg.norm(axis)
     normal = normal if normal[2] >= 0 else -normal
-    cross = np.cross(Z, normal)
-    skew = np.cross(cross, np.eye(3)).T
-    tilt = np.eye(3) + skew + skew @ skew / (1 + normal[2])
+    tilt = least_rotation(Z, normal)
     steps: list[tuple[str, Kind, Array]] = [("x", "prismatic", tilt @ X), ("y", "prismatic", tilt @ Y)]
     return _chain(place, [*steps, ("angle", "continuous", normal)])
 
