@@ -133,7 +133,7 @@ class Camera(NamedTuple):
         step = np.float32(2 / (PICTURE_STYLE.lens * height))
         x, y = (column - np.float32(width / 2 - 0.5)) * step, (np.float32(height / 2 - 0.5) - row) * step
         right, up, back = self.axes.astype(np.float32)
-        return np.asarray(x[:, None] * right + (y[:, None] * up - back))
+        return np.stack([x * right[k] + (y * up[k] - back[k]) for k in range(3)], axis=1)
 
 
 class Layer(NamedTuple):
@@ -242,7 +242,8 @@ def render(
             alpha = np.float32(layer.opacity * opacity)
             lit = _shade(veil, faces[cells], fine.rays(cells), fine, None)
             picture[cells] = (1 - alpha) * picture[cells] + alpha * lit
-    pixels = picture.reshape(height, side_samples, width, side_samples, 3).mean(axis=(1, 3))
+    samples, sides = picture.reshape(height, side_samples, width, side_samples, 3), range(side_samples)
+    pixels = np.sum([samples[:, i, :, j] for i in sides for j in sides], axis=0) / side_samples**2
     return np.asarray(np.round(255 * np.clip(pixels, 0.0, 1.0)), dtype=np.uint8)
 
 
@@ -380,18 +381,21 @@ def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun |
     ray, eye = camera.rays(bare), camera.eye.astype(np.float32)
     depth = np.float32(floor.height - camera.eye[2]) / ray[:, 2]
     x, y = (eye[k] + depth * ray[:, k] for k in range(2))
-    fade = np.float32(1.35) - np.float32(1.35 / floor.radius) * np.hypot(
-        x - np.float32(floor.middle[0]), y - np.float32(floor.middle[1])
-    )
-    near = np.flatnonzero((depth > 0) & (fade > 0))
-    place = np.stack([x[near], y[near], np.full(len(near), floor.height, dtype=np.float32)], axis=1)
-    row, column = np.divmod(bare[near].astype(np.int32), np.int32(camera.size[0]))
+    squares = (x - np.float32(floor.middle[0])) ** 2 + (y - np.float32(floor.middle[1])) ** 2
+    near = np.flatnonzero((depth > 0) & (squares < np.float32(floor.radius**2)))
+    x, y, cells = x[near], y[near], bare[near]
+    row, column = np.divmod(cells.astype(np.int32), np.int32(camera.size[0]))
     edge = np.minimum(np.minimum(row, camera.size[1] - 1 - row), np.minimum(column, camera.size[0] - 1 - column))
     margin = np.float32(PICTURE_STYLE.fading * min(camera.size))
-    fade = np.minimum(fade[near], 1) * np.minimum(edge / margin, 1)
-    lines = np.abs((place[:, :2] / np.float32(floor.grid) + np.float32(0.5)) % 1 - np.float32(0.5)).min(axis=1) < 0.011
-    light = np.float32(1.0) if sun is None else np.float32(0.8) + np.float32(0.2) * sun.lit(place)
-    picture[bare[near]] = (1 - fade * (1 - np.where(lines, np.float32(0.865), np.float32(0.965)) * light))[:, None]
+    fade = np.float32(1.35) * (1 - np.sqrt(squares[near]) / np.float32(floor.radius))
+    fade = np.minimum(fade, 1) * np.minimum(edge / margin, 1)
+    grid = np.float32(1 / floor.grid)
+    is_line = np.minimum(*(np.abs(place - np.rint(place)) for place in (grid * x, grid * y))) < 0.011
+    tone = np.where(is_line, np.float32(0.865), np.float32(0.965))
+    if sun is not None:
+        place = np.stack([x, y, np.full_like(x, floor.height)], axis=1)
+        tone *= np.float32(0.8) + np.float32(0.2) * sun.lit(place)
+    picture[cells] = (1 - fade * (1 - tone))[:, None]
 
 
 def _shade(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun: _Sun | None) -> Array:
@@ -422,8 +426,13 @@ def _shade(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun
     )
     key = np.maximum(normal @ to_light, 0.0)
     gloss = np.maximum(2 * key * np.abs(facing) - back @ to_light, 0.0)
+    gloss **= 2
+    gloss **= 2
+    gloss **= 2  # squares take a tenth of the time of other powers
     light = 0.44 + 0.1 * normal[:, 2] + 0.44 * key * reaches + 0.12 * np.abs(facing)
-    return np.asarray(mesh.colors.astype(np.float32)[faces] * light[:, None] + (0.12 * reaches * gloss**24)[:, None])
+    return np.asarray(
+        mesh.colors.astype(np.float32)[faces] * light[:, None] + (0.12 * reaches * gloss * gloss**2)[:, None]
+    )
 
 
 def _dot(first: Any, second: Any) -> Any:
