@@ -237,6 +237,8 @@ def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
     except ImportError as error:
         message = f"reading MJCF needs the package mujoco, {MUJOCO_EXTRA}"
         raise ModelError(message, name="mujoco", value="mujoco") from error
+    warned = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda words: None)  # else they are written to a file in the current folder
     try:
         spec = mujoco.MjSpec.from_string(reduced.text)
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # the compiler tries a step
@@ -260,6 +262,8 @@ def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
         reason = re.sub(r",? line \d+|\(line = .*?\)", "", str(error)).removeprefix("Error: ").strip()
         message = f"{reduced.origin} cannot be read by MuJoCo: {reason}"
         raise ModelError(message, name=reduced.origin, value=reduced.origin) from error
+    finally:
+        mujoco.set_mju_user_warning(warned)
     meshes = {mesh.name: mesh for mesh in original.meshes}
     return model, {geom.id: meshes.get(name) for geom, name in geoms}
 

@@ -261,6 +261,8 @@ def test_memory_textures_and_simulation_that_a_file_asks_for_are_not_used(
     </worldbody><actuator><muscle joint="j"/></actuator></mujoco>"""
     with pytest.warns(ModelWarning, match="body 'world': geom, since it is no mesh as its file has it"):
         assert Robot.from_mjcf(text).joint_names == ("j",)
+    with refused("body_pos|translation"):  # of which MuJoCo would write a warning into a file
+        Robot.from_mjcf('<mujoco><worldbody><body name="a" pos="nan 0 0"><geom size="1"/></body></worldbody></mujoco>')
     assert os.listdir(tmp_path) == []
 
 
