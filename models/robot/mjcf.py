@@ -7,6 +7,7 @@ by the compiler. Included files must be inside the folder of the first one.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -194,11 +195,11 @@ def _include(element: ElementTree.Element, folder: Path | None, known: set[Path]
     for parent in list(element.iter()):
         for k in reversed([k for k, child in enumerate(parent) if child.tag == "include"]):
             name = parent[k].get("file", "")
-            file = None if folder is None else (folder / name).resolve()
-            if file is None or folder not in file.parents or file in known:
-                reason = (
-                    "a second time" if file in known else "from outside its folder" if folder else "without a folder"
-                )
+            file = None if folder is None else Path(os.path.realpath(folder / name))
+            if file is None or folder not in file.parents or file in known or len(known) > INPUT_LIMITS.nesting:
+                reason = "without a folder" if file is None else "from outside its folder"
+                if file is not None and folder in file.parents:
+                    reason = "a second time" if file in known else f"after {INPUT_LIMITS.nesting} others"
                 message = f"{origin} includes the file {name!r} {reason}, which is not read; insert its contents"
                 raise ModelError(message, name=name or "include", value=name)
             included, _ = parse_file(file, "MJCF")

@@ -220,6 +220,13 @@ def test_included_files_are_read_from_the_folder_alone(tmp_path: Path) -> None:
     for name in ("arm.xml", "again.xml"):
         with refused("includes the file .* a second time"):
             including(name)
+    for k in range(100):
+        (inner / f"{k}.xml").write_text(f'<mujoco><include file="{k + 1}.xml"/></mujoco>')
+    with refused("after 64 others"):
+        including("0.xml")
+    (inner / "ring.xml").symlink_to(inner / "ring.xml")
+    with refused("ring.xml' cannot be read"):
+        including("ring.xml")
     with refused("without a folder"):
         Robot.from_mjcf('<mujoco><worldbody><include file="part.xml"/></worldbody></mujoco>')
 
