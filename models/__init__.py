@@ -42,6 +42,7 @@ from models.robot.kinematics import (
     tip_jacobian,
     tip_pose,
 )
+from models.robot.mjcf import excluded_pairs
 from models.robot.parts import CollisionShape, Joint, Link, Mimic, VisualShape
 from models.robot.rebuild import (
     add_prefix,
@@ -106,6 +107,7 @@ __all__ = [
     "center_of_mass_motion",
     "centers_of_mass",
     "example_robot",
+    "excluded_pairs",
     "expand_xacro",
     "find_wheels",
     "footprint",

@@ -46,11 +46,11 @@ class InputLimits:
         count: Any number that a user chooses, such as a number of nodes; larger values would run too long.
         array_entries: Entries of one array.
         name_characters: Characters of a link or joint name.
-        description_bytes: Bytes of a URDF or SRDF file. The largest public ones have 1 MB.
+        description_bytes: Bytes of a URDF, SRDF or MJCF file. The largest public ones have 1 MB.
         xml_elements: Elements plus attributes of an XML document. Each takes about 200 bytes of memory.
         mesh_bytes, mesh_text_bytes: Bytes of a binary and a text mesh file. Parsing text takes several times its size.
         mesh_triangles: Triangles of a scene after all instances are placed.
-        scene_nodes: Nodes of a Collada scene, counted once per instance.
+        scene_nodes: Nodes of a Collada scene, counted once per instance; parts of bodies in an MJCF file.
         text_bytes, text_lines, line_characters: Size of waypoint, trajectory and G-code files. A path takes 1 or 2 kB a
             line.
         number_characters: Characters of a G-code number.

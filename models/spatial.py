@@ -141,6 +141,29 @@ def rotation(axis: Expression, angle: Expression) -> Expression:
     return along + ca.cos(angle) * across + ca.sin(angle) * skew(a)
 
 
+def rotation_matrices(vectors: Array) -> Array:
+    """Return the matrices (..., 3, 3) of rotations about vectors (..., 3) by their lengths, rad, by Rodrigues."""
+    angles = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    skews = np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
+    versines = np.sinc(angles / (2 * np.pi)) ** 2 / 2  # (1 - cos) / angle^2; np.sinc(x) is sin(pi x) / (pi x)
+    return np.asarray(np.eye(3) + np.sinc(angles / np.pi) * skews + versines * (skews @ skews))
+
+
+def least_rotation(first: Array, second: Array) -> Array:
+    """Return the rotation matrix of the least angle that takes one unit vector to another."""
+    cosine = first @ second
+    across = second - cosine * first
+    sine = np.linalg.norm(across)
+    if sine < np.finfo(float).eps:  # for opposite vectors, half a turn about any axis across
+        across = np.cross(first, np.eye(3)[np.abs(first).argmin()])
+    for _ in range(2):  # again, since rounding errors of a small difference are relatively large
+        across = across / np.linalg.norm(across)
+        across = across - (first @ across) * first
+    plane = np.outer(first, first) + np.outer(across, across)
+    swap = np.outer(across, first)
+    return np.asarray(np.eye(3) + (cosine - 1) * plane + sine * (swap - swap.T))
+
+
 def rotation_from_rpy(roll: Expression, pitch: Expression, yaw: Expression) -> Expression:
     """Return the rotation matrix of roll, pitch, yaw (rad) as in URDF: Rz(yaw) Ry(pitch) Rx(roll). Shape (3, 3)."""
     return ca.mtimes([rotation((0, 0, 1), yaw), rotation((0, 1, 0), pitch), rotation((1, 0, 0), roll)])

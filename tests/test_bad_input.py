@@ -11,7 +11,7 @@ from tests.models.cts.test_bad_rigs import CASES as RIGS
 from tests.models.machines.test_bad_machines import CASES as MACHINES
 from tests.models.paths.test_bad_paths import CASES as PATHS
 from tests.models.robot.test_bad_robots import CASES as ROBOTS
-from tests.models.robot.test_bad_urdf import OPTIONS, STATES, TEXTS, XACRO
+from tests.models.robot.test_bad_urdf import MUJOCO, OPTIONS, STATES, TEXTS, XACRO
 from tests.models.shapes.test_bad_shapes import CASES as SHAPES
 from tests.ocp.app.batch.test_bad_batches import CASES as BATCHES
 from tests.ocp.app.files.test_bad_files import CASES as FILES
@@ -25,6 +25,7 @@ CASES = [
     OPTIONS,
     STATES,
     XACRO,
+    *MUJOCO,
     *MACHINES,
     *PATHS,
     *RIGS,

@@ -51,7 +51,7 @@ LAYERS = {
 MACHINES = {"ocp.motion", "ocp.app"}
 """What may import `models`: all else knows no machine, beyond the modules of MATHEMATICS."""
 MATHEMATICS = {"models.checks", "models.errors", "models.files", "models.shapes.hull"}
-FOREIGN = {"models": {"casadi", "collada", "numpy", "scipy", "xacro", "xacrodoc"}}
+FOREIGN = {"models": {"casadi", "collada", "mujoco", "numpy", "scipy", "xacro", "xacrodoc"}}
 LARGEST_PACKAGE = 14
 LARGEST_MODULE = 500
 

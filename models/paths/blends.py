@@ -147,6 +147,7 @@ def polynomial(coefficients: Array, u: Array, order: int = 0) -> Array:
     return np.asarray(value)
 
 
+@lru_cache(maxsize=6)
 def _falling_factorials(order: int) -> list[float]:
     # k (k - 1) ... (k - order + 1)
     return [float(np.prod(np.arange(k - order + 1, k + 1))) if k >= order else 0.0 for k in range(6)]

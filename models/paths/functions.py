@@ -19,7 +19,8 @@ from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
 from models.paths.blends import GAUSS_NODES, GAUSS_WEIGHTS, gauss_rule, speed
 from models.paths.segments import screw_axes
-from models.paths.smooth_path import SERIES_TERMS, SmoothPath
+from models.paths.smooth_path import SmoothPath
+from models.paths.splines import SERIES_TERMS
 from models.spatial import angular_velocity_from_quaternion, quaternion_product
 
 __all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
@@ -136,12 +137,12 @@ def _horner(columns: Any, u: Any) -> Any:
 def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
     """Return the table of `path_function`: distances at which parts of the path start, and a data column for each part.
 
-    The length of the path follows the distances. A part is what remains of a segment, or a cell of a blend. For a
-    segment: its start point, the axial, tangential and inward vectors of its screw, and its rotation rate. For a blend:
-    the coefficients, three a power. For both: distance, length, whether it is a blend; u at the start, width in u,
-    speeds at both ends.
+    The length of the path follows the distances. A part is what remains of a line, arc or helix, or a cell of a curve.
+    For a segment: its start point, the axial, tangential and inward vectors of its screw, and its rotation rate. For a
+    curve: the coefficients, three a power. For both: distance, length, whether it is a curve; u at the start, width in
+    u, speeds at both ends.
     """
-    on_segment = np.flatnonzero(path.piece_segment >= 0)
+    on_segment = np.flatnonzero(path.piece_curve < 0)
     count, segment, task, cells = len(on_segment), path.piece_segment[on_segment], path.path, path.cells
     skipped = np.concatenate([[0.0], path.remaining])[segment]
     position, tangent, bend, _ = task.at(segment, skipped)

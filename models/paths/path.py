@@ -3,6 +3,8 @@
 No smooth curve rounds a reversal (a corner of 180 deg). `split_at_reversals` ends the path there, or inserts a bulb
 turn of three arcs of 60, 300 and 60 degrees. The bulb leaves the vertex in the direction of arrival and returns to it
 in the opposite direction, without a corner. It extends beyond the vertex by 1.37 times its width.
+
+`fit_splines` replaces many short segments, such as the chords by which CAM programs describe a curve, by few splines.
 """
 
 from __future__ import annotations
@@ -10,8 +12,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -19,10 +22,22 @@ from numpy.typing import NDArray
 
 from models.checks import NOT_NUMBERS, ROUNDING, Array, ArrayInput, check_entries, require
 from models.errors import ModelError
-from models.paths.segments import Arc, Helix, Line, Segment, product, rotation_vector, screw, unit_quaternion
+from models.paths.blends import derivatives_by_arc_length
+from models.paths.segments import Line, Segment, bulb_turn, rotation_vector, screw, unit_quaternion
+from models.paths.splines import (
+    Polyline,
+    Spline,
+    SplineTable,
+    distances_from_chord,
+    exponential,
+    fit_spline,
+    product,
+    rotate,
+    simplified,
+)  # fmt: skip
 from models.spatial import rotation_from_quaternion
 
-__all__ = ["Path", "Reversal", "split_at_reversals"]
+__all__ = ["FittedPath", "Path", "Reversal", "fit_splines", "split_at_reversals"]
 
 SMALLEST_ANGLE = 1e-6
 """Interior angle (rad) below which a corner is a reversal, because its blend would be curved too sharply.
@@ -35,17 +50,18 @@ NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A chain of lines, arcs and helices, each starting at the end of the one before.
+    """A chain of lines, arcs, helices and splines, each starting at the end of the one before.
 
     Attributes:
         segments: The segments in order, at least one.
         lengths: Lengths of the segments. Shape (n,), m.
-        start, tangent, normal: Start point and frame of each segment at its start, in world. Shape (n, 3), m and unit
-            vectors.
-        curvature, torsion: Curvature and torsion of each segment; both zero for a line, torsion zero for an arc. Shape
-            (n,), 1/m.
+        start, tangent, normal: Start point and frame of each segment at its start, in world; the normal of a line or
+            spline is zero. Shape (n, 3), m and unit vectors.
+        curvature, torsion: Curvature and torsion of each segment; both zero for a line, torsion zero for an arc. For a
+            spline the largest curvature at the ends of its pieces, and zero. Shape (n,), 1/m.
         orientation: Tool orientation at the start of each segment, unit quaternion. Shape (n, 4).
         turn: Rotation vector of the tool along each segment, in the axes of its start orientation. Shape (n, 3), rad.
+            For a spline it is nan if the tool turns.
 
     Raises:
         ModelError: There is no segment, or an entry is no segment; position or orientation has a gap; or a corner
@@ -126,7 +142,35 @@ class Path:
         index = require.indices("path: index", index, len(self.segments))
         along = require.array("path: distance", distance)
         frame = self.start[index], self.tangent[index], self.normal[index]
-        return screw(*frame, curvature=self.curvature[index], torsion=self.torsion[index], distance=along)
+        results = screw(*frame, curvature=self.curvature[index], torsion=self.torsion[index], distance=along)
+        if (rows := np.flatnonzero(self.is_spline[index])).size:
+            values = self._table.at(index[rows], np.broadcast_to(along, index.shape)[rows])
+            for result, value in zip(results, values, strict=True):
+                result[rows] = value
+        return results
+
+    def turn_at(self, index: NDArray[np.intp], distance: Array) -> tuple[Array, Array, Array]:
+        """Return tool orientations and their first two derivatives, in world, at distances (m) along segments.
+
+        Shapes: index and distance (M,), results (M, 4), (M, 3), (M, 3), 1, rad/m and rad/m^2.
+        """
+        rate, own = self.turn[index] / self.lengths[index, None], self.orientation[index]
+        quaternion = product(own, exponential(rate * distance[:, None]))
+        spin, change = rotate(own, rate), np.zeros_like(rate)
+        for row in np.flatnonzero(self.is_spline[index]).tolist():
+            spline = self.segments[index[row]]
+            if isinstance(spline, Spline) and spline.turns is not None:
+                quaternion[row], spin[row], change[row] = spline.turn_at(float(distance[row]))
+        return quaternion, spin, change
+
+    @cached_property
+    def is_spline(self) -> NDArray[np.bool_]:
+        """Whether each segment is a spline. Shape (n,)."""
+        return np.array([isinstance(segment, Spline) for segment in self.segments])
+
+    @cached_property
+    def _table(self) -> SplineTable:
+        return SplineTable.of(self.segments, np.cumsum(self.lengths) - self.lengths)
 
     def corner_angles(self) -> Array:
         """Return the interior angle at each vertex, which is pi for a continuous tangent. Shape (n - 1,), rad."""
@@ -145,6 +189,12 @@ class Path:
         matrix = np.array(ca.DM(rotation_from_quaternion(rotation)))
         moved_segments: list[Segment] = []
         for i, segment in enumerate(self.segments):
+            if isinstance(segment, Spline):
+                curves = np.asarray(segment.coefficients) @ matrix.T
+                curves[:, 0] += origin
+                own = None if segment.references is None else product(rotation, segment.references)
+                moved_segments.append(Spline(curves, own, segment.turns))
+                continue
             fields: dict[str, Any] = {"start": origin + matrix @ segment.start}
             if isinstance(segment, Line):
                 fields["end"] = origin + matrix @ segment.end
@@ -201,14 +251,15 @@ class Path:
                 current = begin
             else:
                 current = np.asarray(segment.end_orientation)
-                turns.append(rotation_vector(begin, current, f"segment {i}"))
+                whole = np.full(3, np.nan if np.any(segment.turns) else 0.0) if isinstance(segment, Spline) else None
+                turns.append(whole if whole is not None else rotation_vector(begin, current, f"segment {i}"))
                 current = current if begin @ current >= 0 else -current
         object.__setattr__(self, "orientation", np.array(starts))
         object.__setattr__(self, "turn", np.array(turns))
 
 
 def checked_segments(segments: Any) -> tuple[Segment, ...]:
-    """Return segments as a tuple; raise a ModelError if there are none or one is not a Line, Arc or Helix."""
+    """Return segments as a tuple; raise a ModelError if there are none or one is no segment."""
     try:
         check_entries(segments)
         checked = tuple(segments)
@@ -218,8 +269,8 @@ def checked_segments(segments: Any) -> tuple[Segment, ...]:
     if not checked:
         raise ModelError("the path has no segment; give at least one Line, Arc or Helix", name="segments", value=())
     for i, segment in enumerate(checked):
-        if not isinstance(segment, Line | Arc | Helix):
-            message = f"segment {i} is {segment!r}; a path consists of Line, Arc and Helix"
+        if not isinstance(segment, Segment):
+            message = f"segment {i} is {segment!r}; a path consists of Line, Arc, Helix and Spline"
             raise ModelError(message, name=f"segment {i}", value=segment)
     return checked
 
@@ -229,12 +280,164 @@ def interior_angles(segments: Sequence[Segment]) -> Array:
     start, tangent, normal, k, w, length = (
         np.array([getattr(each, name) for each in segments]) for name in (*FRAME, "length")
     )
-    return _angles(screw(start, tangent, normal, curvature=k, torsion=w, distance=length)[1][:-1], tangent[1:])
+    ends = screw(start, tangent, normal, curvature=k, torsion=w, distance=length)[1]
+    for i, each in enumerate(segments):
+        if isinstance(each, Spline):
+            ends[i] = derivatives_by_arc_length(np.asarray(each.coefficients)[-1:], np.ones(1))[1]
+    return _angles(ends[:-1], tangent[1:])
 
 
 def _angles(before: Array, after: Array) -> Array:
     # accurate near 0 and pi, unlike the arc cosine
     return np.asarray(2 * np.arctan2(np.linalg.norm(before + after, axis=1), np.linalg.norm(before - after, axis=1)))
+
+
+class FittedPath(NamedTuple):
+    """Path in which splines and lines replace runs of short segments; see `fit_splines`.
+
+    Attributes:
+        path: The path of n segments.
+        first: Index of the first segment of the given path that each segment replaces. Shape (n,).
+        deviation: Deviation that remains for rounding each vertex. Shape (n - 1,), m.
+    """
+
+    path: Path
+    first: NDArray[np.intp]
+    deviation: Array
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings of the search for runs of short segments.
+
+    Attributes:
+        simplified: Deviation of the simplified polyline that shows the corners, relative to the tolerance.
+        spline: Largest deviation of a spline, relative to the tolerance; the rest is for rounding the vertices.
+        sagitta: Distance of an arc from the chords that stand for it, relative to the tolerance.
+        long: Deviation, relative to the tolerance, of a line from a curve that bends in it as it does beside it; a line
+            with more stays a line.
+        straight: Deviation of the points of such a line from it, relative to the tolerance.
+        chords: Number of chords of the simplified polyline above which an arc or a helix stays as it is.
+    """
+
+    simplified: float = 0.5
+    spline: float = 0.75
+    sagitta: float = 0.05
+    long: float = 4.0
+    straight: float = 0.05
+    chords: int = 8
+
+
+RUNS = RunSettings()
+
+
+def fit_splines(
+    path: Path, deviation: ArrayInput, *, angle: float = 1e-3, corners: ArrayInput | None = None
+) -> FittedPath:
+    """Replace runs of many short segments, such as the chords of a curve, by splines and lines within a deviation.
+
+    Each point of the result is within 3/4 of the least deviation of the given path, and vice versa; the splines are
+    checked by a bound, not by samples. Their curvature is continuous, and so are two derivatives of it. The number of
+    their pieces depends on the shape of the path, not on the number of its segments. Corners remain: vertices at which
+    a curve within the deviation would have to bend more sharply than beside them. Long lines and arcs remain exact, and
+    collinear lines become one. `smooth` rounds the remaining corners.
+
+    Args:
+        path: The path.
+        deviation: Largest distance (m) between the given path and the smooth one, as for `smooth`.
+        angle: Largest angle (rad) between the tool orientations of a spline and of the path at equal parameters,
+            checked at the ends and in the middle of each segment.
+        corners: Further vertices that remain, for example because the speed changes there; 1 is the end of the first
+            segment. Shape (k,).
+
+    Raises:
+        ModelError: The deviation or the angle is not positive, or a corner is not a vertex.
+    """
+    count = len(require.instance("fit_splines: path", path, Path).segments)
+    tolerances = require.broadcast("path: deviation", deviation, count - 1, "vertices", unit="m", sign="positive")
+    require.positive("path: angle", angle, unit="rad")
+    kept: Any = [] if corners is None else require.indices("path: corners", corners, count)
+    if count < 3:
+        return FittedPath(path, np.arange(count), tolerances)
+    tolerance, left = float(tolerances.min()), np.concatenate([[np.inf], tolerances, [np.inf]])
+    line, number = _polyline(path, RUNS.sagitta * tolerance)
+    is_end = _run_ends(path, line.points, number, tolerance)
+    is_end[kept] = True
+    ends = np.flatnonzero(is_end)
+    segments, first, used = list[Segment](), list[int](), np.zeros(count + 1)
+    for i, j in pairwise(ends.tolist()):
+        part = slice(int(number[i]), int(number[j]) + 1)
+        own = Polyline(line.points[part], None if line.quaternions is None else line.quaternions[part])
+        result = _replacement(path.segments[i:j], own, tolerance, angle) if j - i > 2 else None
+        if result is None:
+            segments += path.segments[i:j]
+            first += range(i, j)
+        else:
+            segments.append(result[0])
+            first.append(i)
+            used[[i, j]] = np.maximum(used[[i, j]], result[1])
+    return FittedPath(Path(tuple(segments)), np.array(first), (left - used)[first[1:]])
+
+
+def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
+    """Return the path as a polyline, from which arcs deviate by `sagitta`, and the number of the point at each vertex.
+
+    The quaternions are None if the path states no tool orientation.
+    """
+    with np.errstate(divide="ignore"):
+        chord = np.where(path.is_spline, np.inf, np.sqrt(8 * sagitta / path.curvature))
+    counts = np.maximum(np.ceil(path.lengths / chord), 1).astype(int)
+    number = np.concatenate([[0], np.cumsum(counts)])
+    index = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(number[-1]) - number[index]) / counts[index]
+    last = len(counts) - 1
+    index, distance = np.append(index, last), np.append(share * path.lengths[index], path.lengths[last])
+    points = path.at(index, distance)[0]
+    turned = path.turns or path.oriented
+    return Polyline(points, path.turn_at(index, distance)[0] if turned else None), number
+
+
+def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: float) -> NDArray[np.bool_]:
+    """Return at which vertices, ends included, runs of short segments end. Shape (n + 1,).
+
+    A simplified polyline shows the shape of the path without its noise. A curve that is within its deviation from the
+    chord c bends by 8 deviation / c from chord to chord; where the path bends much more, it has a corner.
+    """
+    corners = simplified(points, RUNS.simplified * tolerance)
+    steps = np.diff(points[corners], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    bends = np.pi - _angles(steps[:-1] / lengths[:-1, None], steps[1:] / lengths[1:, None])
+    sharp = np.minimum(lengths[:-1], lengths[1:]) * bends > 8 * tolerance
+    # deviation that each chord would have if it bent as at its ends
+    after = np.append(np.where(sharp, np.inf, lengths[:-1] ** 2 * bends / lengths[1:] / 8), np.inf)
+    before = np.append(np.inf, np.where(sharp, np.inf, lengths[1:] ** 2 * bends / lengths[:-1] / 8))
+    is_long = np.minimum(before, after) > RUNS.long * tolerance
+    for k in np.flatnonzero(is_long):
+        off_chord = distances_from_chord(points[corners[k] : corners[k + 1] + 1]).max()
+        is_long[k] = off_chord <= RUNS.straight * tolerance
+    at_ends = np.zeros(len(points), dtype=bool)
+    at_ends[corners[1:-1][sharp]] = True
+    at_ends[corners[:-1][is_long]] = at_ends[corners[1:][is_long]] = True
+    is_end = at_ends[number]
+    inner = np.searchsorted(corners, number[1:]) - np.searchsorted(corners, number[:-1])
+    exact = path.is_spline | (inner > RUNS.chords)
+    is_end[:-1] |= exact
+    is_end[1:] |= exact
+    is_end[[0, -1]] = True
+    return np.asarray(is_end)
+
+
+def _replacement(
+    segments: Sequence[Segment], line: Polyline, tolerance: float, angle: float
+) -> tuple[Segment, float] | None:
+    """Return one segment in place of several and a bound of its deviation (m); None if it needs too many pieces."""
+    (points, quaternions), deviation = line, float(distances_from_chord(line.points).max())
+    is_line = deviation <= min(RUNS.simplified * tolerance, float(np.linalg.norm(points[-1] - points[0])))
+    is_line &= quaternions is None or bool((np.diff(quaternions, axis=0) == 0).all())
+    if is_line and all(isinstance(each, Line) for each in segments):
+        return Line(points[0], points[-1], segments[0].start_orientation), deviation
+    fit = fit_spline(line, (RUNS.spline - RUNS.sagitta) * tolerance, angle, len(segments))
+    return None if fit is None else (fit[0], fit[1] + RUNS.sagitta * tolerance)
 
 
 Reversal: TypeAlias = Literal["split"] | float
@@ -279,24 +482,3 @@ def split_at_reversals(
         joined.append(segment)
         index.append(i)
     return ((Path(tuple(joined)), np.array(index)),)
-
-
-def bulb_turn(segment: Segment, width: float) -> tuple[Arc, Arc, Arc]:
-    """Return the three arcs of a bulb-shaped turn that reverses the direction at the end of a segment.
-
-    Their plane contains the segment's curvature vector or, after a line, a horizontal normal of the line.
-    """
-    frame = np.asarray(segment.start), segment.tangent, segment.normal
-    bends: Any = {"curvature": segment.curvature, "torsion": segment.torsion}
-    _, ahead, bend, _ = screw(*frame, **bends, distance=segment.length)
-    vertex = np.asarray(segment.end)
-    across = bend if bend.any() else np.cross([0.0, 0.0, 1.0], ahead)
-    if np.linalg.norm(across) < 1e-9:
-        across = np.array([1.0, 0.0, 0.0])
-    across = across / np.linalg.norm(across)
-    radius, axis = width / 2, np.cross(ahead, across)
-    middle = vertex + np.sqrt(3) * radius * ahead
-    first = Arc.about(vertex, vertex - radius * across, axis, -np.pi / 3)
-    second = Arc.about(first.end, middle, axis, 5 * np.pi / 3)
-    third = Arc.about(second.end, vertex + radius * across, axis, -np.pi / 3)
-    return first, second, third

@@ -27,8 +27,8 @@ from models.paths.blends import (
     quintic,
 )
 from models.paths.path import Path
-from models.paths.segments import screw
 from models.paths.smooth_path import SmoothPath
+from models.paths.splines import Spline
 from models.spatial import FULL_TURN
 
 __all__ = ["Overlap", "smooth"]
@@ -45,7 +45,7 @@ class RoundingSettings:
             for its closest point.
         reserve: Fraction of the tolerance reserved for deviations between the samples.
         iterations: Largest number of remaining distances tried, and of rounds that shrink overlapping blends.
-        newton_iterations: Newton iterations to the closest point of a helix.
+        newton_iterations: Newton iterations to the closest point of a helix or spline.
         least_slope: Slope of the condition of the closest point below which a step is damped: near the helix axis.
         block: Corners processed at once, which bounds the memory.
         shortest: Length, relative to its segment, below which the rest between two blends is a rounding error and
@@ -85,8 +85,8 @@ class _Corners(NamedTuple):
 
     @property
     def curved(self) -> NDArray[np.intp]:
-        """Indices of the corners with an arc or a helix on at least one side."""
-        segments = self.path.curvature > 0
+        """Indices of the corners with an arc, a helix or a spline on at least one side."""
+        segments = (self.path.curvature > 0) | self.path.is_spline
         return np.flatnonzero(segments[self.vertices] | segments[self.vertices + 1])
 
     def ends(self, remaining: Array) -> Ends:
@@ -299,12 +299,12 @@ def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, fir
 
     Each part, for one row of points, extends from the distance `first` to the distance `last` along its segment.
     """
-    helices = np.flatnonzero(path.torsion[index] != 0)
-    if helices.size:
-        result, others = np.empty(points.shape[:2]), np.flatnonzero(path.torsion[index] == 0)
-        if others.size:
-            result[others] = _distance_to_segment(path, index[others], points[others], first[others], last[others])
-        result[helices] = _distance_to_helix(path, index[helices], points[helices], first[helices], last[helices])
+    spatial = (path.torsion[index] != 0) | path.is_spline[index]
+    if spatial.any():
+        result = np.empty(points.shape[:2])
+        for rows, distances in ((~spatial, _distance_to_segment), (spatial, _distance_to_curve)):
+            if rows.any():
+                result[rows] = distances(path, index[rows], points[rows], first[rows], last[rows])
         return result
     offset = points - path.start[index][:, None]
     along = np.einsum("vsi,vi->vs", offset, path.tangent[index])
@@ -324,28 +324,33 @@ def _distance_to_segment(path: Path, index: NDArray[np.intp], points: Array, fir
     return np.asarray(np.sqrt(np.einsum("vsi,vsi->vs", offset, offset)))
 
 
-def _distance_to_helix(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
-    """Return the distances of points from parts of helices, by Newton's method from the closest sample.
+def _distance_to_curve(path: Path, index: NDArray[np.intp], points: Array, first: Array, last: Array) -> Array:
+    """Return the distances of points from parts of helices or splines, by Newton's method from the closest sample.
 
     Arguments and shapes are those of `_distance_to_segment`.
     """
     if len(index) > SETTINGS.block:
         parts = [slice(k, k + SETTINGS.block) for k in range(0, len(index), SETTINGS.block)]
-        return np.concatenate([_distance_to_helix(path, index[p], points[p], first[p], last[p]) for p in parts])
-    frame = path.start[index][:, None], path.tangent[index][:, None], path.normal[index][:, None]
-    bends = {"curvature": path.curvature[index][:, None], "torsion": path.torsion[index][:, None]}
-    turns = float((np.hypot(*bends.values())[:, 0] * (last - first)).max()) / FULL_TURN
+        return np.concatenate([_distance_to_curve(path, index[p], points[p], first[p], last[p]) for p in parts])
+
+    def at(s: Array) -> list[Array]:
+        values = path.at(np.repeat(index, s.shape[1]), s.ravel())
+        return [value.reshape(*s.shape, 3) for value in values]
+
+    rate = np.where(path.is_spline, 0.0, np.hypot(path.curvature, path.torsion))  # at its end a spline is nearly a line
+    turns = float((rate[index] * (last - first)).max()) / FULL_TURN
     share = np.linspace(0, 1, int(SETTINGS.samples * (1 + turns)))
     places = first[:, None] + (last - first)[:, None] * share
-    curve_points = screw(*frame, **bends, distance=places)[0] - frame[0]
-    square = (curve_points**2).sum(axis=-1)[:, None] - 2 * (points - frame[0]) @ curve_points.transpose(0, 2, 1)
+    origin = path.start[index][:, None]
+    curve_points = at(places)[0] - origin
+    square = (curve_points**2).sum(axis=-1)[:, None] - 2 * (points - origin) @ curve_points.transpose(0, 2, 1)
     s = np.take_along_axis(places, square.argmin(axis=2), axis=1)
     for _ in range(SETTINGS.newton_iterations):
-        at, tangent, bend, _ = screw(*frame, **bends, distance=s)
-        slope = 1 + ((at - points) * bend).sum(axis=-1)
-        s = s - ((at - points) * tangent).sum(axis=-1) / np.maximum(slope, SETTINGS.least_slope)
+        position, tangent, bend, _ = at(s)
+        slope = 1 + ((position - points) * bend).sum(axis=-1)
+        s = s - ((position - points) * tangent).sum(axis=-1) / np.maximum(slope, SETTINGS.least_slope)
         s = np.clip(s, first[:, None], last[:, None])
-    return np.asarray(np.linalg.norm(screw(*frame, **bends, distance=s)[0] - points, axis=-1))
+    return np.asarray(np.linalg.norm(at(s)[0] - points, axis=-1))
 
 
 def smooth(
@@ -387,26 +392,39 @@ def smooth(
     factors = corner_shape(angles) if free else checked_shape(PAPER_SHAPE if shape is None else shape, kind, count - 1)
     corners = _Corners(path, kind, factors, np.arange(count - 1))
     corners, distances = _remaining_distances(corners, remaining, deviation, overlap, free)
-    coefficients = corners.blends(distances)
-    curve_cells = cells(coefficients)
-    blend_lengths = np.bincount(curve_cells.curve, curve_cells.length, minlength=len(distances))
+    blends = corners.blends(distances)
     padded = np.concatenate([[0.0], distances, [0.0]])
     rests = path.lengths - padded[:-1] - padded[1:]
-    lengths, segment, blend = np.empty(2 * count - 1), np.full(2 * count - 1, -1), np.full(2 * count - 1, -1)
-    lengths[::2], lengths[1::2] = rests, blend_lengths
-    segment[::2], blend[1::2] = np.arange(count), np.arange(count - 1)
-    long_enough = np.ones(2 * count - 1, dtype=bool)
-    long_enough[::2] = rests > SETTINGS.shortest * path.lengths
-    bounds = np.concatenate([[0.0], np.cumsum(lengths[long_enough])])
+    long_enough = rests > SETTINGS.shortest * path.lengths
+    splines = {
+        i: segment.part(float(padded[i]), float(path.lengths[i] - padded[i + 1]))
+        for i, segment in enumerate(path.segments)
+        if isinstance(segment, Spline) and long_enough[i]
+    }
+    exact, vertices = np.flatnonzero(long_enough & ~path.is_spline), np.arange(count - 1)
+    of_splines = np.repeat(list(splines), [len(np.asarray(each.coefficients)) for each in splines.values()]).astype(int)
+    # pieces along the path: the rest of segment i, the blend at vertex i, the rest of segment i + 1
+    order = np.argsort(np.concatenate([2 * exact, 2 * vertices + 1, 2 * of_splines]), kind="stable")
+    segment = np.concatenate([exact, np.full(count - 1, -1), of_splines])[order]
+    blend = np.concatenate([np.full(len(exact), -1), vertices, np.full(len(of_splines), -1)])[order]
+    is_curve = order >= len(exact)
+    curve = np.where(is_curve, np.cumsum(is_curve) - 1, -1)
+    curves = np.concatenate([blends, *(np.asarray(each.coefficients) for each in splines.values())])
+    coefficients = curves[order[is_curve] - len(exact)]
+    curve_cells = cells(coefficients)
+    lengths = rests[segment]
+    lengths[is_curve] = np.bincount(curve_cells.curve, curve_cells.length, minlength=len(curves))
     smoothed = SmoothPath(
         path,
         kind,
         distances,
         corners.shape,
         coefficients,
-        bounds,
-        segment[long_enough],
-        blend[long_enough],
+        np.concatenate([[0.0], np.cumsum(lengths)]),
+        segment,
+        blend,
+        curve,
+        splines,
         curve_cells,
     )
     if path.turns:

@@ -19,6 +19,7 @@ import numpy as np
 
 from models.checks import Array, ArrayInput, freeze, require
 from models.errors import ModelError
+from models.paths.splines import Spline
 from models.spatial import FULL_TURN
 
 __all__ = ["Arc", "Helix", "Line", "Segment", "screw", "screw_axes"]
@@ -257,7 +258,7 @@ class Helix(_Circular):
         return self.rise * self.sweep / self.length**2
 
 
-Segment: TypeAlias = Line | Arc | Helix
+Segment: TypeAlias = Line | Arc | Helix | Spline
 
 
 def screw(
@@ -341,6 +342,27 @@ def _set_orientations(segment: Segment, owner: str) -> None:
         rotation_vector(segment.start_orientation, segment.end_orientation, owner)  # refuses half turns
 
 
+def bulb_turn(segment: Segment, width: float) -> tuple[Arc, Arc, Arc]:
+    """Return the three arcs of a bulb-shaped turn that reverses the direction at the end of a segment.
+
+    Their plane contains the segment's curvature vector or, after a line, a horizontal normal of the line.
+    """
+    frame = np.asarray(segment.start), segment.tangent, segment.normal
+    bends: Any = {"curvature": segment.curvature, "torsion": segment.torsion}
+    _, ahead, bend, _ = screw(*frame, **bends, distance=segment.length)
+    vertex = np.asarray(segment.end)
+    across = bend if bend.any() else np.cross([0.0, 0.0, 1.0], ahead)
+    if np.linalg.norm(across) < 1e-9:
+        across = np.array([1.0, 0.0, 0.0])
+    across = across / np.linalg.norm(across)
+    radius, axis = width / 2, np.cross(ahead, across)
+    middle = vertex + np.sqrt(3) * radius * ahead
+    first = Arc.about(vertex, vertex - radius * across, axis, -np.pi / 3)
+    second = Arc.about(first.end, middle, axis, 5 * np.pi / 3)
+    third = Arc.about(second.end, vertex + radius * across, axis, -np.pi / 3)
+    return first, second, third
+
+
 LARGEST_TURN = np.pi - 1e-3
 """Largest angle (rad) allowed between two orientations; near pi the shorter of the two rotations is ambiguous."""
 
@@ -383,11 +405,3 @@ def rotation_vector(first: ArrayInput, second: ArrayInput, owner: str = "orienta
         raise ModelError(message, name=owner, value=angle, limit=LARGEST_TURN)
     factor = angle / norm if norm > 0 else 2.0
     return np.array([x * factor, y * factor, z * factor])
-
-
-def product(first: ArrayInput, second: ArrayInput) -> Array:
-    """Return the product of two quaternions [w, x, y, z], or of two arrays of quaternions. Shape (..., 4)."""
-    p, q = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
-    scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
-    vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
-    return np.concatenate([scalar, vector], axis=-1)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from math import factorial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +18,9 @@ from numpy.typing import NDArray
 
 from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
-from models.paths.blends import BlendKind, Cells, curvature, derivatives_by_arc_length, parameter, polynomial, quintic
+from models.paths.blends import BlendKind, Cells, curvature, derivatives_by_arc_length, parameter, quintic
 from models.paths.path import Path
+from models.paths.splines import Spline, along_piece, chart
 
 __all__ = ["Blend", "PathPoint", "SmoothPath", "Turn"]
 
@@ -91,17 +91,20 @@ class Blend:
 class SmoothPath:
     """A path with rounded corners, parametrised by the distance from its start. `smooth` constructs it.
 
-    Its pieces are the remaining parts of the segments and the blends between them.
+    Its pieces are the remaining parts of the segments and the blends between them. Each polynomial piece of a spline
+    is a piece of its own.
 
     Attributes:
         path: The path before its corners were rounded.
         kind: "cubic" or "quintic".
         remaining, shape: Remaining distance and shape factor of the blend at each vertex. Shape (V,), m and 1.
-        coefficients: Polynomial coefficients of the blends. Shape (V, 6, 3), m.
+        coefficients: Polynomial coefficients of blends and pieces of splines, along the path. Shape (K, 6, 3), m.
         bounds: Distances at which the pieces begin, and finally the length. Shape (P + 1,), m.
         piece_segment: Segment of each piece, -1 for a blend. Shape (P,).
         piece_blend: Vertex of each blend, -1 for a part of a segment. Shape (P,).
-        cells: Quadrature cells of the blends.
+        piece_curve: Row of `coefficients` of each piece, -1 for lines, arcs and helices. Shape (P,).
+        splines: Remaining parts of the segments that are splines, by segment.
+        cells: Quadrature cells of the polynomial curves.
     """
 
     path: Path
@@ -112,10 +115,16 @@ class SmoothPath:
     bounds: Array
     piece_segment: NDArray[np.intp]
     piece_blend: NDArray[np.intp]
+    piece_curve: NDArray[np.intp]
+    splines: dict[int, Spline]
     cells: Cells
 
     def __repr__(self) -> str:
-        counts = f"{len(self.path.segments)} segments and {int((self.piece_blend >= 0).sum())} {self.kind} blends"
+        segments, blends = len(self.path.segments), int((self.piece_blend >= 0).sum())
+        splines = len(self.splines)
+        of_splines = f" ({splines} spline{'s'[: splines != 1]} of {int((self.piece_curve >= 0).sum()) - blends} pieces)"
+        counts = f"{segments} segment{'s'[: segments != 1]}{of_splines if splines else ''}"
+        counts += f" and {blends} {self.kind} blend{'s'[: blends != 1]}"
         return f"<SmoothPath of {self.length:.6g} m: {counts}>"
 
     @property
@@ -135,12 +144,12 @@ class SmoothPath:
 
     @cached_property
     def cell_bounds(self) -> Array:
-        """Distance along the path at which each quadrature interval (cell) of the blends begins. Shape (C,), m."""
+        """Distance along the path at which each quadrature interval (cell) of the curves begins. Shape (C,), m."""
         before = np.cumsum(self.cells.length) - self.cells.length
         first = np.searchsorted(self.cells.curve, np.arange(len(self.coefficients)))
-        # to the last bit, the bound of a blend's first cell must equal the blend's own, or points fall before the blend
+        # to the last bit, the bound of a curve's first cell must equal the curve's own, or points fall before the curve
         inside = before - before[first][self.cells.curve]
-        return np.asarray(self.bounds[self.blend_starts][self.cells.curve] + inside)
+        return np.asarray(self.bounds[:-1][self.piece_curve >= 0][self.cells.curve] + inside)
 
     def blend(self, vertex: int) -> Blend:
         """Return the blend at a vertex (0: end of the first segment); raise a ModelError for an unknown vertex."""
@@ -156,7 +165,7 @@ class SmoothPath:
             float(self.shape[vertex]),
             float(self.bounds[piece]),
             float(self.bounds[piece + 1]),
-            self.coefficients[vertex],
+            self.coefficients[self.piece_curve[piece]],
         )
 
     def at(self, distance: ArrayInput) -> PathPoint:
@@ -183,20 +192,23 @@ class SmoothPath:
         return Turn(*_in_blocks(self._turn, s, (4, 3, 3, 3)))
 
     def parameter(self, distance: ArrayInput) -> Array:
-        """Return the curve parameter u of the blend at each distance from the start; nan on segments. Shape (M,)."""
+        """Return the curve parameter u of the blend or piece of a spline at each distance from the start. Shape (M,).
+
+        It is nan on lines, arcs and helices.
+        """
         s = self.checked_distance(distance)
-        u, curved = np.full(len(s), np.nan), self.piece_blend[self._piece(s)] >= 0
+        u, curved = np.full(len(s), np.nan), self.piece_curve[self._piece(s)] >= 0
         u[curved] = _in_blocks(lambda at: (self._parameter(at)[1][:, None],), s[curved], (1,))[0][:, 0]
         return u
 
     def sample_distances(self, per_cell: int = 16, per_segment: int = 2) -> Array:
         """Return distances at which to sample the path, for example for a plot. Shape (M,), m.
 
-        They are equidistant in each segment and in each cell, a quadrature interval, of a blend.
+        They are equidistant in each line, arc or helix and in each cell, a quadrature interval, of a blend or spline.
         """
         for name, number in (("per_cell", per_cell), ("per_segment", per_segment)):
             require.count(f"path: {name}", number)
-        on_segment = np.flatnonzero(self.piece_segment >= 0)
+        on_segment = np.flatnonzero(self.piece_curve < 0)
         starts = np.concatenate([self.bounds[on_segment], self.cell_bounds])
         lengths = np.concatenate([self.piece_lengths[on_segment], self.cells.length])
         counts = np.concatenate([np.full(len(on_segment), per_segment), np.full(len(self.cells.length), per_cell)])
@@ -249,13 +261,13 @@ class SmoothPath:
     def _at(self, s: Array) -> tuple[Array, ...]:
         piece = self._piece(s)
         results = tuple(np.empty((len(s), 3)) for _ in range(4))
-        straight = np.flatnonzero(self.piece_segment[piece] >= 0)
+        straight = np.flatnonzero(self.piece_curve[piece] < 0)
         if straight.size:
             pieces = piece[straight]
             values = self._on_segment(self.piece_segment[pieces], s[straight] - self.bounds[pieces])
             for result, value in zip(results, values, strict=True):
                 result[straight] = value
-        curved = np.flatnonzero(self.piece_blend[piece] >= 0)
+        curved = np.flatnonzero(self.piece_curve[piece] >= 0)
         if curved.size:
             curve, u = self._parameter(s[curved])
             for result, value in zip(results, derivatives_by_arc_length(self.coefficients[curve], u), strict=True):
@@ -265,7 +277,7 @@ class SmoothPath:
     def _curvature(self, s: Array) -> tuple[Array]:
         piece = self._piece(s)
         values = np.abs(self.path.curvature[self.piece_segment[piece]])
-        curved = np.flatnonzero(self.piece_blend[piece] >= 0)
+        curved = np.flatnonzero(self.piece_curve[piece] >= 0)
         curve, u = self._parameter(s[curved])
         values[curved] = curvature(self.coefficients[curve], u)
         return (values[:, None],)
@@ -283,10 +295,10 @@ class SmoothPath:
     def _end_curvatures(self, u: float) -> Array:
         """Return the curvature vector of each segment and blend at its own start (u = 0) or end (u = 1)."""
         result = np.empty((len(self.piece_segment), 3))
-        parts = np.flatnonzero(self.piece_segment >= 0)
+        parts = np.flatnonzero(self.piece_curve < 0)
         result[parts] = self._on_segment(self.piece_segment[parts], u * self.piece_lengths[parts])[2]
-        blends = np.flatnonzero(self.piece_blend >= 0)
-        result[blends] = derivatives_by_arc_length(self.coefficients, np.full(len(blends), u))[2]
+        curves = np.flatnonzero(self.piece_curve >= 0)
+        result[curves] = derivatives_by_arc_length(self.coefficients, np.full(len(curves), u))[2]
         return result
 
     @cached_property
@@ -296,21 +308,27 @@ class SmoothPath:
         Shapes (P, 4) and (P, 6, 3). The variable of the polynomials is distance / length.
         """
         path, lengths = self.path, self.piece_lengths
-        rate = path.turn / path.lengths[:, None]
         start_offset = np.concatenate([[0.0], self.remaining])
         reference = np.empty((len(lengths), 4))
         theta = np.zeros((len(lengths), 6, 3))
         parts = np.flatnonzero(self.piece_segment >= 0)
         segment = self.piece_segment[parts]
         reference[parts] = path.orientation[segment]
-        theta[parts, 0] = rate[segment] * start_offset[segment][:, None]
-        theta[parts, 1] = rate[segment] * lengths[parts][:, None]
+        rate = path.turn[segment] / path.lengths[segment, None]
+        theta[parts, 0] = rate * start_offset[segment][:, None]
+        theta[parts, 1] = rate * lengths[parts][:, None]
+        for number, spline in self.splines.items():
+            if spline.references is not None:
+                reference[parts[segment == number]] = spline.references
+                theta[parts[segment == number]] = spline.turns
         blends = np.flatnonzero(self.piece_blend >= 0)
         reference[blends] = path.orientation[1:]
-        away, length = self.remaining[:, None], lengths[blends][:, None]
-        before, after = rate[:-1], rate[1:]
-        none = np.zeros_like(before)
-        theta[blends] = quintic((-before * away, before * length, none), (after * away, after * length, none))
+        length, vertex = lengths[blends][:, None], np.arange(len(blends))
+        ends = []
+        for index, distance in ((vertex, path.lengths[:-1] - self.remaining), (vertex + 1, self.remaining)):
+            vector, rate, change = chart(path.orientation[1:], *path.turn_at(index, distance))
+            ends.append((vector, rate * length, change * length**2))
+        theta[blends] = quintic(*ends)
         return reference, theta
 
 
@@ -322,65 +340,3 @@ def _in_blocks(function: Callable[[Array], tuple[Array, ...]], s: Array, widths:
         for result, values in zip(results, function(s[part]), strict=True):
             result[part] = values
     return results
-
-
-SERIES_TERMS = 18
-
-
-def along_piece(reference: Array, theta: Array, length: Array, fraction: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the tool orientation and its rates at M samples on segments and blends of a path.
-
-    It is computed in numpy as `orientation_function` does in casadi. omega = theta' + B theta x theta' + C theta x
-    (theta x theta'), with B = (1 - cos a)/a^2, C = (a - sin a)/a^3 and a = |theta|, in the axes of the reference. B and
-    C are entire functions of a^2.
-
-    Args:
-        reference: Shape (M, 4).
-        theta: Shape (M, 6, 3).
-        length, fraction: Shape (M,).
-
-    Returns:
-        Unit quaternion (M, 4); rate, acceleration and jerk with respect to the distance (M, 3).
-    """
-    t0, t1, t2, t3 = (polynomial(theta, fraction, order) / length[:, None] ** order for order in range(4))
-    square = _dot(t0, t0)
-    first, second = 2 * _dot(t0, t1), 2 * (_dot(t1, t1) + _dot(t0, t2))
-    a0, a1 = np.cross(t0, t1), np.cross(t0, t2)
-    a2 = np.cross(t1, t2) + np.cross(t0, t3)
-    b0, b1 = np.cross(t0, a0), np.cross(t1, a0) + np.cross(t0, a1)
-    b2 = np.cross(t2, a0) + 2 * np.cross(t1, a1) + np.cross(t0, a2)
-    omega = [t1, t2, t3]
-    for start, (v0, v1, v2) in ((2, (a0, a1, a2)), (3, (b0, b1, b2))):
-        f0, f1, f2 = _series(start, square)
-        f2 = f2 * first**2 + f1 * second
-        f1 = f1 * first
-        omega[0] = omega[0] + f0 * v0
-        omega[1] = omega[1] + f1 * v0 + f0 * v1
-        omega[2] = omega[2] + f2 * v0 + 2 * f1 * v1 + f0 * v2
-    half = np.sqrt(square) / 2
-    scalar, vector = np.cos(half)[:, 0], np.sinc(half / np.pi) / 2 * t0
-    w, v = reference[:, 0], reference[:, 1:]
-    product = w[:, None] * vector + scalar[:, None] * v + np.cross(v, vector)
-    quaternion = np.column_stack([w * scalar - (v * vector).sum(axis=1), product])
-    rates = []
-    for value in omega:
-        twist = 2 * np.cross(v, value)
-        rates.append(value + w[:, None] * twist + np.cross(v, twist))
-    return quaternion, rates[0], rates[1], rates[2]
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray((a * b).sum(axis=1, keepdims=True))
-
-
-def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    """Return the value and first two derivatives of a power series that occurs in derivatives of orientations.
-
-    The sum of (-x)^k / (2 k + start)! over k at x = `square`; derivatives are with respect to x.
-    """
-    value, first, second = (np.zeros_like(square) for _ in range(3))
-    for k in reversed(range(SERIES_TERMS)):
-        second = second * square + 2 * first
-        first = first * square + value
-        value = value * square + (-1) ** k / factorial(2 * k + start)
-    return value, first, second

@@ -16,6 +16,7 @@ import numpy as np
 
 from models.checks import Array, ArrayInput, require, warn_of_millimetres
 from models.errors import ModelError, ModelWarning
+from models.robot.mjcf import read_mjcf
 from models.robot.parts import Joint, Link, urdf_text
 from models.robot.tree import (
     JointCoupling,
@@ -28,7 +29,7 @@ from models.robot.tree import (
     ties_to_leaders,
     tree_order,
 )
-from models.robot.urdf import InertiaRule, Source, numbers_of, parse_urdf, read_urdf, text_of
+from models.robot.urdf import Description, InertiaRule, Source, numbers_of, parse_urdf, read_urdf, text_of
 
 MimicRule: TypeAlias = Literal["couple", "lock", "free"]
 
@@ -140,13 +141,60 @@ class Robot:
             ModelWarning: Parts of the file that are left out, physically impossible inertias, joints to which limits of
                 joints that mimic them leave a single position.
         """
-        require.choice("URDF: mimic", mimic, get_args(MimicRule))
-        description = read_urdf(source, inertia=inertia)
+        place = {"tip_translation": tip_translation, "tip_rotation": tip_rotation}
+        return cls._from_description(read_urdf(source, inertia=inertia), tip, root, lock=lock, mimic=mimic, **place)
+
+    @classmethod
+    def from_mjcf(
+        cls,
+        source: Source,
+        *,
+        tip: str | None = None,
+        root: str | None = None,
+        tip_translation: ArrayInput = (0.0, 0.0, 0.0),
+        tip_rotation: ArrayInput = None,
+        lock: Mapping[str, float] | None = None,
+        mimic: MimicRule = "couple",
+    ) -> Robot:
+        """Read a robot from an MJCF description with the package `mujoco`, the extra `mujoco`.
+
+        `models.robot.mjcf.read_mjcf` documents contents and defaults. `excluded_pairs` reads the pairs of bodies that
+        the description excludes from contact.
+
+        Args:
+            source: The text, recognised by its first character "<", or the path of a file.
+            tip: Body or named site that carries the tip; the only leaf of the tree if None.
+            root: As in from_urdf, with the root "world".
+            tip_translation, tip_rotation, lock, mimic: As in from_urdf.
+
+        Raises:
+            ModelError: As read_mjcf, Robot and `models.robot.rebuild.lock_joints`.
+
+        Warns:
+            ModelWarning: As read_mjcf; joints to which limits of joints that mimic them leave a single position.
+        """
+        place = {"tip_translation": tip_translation, "tip_rotation": tip_rotation}
+        return cls._from_description(read_mjcf(source), tip, root, lock=lock, mimic=mimic, **place)
+
+    @classmethod
+    def _from_description(
+        cls,
+        description: Description,
+        tip: str | None,
+        root: str | None,
+        *,
+        lock: Mapping[str, float] | None,
+        mimic: MimicRule,
+        tip_translation: ArrayInput,
+        tip_rotation: ArrayInput,
+    ) -> Robot:
+        """Return the robot of a description; the arguments are those of from_urdf."""
+        require.choice("robot: mimic", mimic, get_args(MimicRule))
         joints = description.joints
         if mimic == "free":
             joints = tuple(replace(joint, mimic=None) for joint in joints)
         names = {joint.name: None for joint in joints}
-        positions = {} if lock is None else require.mapping("URDF: lock", lock)
+        positions = {} if lock is None else require.mapping("robot: lock", lock)
         for name in positions:
             if name not in names:
                 raise require.unknown("joint", name, names)
@@ -161,7 +209,7 @@ class Robot:
         robot = cls(links, joints, description.tip if tip is None else tip, tip_translation, turn, description.name)
         ranges = zip(robot.moving_joints, robot.lower, robot.upper, strict=True)
         if stuck := [joint.name for joint, lower, upper in ranges if lower == upper and joint.lower < joint.upper]:
-            warn(f"joints {stuck} cannot move: limits of joints that follow them leave one position", ModelWarning, 2)
+            warn(f"joints {stuck} cannot move: limits of joints that follow them leave one position", ModelWarning, 3)
         return robot
 
     def to_urdf(self, file: str | os.PathLike[str] | None = None) -> str:

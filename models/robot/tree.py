@@ -15,12 +15,14 @@ from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
+from warnings import warn
 
 import numpy as np
 
 from models.checks import Array, require
-from models.errors import ModelError
+from models.errors import ModelError, ModelWarning
 from models.robot.parts import Joint, Kind, Link, Mimic
+from models.spatial import least_rotation
 
 
 def require_unique(names: Iterable[str], kind: str) -> None:
@@ -285,9 +287,7 @@ def planar_joint(place: Joint, axis: Array | None) -> JointChain:
     """
     normal = Z if axis is None or not np.any(axis) else axis / np.linalg.norm(axis)
     normal = normal if normal[2] >= 0 else -normal
-    cross = np.cross(Z, normal)
-    skew = np.cross(cross, np.eye(3)).T
-    tilt = np.eye(3) + skew + skew @ skew / (1 + normal[2])
+    tilt = least_rotation(Z, normal)
     steps: list[tuple[str, Kind, Array]] = [("x", "prismatic", tilt @ X), ("y", "prismatic", tilt @ Y)]
     return _chain(place, [*steps, ("angle", "continuous", normal)])
 
@@ -311,3 +311,38 @@ def _chain(place: Joint, steps: Sequence[tuple[str, Kind, Array]]) -> JointChain
         frame = {"translation": place.translation, "rotation": place.rotation} if k == 0 else {}
         joints.append(Joint(f"{place.name}_{suffix}", kind, ends[k], ends[k + 1], axis=axis, **frame))
     return JointChain(tuple(links), tuple(joints))
+
+
+def replace_joint(
+    place: Joint, chain: JointChain, links: Sequence[Link], joints: Sequence[Joint]
+) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
+    """Return the links and joints of a robot after replacing one joint by a chain of joints."""
+    others = [(each,) if each is not place else chain.joints for each in joints]
+    return (*links, *chain.links), tuple(each for group in others for each in group)
+
+
+def replace_floating(
+    place: Joint, links: Sequence[Link], joints: Sequence[Joint]
+) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
+    """Return the links and joints of a robot without a floating joint, see `models.robot.urdf.read_urdf`.
+
+    If it connects the whole robot to a massless root, both are omitted; otherwise a chain replaces it.
+
+    Args:
+        place: Fixed joint with the name, links and frame of the floating one.
+        links, joints: Of the robot, with that joint.
+
+    Warns:
+        ModelWarning: The omitted root has collision shapes.
+    """
+    base = next((link for link in links if link.name == place.parent), None)
+    alone = all(joint is place for joint in joints if place.parent in (joint.parent, joint.child))
+    if base is None or not alone or base.mass or base.inertia.any():
+        return replace_joint(place, floating_joint(place), links, joints)
+    if base.collisions:
+        message = (
+            f"link {base.name!r}, from which joint {place.name!r} lets the robot float, is left out with its "
+            "<collision> shapes: give them as obstacles"
+        )
+        warn(ModelWarning(message, name=base.name, value=len(base.collisions)), stacklevel=4)
+    return tuple(link for link in links if link is not base), tuple(joint for joint in joints if joint is not place)

@@ -26,7 +26,7 @@ from models.checks import MAX_LISTED, Array, require, warn_of_degrees
 from models.errors import ModelError, ModelWarning
 from models.files import INPUT_LIMITS, parse_xml, read_regular
 from models.robot.parts import MOMENTS, SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
-from models.robot.tree import floating_joint, planar_joint
+from models.robot.tree import planar_joint, replace_floating, replace_joint
 
 Source: TypeAlias = str | os.PathLike[str]
 InertiaRule: TypeAlias = Literal["warn", "as_given"]
@@ -65,7 +65,7 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """The content of a URDF file.
+    """The content of a URDF or MJCF file.
 
     Attributes:
         name: Name of the robot; "robot" if the file has none.
@@ -115,43 +115,24 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
     omitted += [note for kind in ("link", "joint") for part in tree.findall(kind) for note in _unknown_attributes(part)]
     links = _links(tree, inertia, folder, omitted)
     described = [(each, _joint(each)) for each in tree.findall("joint")]
-    joints: list[Joint] = []
+    joints = tuple(joint for _, joint in described)
     for element, joint in described:
-        kind = element.get("type")
-        if kind == "floating" and _is_virtual(joint, links, [each for _, each in described]):
-            links = _without_world(joint, links)
-        elif kind in COMPOSITE:
-            added = floating_joint(joint) if kind == "floating" else planar_joint(joint, _axis(element))
-            links, joints = (*links, *added.links), [*joints, *added.joints]
-        else:
-            joints.append(joint)
-    if omitted := list(dict.fromkeys(omitted)):
-        place = f"file {os.fspath(source)!r}" if is_file else "the given text"
-        more = f"; and {len(omitted) - MAX_LISTED} more" if len(omitted) > MAX_LISTED else ""
-        message = f"{place}: these parts are left out: {'; '.join(omitted[:MAX_LISTED])}{more}"
-        warn(ModelWarning(message, name=omitted[0], value=tuple(omitted)), stacklevel=3)
+        if (kind := element.get("type")) == "floating":
+            links, joints = replace_floating(joint, links, joints)
+        elif kind == "planar":
+            links, joints = replace_joint(joint, planar_joint(joint, _axis(element)), links, joints)
+    omission_warning(omitted, f"file {os.fspath(source)!r}" if is_file else "the given text")
     tip = _only(tree, "tip", "the robot")
     tip_name = None if tip is None else text_of(tip, "link", "the robot")
-    return Description(tree.get("name") or "robot", links, tuple(joints), tip_name)
+    return Description(tree.get("name") or "robot", links, joints, tip_name)
 
 
-def _is_virtual(floating: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> bool:
-    """Return whether a floating joint connects the whole robot to a massless root link; both can then be omitted."""
-    base = next((link for link in links if link.name == floating.parent), None)
-    alone = all(joint is floating for joint in joints if floating.parent in (joint.parent, joint.child))
-    return base is not None and alone and not base.mass and not base.inertia.any()
-
-
-def _without_world(floating: Joint, links: tuple[Link, ...]) -> tuple[Link, ...]:
-    """Return the links without the massless root link to which a floating joint connects the robot."""
-    base = next(link for link in links if link.name == floating.parent)
-    if base.collisions:
-        message = (
-            f"link {base.name!r}, from which joint {floating.name!r} lets the robot float, is left out with its "
-            "<collision> shapes: give them as obstacles"
-        )
-        warn(ModelWarning(message, name=base.name, value=len(base.collisions)), stacklevel=4)
-    return tuple(link for link in links if link is not base)
+def omission_warning(omitted: Sequence[str], origin: str) -> None:
+    """Warn about the parts of a description that are left out, if there are any, and name its origin."""
+    if omitted := list(dict.fromkeys(omitted)):
+        more = f"; and {len(omitted) - MAX_LISTED} more" if len(omitted) > MAX_LISTED else ""
+        message = f"{origin}: these parts are left out: {'; '.join(omitted[:MAX_LISTED])}{more}"
+        warn(ModelWarning(message, name=omitted[0], value=tuple(omitted)), stacklevel=4)
 
 
 def expand_xacro(file: str | os.PathLike[str]) -> str:
@@ -196,36 +177,7 @@ def parse_urdf(source: Source, omitted: list[str] | None = None) -> ElementTree.
         ModelError: The source is unreadable, or xacro.
     """
     unbound: list[str] = []
-    text, lines_before = "", 0
-    data: str | bytes = b""
-    if isinstance(source, str):
-        data = text = source.lstrip(BLANK)
-        lines_before = source[: len(source) - len(text)].count("\n")
-    try:
-        if isinstance(source, str) and not text:
-            message = "source: an empty text cannot be read as URDF; give the XML or the path of a file"
-            raise ModelError(message, name="source", value=source)
-        if text.startswith("<"):
-            origin = "the given text"
-        else:
-            if not isinstance(source, str | os.PathLike):
-                message = f"a URDF source is a text or a path, not {type(source).__name__}"
-                raise ModelError(message, name="source", value=source)
-            origin = f"file {os.fspath(source)!r}"
-            data = read_regular(source, INPUT_LIMITS.description_bytes)
-        tree = parse_xml(data, unbound)
-    except ElementTree.ParseError as error:
-        line, column = error.position
-        reason = str(error).split(": line")[0]
-        message = f"{origin} is not well-formed XML: {reason}, line {line + lines_before}, column {column}"
-        raise ModelError(message, name=origin, value=(line + lines_before, column)) from error
-    except OSError as error:
-        message = f"{origin} cannot be read: {error.strerror or error}; a URDF text begins with '<'"
-        raise ModelError(message, name=origin, value=source) from error
-    except ModelError:
-        raise
-    except (ValueError, LookupError) as error:
-        raise ModelError(f"{origin} cannot be read: {error}", name=origin, value=source) from error
+    tree, origin = parse_file(source, "URDF", unbound)
     namespace = tree.tag[: tree.tag.rfind("}") + 1]
     macros = [name.partition(":")[2] for name in unbound if name.startswith("xacro:")]
     for element in tree.iter():
@@ -240,9 +192,53 @@ def parse_urdf(source: Source, omitted: list[str] | None = None) -> ElementTree.
         omitted += [f"{name}, whose prefix is not declared" for name in unbound if not name.startswith("xacro:")]
         omitted += [f"<xacro:{tag}>, a macro that is not defined" for tag in macros]
     if tree.tag != "robot":
-        message = f"{origin} is not URDF: its root element is <{tree.tag}>, not <robot>"
+        hint = "; Robot.from_mjcf reads MJCF" if tree.tag in ("mujoco", "sdf") else ""
+        message = f"{origin} is not URDF: its root element is <{tree.tag}>, not <robot>{hint}"
         raise ModelError(message, name=origin, value=tree.tag, limit="robot")
     return tree
+
+
+def parse_file(source: Source, kind: str, unbound: list[str] | None = None) -> tuple[ElementTree.Element, str]:
+    """Return the root element of an XML text or file, and a description of the source for messages.
+
+    Args:
+        source: The text, recognised by its first character "<", or the path of a file.
+        kind: Name of the format, for messages.
+        unbound: As in `models.files.parse_xml`.
+
+    Raises:
+        ModelError: The source is unreadable or malformed.
+    """
+    text, lines_before = "", 0
+    data: str | bytes = b""
+    if isinstance(source, str):
+        data = text = source.lstrip(BLANK)
+        lines_before = source[: len(source) - len(text)].count("\n")
+    try:
+        if isinstance(source, str) and not text:
+            message = f"source: an empty text cannot be read as {kind}; give the XML or the path of a file"
+            raise ModelError(message, name="source", value=source)
+        if text.startswith("<"):
+            origin = "the given text"
+        else:
+            if not isinstance(source, str | os.PathLike):
+                message = f"a {kind} source is a text or a path, not {type(source).__name__}"
+                raise ModelError(message, name="source", value=source)
+            origin = f"file {os.fspath(source)!r}"
+            data = read_regular(source, INPUT_LIMITS.description_bytes)
+        return parse_xml(data, unbound), origin
+    except ElementTree.ParseError as error:
+        line, column = error.position
+        reason = str(error).split(": line")[0]
+        message = f"{origin} is not well-formed XML: {reason}, line {line + lines_before}, column {column}"
+        raise ModelError(message, name=origin, value=(line + lines_before, column)) from error
+    except OSError as error:
+        message = f"{origin} cannot be read: {error.strerror or error}; a {kind} text begins with '<'"
+        raise ModelError(message, name=origin, value=source) from error
+    except ModelError:
+        raise
+    except (ValueError, LookupError) as error:
+        raise ModelError(f"{origin} cannot be read: {error}", name=origin, value=source) from error
 
 
 def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str, omitted: list[str]) -> tuple[Link, ...]:

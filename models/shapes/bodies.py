@@ -22,7 +22,7 @@ from models.errors import ModelError, ModelWarning
 from models.robot.parts import CollisionShape, Joint, Link
 from models.robot.robot import Robot
 from models.shapes.covering import cover
-from models.shapes.hull import convex_hull
+from models.shapes.hull import cached_hull
 from models.shapes.mesh_files import find_mesh, read_mesh
 from models.shapes.shapes import CORNERS, SIDES, Box, Capsule, Cylinder, Mesh, Shape, Sphere, checked_shape
 
@@ -49,9 +49,9 @@ class LinkMesh:
     def hull(self) -> Mesh:
         """Convex hull of the mesh in link axes; coplanar points are first thickened to cubes of half-edge 1 um."""
         try:
-            return Mesh.around(convex_hull(self.points))
+            return Mesh.around(cached_hull(self.points))
         except ModelError:
-            return Mesh.around(convex_hull((self.points[:, None] + 1e-6 * CORNERS).reshape(-1, 3)))
+            return Mesh.around(cached_hull((self.points[:, None] + 1e-6 * CORNERS).reshape(-1, 3)))
 
 
 @dataclass(frozen=True, eq=False)

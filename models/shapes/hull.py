@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from models.checks import ROUNDING, Array, freeze
 from models.errors import ModelError
+from models.files import cache_key, load_value, source_version, store_value
 
 __all__ = ["gap_along", "is_box", "nearest_directions"]
 
@@ -69,6 +70,21 @@ def convex_hull(points: Array) -> Hull:
 
     Thread(target=compute, daemon=True).start()
     return hull.result()
+
+
+def cached_hull(points: Array) -> Hull:
+    """Return the convex hull of points as `convex_hull` does, from a file if it was computed before."""
+    key = cache_key(source_version(__name__), "hull", points)
+    try:
+        vertices, faces, normals, offsets = (np.asarray(part) for part in load_value(key))
+        known = Hull(freeze(vertices), faces.astype(np.intp), freeze(normals), freeze(offsets))
+        if vertices[faces].shape[1:] == (3, 3) and (vertices @ normals.T <= offsets).all():
+            return known
+    except (IndexError, TypeError, ValueError):  # no such file, or an invalid one
+        pass
+    hull = convex_hull(points)
+    store_value(key, [part.tolist() for part in (hull.vertices, hull.faces, hull.normals, hull.offsets)])
+    return hull
 
 
 def _convex_hull(points: Array) -> Hull:

@@ -20,7 +20,7 @@ from contextlib import suppress
 from io import BytesIO, TextIOWrapper
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 from urllib.parse import unquote, urlparse
 from xml.etree import ElementTree
 
@@ -249,8 +249,21 @@ def _read_stl_text(file: Path, data: bytes) -> Triangles:
 
 def _merge_vertices(corners: Array) -> Triangles:
     """Return a triangle mesh, given three rows of `corners` for each triangle; coincident corners are merged."""
-    vertices, faces = np.unique(corners, axis=0, return_inverse=True)
-    return without_colors(vertices, faces.reshape(-1, 3).astype(np.intp))
+    first, faces = distinct_rows(corners)
+    return without_colors(corners[first], faces.reshape(-1, 3))
+
+
+def distinct_rows(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first indices of the distinct rows of a table in ascending order, and for each row its distinct one.
+
+    `np.unique` with an axis does the same, but takes several times longer.
+    """
+    order = np.lexsort(rows.T[::-1])
+    ordered = rows[order]
+    is_new = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))[: len(rows)]
+    which = np.empty(len(rows), dtype=np.intp)
+    which[order] = np.cumsum(is_new) - 1
+    return order[is_new], which
 
 
 # ------------------------------------------------------------------------------------------------------------- OBJ

@@ -264,7 +264,7 @@ def _hand(ax: Any, example: CaptureExample) -> None:
 def _rates(ax: Any, example: CaptureExample) -> None:
     for k, times in enumerate(_timed(example)):
         rates = example.samples(("approach", "detumble")[k], len(times))["velocities"][:, :7]
-        options: dict[str, Any] = {} if k else {"ncols": 2, "fontsize": 6.0, "loc": "upper right"}
+        options: dict[str, Any] = {} if k else {"ncols": 2, "fontsize": 6.0, "loc": "upper right", "title": "joint"}
         joint_curves(ax, times, rates, [f"{i + 1}" for i in range(7)], **options)
     _grasp(ax, example)
     ax.set(title="joint velocities", xlabel="time, s", ylabel="rad/s")
@@ -274,4 +274,4 @@ def _grasp(ax: Any, example: CaptureExample) -> None:
     """A line at the time of the grasp."""
     at = _timed(example)[0][-1]
     ax.axvline(at, color="black", lw=0.6)
-    ax.text(at + 1.0, 0.98, "grasp", transform=ax.get_xaxis_transform(), fontsize=7, va="top")
+    ax.text(at + 1.0, 0.88, "grasp", transform=ax.get_xaxis_transform(), fontsize=7, va="top")

@@ -13,11 +13,12 @@ from ocp.problem import record_reader
 ROOT = Path(__file__).parents[2]
 MB = 2**20
 LIMITS = {
-    "URDF, SRDF": INPUT_LIMITS.description_bytes / MB,
+    "URDF, SRDF, MJCF": INPUT_LIMITS.description_bytes / MB,
     "elements and attributes of an XML document": INPUT_LIMITS.xml_elements,
     "STL": INPUT_LIMITS.mesh_bytes / MB,
     "OBJ, DAE, text of STL": INPUT_LIMITS.mesh_text_bytes / MB,
     "triangles of a mesh": INPUT_LIMITS.mesh_triangles,
+    "bodies, joints, geoms and sites of an MJCF file": INPUT_LIMITS.scene_nodes,
     "waypoints, trajectory (CSV, JSON, YAML), robot program, G-code": INPUT_LIMITS.text_bytes / MB,
     "lines of a text": INPUT_LIMITS.text_lines,
     "characters of a line": INPUT_LIMITS.line_characters,

@@ -17,6 +17,7 @@ from models.spatial import (
     expression,
     force_cross,
     force_transform,
+    least_rotation,
     motion_cross,
     motion_transform,
     quaternion_about,
@@ -26,6 +27,7 @@ from models.spatial import (
     rotation,
     rotation_from_quaternion,
     rotation_from_rpy,
+    rotation_matrices,
     skew,
     solve_spd,
     spatial_inertia,
@@ -298,3 +300,29 @@ def test_determinant_of_a_singular_matrix_is_finite_and_zero(seed: int, size: in
     matrix[-1] = matrix[0]
     assert float(determinant(matrix)) == 0.0
     assert float(determinant(np.zeros((size, size)))) == 0.0
+
+
+@given(seeds)
+def test_rotation_matrices_are_those_of_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vectors = rng.normal(size=(2, 4, 3)) * 10.0 ** rng.integers(-12, 2, (2, 4, 1))
+    expected = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    np.testing.assert_allclose(rotation_matrices(vectors).reshape(-1, 3, 3), expected, atol=1e-14)
+    np.testing.assert_array_equal(rotation_matrices(np.zeros(3)), np.eye(3))
+
+
+@given(seeds, st.floats(-16, 0), st.booleans())
+def test_the_least_rotation_turns_one_vector_to_another_about_the_axis_across(
+    seed: int, size: float, back: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    first, step = rng.normal(size=(2, 3))
+    second = (-first if back else first) + 10.0**size * step
+    first, second = (vector / np.linalg.norm(vector) for vector in (first, second))
+    for end in (second, -first, first):
+        turn = least_rotation(first, end)
+        np.testing.assert_allclose(turn @ first, end, atol=1e-14)
+        np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-14)
+        assert np.linalg.det(turn) == pytest.approx(1.0)
+        angle = np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())
+        assert angle == pytest.approx(np.arctan2(np.linalg.norm(np.cross(first, end)), first @ end), abs=1e-7)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from models import ModelError, Path, SmoothPath, smooth
 from models.checks import NOT_NUMBERS, Array, ArrayInput, floats
-from models.paths.path import NO_ROTATION, Reversal
+from models.paths.path import NO_ROTATION, Reversal, fit_splines
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule import LineLimits, Schedule, schedule
 
@@ -73,10 +73,16 @@ class Cut:
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> SmoothPath:
         """Return the path of the cut with rounded corners; the arguments are those of `Program.smooth`."""
+        return self._fitted(tolerance, options)[0]
+
+    def _fitted(self, tolerance: float | None, options: dict[str, Any]) -> tuple[SmoothPath, Array]:
+        """Return the smooth path of the cut, and the feed on each of its segments, m/s."""
         deviation = np.fmin(self.tolerances[:-1], self.tolerances[1:])
         if tolerance is not None:
             deviation = np.fmin(deviation, require.positive("tolerance", tolerance))
-        return smooth_path(self.path, np.where(np.isnan(deviation), DEFAULT_TOLERANCE_M, deviation), options)
+        deviation = np.where(np.isnan(deviation), DEFAULT_TOLERANCE_M, deviation)
+        path, first = smooth_path(self.path, deviation, options, np.flatnonzero(np.diff(self.feeds)) + 1)
+        return path, self.feeds[first]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,11 +190,12 @@ class Program:
         return Program(tuple(sections), start, self.notes)
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> tuple[SmoothPath, ...]:
-        """Return the paths of all cuts with rounded corners.
+        """Return the paths of all cuts with rounded corners; splines replace runs of short segments of equal feed.
 
         Args:
-            tolerance: Largest deviation from the path, m. A smaller tolerance in the file (G64 P) takes precedence.
-                None: that of the file, or 0.05 mm.
+            tolerance: Largest deviation from the path, m. A smaller tolerance in the file (G64 P) takes precedence; the
+                smallest one of a cut applies to its splines, see `models.paths.fit_splines`. None: that of the file, or
+                0.05 mm.
             options: `kind`, `shape`, `overlap` of models.smooth.
 
         Raises:
@@ -219,8 +226,8 @@ class Program:
         schedules: list[Schedule | None] = []
         for each in self.sections:
             if isinstance(each, Cut):
-                path = each.smooth(tolerance, **options)
-                schedules.append(schedule(path, replace(limits, speed=np.minimum(each.feeds, fastest))))
+                path, feeds = each._fitted(tolerance, options)
+                schedules.append(schedule(path, replace(limits, speed=np.minimum(feeds, fastest))))
             elif isinstance(each, Rapid):
                 line = smooth(Path.through([each.start, each.end]), DEFAULT_TOLERANCE_M)
                 schedules.append(schedule(line, replace(limits, speed=rapid_speed)))
@@ -250,14 +257,23 @@ def _transform(points: Array, position: ArrayInput, orientation: ArrayInput) -> 
     return np.asarray(origin + points @ np.array([np.asarray(line.end) - origin for line in frame]))
 
 
-def smooth_path(path: Path, deviation: ArrayInput, options: dict[str, Any]) -> SmoothPath:
-    """Round the corners of a path within a deviation; raise ProblemError for errors of `models.smooth`."""
+def smooth_path(
+    path: Path, deviation: ArrayInput, options: dict[str, Any], corners: ArrayInput | None = None
+) -> tuple[SmoothPath, NDArray[np.intp]]:
+    """Fit splines to short segments of a path and round its corners within a deviation, see `models.paths.fit_splines`.
+
+    Return also the index of the first segment that each segment of the result replaces.
+
+    Raises:
+        ProblemError: As `models.smooth`.
+    """
     known = {"kind", "shape", "overlap"}
     if unknown := [name for name in options if name not in known]:
         message = f"smooth: unknown option {unknown[0]!r}; known: {', '.join(sorted(known))}"
         raise ProblemError(message, name=unknown[0], limit=tuple(sorted(known)))
     try:
-        return smooth(path, deviation=deviation, **options)
+        fitted, first, left = fit_splines(path, deviation, corners=corners)
+        return smooth(fitted, deviation=left, **options), first
     except ModelError as error:
         raise ProblemError(str(error), **vars(error)) from error
 

@@ -28,7 +28,8 @@ from models import ModelError, Path, SmoothPath
 from models.checks import ROUNDING, Array, short_repr, warn_of_degrees, warn_of_millimetres
 from models.paths import Line, split_at_reversals
 from models.paths.path import Reversal
-from models.paths.segments import SHORTEST_SEGMENT, product, rotation_vector
+from models.paths.segments import SHORTEST_SEGMENT, rotation_vector
+from models.paths.splines import product
 from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smooth_path
 from ocp.app.files.safe_files import FileName, is_number, line_error, read_lines, split_cells
 from ocp.errors import ProblemError, require
@@ -142,17 +143,17 @@ class Waypoints:
     def smooth(
         self, tolerance: float = DEFAULT_TOLERANCE_M, *, reversal: Reversal | None = None, **options: Any
     ) -> SmoothPath:
-        """Return the path through the waypoints with rounded corners.
+        """Return the path through the waypoints with rounded corners; splines replace runs of short lines.
 
         Args:
-            tolerance: Largest deviation from the path, m.
+            tolerance: Largest deviation from the path, m; see `models.paths.fit_splines` for the splines.
             reversal: As in `path`.
             options: `kind`, `shape`, `overlap` of models.smooth.
 
         Raises:
             ProblemError: As `path`; the tolerance is not positive; an option is unknown.
         """
-        return smooth_path(self.path(reversal=reversal), require.positive("tolerance", tolerance), options)
+        return smooth_path(self.path(reversal=reversal), require.positive("tolerance", tolerance), options)[0]
 
     def _check_still(self, last: int, i: int) -> None:
         """Raise ProblemError if the tool turns between two waypoints without a change of position."""

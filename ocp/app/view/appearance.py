@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from models import CollisionShape, HalfSpace, Machine, ModelError, MovingObstacle, Robot, link_frames
 from models.checks import Array
 from models.shapes.hull import convex_hull
-from models.shapes.mesh_files import Triangles, find_mesh, join_meshes, read_painted_mesh, without_colors
+from models.shapes.mesh_files import Triangles, distinct_rows, find_mesh, join_meshes, read_painted_mesh, without_colors
 from models.shapes.shapes import Shape
 from ocp.audit.clearance import separation_frames
 from ocp.motion.plan import Plan
@@ -249,12 +249,12 @@ def _few(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Tr
 def _coarser(mesh: Triangles, size: float) -> Triangles:
     """Merge the vertices of a mesh that lie in one grid cell into their mean, and remove degenerate faces."""
     cells = np.floor(mesh.vertices / size).astype(np.int64)
-    _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    cell = cell.ravel()
+    _, cell = distinct_rows(cells)
+    counts = np.bincount(cell)
     middles = np.stack([np.bincount(cell, column) for column in mesh.vertices.T], axis=1) / counts[:, None]
     faces = cell[mesh.faces]
     proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
-    _, first = np.unique(np.sort(faces[proper], axis=1), axis=0, return_index=True)
+    first, _ = distinct_rows(np.sort(faces[proper], axis=1))
     distinct = np.flatnonzero(proper)[np.sort(first)]
     return Triangles(middles, faces[distinct], mesh.colors[distinct])
 
@@ -264,18 +264,18 @@ def _parts(surfaces: list[tuple[str, Triangles]]) -> list[Part]:
     parts = []
     for link in dict.fromkeys(name for name, _ in surfaces):
         mesh = join_meshes([triangles for name, triangles in surfaces if name == link])
-        colors, color_index = np.unique(np.round(mesh.colors, 3), axis=0, return_inverse=True)
-        for k, color in enumerate(colors):
-            faces = mesh.faces[color_index.ravel() == k]
-            if len(faces):
-                parts.append(part_of(link, mesh.vertices, faces, color))
+        colors = np.round(mesh.colors, 3)
+        first, color_index = distinct_rows(colors)
+        for k, color in enumerate(colors[first]):
+            parts.append(part_of(link, mesh.vertices, mesh.faces[color_index == k], color))
     return parts
 
 
 def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> Part:
     """Return a surface as a Part, with vertex normals that are averaged over adjacent faces except across creases."""
-    places, where = np.unique(np.round(vertices, 6) + 0.0, axis=0, return_inverse=True)
-    faces = where.ravel()[faces]
+    places = np.round(vertices, 6) + 0.0
+    first, where = distinct_rows(places)
+    places, faces = places[first], where[faces]
     one, two, three = (places[faces[:, k]] for k in range(3))
     areas = np.cross(two - one, three - one)
     length = np.linalg.norm(areas, axis=1)
@@ -296,8 +296,10 @@ def part_of(link: str, vertices: Array, faces: NDArray[np.intp], color: Any) -> 
     exclusive = around > SURFACE_STYLE.max_neighbours
     sums[exclusive] = units[np.flatnonzero(exclusive) // 3]
     normals = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-300)[:, None]
-    fine = np.round(normals * 100).astype(np.int64)
-    _, first, which = np.unique(np.column_stack([corners, fine]), axis=0, return_index=True, return_inverse=True)
+    keys = corners.astype(np.int64)
+    for column in np.round(normals.T * 100).astype(np.int64) + 100:
+        keys = 201 * keys + column
+    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
     color = tuple(float(value) for value in color)
     assert len(color) == 4
     return Part(link, places[corners[first]], normals[first], which.reshape(-1, 3).astype(np.intp), color)

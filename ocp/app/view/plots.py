@@ -56,7 +56,10 @@ def draw_curves(
     """Return an SVG with position, velocity and acceleration of every joint over time, with their limits and faults."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(PICTURE_STYLE.width, 0.4 + 1.15 * len(names)), layout="constrained")
+    width, height = PICTURE_STYLE.width, 0.4 + 1.15 * len(names)
+    figure = Figure(figsize=(width, height))
+    # margins in inches, wide enough for the labels; a constrained layout takes as long as all else
+    figure.subplots_adjust(0.85 / width, 0.45 / height, 1 - 0.08 / width, 1 - 0.3 / height, wspace=0.5, hspace=0.22)
     draw_joints(figure, {"": motion}, bounds, names=names, units=units, faults=faults)
     return as_svg(figure)
 

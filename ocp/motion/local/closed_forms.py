@@ -23,12 +23,11 @@ from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from models.checks import Array
 from models.cts.trigonometric import Harmonics, polish, roots, square_of_first_harmonic
-from models.spatial import Frame, cross
+from models.spatial import Frame, cross, rotation_matrices
 from ocp.motion.local.chain import Chain, Motion, Solutions, SymbolicAxis, compose, inverse
 from ocp.problem.values import Sampler
 
@@ -114,8 +113,7 @@ class PoseSolver(ABC):
         for _ in range(NEARBY.pairs):
             turn, shift = NEARBY.distance * rng.normal(size=(2, 3))
             for sign in (1.0, -1.0):
-                rotation = scipy.spatial.transform.Rotation.from_rotvec(sign * turn).as_matrix()
-                yield Motion(tips.turn @ rotation, tips.shift + sign * self.chain.size * shift)
+                yield Motion(tips.turn @ rotation_matrices(sign * turn), tips.shift + sign * self.chain.size * shift)
 
     def solutions(self, positions: Array, rotations: Array, redundant: Array) -> tuple[NDArray[np.intp], Array]:
         """Return the pose indices (K,) and joint positions (K, n) of all isolated IK solutions; see `solve`."""

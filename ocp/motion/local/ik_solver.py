@@ -8,12 +8,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from models import FixedBase, Machine, ModelError
 from models.checks import Array, ArrayInput, real
 from models.machines.machine import with_tip
+from models.spatial import least_rotation, rotation_matrices
 from ocp.errors import ProblemError, require
 from ocp.motion.local.arm_solver import ARM, ArmSolver, arm_solver, sample_shares
 from ocp.motion.local.chain import TURN, Chain
@@ -250,9 +250,7 @@ class PreparedArm:
         if (
             self.free is ToolFreedom.ROTATION
         ):  # any rotation will do, but not one at which the added joints are singular
-            rotations = np.tile(
-                scipy.spatial.transform.Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix(), (count, 1, 1)
-            )
+            rotations = np.tile(rotation_matrices(np.array([0.3, 0.5, 0.7])), (count, 1, 1))
         redundant = self.arm.redundant_positions(solver, shares[:, : len(solver.redundant)])
         if self.sampled_angles:
             rotations = (rotations[:, None] @ self._rotations(shares[:, len(solver.redundant) :])).reshape(-1, 3, 3)
@@ -286,16 +284,14 @@ class PreparedArm:
 
         `shares` (S, 1) or (S, 3) are fractions of full turns of roll and azimuth, and of the area of the cone's cap.
         """
-        rolled = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, :1] * self.tool_axis)
+        rolled = rotation_matrices(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
-            return np.asarray(rolled.as_matrix())
+            return rolled
         across = np.eye(3)[np.abs(self.tool_axis).argmin()]
         across = np.cross(self.tool_axis, across) / np.linalg.norm(np.cross(self.tool_axis, across))
-        azimuths = scipy.spatial.transform.Rotation.from_rotvec(TURN * shares[:, 1:2] * self.tool_axis)
+        azimuths = rotation_matrices(TURN * shares[:, 1:2] * self.tool_axis)
         tilts = np.arccos(1 - shares[:, 2:3] * (1 - np.cos(self.within)))  # uniform on the cap of the sphere
-        return np.asarray(
-            (scipy.spatial.transform.Rotation.from_rotvec(tilts * azimuths.apply(across)) * rolled).as_matrix()
-        )
+        return rotation_matrices(tilts * (azimuths @ across)) @ rolled
 
 
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
@@ -363,9 +359,7 @@ class IkBranches:
         """Return a rotation of the tip that satisfies the task. Shape (3, 3)."""
         if self._task.direction is not None:
             axis, direction = np.array(self._task.tool_axis), targets[6:9] / np.linalg.norm(targets[6:9])
-            return np.asarray(
-                scipy.spatial.transform.Rotation.align_vectors(direction[None], axis[None])[0].as_matrix()
-            )
+            return least_rotation(axis, direction)
         if self._task.orientation is not None and set(self._task.chosen) & set(ANGULAR):
             return np.asarray(targets[6:15].reshape(3, 3).T)
         return self.arm.arm.chain.rotation

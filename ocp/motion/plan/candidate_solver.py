@@ -29,8 +29,7 @@ from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import cost_of_motion, solve_with_accelerations
 from ocp.motion.plan.candidate_queue import Solver
-from ocp.motion.plan.singular import MotionSample, describe_shortfall, is_nearly_singular, limit_reason
-from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage, collision_reason
+from ocp.motion.result.candidate import Candidate, MotionSample, Reason, Rejection, Seed, Stage, collision_reason
 from ocp.motion.result.plan import audit_key
 from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan, parts_of
@@ -115,7 +114,8 @@ class CandidateSolver(Solver):
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
         """Return whether to relax the tasks, because the task Jacobian is nearly singular along a local motion."""
-        return self._can_relax and is_nearly_singular(self.motion.stretches, local)
+        samples = map(MotionSample.of_local, self.motion.stretches, local)
+        return self._can_relax and any(sample.is_nearly_singular for sample in samples)
 
     @property
     def _can_relax(self) -> bool:
@@ -136,7 +136,7 @@ class CandidateSolver(Solver):
         solution = candidate.solution
         if solution is not None and candidate.seed.relaxed:
             samples = self._motion_samples(solution)
-        return limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
+        return Reason.of_shortfall(self.request, samples)
 
     def _turned_over(self, solution: Solution) -> Reason | None:
         """Return a rejection reason if the tool at a free start is turned by more than 90 degrees from its target."""
@@ -231,7 +231,7 @@ class CandidateSolver(Solver):
         worst = audit.failures[0]
         if candidate.seed.relaxed and not audit.feasible:
             samples = self._motion_samples(solution)
-            reason = limit_reason(self.request, samples) or describe_shortfall(self.request, samples)
+            reason = Reason.of_shortfall(self.request, samples)
             return candidate.with_rejection(replace(reason, kind=Rejection.AUDIT))
         words = f"{worst.name} {worst.value:.2g}"
         return candidate.with_rejection(

@@ -85,7 +85,7 @@ def _check_request(request: GoalRequest) -> GoalTask:
     """
     machine = require.instance("machine", request.machine, FixedBase)
     limits = Limits() if request.limits is None else require.instance("limits", request.limits, Limits)
-    bounds = limits.bounds(machine, ("velocity",))
+    bounds = limits.bounds(machine)  # the problem that is declared warns of unknown limits
     unlimited = np.isinf([bounds.velocity, bounds.acceleration, bounds.jerk, bounds.torque]).all(axis=0)
     bounds = bounds._replace(velocity=np.where(unlimited, request.settings.unlimited_rate, bounds.velocity))
     if request.horizon is not None:

@@ -29,6 +29,7 @@ from ocp.motion.search.joint_space import all_turns, turning_joints, whole_turns
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
+from ocp.motion.tasks.targets import resolving_times
 from ocp.motion.tasks.tip_task import TipTask
 
 __all__ = [
@@ -48,7 +49,7 @@ class PlannerSettings:
 
     Attributes:
         ik_starts: Number of random starts of inverse kinematics.
-        local_steps: Number of time steps of a local motion, besides the breaks of its tasks.
+        local_steps: Least number of time steps of a local motion, besides those that its tasks need.
         dampings: Dampings of local motions, relative to the singular values; the next is tried if no motion tracks.
         min_intervals: Least number of mesh intervals.
         coarse_degree, fine_degree: Degrees of collocation; the fine one represents a smooth segment to rounding.
@@ -289,13 +290,13 @@ def _track_within(request: PlanRequest, configurations: Array, lower: Array, upp
                 joints = _joints_at_new_poses(request, stretch, base, joints, lower, upper)
                 if request.stretches[len(motions) - 1].equations is None:
                     motions[-1] = motions[-1].straight_to(joints)
-            steps = int(np.ceil(settings.local_steps * stretch.duration / request.horizon))
-            grid = np.linspace(stretch.begin, stretch.end, max(steps, settings.min_intervals) + 1)
-            times, equations = np.union1d(grid, stretch.nodes), stretch.equations
-            if equations is None:
+            steps = max(int(np.ceil(settings.local_steps * stretch.duration / request.horizon)), settings.min_intervals)
+            times = np.union1d(np.linspace(stretch.begin, stretch.end, steps + 1), stretch.nodes)
+            if (equations := stretch.equations) is None:
                 motions.append(LocalMotion.stationary(times, base, joints))
             else:
                 options: dict[str, Any] = {"weights": request.weights, "damping": damping}
+                times = resolving_times(equations, times)
                 motions.append(track_tasks(equations, joints, base, times, lower=lower, upper=upper, **options))
             base, joints = motions[-1].base[:, -1], motions[-1].joints[:, -1]
         if min(largest_pose_errors(motions)) <= REACH_TOLERANCE:

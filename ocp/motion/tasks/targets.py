@@ -16,9 +16,9 @@ from ocp.curves import lagrange
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask, target_size
 from ocp.problem.values import Sampler
-from ocp.tolerances import LIMIT_SHARE
+from ocp.tolerances import LIMIT_SHARE, ROUNDING_SHARE
 
-__all__ = ["Target", "required_nodes", "targets_along", "tip_poses"]
+__all__ = ["Target", "required_nodes", "resolving_times", "targets_along", "tip_poses"]
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,15 @@ class NodeSettings:
         samples: Samples between two breaks at which the targets are compared with their interpolants.
         pose_error: Largest error of an interpolated position, rotation matrix or direction, m and 1.
         rate_error: Largest error of an interpolated velocity, relative to its largest value.
+        chord_error: Largest distance of a position, rotation matrix or direction from the chord of a time step of a
+            local motion, m and 1. It is small compared with an arm, so that two Newton steps correct the step's error.
     """
 
     points: int = 7
     samples: int = 4
     pose_error: float = 1e-6
     rate_error: float = LIMIT_SHARE / 2
+    chord_error: float = 1e-3
 
 
 NODES = NodeSettings()
@@ -141,16 +144,46 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
     return breaks[sorted(ends)]
 
 
-def _largest_errors(equations: TaskEquations, values: Array) -> Array:
-    """Return the permitted interpolation error of each target value, from samples (M, size). Shape (size,)."""
-    largest, at = np.full(values.shape[1], NODES.pose_error), 0
-    for bound in equations.bound:
-        task = bound.task
+def resolving_times(equations: TaskEquations, times: Array) -> Array:
+    """Return given times and further ones, between which the target poses are nearly linear: `NODES.chord_error`.
+
+    Args:
+        equations: Equations of the tasks.
+        times: Increasing times, s. Shape (k,), k >= 2.
+    """
+    time = ca.MX.sym("time")
+    sampler = Sampler([time], [equations.target_function()(time)])
+    poses = [row for pose, _ in _target_rows(equations) for row in range(pose.start, pose.stop)]
+    shortest = ROUNDING_SHARE * (times[-1] - times[0])
+    while poses:
+        middle = (times[:-1] + times[1:]) / 2
+        ends, inside = (sampler(part[:, None])[0][:, poses] for part in (times, middle))
+        bends = np.abs(inside - (ends[:-1] + ends[1:]) / 2).max(axis=1) > NODES.chord_error
+        bends &= np.diff(times) > shortest
+        if not bends.any():
+            break
+        times = np.union1d(times, middle[bends])
+    return times
+
+
+def _target_rows(equations: TaskEquations) -> list[tuple[slice, slice]]:
+    """Return the rows of each position, orientation and direction among the target values, and those of its rate."""
+    rows, at = list[tuple[slice, slice]](), 0
+    for task in (bound.task for bound in equations.bound):
+        if task.velocity is not None:
+            at += task.size
         for track, size in ((task.position, 3), (task.orientation, 9), (task.direction, 3)):
             if track is not None:
-                rates = slice(at + size, at + size + 3)
-                largest[rates] = NODES.rate_error * np.linalg.norm(values[:, rates], axis=1).max()
+                rows.append((slice(at, at + size), slice(at + size, at + size + 3)))
                 at += size + 3
+    return rows
+
+
+def _largest_errors(equations: TaskEquations, values: Array) -> Array:
+    """Return the permitted interpolation error of each target value, from samples (M, size). Shape (size,)."""
+    largest = np.full(values.shape[1], NODES.pose_error)
+    for _, rates in _target_rows(equations):
+        largest[rates] = NODES.rate_error * np.linalg.norm(values[:, rates], axis=1).max()
     return largest
 
 

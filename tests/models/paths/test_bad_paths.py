@@ -5,7 +5,17 @@ from __future__ import annotations
 import pytest
 
 from models import Arc, Helix, Line, Path, SmoothPath, smooth
-from models.paths import gamma, gauss_newton, march, path_function, predictor_corrector, rest_to_rest, turn_function
+from models.paths import (
+    Spline,
+    fit_splines,
+    gamma,
+    gauss_newton,
+    march,
+    path_function,
+    predictor_corrector,
+    rest_to_rest,
+    turn_function,
+)
 from tests.bad_values import (
     CHOICE,
     COUNT,
@@ -91,6 +101,23 @@ CASES = [
             "sweep": POSITIVE | NOTHING,
             "rise": FINITE | NOTHING,
             "start_orientation": QUATERNION,
+        },
+    ),
+    Case(
+        "Spline",
+        Spline,
+        {"coefficients": [[[0.0, 0, 0], [1, 0, 0], *[[0, 0, 0]] * 4]]},
+        {"coefficients": array(1, 6, 3), "references": array(1, 4), "turns": array(1, 6, 3)},
+    ),
+    Case(
+        "fit_splines",
+        fit_splines,
+        {"path": CORNER, "deviation": 0.01},
+        {
+            "path": INSTANCE,
+            "deviation": but(POSITIVE, "inf") | NOTHING | {"two": [0.1, 0.1]},
+            "angle": POSITIVE | NOTHING,
+            "corners": {"high": [9], "low": [-1], "half": [0.5], "word": "a"},
         },
     ),
     Case(

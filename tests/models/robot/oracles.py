@@ -60,6 +60,11 @@ def mujoco_model(
     robot: Robot, ground: str = "", foot: str = "", options: str = "", *, fixed: bool = False
 ) -> mujoco.MjModel:
     """The robot on a free joint, or `fixed`. `ground` and `foot` are geoms of the world and of the root, as MJCF."""
+    return mujoco.MjModel.from_xml_string(mjcf_text(robot, ground, foot, options, fixed=fixed))
+
+
+def mjcf_text(robot: Robot, ground: str = "", foot: str = "", options: str = "", *, fixed: bool = False) -> str:
+    """The same as text."""
 
     def numbers(values: Array) -> str:
         return " ".join(repr(float(value)) for value in np.ravel(values))
@@ -86,7 +91,7 @@ def mujoco_model(
 
     root = f'<body name="{robot.root}">{body(robot.root, foot if fixed else "<freejoint/>" + foot)}</body>'
     settings = f'<compiler angle="radian" boundmass="0"/><option {options}/>'
-    return mujoco.MjModel.from_xml_string(f"<mujoco>{settings}<worldbody>{ground}{root}</worldbody></mujoco>")
+    return f"<mujoco>{settings}<worldbody>{ground}{root}</worldbody></mujoco>"
 
 
 def mujoco_dynamics(

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from models import ModelError, Robot, expand_xacro, named_states
+from models import ModelError, Robot, excluded_pairs, expand_xacro, named_states
 from tests.bad_values import (
     CHOICE,
     INSTANCE,
@@ -72,6 +72,19 @@ STATES = Case(
     {"srdf": {name: bad for name, bad in SOURCE.items() if name != "no link"}, "robot": INSTANCE},
 )
 
+MJCF = """<mujoco><worldbody><body name="tool"><joint name="turn"/><geom size="1"/></body></worldbody>
+<contact><exclude body1="world" body2="tool"/></contact></mujoco>"""
+MJCF_SOURCE = {name: bad for name, bad in SOURCE.items() if name != "no link"} | {"list": [MJCF], "URDF": URDF}
+MUJOCO = [
+    Case(
+        "from_mjcf",
+        Robot.from_mjcf,
+        {"source": MJCF},
+        {**{key: bad for key, bad in OPTIONS.bad.items() if key != "inertia"}, "source": MJCF_SOURCE},
+    ),
+    Case("excluded_pairs", excluded_pairs, {"source": MJCF}, {"source": MJCF_SOURCE}),
+]
+
 
 def expanded(**options: Any) -> str:
     with TemporaryDirectory() as folder:
@@ -124,12 +137,12 @@ TEXTS = {
 }
 
 
-@pytest.mark.parametrize("case", good_calls([OPTIONS, STATES, XACRO]))
+@pytest.mark.parametrize("case", good_calls([OPTIONS, STATES, XACRO, *MUJOCO]))
 def test_valid_values_are_accepted(case: Case) -> None:
     case.call(**case.good)
 
 
-@pytest.mark.parametrize(("case", "argument"), panel([OPTIONS, STATES, XACRO]))
+@pytest.mark.parametrize(("case", "argument"), panel([OPTIONS, STATES, XACRO, *MUJOCO]))
 def test_bad_options_are_refused_by_name(case: Case, argument: str) -> None:
     assert_refused(case, argument)
 

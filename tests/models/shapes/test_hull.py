@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import ModelError
+from models import files as cache
 from models.shapes import hull as hull_module
-from models.shapes.hull import convex_hull
+from models.shapes.hull import cached_hull, convex_hull
 
 CUBE = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
 seeds = st.integers(0, 2**32 - 1)
@@ -93,3 +96,25 @@ def test_ctrl_c_ends_the_wait_for_a_hull_that_is_still_computed(monkeypatch: pyt
     finally:
         signal.signal(signal.SIGINT, before)
         ended.set()
+
+
+@pytest.mark.parametrize("contents", [None, "", "{}", "[[], [], [], []]", "[1, 2, 3, 4]"])
+def test_a_cached_hull_is_the_computed_one(
+    contents: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    expected = convex_hull(points)
+    for _ in range(2):
+        result = cached_hull(points)
+        for name in ("vertices", "faces", "normals", "offsets"):
+            np.testing.assert_array_equal(getattr(result, name), getattr(expected, name))
+        (file,) = tmp_path.rglob("*.json")
+        if contents is not None:
+            cache.store_value(file.stem, json.loads(contents or "null"))
+    with monkeypatch.context() as patch:
+        patch.setattr(hull_module, "convex_hull", None)
+        if contents is None:  # the second call computed nothing
+            cached_hull(points)
+    with pytest.raises(ModelError, match="coplanar"):
+        cached_hull(points * [1.0, 1.0, 0.0])

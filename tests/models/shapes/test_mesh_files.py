@@ -8,16 +8,20 @@ import sys
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from models import ModelError
 from models.checks import Array
 from models.files import INPUT_LIMITS
 from models.shapes import mesh_files
-from models.shapes.mesh_files import Faces, find_mesh, read_mesh, read_painted_mesh
+from models.shapes.mesh_files import Faces, distinct_rows, find_mesh, read_mesh, read_painted_mesh
 from tests.models.robot.pinocchio_robots import collection
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.2, 0.0], [0.1, 0.1, 0.5]])
@@ -414,3 +418,15 @@ def test_meshes_of_real_robots_have_the_size_that_coal_reads(robot: str) -> None
         other = np.array(coal.MeshLoader().load(str(file)).vertices())
         np.testing.assert_allclose(vertices.min(axis=0), other.min(axis=0), atol=1e-6, err_msg=str(file))
         np.testing.assert_allclose(vertices.max(axis=0), other.max(axis=0), atol=1e-6, err_msg=str(file))
+
+
+KINDS_OF_ROWS, SHAPES_OF_ROWS = st.sampled_from([float, np.int64]), st.tuples(st.integers(0, 30), st.integers(1, 4))
+
+
+@given(hnp.arrays(KINDS_OF_ROWS, SHAPES_OF_ROWS, elements=st.integers(-2, 2)))
+def test_distinct_rows_are_those_of_numpy(rows: Any) -> None:
+    first, which = distinct_rows(rows)
+    expected, index, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    np.testing.assert_array_equal(rows[first], expected)
+    np.testing.assert_array_equal(first, index)
+    np.testing.assert_array_equal(which, inverse.ravel())

@@ -126,6 +126,20 @@ def test_the_tolerance_of_the_file_and_of_the_caller_both_hold(program: Program)
     assert program.smooth(kind="cubic", shape=3.0)[0].kind == "cubic"
 
 
+def test_a_spline_has_one_feed(tmp_path: File) -> None:
+    angle = np.linspace(0, np.pi, 601)
+    lines = [f"G1 X{50 * np.cos(a):.3f} Y{50 * np.sin(a):.3f} F{600 if a < np.pi / 2 else 1200}" for a in angle]
+    (tmp_path / "arc.nc").write_text("\n".join(["G21 G90", "G0 X50 Y0", *lines, "M2"]))
+    timed = read_gcode(tmp_path / "arc.nc").schedule(LineLimits(1.0, 2.0, 100.0))
+    motion = timed.at(np.linspace(0, timed.duration, 20_001))
+    cut = np.array([isinstance(each, Cut) for each in timed.program.sections])[motion.section]
+    assert motion.speed[cut & (motion.position[:, 0] > 1e-4)].max() == pytest.approx(0.01, rel=1e-6)
+    assert motion.speed[cut].max() == pytest.approx(0.02, rel=1e-6)
+    schedule = timed.schedules[1]
+    assert schedule is not None
+    assert len(schedule.path.bounds) < 30
+
+
 @settings(max_examples=20)
 @given(seeds)
 def test_a_program_that_is_placed_is_the_same_elsewhere(program: Program, seed: int) -> None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import pathlib
 import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from models import FixedBase, Machine, Mimic, ModelWarning, Robot, planar_chain
+from models import FixedBase, Machine, Mimic, ModelWarning, Path, Robot, planar_chain, smooth
 from models.spatial import quaternion_from_rotation
 from ocp import (
     Collocation,
@@ -24,12 +26,16 @@ from ocp import (
     TipTask,
     Waypoints,
     inverse_kinematics,
+    joint_path,
     minimum_velocity_problem,
     plan,
     solve,
 )
+from ocp.app.check.verdict import check_trajectory
+from ocp.app.files import read_trajectory
 from ocp.motion.builders.dynamics_plan import solve_dynamics
 from ocp.motion.result.segmented_plan import SegmentedPlan
+from ocp.motion.schedule import JointLimits, LineLimits, schedule
 from tests.families import some
 from tests.ocp.motion.tasks.space_tasks import UR5_START, ur5
 
@@ -79,6 +85,28 @@ def moved(machine: FixedBase, **options: Any) -> Any:
     return solution.cost
 
 
+def move_to_goal(machine: FixedBase, **options: Any) -> Any:
+    return plan(machine, Goal(joints=END), start=START, **options).cost
+
+
+def check_plan(machine: FixedBase) -> Any:
+    with TemporaryDirectory() as folder:
+        file = pathlib.Path(folder) / "plan.csv"
+        plan(machine, task(machine), start=START, limits=Limits(velocity=np.inf)).write_csv(file)
+        check = check_trajectory(machine, read_trajectory(file))
+    assert not check.faults
+    return [row.name for row in check.rows]
+
+
+def schedule_plan(machine: FixedBase) -> Any:
+    """A plan along a path becomes a joint path, whose timing obeys the velocity limits of the robot."""
+    path = smooth(Path.through([(0.5, 0.5, 0.0), (0.4, 0.6, 0.0), (0.2, 0.6, 0.0)]), deviation=0.01)
+    result = plan(machine, TipTask.along(path, 0.05, rows=(3, 4)), limits=Limits(velocity=np.inf))
+    joints = JointLimits(velocity=machine.robot.velocity)
+    limits = LineLimits(0.1, 2.0, 50.0, joints=joints)
+    return schedule(path, limits, joints=joint_path(machine, result, path)).duration
+
+
 REQUESTS: dict[str, tuple[Callable[[FixedBase], Any], set[str]]] = {
     "start": (partial(planned, search="start", start=START), {"velocity"}),
     "configurations": (planned, {"velocity"}),
@@ -90,6 +118,13 @@ REQUESTS: dict[str, tuple[Callable[[FixedBase], Any], set[str]]] = {
     "no torques": (partial(planned, start=START, limits=Limits(torque=np.inf)), {"velocity"}),
     "dynamics": (moved, {"velocity", "torque"}),
     "dynamics, own": (partial(moved, limits=Limits(velocity=5.0, torque=200.0)), set()),
+    "goal": (move_to_goal, {"velocity"}),
+    "goal in least time": (
+        partial(move_to_goal, limits=Limits(acceleration=30.0), cost=Cost(velocity=0.0, time=1.0)),
+        {"velocity", "torque"},
+    ),
+    "check": (check_plan, set()),
+    "schedule": (schedule_plan, set()),
     "pieces": (plan_segments, {"velocity"}),
     "inverse kinematics": (lambda machine: str(inverse_kinematics(machine, task(machine))), set()),
     "least velocities": (least_velocities, {"velocity"}),

@@ -9,12 +9,12 @@ import pytest
 
 from models import FixedBase, SmoothPath, planar_chain, smooth
 from models.checks import Array
-from models.paths import Arc, Line, Path
+from models.paths import Arc, Helix, Line, Path
 from ocp import TipTask, plan
 from ocp.curves import lagrange
 from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.tasks.equations import TaskEquations, bind, task_errors
-from ocp.motion.tasks.targets import NODES, required_nodes
+from ocp.motion.tasks.targets import NODES, required_nodes, resolving_times
 
 SPEED = 0.1  # m/s
 MACHINE = FixedBase(planar_chain([0.5, 0.4, 0.3], [1.0, 1.0, 1.0]))
@@ -74,6 +74,19 @@ def test_tasks_of_a_velocity_and_few_segments_keep_all_breaks() -> None:
     few, _, ends = along(circle(4))
     (stretch,) = stretches_of(MACHINE, [few], float(few.duration or 0.0))
     np.testing.assert_array_equal(stretch.nodes, ends[1:-1])
+
+
+def test_targets_are_nearly_linear_between_the_steps_of_a_local_motion() -> None:
+    helix = smooth(Path((Helix((0.7, 0.2, 0), (0.6, 0.2, 0), (0, 0, 1), 40.0, 0.0),)), deviation=1e-5)
+    _, equations, breaks = along(helix)
+    times = resolving_times(equations, np.linspace(0.0, breaks[-1], 9))
+    targets = equations.target_function()
+    ends, inside = (np.array(targets.map(len(t))(t[None]))[:3].T for t in (times, (times[:-1] + times[1:]) / 2))
+    chords = np.linalg.norm(inside - (ends[:-1] + ends[1:]) / 2, axis=1)
+    assert chords.max() <= NODES.chord_error * np.sqrt(2)
+    assert chords.max() > NODES.chord_error / 8  # not finer than necessary
+    still = TipTask(rows=(3, 4), velocity=(0.1, 0.0), duration=1.0)
+    np.testing.assert_array_equal(resolving_times(bind(MACHINE, still), breaks), breaks)
 
 
 @pytest.mark.long
