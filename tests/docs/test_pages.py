@@ -21,7 +21,8 @@ from scripts.papers.reproduced import read_tables
 
 SITE = Path(__file__).resolve().parents[2] / "docs"
 PAGES = sorted(SITE.rglob("*.md"))
-NEEDS = {"example-robot-data": "gallery", "spartpy": "gallery", "run_batch": "cluster", "read_joint_limits": "yaml"}
+NEEDS = {"example-robot-data": "gallery", "spartpy": "gallery", "run_batch": "cluster", "read_joint_limits": "yaml",
+         "from_mjcf": "mujoco"}  # fmt: skip
 """Names that need an extra, by a word of a block."""
 FORMULAS = re.compile(r"\$\$(.+?)\$\$|(?<![\w$])\$([^$\n]+?)\$(?![\w$])", re.DOTALL)
 
