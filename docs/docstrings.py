@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+import sys
 from typing import Any
 
 __all__ = ["documented", "escaped", "names", "prepared", "setup"]
@@ -40,11 +41,24 @@ def documented(text: str) -> str:
         lines = []
         for package, name in names(block[0]):
             value = getattr(importlib.import_module(package), name)
-            kind = "class" if inspect.isclass(value) else "function" if callable(value) else "data"
-            lines += [f".. auto{kind}:: {package}.{name}", *(["   :members:"] if kind == "class" else []), ""]
+            if inspect.isclass(value):
+                lines += [f".. autoclass:: {package}.{name}", "   :members:", ""]
+            elif inspect.isfunction(value):
+                lines += [f".. autofunction:: {package}.{name}", ""]
+            else:  # its docstring stands where it is assigned
+                lines += [f".. autodata:: {_home(package, name)}.{name}", "   :no-value:", ""]
         return "\n".join(["```{eval-rst}", *lines, "```"])
 
     return NAMES.sub(directives, text)
+
+
+def _home(package: str, name: str) -> str:
+    """The module that assigns a constant which a package exports."""
+    assigned = re.compile(rf"^{name}(:.*)? = ", re.MULTILINE)
+    for module in [module for module in sys.modules.values() if module.__name__.startswith(f"{package}.")]:
+        if name in vars(module) and assigned.search(inspect.getsource(module)):
+            return module.__name__
+    raise ValueError(f"no module of {package} assigns {name}")
 
 
 def _read(app: Any, name: str, content: list[str]) -> None:

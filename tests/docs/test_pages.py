@@ -21,7 +21,8 @@ from scripts.papers.reproduced import read_tables
 
 SITE = Path(__file__).resolve().parents[2] / "docs"
 PAGES = sorted(SITE.rglob("*.md"))
-NEEDS = {"example-robot-data": "gallery", "spartpy": "gallery", "run_batch": "cluster", "read_joint_limits": "yaml"}
+NEEDS = {"example-robot-data": "gallery", "spartpy": "gallery", "run_batch": "cluster", "read_joint_limits": "yaml",
+         "from_mjcf": "mujoco"}  # fmt: skip
 """Names that need an extra, by a word of a block."""
 FORMULAS = re.compile(r"\$\$(.+?)\$\$|(?<![\w$])\$([^$\n]+?)\$(?![\w$])", re.DOTALL)
 
@@ -74,7 +75,7 @@ def test_listed_names_become_directives_of_their_kind_in_the_order_of_the_list()
     assert re.findall(r"^\.\. (\w+):: (\S+)$", report, re.MULTILINE) == [
         ("autofunction", "models.smooth"),
         ("autoclass", "models.Path"),
-        ("autodata", "models.STANDING_STARTS"),
+        ("autodata", "models.examples.STANDING_STARTS"),
     ]
     assert report.startswith("Before.\n```{eval-rst}\n")
     assert report.endswith("\n```\nAfter.")

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from docs.executed import blocks
 from tests.readme import steps
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -116,12 +117,16 @@ def main() -> int:
 
 
 def read_on(folder: Path, wheel: Path) -> list[str]:
-    """Do what the README says, with the extras that it names alone, in a folder that is empty; what did not hold."""
+    """Run the pages without extras, then do what the README says, in a folder that is empty; what did not hold."""
     venv.create(folder / "core", with_pip=True)
     user = User(folder / "reader", folder / "core" / "bin")
     user.home.mkdir()
     done = user.run("python", "-m", "pip", "install", "--quiet", str(wheel))
     user.holds(f"pip install {wheel.name}, without extras", done.returncode == 0, done.stderr)
+    for page, line, source in standalone():
+        (user.home / "block.py").write_text(source, encoding="utf-8")
+        done = user.run("python", "block.py")
+        user.holds(f"{page}, line {line}", done.returncode == 0, f"{done.stdout}\n{done.stderr}")
     for step in steps():
         if step.extras:
             done = user.run("python", "-m", "pip", "install", "--quiet", f"{wheel}[{step.extras}]")
@@ -132,6 +137,14 @@ def read_on(folder: Path, wheel: Path) -> list[str]:
             done = user.run(*step.words)
             user.holds(f"README: {' '.join(step.words)}", done.returncode == 0, f"{done.stdout}\n{done.stderr}")
     return user.messages
+
+
+def standalone() -> Iterator[tuple[str, int, str]]:
+    """Blocks of the site's pages that run alone and name no extra in their first line."""
+    for page in sorted((ROOT / "docs").rglob("*.md")):
+        for line, alone, source in blocks(page.read_text(encoding="utf-8")):
+            if alone and not source.startswith("# needs"):
+                yield str(page.relative_to(ROOT)), line, source
 
 
 def built(folder: Path) -> Path:

@@ -364,12 +364,13 @@ def write_robot_program(
     collisions is not known.
 
     What the controller keeps of the timing:
-        URScript: `servoj` with the duration of each step, in whole ns. The arm lags behind by its lookahead time.
-        RAPID: `MoveAbsJ` with the duration of each step (`T`), in whole ns. The arm flies by all points but the last.
-        KRL: No times. `PTP` with the velocity that the fastest joint has on average in the step, in whole percent of
-            the velocity limit in the robot model, rounded down, at least 1. The controller adds its acceleration and
-            rounds the points (`C_PTP`), so that the motion usually takes longer. KUKA requires that the file be named
-            like the program: a letter, then letters, digits and _, 24 characters at most, and no word of KRL.
+
+    - URScript: `servoj` with the duration of each step, in whole ns. The arm lags behind by its lookahead time.
+    - RAPID: `MoveAbsJ` with the duration of each step (`T`), in whole ns. The arm flies by all points but the last.
+    - KRL: No times. `PTP` with the velocity that the fastest joint has on average in the step, in whole percent of the
+      velocity limit in the robot model, rounded down, at least 1. The controller adds its acceleration and rounds the
+      points (`C_PTP`), so that the motion usually takes longer. KUKA requires that the file be named like the program:
+      a letter, then letters, digits and _, 24 characters at most, and no word of KRL.
 
     Args:
         motion: A plan, or a trajectory with `names`, `t` and `positions`, such as `read_trajectory` returns.
