@@ -268,7 +268,7 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     _file(report, "file", "HTML file to write")
     _force(report)
     report.add_argument("--period", type=float, default=0.01, metavar="S", help="sampling period, s (default: 0.01)")
-    report.add_argument("--title", help="title of the report (default: the plan's file)")
+    report.add_argument("--title", help="title of the report (default: the robot and the plan's file)")
     view = _command(commands, "view", "play motions in a browser", VIEW, VIEW_EXAMPLES, run_view)
     _file(view, "plan", "file of a plan, or of a solution with --robot (.npz)")
     _file(view, "beside", "plans, or trajectories of the same robot, to compare with it", nargs="*", default=[])

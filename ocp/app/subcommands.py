@@ -138,7 +138,8 @@ def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, st
     plan = Plan.load(options.plan)
     check_period(plan, options.period)
     progress("audit")
-    report = report_of_plan(plan, options.period, options.title or str(options.plan))
+    title = options.title or f"{plan.machine.robot.name}: {options.plan.stem}"
+    report = report_of_plan(plan, options.period, title)
     write_text(file, report.html())
     data = {"written": str(options.file), "passed": report.passed, "verdict": report.verdict}
     return (0 if report.passed else 1), f"{report.verdict}\nwritten: {options.file}", data

@@ -12,7 +12,6 @@ import numpy as np
 from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Standing
 from models.checks import Array, real
 from models.shapes.mesh_files import find_mesh
-from ocp.app.check.collisions import clearance_rows, path_rows, with_wide_limits
 from ocp.app.check.data_checks import CleanedTrajectory, Fault, clean_trajectory
 from ocp.app.check.interpolation import Rule
 from ocp.app.check.joint_limits import (
@@ -25,7 +24,7 @@ from ocp.app.check.joint_limits import (
     standing_rows,
     torque_rows,
 )
-from ocp.app.check.suspicions import doubtful_times, exchanged_joints
+from ocp.app.check.kinematic_checks import clearance_rows, doubtful_times, exchanged_joints, path_rows, with_wide_limits
 from ocp.app.files import RawTrajectory, Waypoints
 from ocp.app.files.trajectory import UNITS
 from ocp.audit.audit import Audit

@@ -15,10 +15,10 @@ import pytest
 from models import CollisionScene, FixedBase, FreeFloating, Machine, Robot, Sphere, Standing, mass_matrix, rectangle
 from ocp import Plan
 from ocp.app import Check, check_trajectory
-from ocp.app.check.collisions import prove_clearance, with_wide_limits
 from ocp.app.check.data_checks import BASES
 from ocp.app.check.interpolation import Motion, PiecewisePolynomial, polynomial_maxima
 from ocp.app.check.joint_limits import floating_torques, integrate_base
+from ocp.app.check.kinematic_checks import prove_clearance, with_wide_limits
 from ocp.app.files import read_trajectory
 from ocp.errors import ProblemError
 from ocp.motion.local.collisions import distances_along
