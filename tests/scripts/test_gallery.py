@@ -97,10 +97,10 @@ def test_the_cyclic_plan_returns_within_the_limits_where_the_pseudo_inverse_drif
     assert (np.diff(drift) > 0.1).all()
 
 
-def test_the_lowest_cost_start_lies_in_another_family_than_the_best_conditioned_one(coarse: Gallery) -> None:
+def test_a_motion_from_the_best_conditioned_start_costs_more_than_the_plan(coarse: Gallery) -> None:
     row = coarse.rows["posture_set"]
     assert 0.98 * row["cost_optimal"] <= row["bound"] <= row["cost_optimal"]
-    assert row["cost_optimal"] < 0.8 * row["cost_from_the_best_conditioned_start"]
+    assert row["cost_optimal"] < 0.9 * row["cost_from_the_best_conditioned_start"]
     machine, task = FixedBase(robots.UR5.read()), posture_set.seam()
     charts, through, family = posture_set.landscape(machine, task, 9, row["cost_optimal"])
     assert through.min() <= row["cost_optimal"]  # on any instants
