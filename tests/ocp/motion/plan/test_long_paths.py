@@ -43,7 +43,7 @@ def test_a_program_of_thousands_of_chords_is_planned(tmp_path: Path) -> None:
     lines = [f"G1 X{x:.3f} Y{y:.3f} Z{z:.3f}" for x, y, z in 1e3 * points]
     (tmp_path / "flower.nc").write_text("\n".join(["G21 G90 F1200", "G0 X550 Z200", *lines]))
     (path,) = read_gcode(tmp_path / "flower.nc").smooth(DEVIATION)
-    check(plan(MACHINE, TipTask.along(path, SPEED, direction=DOWN), search="start"), points)
+    check(plan(MACHINE, TipTask.along(path, SPEED, steady=True, direction=DOWN), search="start"), points)
 
 
 @pytest.mark.long
@@ -53,6 +53,6 @@ def test_ten_thousand_waypoints_are_planned_in_time(tmp_path: Path, count: int, 
     np.savetxt(tmp_path / "flower.csv", points, delimiter=",", header="x,y,z", fmt="%.6f")
     begin = time.process_time()
     path = read_waypoints(tmp_path / "flower.csv", unit="m").smooth(DEVIATION)
-    result = plan(MACHINE, TipTask.along(path, SPEED, direction=DOWN), search="start")
+    result = plan(MACHINE, TipTask.along(path, SPEED, steady=True, direction=DOWN), search="start")
     assert time.process_time() - begin < seconds
     check(result, points)
