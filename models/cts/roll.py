@@ -89,7 +89,7 @@ class ConstraintCheck(NamedTuple):
         return ca.logic_and(self.pitch_joints(), ca.logic_and(self.yaw, self.yaw_angles))
 
     def pitch_joints(self) -> Expression:
-        """Return whether the pitch link reaches the target and joints 4, 5 and 6 are within their limits."""
+        """Return whether, at the roll angle, the pitch link reaches the target, and joints 4 to 6 are within limits."""
         return ca.logic_and(self.pitch, self.pitch_angles)
 
     def angles(self) -> Expression:
@@ -238,7 +238,7 @@ def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel
 
 
 def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point]:
-    """Return four approximate roll angles of a target, as (cos, sin), at which the cosine of joint angle 2 is given.
+    """Return four approximate roll angles, as (cos, sin), at which the cosine of joint angle 2 has a given value.
 
     They are roots of the squared equation cos q2 = `cosine`. The squared equation is smooth near a stretched pitch
     link, where cos q2 is not; near yaw 0 it has nearly double roots, where cos q2 has simple ones.

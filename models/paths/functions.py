@@ -194,7 +194,7 @@ def _predictor_corrector(degree: int, corrections: int) -> Any:
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """Return the default mapping from distance along a blend to curve parameter u, by a predictor and Newton steps.
+    """Return a function that computes the parameter u of a blend at an arc length, by quadrature and Newton steps.
 
     The predictor is equation (15), the Newton steps solve for the arc length. Arguments and result as for
     `predictor_corrector`, except `nodes`: the number of quadrature nodes over one control step, for each Newton step.

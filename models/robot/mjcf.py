@@ -320,7 +320,7 @@ def _body_shapes(
 
 
 def _primitive(number: int, size: Array) -> tuple[ShapeKind, tuple[float, ...]]:
-    """Return kind and size of a collision shape for a geom's number in MuJoCo and half sizes; no size for a plane."""
+    """Return kind and size of the collision shape for a type number of MuJoCo and half sizes; no size for a plane."""
     a, b, c = size.tolist()
     kinds: dict[int, tuple[ShapeKind, tuple[float, ...]]] = {
         2: ("sphere", (a,)),

@@ -169,7 +169,7 @@ class Linearisation:
 
     @property
     def may_be_degenerate(self) -> bool:
-        """Whether inequalities may be active, so that the multipliers of the plan may not be unique."""
+        """Whether inequalities may be active. The multipliers of the plan are then not necessarily unique."""
         sides = (self.control_limits, self.state_limits, self.node_limits)
         return any(bool(limits.near[:, ~limits.equal].any()) for limits in sides)
 
@@ -288,7 +288,7 @@ class Linearisation:
         self.node_limits_x[:, nx:] = row_y.reshape(n + 1, nx + 1, len(self.still)).transpose(0, 2, 1)
 
     def _arcs(self) -> None:
-        """Add state equalities as limits of the controls, using their first time derivative that contains a control.
+        """Add state equalities as limits of the controls: differentiate them in time until a control appears.
 
         A transcription that imposes such a row at points determines the costates up to multiples of the gradients of
         the row and of its derivatives (Hartl, Sethi, Vickson 1995, section 4). The slope of the Hamiltonian is then

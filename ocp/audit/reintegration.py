@@ -134,7 +134,7 @@ class Steps(NamedTuple):
 
     @classmethod
     def even(cls, cells: int, each: int) -> Steps:
-        """Return one integration step per grid cell, for mesh intervals of ``each`` cells."""
+        """Return equal integration steps, one in each grid cell; every mesh interval has ``each`` cells."""
         cell = np.arange(cells)
         return cls(cell, (cell % each) / each, np.full(cells, 1.0 / each))
 
@@ -346,7 +346,10 @@ def excess_over(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.
 
 
 def _violation_of(label: str, name: str, t: np.ndarray, excess: np.ndarray, sizes: np.ndarray) -> Violation:
-    """Return the `Violation` of a vector constraint from each entry's excess over its bounds and size."""
+    """Return the `Violation` of a vector constraint.
+
+    For each entry, `excess` is how far it is beyond its bounds, and `sizes` the magnitude that this is compared with.
+    """
     shares = excess / sizes
     largest = np.argmax(shares, axis=1)[:, None]
     size = np.take_along_axis(np.broadcast_to(sizes, excess.shape), largest, axis=1)[:, 0]

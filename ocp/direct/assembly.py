@@ -477,7 +477,7 @@ def _scatter_matrix(
     shape: tuple[int, int],
     factors: list[np.ndarray] | None = None,
 ) -> Any:
-    """Return a sparse matrix: constant entries plus nonzeros of ``matrices`` times factors, at given indices."""
+    """Return the sparse sum of constant entries and of the nonzeros of ``matrices``, times factors, at their places."""
     rows = np.concatenate([constant[0], *[at[0] for at in places]]).astype(int)
     columns = np.concatenate([constant[1], *[at[1] for at in places]]).astype(int)
     entries, number = np.unique(columns * shape[0] + rows, return_inverse=True)

@@ -89,7 +89,7 @@ class BoundTable:
 
     @cached_property
     def _pullback(self) -> Any:
-        """The casadi function that :meth:`pullback` evaluates."""
+        """CasADi function of :meth:`pullback`: the transposed Jacobian of the point function times multipliers."""
         count, n = self.function.numel_in(0), self.function.numel_out(0)
         parameters, multipliers = ca.MX.sym("p", count), ca.MX.sym("multipliers", n, 2)
         bounds = self.function(parameters)
@@ -212,7 +212,7 @@ class Formulation:
         return ca.Function(name, symbols, inner.call([*symbols, self._signal(symbols[2])]), labels, names)
 
     def point_data(self, fractions: np.ndarray) -> np.ndarray:
-        """Return the data of :meth:`point_function` at K points: horizon fraction and signals. Shape (1 + nw, K)."""
+        """Return horizon fraction and signals at K points, arguments of :meth:`point_function`. Shape (1 + nw, K)."""
         return np.vstack([np.reshape(fractions, (1, -1)), self.signals_at(np.ravel(fractions) * self.duration).T])
 
     def signals_at(self, times: np.ndarray, order: int = 0) -> np.ndarray:

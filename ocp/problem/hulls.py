@@ -329,7 +329,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Yield the groups of equal hull kinds that `rows` refer to, with positions in `rows` and in the group."""
+        """Split pairs by the kinds of their hulls; yield each group, its places in `rows`, and indices in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:

@@ -490,7 +490,7 @@ class Problem:
         tolerance: Value = None,
         known: Sequence[Any] = (),
     ) -> Constraint:
-        """Return a new constraint on an expression of the symbols of path constraints and of the ``known`` symbols."""
+        """Return a new constraint; its expression may contain what path constraints may, and the ``known`` symbols."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
         return self._reader.constraint(
             kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance

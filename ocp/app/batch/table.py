@@ -146,7 +146,7 @@ class Batch:
         return f'{counts}, first: {first.error or first.status}: {message}; run again with again="failed"'
 
     def check(self) -> None:
-        """Raise BatchError with the summary if a task failed or ended its workers."""
+        """Raise BatchError with a summary of the batch if a task failed, or crashed the processes that ran it."""
         if count := len(self) - self.counts.get("done", 0):
             raise BatchError(self.summary, self, name=self.folder.name, value=count, limit=0)
 

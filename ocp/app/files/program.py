@@ -68,7 +68,7 @@ class Cut:
 
     @property
     def name(self) -> str:
-        """Description of the cut with its line numbers."""
+        """Name of this cutting motion for messages, with the lines of the file that describe it."""
         return f"cut, lines {self.lines[0]} to {self.lines[-1]}"
 
     def smooth(self, tolerance: float | None = None, **options: Any) -> SmoothPath:
@@ -143,7 +143,7 @@ class Program:
 
     @cached_property
     def cuts(self) -> tuple[Cut, ...]:
-        """The cuts of the program."""
+        """The cutting motions of the program, without rapid motions and pauses, in their order."""
         return tuple(each for each in self.sections if isinstance(each, Cut))
 
     @property
@@ -329,7 +329,7 @@ class TimedProgram:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Descriptions of the sections with line numbers."""
+        """Name of each section of the program for messages, with the lines of the file that describe it."""
         return tuple(each.name for each in self.program.sections)
 
     def at(self, time: ArrayLike) -> ProgramMotion:

@@ -215,7 +215,7 @@ def _motion_of(plan: Plan) -> Motion:
 
 
 def _comparison(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
-    """Convert a motion that is compared with a plan to a Motion; return it with its cost (None if unknown)."""
+    """Return, as a Motion, what is plotted for comparison with a plan, and its cost (None if unknown)."""
     cost: float | None = None
     if isinstance(other, Plan):
         joints, motion, cost = other.names, _motion_of(other), other.cost

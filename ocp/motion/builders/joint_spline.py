@@ -210,7 +210,7 @@ def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple
 
 
 def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> Array:
-    """Return the path distances (M,) at which the targets of a plan are at times (M,), from 0 to the path's length.
+    """Return how far along the path the targets of a plan are at given times, from 0 to the path's length. Shape (M,).
 
     Raises:
         ProblemError: As in `_samples_of_plan`.

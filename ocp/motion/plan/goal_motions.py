@@ -204,7 +204,10 @@ def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate
 
 
 def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return audited candidates along paths: as requested, fastest, within actuator limits, or at constant speed."""
+    """Return audited candidate motions along paths, with the timing that the request needs.
+
+    That is the least time, any timing within the limits of the actuators, or constant speed.
+    """
     if task.is_fastest:
         return [_fastest(task, path) for path in paths]
     return _within_actuator_limits(task, paths) if task.is_dynamic else _at_constant_speed(task, paths)

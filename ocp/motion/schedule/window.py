@@ -216,7 +216,7 @@ class EnforcedRows:
         self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
     def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
-        """Enforce given limits at the point of an interval where each is used most; return which were already enforced.
+        """Add limits as constraints at the point of an interval where each is nearest; return which were there already.
 
         Masks of shape (2, N, K + L + P).
         """
@@ -392,7 +392,7 @@ def _fine_usage(
 
 
 def _vertex(values: Array, places: list[Array]) -> Array:
-    """Return the extremum of the parabola through three points if it lies between these, else the first value."""
+    """Return the extreme value of the parabola through three points if it lies between them, else the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
     with np.errstate(divide="ignore", invalid="ignore"):

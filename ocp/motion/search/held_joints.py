@@ -132,7 +132,7 @@ def _place_idle_joints(whole: PlanRequest, request: PlanRequest, configurations:
 
 
 def _own_held(whole: PlanRequest, request: PlanRequest) -> dict[str, float]:
-    """Return the positions, by name, of the joints that `request` holds at rest and `whole` does not."""
+    """Return the positions of the joints that are held at rest only in `request`, not in the user's request `whole`."""
     return {name: position for name, position in request.held.items() if name not in whole.held}
 
 

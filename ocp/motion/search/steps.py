@@ -245,7 +245,9 @@ def _nearest_places(
 
 @dataclass(frozen=True, eq=False)
 class SquaredRateBounds:
-    """Lower bounds of the cost of steps plus the remaining cost, as functions of the start coordinates of the step.
+    """Lower bounds of the cost of a step and of the motion after it, as functions of where the step starts.
+
+    The cost is the integral of the squared joint rates; places are coordinates in the chart.
 
     At t, the bound is least + slope . t + t . level . t / 2, plus the minimum over t' in the box `end_box` of
     v . v / (2 dt) + after . t' + t' . after_curve . t' / 2. Here v = projection - rotation . t + t' is the step along

@@ -106,7 +106,10 @@ class ChartGraph:
         return self._sweep(range(len(self.layers)), 1, cost_to_go, max_cost)
 
     def reachable(self) -> list[NDArray[np.bool_]]:
-        """Return which manifold charts lie on a path from the first to the last time sample. Shape (N,) each."""
+        """Return, for each time sample, which of its charts lie on a path of steps from the first sample to the last.
+
+        One array for each sample, with an entry for each of its charts.
+        """
         masks = [np.ones(len(charts), dtype=bool) for charts in self.layers]
         end = len(masks) - 1
         for order in (range(end), range(end, 0, -1)):
@@ -341,7 +344,7 @@ def _quadratic_at_places(curve: Array, places: list[Array], starts: Indices) -> 
 def _tangent_bounds(
     places: Array, values: tuple[Array, Array], curve: Array, common: Array, tilt: Array
 ) -> QuadraticBounds:
-    """Return lower bounds of costs by tangents at given points, after subtracting a common quadratic function.
+    """Return lower bounds of costs minus a common quadratic function, from the tangents of the costs at given points.
 
     The subtracted function is tilt . t + t . common . t / 2.
     """

@@ -70,7 +70,7 @@ class IndexAtLeast:
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return lower and upper corner (x, y) of the region of points that satisfy the rule. Shape (2,) each, m."""
+        """Return the corners of the rectangle in which the zero moment point satisfies the rule. Shape (2,) each, m."""
         radius = machine.half_widths * np.sqrt(1 - self.value)
         return machine.most_stable_point - radius, machine.most_stable_point + radius
 
@@ -178,7 +178,7 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 
 
 def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return in which coordinates, 0 for x and 1 for y, a motion can violate the rule on the stability index.
+    """Return the axes (0: x, 1: y) along which a motion can move the zero moment point out of the region of a rule.
 
     Args:
         machine, zmp, point, external: As for foot_rows.
@@ -228,7 +228,9 @@ LIMITED = ("velocity", "acceleration", "jerk", "torque", "power")
 
 
 class JointBounds(NamedTuple):
-    """Limits of every joint, infinite for no limit, in rad or m, s, N m or N, and W. Shape (n,) each.
+    """Limits of position, velocity, acceleration, jerk, torque and power of each joint, in SI units. Shape (n,) each.
+
+    A limit is infinite if there is none.
 
     Attributes:
         lower, upper: Position limits.
