@@ -290,7 +290,7 @@ class Chain:
         return self.distinct(Solutions(*parts), free, goal)
 
     def distinct(self, solutions: Solutions, numbers: Sequence[int], goal: Motion) -> Solutions:
-        """Return the IK solutions of several poses without duplicates, in the order of the poses, in the range -pi to pi.
+        """Return the IK solutions of several poses without duplicates, ordered by pose, in the range -pi to pi.
 
         Args:
             solutions: The solutions.
