@@ -279,7 +279,7 @@ class _Dual:
             program.add(rows[self.free], self.end_residual[-1], sign)
 
     def fit(self, x: np.ndarray, known: Adjoint) -> Fit:
-        """Convert a solution of the quadratic program to multipliers and excess cost (loss) of the plan."""
+        """Return the multipliers that fit the plan best, and its excess cost, from the solution of the program."""
         along, (n, q), nx, size = self.along, self.along.shape, self.along.form.nx, self.along.state_size
         lost = np.zeros(n)
         for part in self.residual:

@@ -258,7 +258,10 @@ class Prepared:
         return attempts
 
     def _elastic(self, first: Attempt) -> Elastic | None:
-        """Return the plan of least constraint violation; Ctrl-C raises Interrupted with the plan of run `first`."""
+        """Return the plan of least constraint violation after the run `first` has failed; None if there is none.
+
+        On Ctrl-C, Interrupted is raised with the plan of that run.
+        """
         horizon = horizon_of(self.formulation, self.transcription, first.outcome, first.arguments["p"])
         try:
             return elastic_plan(self, first.outcome, first.arguments, first.scales, horizon=horizon)

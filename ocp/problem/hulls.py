@@ -491,7 +491,7 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
 
 
 def stack_motion_bounds(what: str, bounds: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
-    """Stack bounds on how strongly each state moves the bodies of pairs, in the order of ``movers``; 0 where missing.
+    """Stack bounds of the displacement of the bodies of pairs per unit change of each state; 0 for a state without one.
 
     Args:
         movers: Size of each state that moves a body. count: Number of pairs.

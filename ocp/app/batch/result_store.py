@@ -391,7 +391,7 @@ class ResultStore:
         write_whole(path, lambda stream: stream.write(text), synced=False)
 
     def payload(self, record: dict[str, Any]) -> Payload:
-        """Return the payload of a record, which consists of the record and the contents of its files.
+        """Return all data of one result: its record and the contents of the files that belong to it.
 
         Raises:
             OSError: A file is missing.

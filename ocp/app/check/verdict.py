@@ -361,7 +361,7 @@ def _missing_meshes(robot: Robot, folders: Sequence[str | Path]) -> list[str]:
 
 
 def _unlimited_quantities(rows: Sequence[Row]) -> tuple[str, ...]:
-    """Return texts that name the quantities without a limit, one text for all joints of a quantity."""
+    """Return one text for each quantity without a limit, such as the jerk, which names the joints concerned."""
     joints: dict[str, list[str]] = {}
     counts: dict[str, int] = {}
     for row in rows:

@@ -315,7 +315,7 @@ def _widths(solution: Solution) -> dict[str, int]:
 
 
 def _local_widths(name: str, other: Any) -> dict[str, int]:
-    """Return the number of entries of base, joints and rates in a result of `resolve`, by name."""
+    """Return how many curves base, joints and rates of a local motion (a result of `resolve`) have, by name."""
     if not isinstance(other, LocalSolution):
         words = (
             f"plot: {name!r} is a {type(other).__name__}; a solution can be compared with a solution or a result of "

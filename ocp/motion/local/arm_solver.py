@@ -152,7 +152,7 @@ def _whole_turns(counts: tuple[int, ...]) -> Array:
 
 
 class _Windows(NamedTuple):
-    """Intervals of one full turn within the position limits of revolute joints.
+    """Intervals of one full turn of revolute joints, into which angles are shifted to be within the position limits.
 
     Attributes:
         lower, upper: Limits, beyond which lies only rounding. Shape (n,).

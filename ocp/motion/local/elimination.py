@@ -184,7 +184,9 @@ class Elimination(PoseSolver):
     openings: tuple[LoopOpening, ...]
 
     def solve_regular(self, tips: Motion, redundant: Array) -> tuple[Solutions, Mask, Mask]:
-        """Return the IK solutions at M poses of the tip; some may be missing. See `PoseSolver.solve_regular`.
+        """Return the IK solutions at M poses of the tip; at singular poses some may be missing.
+
+        See `PoseSolver.solve_regular`.
 
         Some may be missing where the problem is singular, or where fewer solutions than real eigenvalues or an odd
         number of solutions were found. Multiple eigenvalues mix the products of several solutions, which is to be
@@ -339,7 +341,7 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
-    """Return the coefficient matrices of the polynomial eigenvalue problem of an opening. Shape (M, 3, 12, 12).
+    """Return the coefficient matrices of the eigenvalue problem of a chain cut at some joint. Shape (M, 3, 12, 12).
 
     They belong to 1, cos h and sin h of the joint that has the eigenvalue.
     """

@@ -271,10 +271,10 @@ class AtlasSearch:
         return np.array([path[number] for number in range(last + 1)])
 
     def project_in_box(self, k: int, box: Charts, place: Array) -> Array | None:
-        """Project a chart point, given by coordinates (r,), onto the manifold; return a valid (collision-free) result.
+        """Project a chart point, given by coordinates (r,), onto the manifold; return it if it is valid, else None.
 
-        If the result is not valid, points nearer to the middle of the chart are tried: a box reaches beyond the joint
-        limits by the deviation of the manifold. Return None if no point leads to a valid configuration.
+        A valid configuration is within the joint limits and collision-free. If the result is not valid, points nearer
+        to the middle of the chart are tried: a box reaches beyond the limits by the deviation of the manifold.
         """
         middle = (box.low[0] + box.high[0]) / 2
         shares = (0.0, 0.25, 0.5, 1.0)

@@ -300,7 +300,10 @@ def track_expression(
 
 
 def _call_track(track: Callable[[Any], Any], time: Any, what: str) -> Any:
-    """Evaluate a user's target function; raise ProblemError if it fails, except for errors by which it rejects SX."""
+    """Evaluate a user's target function; raise ProblemError if it fails.
+
+    Errors that show that the function cannot take symbols of CasADi's type SX are passed on.
+    """
     try:
         return track(time)
     except (RuntimeError, NotImplementedError, ProblemError, ModelError):
