@@ -254,8 +254,13 @@ CALL_DELAY_S = 2.0
 _LISTENER: ContextVar[Callable[[str], Any] | None] = ContextVar("listener", default=None)
 
 
-def report(stage: str) -> None:
-    """Report the name of the current stage to the function that shows the progress of the call, if there is one."""
+def report(stage: str, *, step: bool = False) -> None:
+    """Report the name of the current stage to the function that shows the progress of the call, and to the log.
+
+    One of many steps of a stage is not logged.
+    """
+    if not step:
+        LOG.info("%s", stage)
     listener = _LISTENER.get()
     if listener is not None:
         listener(stage)

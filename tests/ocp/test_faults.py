@@ -33,7 +33,16 @@ from ocp import (
     solve,
     tighten,
 )
-from ocp.console import TimeLimitReached, casadi_silenced, check_time, interruptible, time_left, time_limited
+from ocp.console import (
+    TimeLimitReached,
+    casadi_silenced,
+    check_time,
+    interruptible,
+    report,
+    shown_progress,
+    time_left,
+    time_limited,
+)
 from ocp.direct.prepared import Prepared
 from ocp.errors import Interrupted, SolverStatus
 from tests.families import some
@@ -592,3 +601,12 @@ def test_a_limit_of_processor_time_passes_only_while_the_program_works() -> None
         with pytest.raises(TimeLimitReached):
             check_time()
     assert time_left() == np.inf
+
+
+def test_stages_are_logged_and_steps_of_a_stage_are_not(caplog: pytest.LogCaptureFixture) -> None:
+    stages: list[str] = []
+    with caplog.at_level(logging.INFO, "ocp"), shown_progress("plan", stages.append):
+        report("collision scene")
+        report("3 of 7 motions done", step=True)
+    assert stages == ["collision scene", "3 of 7 motions done"]
+    assert [each.getMessage() for each in caplog.records] == ["collision scene"]

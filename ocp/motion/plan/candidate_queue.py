@@ -156,7 +156,7 @@ class CandidateQueue:
                 self._turned.setdefault(id(leader.seed), []).append(seed)
         while self._heap:
             candidate = heappop(self._heap)[-1]
-            report(self._state)
+            report(self._state, step=True)
             if self.exhausted:
                 words = f"{len(self.candidates)} candidates failed in {self.settings.refusal_time:g} s before it"
                 self.candidates.append(candidate.with_rejection(Reason(Rejection.NOT_TRIED, words)))
