@@ -19,6 +19,7 @@ NAMES = re.compile(r"^```\{names\} ([\w.]+)\n(.*?)^```$", re.MULTILINE | re.DOTA
 QUOTED = re.compile(r"(``.+?``|:\w+:`[^`]+`|`[^`]+`)")
 """What is marked as code, or as a reference, is left as it is."""
 MARKS = re.compile(r"([*|]|(?<=\w)_(?=\W|$))")
+UNPARSABLE = re.compile(r"<factory>|<class '(?:\w+\.)*(\w+)'>")
 FORMULA = re.compile(r"^    ")
 SECTION = re.compile(r"^(Args|Attributes|Returns|Raises|Yields):$")
 
@@ -69,11 +70,19 @@ def setup(app: Any) -> dict[str, bool]:
     """For Sphinx."""
     app.connect("source-read", _read)
     app.connect("autodoc-process-docstring", _process, priority=100)  # before napoleon
+    app.connect("autodoc-process-signature", _signature)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
 def _process(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     lines[:] = prepared(lines)
+
+
+def _signature(
+    app: Any, what: str, name: str, thing: Any, options: Any, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    """Return a signature that Sphinx can parse, without `<factory>` and `<class 'module.Name'>` as defaults."""
+    return signature and UNPARSABLE.sub(lambda match: match[1] or "...", signature), returns
 
 
 def prepared(lines: list[str]) -> list[str]:

@@ -15,17 +15,20 @@ import re
 import subprocess
 import sys
 import tempfile
+import textwrap
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
-__all__ = ["Block", "blocks", "executed", "main", "setup"]
+__all__ = ["Block", "blocks", "executed", "main", "setup", "wrapped"]
 
 FENCE = re.compile(r"^```(python|py)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 ROOT = Path(__file__).resolve().parents[1]
 LONGEST = 900  # s, of a page
 MOST_LINES = 60
 """Of what a block prints, that are shown."""
+WIDTH = 88
+"""Characters of a line that the column of a page holds."""
 
 
 class Block(NamedTuple):
@@ -60,10 +63,22 @@ def _below(printed: str, html: str) -> str:
         lines = printed.rstrip("\n").splitlines()
         if len(lines) > MOST_LINES:
             lines = [*lines[:MOST_LINES], f"... and {len(lines) - MOST_LINES} lines more"]
-        parts += "\n::::{container} output\n````{code-block} text\n" + "\n".join(lines) + "\n````\n::::\n"
+        shown = "\n".join(wrapped(line) for line in lines)
+        parts += f"\n::::{{container}} output\n````{{code-block}} text\n{shown}\n````\n::::\n"
     if html:
         parts += f'\n````{{raw}} html\n<div class="output">{html}</div>\n````\n'
     return parts
+
+
+def wrapped(line: str) -> str:
+    """Return a printed line, if it is too long for the page as several lines; the last column of a table moves down."""
+    if len(line) <= WIDTH:
+        return line
+    table = re.match(r"(.*\S)\s{2,}(\S.*)", line)
+    first, rest = table.groups() if table and len(table[1]) <= WIDTH else ("", line)
+    indent = " " * (len(line) - len(line.lstrip()) + 6)
+    lines = textwrap.wrap(rest, WIDTH, initial_indent=indent if first else "", subsequent_indent=indent)
+    return "\n".join([first, *lines] if first else lines)
 
 
 def _run(name: str, found: list[Block]) -> list[tuple[str, str]]:

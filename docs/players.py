@@ -50,7 +50,7 @@ def command(plan: Path, file: Path, title: str = "") -> list[str]:
 
 
 class Player(Directive):  # type: ignore[misc]
-    """A frame that plays a plan of the gallery, and a link to it alone, below its picture, which can be printed."""
+    """The picture of a plan of the gallery, below it a player, closed until it is asked for, and a link to it alone."""
 
     required_arguments = 1
 
@@ -62,7 +62,8 @@ class Player(Directive):  # type: ignore[misc]
         page = f"{'../' * depth}{FOLDER}/{name}.html"
         title = escape(titles().get(name, name))
         frame = f'<iframe class="player" src="{page}" title="{title}" loading="lazy"></iframe>'
-        link = f'<p><a href="{page}">{title}, on a page of its own</a></p>'
+        frame = f'<details class="player"><summary>Play the motion here</summary>{frame}</details>'
+        link = f'<p><a href="{page}">Play it on a page of its own</a></p>'
         picture = nodes.image(uri=f"{'../' * (depth + 1)}results/gallery/{name}.png", alt=title)
         return [picture, nodes.raw("", f"{frame}\n{link}", format="html")]
 

@@ -138,7 +138,7 @@ def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, st
     plan = Plan.load(options.plan)
     check_period(plan, options.period)
     progress("audit")
-    title = options.title or f"{plan.machine.robot.name}: {options.plan.stem}"
+    title = options.title or ": ".join(dict.fromkeys((plan.machine.robot.name, options.plan.stem)))
     report = report_of_plan(plan, options.period, title)
     write_text(file, report.html())
     data = {"written": str(options.file), "passed": report.passed, "verdict": report.verdict}

@@ -1,7 +1,12 @@
-"""What is done with each page, and what has to hold: it loads, plays, scrubs, switches plans, and asks nobody."""
+"""Laws of the pages of the viewer, of a report and of the site, on a desktop, on a phone and in dark mode.
+
+A page complains of nothing, loads nothing from another host, and shows its pictures within the width of the window. In
+dark mode its plots are dark. A player plays, scrubs and switches plans.
+"""
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,22 +17,40 @@ from typing import Any
 from urllib.parse import unquote, urlparse
 
 import numpy as np
+from matplotlib.image import imread
 
 from ocp import Plan
 from ocp.app.files import read_trajectory
 from ocp.app.view.animation import Animation, animate_plan, animate_trajectory
 from ocp.app.view.appearance import TIP_FRAME, frames_along
 from ocp.app.view.player import PageServer, build_page
+from ocp.app.view.report import report_of_plan
 
 __all__ = ["Look", "failures"]
 
 SLOW = 60_000
 """ms: the pictures are made without a graphics card."""
+SETTINGS: dict[str, dict[str, Any]] = {
+    "desktop": {"viewport": {"width": 1280, "height": 900}},
+    "phone": {"viewport": {"width": 390, "height": 844}},
+    "dark": {"viewport": {"width": 1280, "height": 900}, "color_scheme": "dark"},
+}
+TALLEST = 16384
+"""px: the tallest picture that Chromium draws."""
+DARK = 0.3
+"""Largest median brightness of a dark plot, between 0 (black) and 1 (white)."""
+BRIGHT = 0.6
+"""Least brightness of the brightest hundredth of a dark plot: of its text and its lines."""
 GALLERY = {
     "panda": "Panda: a circle, cyclic, beside the pseudo-inverse",
     "space_arm": "A free-flying arm, beside the pseudo-inverse",
     "mobile_manipulator": "TIAGo on its wheels, a rope in its hand",
 }
+PLOTS = """[...document.querySelectorAll("div.output svg, figure:not(.chart) > svg")].map((one) => {
+    const box = one.getBoundingClientRect();
+    return [box.left, box.top + scrollY, box.right, box.bottom + scrollY].map(Math.round); })"""
+CUT_CODE = """[...document.querySelectorAll("div.highlight-python3 pre, div.highlight-python pre")]
+    .filter((one) => one.scrollWidth > one.clientWidth).map((one) => one.textContent.slice(0, 60))"""
 LOOSE = {"mobile_manipulator": {"tolerances": {"tip": 0.06, "velocities": 1e-3, "zero moment point": 1e-3}}}
 """As scripts/robots/standing.py has them."""
 
@@ -96,17 +119,18 @@ def failures(look: Look, root: Path) -> list[str]:
         look.check(len(text.encode()) <= 8_000_000, f"{name}: the page has {len(text.encode())} bytes")
         with look.opened(target.as_uri(), name) as opened:
             player(look, opened, name, shown[0], ends=name == "space_arm")
-        with look.opened(target.as_uri(), f"{name}, phone", viewport={"width": 390, "height": 844}) as opened:
-            ready(opened)
-            wide = opened.evaluate("document.documentElement.scrollWidth")
-            look.check(wide <= 390, f"{name}: on a phone the page is {wide} px wide")
-            look.picture(opened, f"{name}_phone")
+        for setting in ("phone", "dark"):
+            with look.opened(target.as_uri(), f"{name}, {setting}", **SETTINGS[setting]) as opened:
+                ready(opened)
+                layout(look, opened, f"{name}_{setting}", setting)
         if name == "panda":
             with PageServer(text) as served, look.opened(served.address, "served") as opened:
                 player(look, opened, "served", shown[0], ends=False)
-            with look.opened(target.as_uri(), "dark", color_scheme="dark") as opened:
-                ready(opened)
-                look.picture(opened, "panda_dark")
+            report = look.folder / "report.html"
+            report.write_text(report_of_plan(plan, 0.01, title).html(), encoding="utf-8")
+            for setting, options in SETTINGS.items():
+                with look.opened(report.as_uri(), f"report, {setting}", **options) as opened:
+                    layout(look, opened, f"report_{setting}", setting)
     site(look, root / "build" / "site")
     return look.messages
 
@@ -124,6 +148,29 @@ def until(opened: Any, holds: str) -> None:
         if monotonic() > end:
             raise TimeoutError(f"{holds}: not within {SLOW / 1000:g} s")
         opened.wait_for_timeout(20)
+
+
+def layout(look: Look, opened: Any, name: str, setting: str) -> None:
+    """Check the width, the pictures and the plots of a page, and keep a picture of the whole of it."""
+    wide, window = opened.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    look.check(wide <= window, f"{name}: the page is {wide} px wide in a window of {window} px")
+    missing = opened.evaluate("[...document.images].filter((one) => !one.naturalWidth).map((one) => one.src)")
+    look.check(not missing, f"{name}: pictures are not loaded: {missing}")
+    if setting == "desktop":
+        cut = opened.evaluate(CUT_CODE)
+        look.check(not cut, f"{name}: code is cut off at the right: {cut}")
+    tall = opened.evaluate("document.documentElement.scrollHeight")
+    clip = {"x": 0, "y": 0, "width": window, "height": min(tall, TALLEST)}
+    picture = opened.screenshot(path=look.folder / f"{name}.png", full_page=True, clip=clip)
+    if setting == "dark":
+        pixels = imread(io.BytesIO(picture))[..., :3].mean(-1)
+        page = float(np.median(pixels))
+        look.check(page < DARK, f"{name}: the page has the brightness {page:.2f} in dark mode")
+        for number, (left, top, right, bottom) in enumerate(opened.evaluate(PLOTS)):
+            plot = pixels[top:bottom, left:right]
+            paper, ink = float(np.median(plot)), float(np.quantile(plot, 0.99))
+            words = f"{name}: plot {number + 1} has paper of the brightness {paper:.2f} and marks of {ink:.2f}"
+            look.check(paper < DARK and ink > BRIGHT, f"{words} in dark mode")
 
 
 def player(look: Look, opened: Any, name: str, first: Animation, *, ends: bool) -> None:
@@ -208,7 +255,7 @@ def poses(look: Look, opened: Any, name: str, first: Animation) -> None:
 
 
 def site(look: Look, folder: Path) -> None:
-    """Every page of the site, where it has been built: no complaint, no other host, and every link within resolves."""
+    """Check every page of the site, if it has been built: its layout in all settings, its links and its players."""
     pages = sorted(folder.rglob("*.html")) if folder.is_dir() else []
     print(f"browser: {len(pages)} pages of the site", flush=True)
     anchors: dict[Path, set[str]] = {}
@@ -219,12 +266,21 @@ def site(look: Look, folder: Path) -> None:
         return anchors[file]
 
     for file in pages:
-        name = file.relative_to(folder).as_posix()
-        with look.opened(file.as_uri(), name) as opened:
-            opened.wait_for_load_state("load")
-            links = opened.eval_on_selector_all("a[href]", "(all) => all.map((one) => one.href)")
-            for link in dict.fromkeys(links):
-                _resolves(look, name, link, known)
+        name = file.relative_to(folder).with_suffix("").as_posix()
+        for setting, options in SETTINGS.items():
+            with look.opened(file.as_uri(), f"{name}, {setting}", **options) as opened:
+                opened.wait_for_load_state("load")
+                if file.parent.name == "players":
+                    ready(opened)
+                layout(look, opened, f"site_{name.replace('/', '_')}_{setting}", setting)
+                for closed in opened.locator("details.player").all():  # its player is loaded when it is opened
+                    closed.locator("summary").click()
+                    ready(closed.locator("iframe").element_handle().content_frame())
+                    closed.locator("summary").click()
+                if setting == "desktop":
+                    links = opened.eval_on_selector_all("a[href]", "(all) => all.map((one) => one.href)")
+                    for link in dict.fromkeys(links):
+                        _resolves(look, name, link, known)
 
 
 def _resolves(look: Look, name: str, link: str, known: Callable[[Path], set[str]]) -> None:

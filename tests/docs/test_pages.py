@@ -13,7 +13,7 @@ import pytest
 from latex2mathml.converter import convert
 
 from docs.docstrings import documented, names, prepared
-from docs.executed import blocks, executed
+from docs.executed import WIDTH, blocks, executed, wrapped
 from docs.numbers import MARK, listed
 from docs.players import command, titles
 from ocp.__main__ import parser
@@ -169,6 +169,16 @@ def test_standalone_blocks_are_distinguished_from_continuations() -> None:
     result = blocks("a\n```python\nx = 1\n```\nb\n```py\nx + 1\n```\n```python3\nno\n```\n")
     assert [(line, alone) for line, alone, _ in result] == [(3, True), (7, False)]
     assert [source for _, _, source in result] == ["x = 1\n", "x + 1\n"]
+
+
+def test_long_lines_keep_their_words_and_fit_the_column_and_tables_break_before_their_last_column() -> None:
+    row = "  cost, relative" + 40 * " " + "1.53e-16    ok      " + "reported 0.09073374, integrated 0.09073374"
+    lines = wrapped(row).splitlines()
+    assert lines[0].endswith("ok")
+    assert lines[1].startswith("        reported")
+    for line in (row, "word " * 50, 9 * "  " + "deep " * 40, "short"):
+        assert wrapped(line).split() == line.split()
+        assert max(map(len, wrapped(line).splitlines())) <= WIDTH
 
 
 def test_long_output_is_truncated_at_its_end() -> None:

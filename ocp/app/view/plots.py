@@ -132,9 +132,11 @@ def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
             distant.append(f"{limit:.3g}")
     if distant:
         words = f"limit{'s' if len(distant) > 1 else ''} {', '.join(distant)}"
-        ax.annotate(words, (0.99, 0.97), xycoords="axes fraction", ha="right", va="top", color=LIMIT, fontsize=6)
+        place, side = (0.03, "bottom") if high == upper else (0.97, "top")  # not on the line of the upper limit
+        ax.annotate(words, (0.99, place), xycoords="axes fraction", ha="right", va=side, color=LIMIT, fontsize=6)
     margin = max(0.06 * (high - low), 0.55 * (span - (high - low)))
-    ax.set_ylim(low - margin, high + margin + (0.1 * span if distant else 0.0))
+    space = 0.1 * span if distant else 0.0
+    ax.set_ylim(low - margin - space * (high == upper), high + margin + space * (high != upper))
 
 
 def line_style(number: int) -> dict[str, Any]:

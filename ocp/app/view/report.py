@@ -55,12 +55,14 @@ h1 { font-size: 1.5rem; margin: 1rem 0 .3rem } h2 { font-size: 1.1rem; margin: 2
 .verdict { font-size: 1.1rem; padding: .7rem 1rem; border-left: .4rem solid; background: var(--soft) }
 .good { color: var(--good) } .bad { color: var(--bad) }
 .facts { display: flex; flex-wrap: wrap; gap: .4rem 2rem; padding: 0; list-style: none }
-figure { margin: 0; border: 1px solid var(--line); padding: .3rem }
-figure img, figure svg { width: 100%; height: auto; display: block; background: #fff }
-@media (prefers-color-scheme: dark) { figure svg { filter: invert(.9) hue-rotate(180deg) } }
+figure { overflow-x: auto; margin: 0; border: 1px solid var(--line); padding: .3rem }
+figure img, figure svg { width: 100%; height: auto; display: block; background: #fff } figure svg { min-width: 34rem }
+@media (prefers-color-scheme: dark) { figure svg { filter: invert(.9) hue-rotate(180deg) }
+  figure img { filter: brightness(.85) } }
 figcaption { font-size: .85rem; padding: .2rem .4rem } summary { cursor: pointer; padding: .3rem 0 }
 .scroll { overflow-x: auto } table { border-collapse: collapse; font-size: .85rem; width: 100% }
 th, td { text-align: left; padding: .25rem .6rem; border-bottom: 1px solid var(--line); vertical-align: top }
+td:last-child { min-width: 14rem }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
 footer { margin-top: 3rem; font-size: .8rem; opacity: .7 }
 """
@@ -189,12 +191,13 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     base_path = plan.at(sample.t)["base"] if machine.base_size else None
     units = [joint.unit for joint in robot.moving_joints]
     cost = f"cost {plan.cost:.5g}" + ("" if plan.bound is None else f", none below {plan.bound:.5g}")
+    count = [f"{len(plan.candidates)} candidates"] if len(plan.candidates) > 1 else []
     limited = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         title,
         f"The plan {verdict.sentence}.",
         verdict.passed,
-        (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, f"{len(plan.candidates)} candidates"),
+        (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, *count),
         tuple(str(fault) for fault in check.faults),
         draw_scene(machine, motion, base_path, obstacles_of_plan(plan, sample.t)),
         draw_curves(motion, bounds, names=plan.names, units=units, faults=check.faults),

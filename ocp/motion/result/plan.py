@@ -244,8 +244,8 @@ class Plan(ABC):
 
     def __str__(self) -> str:
         """Return a text of at most 15 lines: cost, joints held at rest, and rejected motions with their reasons."""
-        moving = [name for name in self.names if name not in self.held]
-        lines = [f"plan of {self.horizon:.6g} s for {', '.join(moving)}: {self._costs}; {self._counts}"]
+        moving = len(self.names) - len(self.held)
+        lines = [f"plan of {self.horizon:.6g} s for {moving} joints: {self._costs}; {self._counts}"]
         if self.held:
             held = [f"{name} at {position:.4g}" for name, position in self.held.items()]
             more = f" and {len(held) - MAX_LISTED} more" if len(held) > MAX_LISTED else ""

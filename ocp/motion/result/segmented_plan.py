@@ -242,7 +242,7 @@ class SequencePlan(ConsecutivePlans):
         return super()._junction_findings() + rates
 
     def __str__(self) -> str:
-        lines = [f"plan of {self.horizon:.6g} s for {', '.join(self.names)}: {len(self.parts)} motions, {self._costs}"]
+        lines = [f"plan of {self.horizon:.6g} s for {len(self.names)} joints: {len(self.parts)} motions, {self._costs}"]
         for piece in self.pieces:
             end = piece.begin + piece.plan.horizon
             lines.append(f"  {piece.begin:.4g} to {end:.4g} s, {piece.name}: {piece.plan._costs}")
@@ -347,7 +347,8 @@ class SegmentedPlan(ConsecutivePlans):
         count = len(self.reconfigurations)
         counted = f"{count} reconfiguration{'' if count == 1 else 's'}"
         fewest = "the fewest possible" if self.fewest == count else f"at least {self.fewest} needed"
-        lines = [f"plan of {self.horizon:.6g} s for {', '.join(self.names)}: {counted}, {fewest}; cost {self.cost:.6g}"]
+        joints = len(self.names)
+        lines = [f"plan of {self.horizon:.6g} s for {joints} joints: {counted}, {fewest}; cost {self.cost:.6g}"]
         for k, segment in enumerate(self.segments):
             end = self.start_times[k] + segment.horizon
             bound = "" if segment.bound is None else f", lower bound {segment.bound:.6g}"

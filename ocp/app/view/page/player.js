@@ -386,7 +386,8 @@ class Player {
     const head = document.createElement("h2"), table = document.createElement("table"), box = document.createElement("div");
     head.textContent = "The audit";
     box.className = "scroll";
-    const number = (value, digits) => value === null ? "" : String(+value.toPrecision(digits));
+    const number = (value, digits) => value === null ? "" : value && Math.abs(value) < 1e-4 ?
+      value.toExponential(digits - 1) : String(+value.toPrecision(digits));
     const line = (cells, tag) => {
       const row = document.createElement("tr");
       cells.forEach((text, k) => {
