@@ -165,7 +165,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     cells = _Cells(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
     s = _separate(np.concatenate([_time_nodes(cells, path.length), nodes]), nodes)
     inner = nodes[1:-1]
-    before = inner - np.minimum(ROUNDING_SHARE * path.length, np.diff(nodes)[:-1] / 2)
+    before = inner - np.minimum(16 * np.spacing(path.length), np.diff(nodes)[:-1] / 2)  # beyond rounding of a bound
     of_interval = np.asarray(requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
     sharp = bool(np.isfinite(cells.jerk).any())
     return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)

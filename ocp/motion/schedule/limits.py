@@ -346,7 +346,7 @@ def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -
     if not jumps.size:
         return
     at = int(jumps.argmax())
-    if jumps[at] > 1e-9 * (1 + float(path.curvature(path.bounds).max())):
+    if jumps[at] > 1e-9 * (1 + float(path.curvature(path.sample_distances()).max())):  # else rounding
         place, jump, owner = float(path.bounds[at + 1]), float(jumps[at]), "joint" if joints_limited else "tool"
         message = (
             f"a {owner} jerk limit cannot be kept at {place:g} m, where the path's curvature jumps by "
