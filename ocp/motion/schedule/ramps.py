@@ -312,7 +312,8 @@ def _greatest_squares(caps: Array, near: tuple[Array, Array], far: tuple[Array, 
         value = float(caps[0])
         values = [value]
         for gain, more, cap in zip(factor.tolist(), shift.tolist(), bounds, strict=True):
-            value = min(max(gain * value + more, 0.0), cap)
+            value = gain * value + more
+            value = cap if value > cap else value if value > 0.0 else 0.0  # quicker than min and max
             values.append(value)
         before, x = x, np.array(values)
         if np.abs(x - before).max() <= ROUNDING_SHARE * x.max():

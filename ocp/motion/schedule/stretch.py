@@ -238,8 +238,8 @@ def _usage_without_jerk(profile: SpeedProfile, rows: tuple[Rows, ...], requested
 
     Each row is interpolated by a parabola through the three places.
     """
-    starts = (kind[:-1] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
-    first = LineMotion(*starts, jerk=profile.jerk)
+    t, s, v, a = (kind[:-1] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
+    first = LineMotion(t, s, v, a, profile.jerk)
     inside = profile.at_distance((profile.distance[:-1] + profile.distance[1:]) / 2)
     end = first.acceleration + profile.jerk * np.diff(profile.t)
     last = LineMotion(profile.t[1:], profile.distance[1:], profile.speed[1:], end, profile.jerk)
