@@ -209,7 +209,8 @@ class Program:
         """Return the trajectory of the program, in which each section runs from rest to rest.
 
         Args:
-            limits: Limits of all sections; the speed, one number, also limits the feeds.
+            limits: Limits of all sections; the speed, one number, also limits the feeds. An infinite centripetal limit
+                is that of the acceleration. `LineLimits.tool` limits each axis of a machine.
             rapid: Speed of rapids, m/s; None: the speed of the limits.
             tolerance, options: As in `smooth`.
 
@@ -222,6 +223,8 @@ class Program:
             message = f"limits of a program: {name} must be {'None' if name == 'joints' else 'one number, m/s'}"
             raise ProblemError(message, name=name, value=getattr(limits, name))
         fastest = float(np.asarray(limits.speed))
+        if np.isinf(limits.centripetal):
+            limits = replace(limits, centripetal=limits.acceleration)
         rapid_speed = fastest if rapid is None else require.positive("rapid", rapid)
         schedules: list[Schedule | None] = []
         for each in self.sections:

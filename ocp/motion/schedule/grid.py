@@ -8,7 +8,7 @@ distance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ from ocp.motion.schedule.limits import (
 from ocp.motion.tasks.speed_profile import Array, segment_index
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Grid", "coarse_grid", "make_grid", "reachable_bounds"]
+__all__ = ["GAUSS", "Grid", "coarse_grid", "make_grid", "reachable_bounds"]
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class GridSettings:
 
     halvings: int = 8
     shortest: float = 1e-7
-    uneven: float = 0.2
+    uneven: float = 0.05
     uneven_speed: float = 0.02
     cells: int = 4
     segments: int = 64
     closest: float = 0.05
-    build_up: float = 0.5
+    build_up: float = 0.25
     ramp: float = 0.05
     turn: float = 0.25
     least_build_up: float = 0.05
@@ -71,6 +71,10 @@ class GridSettings:
 
 
 SETTINGS = GridSettings()
+
+GAUSS = (0.5 - 12**-0.5, 0.5 + 12**-0.5)
+"""Gauss points of an interval, at which limits are compared besides its ends and its middle: a wave may have equal
+phases at equidistant places."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +111,11 @@ class Grid:
         right = np.arange(1, count + 1)
         right[self.jumps[at] - first - 1] = count + 1 + np.arange(len(at))
         return rows.take(slice(count)), rows.take(right)
+
+    def halved(self) -> Grid:
+        """Return the grid with a further node in the middle of each interval."""
+        s = np.sort(np.concatenate([self.distance, (self.distance[:-1] + self.distance[1:]) / 2]))
+        return replace(self, distance=s, requested=np.repeat(self.requested, 2), jumps=2 * self.jumps)
 
     def parts(self) -> list[tuple[int, int]]:
         """Divide the grid into consecutive blocks of bounded size; return the first and last node of each block."""
@@ -156,7 +165,7 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
     cells = _Cells(*(np.concatenate(kind) for kind in zip(*parts, strict=True)))
     s = _separate(np.concatenate([_time_nodes(cells, path.length), nodes]), nodes)
     inner = nodes[1:-1]
-    before = inner - np.minimum(ROUNDING_SHARE * path.length, np.diff(nodes)[:-1] / 2)
+    before = inner - np.minimum(16 * np.spacing(path.length), np.diff(nodes)[:-1] / 2)  # beyond rounding of a bound
     of_interval = np.asarray(requested[segment_index(bounds, (s[:-1] + s[1:]) / 2)])
     sharp = bool(np.isfinite(cells.jerk).any())
     return Grid(path, limits, joints, s, of_interval, np.searchsorted(s, inner), before, sharp)
@@ -176,11 +185,15 @@ def _halve_intervals(
     _check_rest(rows, s, limit_names(limits, joints))
     new = np.arange(len(s) - 1)
     for _ in range(SETTINGS.halvings):
-        middle = (s[new] + s[new + 1]) / 2
+        middle, begin, end = (s[new] + s[new + 1]) / 2, rows.take(new), rows.take(new + 1)
         middle_rows = limit_rows(path, limits, joints, middle)
-        uneven = _uneven_intervals(
-            rows.take(new), middle_rows, rows.take(new + 1), _steady_speeds(rows, s, *requested)[new]
-        )
+        top = _steady_speeds(rows, s, *requested)[new]
+        uneven = _uneven_intervals((begin, middle_rows, end), 0.5, top)
+        # a wave may have equal phases at both ends and in the middle: other places tell
+        at = np.flatnonzero(~uneven)
+        for fraction in GAUSS if at.size else ():
+            beside = limit_rows(path, limits, joints, s[new[at]] + fraction * (s[new[at] + 1] - s[new[at]]))
+            uneven[at] |= _uneven_intervals((begin.take(at), beside, end.take(at)), fraction, top[at])
         uneven &= s[new + 1] - s[new] > SETTINGS.shortest * path.length
         if not uneven.any():
             break
@@ -235,18 +248,23 @@ def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Arr
     return np.asarray(np.minimum(np.minimum(steady[:-1], steady[1:]), here))
 
 
-def _uneven_intervals(left: Rows, middle: Rows, right: Rows, top: Array) -> NDArray[np.bool_]:
-    """Return in which intervals a limit varies too nonlinearly with distance for linear interpolation. Shape (N,)."""
-    sides = left, middle, right
+def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Array) -> NDArray[np.bool_]:
+    """Return in which intervals a limit varies too nonlinearly with distance for linear interpolation. Shape (N,).
+
+    Args:
+        places: Limit rows at the beginning, at a fraction of the length, and at the end of each interval. Shape (N,).
+        fraction: That fraction.
+        top: Fastest steady speeds. Shape (N,), m/s.
+    """
     kinds = (
         # by the squared speed, as the rows of speed are in the program
-        ([rows.speed**2 for rows in sides], top**2, 2 * SETTINGS.uneven_speed),
-        ([rows.acceleration[:, :, 1] for rows in sides], top**2, SETTINGS.uneven),
-        ([rows.jerk[:, :, 2] for rows in sides], top**3, SETTINGS.uneven),
+        ([rows.speed**2 for rows in places], top**2, 2 * SETTINGS.uneven_speed),
+        ([rows.acceleration[:, :, 1] for rows in places], top**2, SETTINGS.uneven),
+        ([rows.jerk[:, :, 2] for rows in places], top**3, SETTINGS.uneven),
     )
     uneven = np.zeros(len(top), dtype=bool)
-    for (first, mid, last), scale, tolerance in kinds:
-        deviation = np.abs(mid - (first + last) / 2) * scale[:, None]
+    for (first, inside, last), scale, tolerance in kinds:
+        deviation = np.abs(inside - (1 - fraction) * first - fraction * last) * scale[:, None]
         uneven |= deviation.max(axis=1, initial=0.0) > tolerance
     return uneven
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +32,9 @@ __all__ = [
 
 BLOCK_SIZE = 20_000
 """Largest number of points of a path whose limits are evaluated at once, to bound the memory for a long path."""
+
+NO_COEFFICIENT = float(np.sqrt(np.finfo(float).tiny))
+"""Size below which a coefficient counts as zero, so that its inverse square is a number."""
 
 
 class PathLike(Protocol):
@@ -107,10 +110,10 @@ class JointLimits:
 
 @dataclass(frozen=True, eq=False)
 class ToolLimits:
-    """Limits of the tool: acceleration (m/s^2) and jerk (m/s^3) along each world axis, and angular speed.
+    """Limits of the tool: acceleration, jerk and velocity (m/s^2, m/s^3, m/s) along each world axis; angular speed.
 
     Attributes:
-        acceleration, jerk: Symmetric limits. Shape (3,), or one number for all axes.
+        acceleration, jerk, velocity: Symmetric limits. Shape (3,), or one number for all axes.
         turn_rate: Largest angular speed, rad/s.
 
     Raises:
@@ -120,9 +123,10 @@ class ToolLimits:
     acceleration: ArrayLike = np.inf
     jerk: ArrayLike = np.inf
     turn_rate: float = np.inf
+    velocity: ArrayLike = np.inf
 
     def __post_init__(self) -> None:
-        for name in ("acceleration", "jerk"):
+        for name in ("acceleration", "jerk", "velocity"):
             value = getattr(self, name)
             _check(f"tool {name}", value, False)
             if np.ndim(value) and np.shape(value) != (3,):
@@ -312,7 +316,7 @@ def torques_along(joints: JointPath, distance: Array) -> TorqueRates:
         message = "torque limits need joints with torques: joints=joint_path(machine, plan)"
         raise ProblemError(message, name="joint torque", value=joints)
     torques: TorqueRates = joints.torques(distance)  # type: ignore[attr-defined]
-    shape = (len(distance), len(joints.names))
+    shape = len(distance), len(joints.names)
     for kind in ("inertia", "drag", "rest"):
         value = np.asarray(getattr(torques, kind), dtype=float)
         if value.shape != shape or not np.isfinite(value).all():
@@ -342,7 +346,7 @@ def check_smooth(path: PathLike, limits: LineLimits, joints: JointPath | None) -
     if not jumps.size:
         return
     at = int(jumps.argmax())
-    if jumps[at] > 1e-9 * (1 + float(path.curvature(path.bounds).max())):
+    if jumps[at] > 1e-9 * (1 + float(path.curvature(path.sample_distances()).max())):  # else rounding
         place, jump, owner = float(path.bounds[at + 1]), float(jumps[at]), "joint" if joints_limited else "tool"
         message = (
             f"a {owner} jerk limit cannot be kept at {place:g} m, where the path's curvature jumps by "
@@ -364,7 +368,7 @@ class Rows(NamedTuple):
     acceleration: Array
     jerk: Array
 
-    def take(self, places: NDArray[np.intp] | slice) -> Rows:
+    def take(self, places: NDArray[Any] | slice) -> Rows:
         """Return the coefficients at a subset of the points."""
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
@@ -418,14 +422,15 @@ def _names_by_kind(limits: LineLimits, joints: JointPath | None) -> tuple[list[s
     if np.isfinite(limits.jerk):
         jerk = ["line jerk"]
     if limits.tool is not None:
-        speed += ["tool turn rate"]
+        speed += ["tool turn rate", *(f"tool velocity along {axis}" for axis in "xyz")]
         acceleration += [f"tool acceleration along {axis}" for axis in "xyz"]
         jerk += [f"tool jerk along {axis}" for axis in "xyz"]
     if joints is not None:
         names = joints.names
         speed += [f"joint {name!r} velocity" for name in names]
         acceleration += [f"joint {name!r} acceleration" for name in names]
-        jerk += [f"joint {name!r} jerk" for name in names]
+        if np.isfinite(limits.of_joints(len(names))[2]).any():
+            jerk += [f"joint {name!r} jerk" for name in names]
         if torque_rows(limits, joints):
             acceleration += [f"joint {name!r} torque" for name in names]
     return speed, acceleration, jerk
@@ -462,8 +467,6 @@ def limit_rows(
 def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, torques: bool) -> Rows:
     """Return the coefficients of all limits at no more than `BLOCK_SIZE` distances along a path."""
     speed, acceleration, jerk = (np.zeros((len(s), len(kind), 3)) for kind in _names_by_kind(limits, joints))
-    if not s.size:
-        return Rows(speed[:, :, 0], acceleration, jerk)
     if np.isfinite(limits.centripetal):
         speed[:, 0, 0] = np.sqrt(curvature_along(path, s) / limits.centripetal)
     acceleration[:, 0, 0] = 1 / limits.acceleration
@@ -473,19 +476,24 @@ def _block_rows(path: PathLike, limits: LineLimits, joints: JointPath | None, s:
     if limits.tool is not None:
         tangent, curvature, rate, turn = tool_along(path, s)
         speed[:, 1, 0] = np.linalg.norm(turn, axis=1) / limits.tool.turn_rate
-        accelerations, jerks = (np.broadcast_to(value, (3,)) for value in (limits.tool.acceleration, limits.tool.jerk))
+        each = (limits.tool.acceleration, limits.tool.jerk, limits.tool.velocity)
+        accelerations, jerks, velocities = (np.broadcast_to(value, (3,)) for value in each)
+        speed[:, 2:5, 0] = np.abs(tangent) / velocities
         acceleration[:, 1:4, 0], acceleration[:, 1:4, 1] = tangent / accelerations, curvature / accelerations
         jerk[:, p : p + 3] = np.stack([tangent, 3 * curvature, rate], axis=2) / jerks[:, None]
-        k, m, p = 2, 4, p + 3
+        k, m, p = 5, 4, p + 3
     if joints is not None:
         n = len(joints.names)
         rates, (velocities, accelerations, jerks) = rates_along(joints, s), limits.of_joints(n)
         first, second, third = (np.asarray(values, dtype=float) for values in (rates.first, rates.second, rates.third))
         speed[:, k:, 0] = np.abs(first) / velocities
         acceleration[:, m : m + n, 0], acceleration[:, m : m + n, 1] = first / accelerations, second / accelerations
-        jerk[:, p:] = np.stack([first, 3 * second, third], axis=2) / jerks[:, None]
+        if jerk.shape[1] > p:
+            jerk[:, p:] = np.stack([first, 3 * second, third], axis=2) / jerks[:, None]
         if torques and torque_rows(limits, joints):
             along = torques_along(joints, s)
             values = np.stack([along.inertia, along.drag, along.rest], axis=2)
             acceleration[:, m + n :] = values / limits.torques(n)[:, None]
+    for rows in (speed, acceleration, jerk):
+        rows[np.abs(rows) < NO_COEFFICIENT] = 0.0  # of a joint that stands still but for rounding
     return Rows(speed[:, :, 0], acceleration, jerk)

@@ -4,10 +4,11 @@ A zone is a stretch of the path with constant limits of speed, acceleration and 
 their bounds and joins the fastest motions between them.
 
 Without jerk limits the fastest motion follows from a backward and a forward pass in (s, v^2). With x = v^2 at the nodes
-and one acceleration u in each interval of width h, x grows by 2 h u, and each row is linear in (u, x). Backward, the
-squared speeds from which the end can be reached form an interval at each node: eliminating u from the rows of an
-interval leaves bounds on x. Forward, the greatest u that stays among them is taken (Pham and Pham, A New Approach to
-Time-Optimal Path Parameterization Based on Reachability Analysis, 2018; the rows hold at both ends of an interval).
+and an acceleration u that is linear in each interval of width h, x grows by h times the sum of u at both ends, and each
+row bounds u by lines in x. Backward, the squared speeds from which the end can be reached are those up to a greatest
+one, which follows from that of the next node; forward, the greatest x that stays below is taken (Pham and Pham, A New
+Approach to Time-Optimal Path Parameterization Based on Reachability Analysis, 2018; by the trapezoidal rule here, whose
+error falls with h^2). A pass is the fixed point of a minimum of increasing functions, which are piecewise linear.
 """
 
 from __future__ import annotations
@@ -37,6 +38,15 @@ __all__ = [
 
 Memory = MutableMapping[tuple[float, ...], Phases]
 """Cache of computed motions, keyed by distance, end speeds and limits."""
+
+NO_INERTIA = 1e-12
+"""Coefficient of the acceleration, over the largest of all rows, below which a row does not limit the acceleration."""
+
+UNBOUNDED = 1e300
+"""Bound of an acceleration that is not limited; finite, so that its multiple by 0 is 0."""
+
+ACTIVE_USAGE = 0.1
+"""Share of a limit below which its part at a steady speed cannot make it active in a short interval."""
 
 REACH_MARGIN = 1e-6
 """Fraction of a zone (stretch with constant limits) kept in reserve, so that a motion through the zone is feasible."""
@@ -195,67 +205,117 @@ def _limit_speed(speed: float, other_end: float, length: float, limits: tuple[fl
     return min(speed, reachable_speed(other_end, length * (1 - REACH_MARGIN), *limits[1:]))
 
 
-def reachability_passes(distance: Array, caps: Array, *, p: Array, q: Array, low: Array, high: Array) -> Array:
-    """Return the greatest squared speeds at path nodes (N + 1,) from rest to rest, by a backward and a forward pass.
+class _Bounds(NamedTuple):
+    """Bounds low + slope x <= u <= high + slope x of the acceleration u at squared speed x. Shape (N, R) each."""
+
+    slope: Array
+    low: Array
+    high: Array
+
+    @classmethod
+    def build(cls, rows: Array) -> _Bounds:
+        """Return the bounds that rows (p, q, r) set, -1 <= p u + q x + r <= 1. Shape (N, R, 3)."""
+        p, q, r = np.moveaxis(rows, 2, 0)
+        size = np.abs(p)
+        free = size <= NO_INERTIA * size.max(axis=1, keepdims=True)
+        inverse = 1 / np.where(free, 1.0, p)
+        middle, reach = -r * inverse, np.where(free, UNBOUNDED, np.abs(inverse))
+        return cls(np.where(free, 0.0, -q * inverse), middle - reach, middle + reach)
+
+    def at(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return the greatest lower and the least upper bound at squared speeds (N,), and their difference's slope."""
+        change, each = self.slope * x[:, None], np.arange(len(x))
+        below, above = change + self.low, change + self.high
+        low, high = below.argmax(axis=1), above.argmin(axis=1)
+        return below[each, low], above[each, high], self.slope[each, high] - self.slope[each, low]
+
+    def feasible(self, caps: Array) -> Array:
+        """Return the greatest squared speeds, at most `caps` (N,), at which the bounds leave an acceleration."""
+        x, at = caps.copy(), np.flatnonzero(caps > 0)
+        while at.size:  # Newton's method on a concave function, from above its root
+            low, high, slope = _Bounds(*(kind[at] for kind in self)).at(x[at])
+            beyond = low - high > ROUNDING_SHARE * (np.abs(low) + np.abs(high))
+            at = at[beyond]
+            x[at] = np.maximum(x[at] + ((low - high)[beyond] / slope[beyond]), 0.0)
+            at = at[x[at] > 0]
+        return x
+
+
+def reachability_passes(distance: Array, caps: Array, left: Array, right: Array) -> tuple[Array, Array, Array]:
+    """Return the greatest squared speeds at path nodes (N + 1,), by a backward and a forward pass, and accelerations.
 
     Args:
         distance: Distances of the nodes. Shape (N + 1,), m.
-        caps: Greatest permitted squared speed at each node. Shape (N + 1,).
-        p, q, low, high: low <= p u + q x <= high in each interval, x at its first node. Shape (N, R).
+        caps: Greatest permitted squared speed at each node; 0 at rest. Shape (N + 1,).
+        left, right: Coefficients (p, q, r) of rows -1 <= p u + q x + r <= 1 with -1 < r < 1, where each interval
+            begins and where it ends. Shape (N, R, 3).
+
+    Returns:
+        The squared speeds, and the accelerations where each interval begins and where it ends. Shape (N,).
 
     Raises:
-        ProblemError: No motion can pass a node, its distance (m) as `time`.
+        ProblemError: The motion must stop at a node, its distance (m) as `time`.
     """
-    h = np.diff(distance)
-    floor, ceiling = _feasible_squares(p, q, low, high, caps[:-1])
-    least, top = np.zeros(len(distance)), np.zeros(len(distance))
-    # bounds of u, linear in x: rows with p > 0 bound u from above by `high`, from below by `low`, others vice versa
-    sign = np.sign(p)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.where(sign == 0, 0.0, -q / p)
-        above = np.where(sign == 0, np.inf, np.where(sign > 0, high, low) / p)
-        below = np.where(sign == 0, -np.inf, np.where(sign > 0, low, high) / p)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for k in range(len(h) - 1, -1, -1):
-            # the range of x + 2 h u over u must intersect the reachable interval of the next node
-            bend = 1 + 2 * h[k] * slope[k]
-            ends = (top[k + 1] - 2 * h[k] * below[k]) / bend
-            starts = (least[k + 1] - 2 * h[k] * above[k]) / bend
-            up, down = bend > 0, bend < 0
-            high_x = min(ceiling[k], ends[up].min(initial=np.inf), starts[down].min(initial=np.inf))
-            low_x = max(floor[k], starts[up].max(initial=0.0), ends[down].max(initial=0.0))
-            if not low_x <= high_x * (1 + ROUNDING_SHARE) + 1e-300:
-                place = float(distance[k])
-                message = f"no motion keeps the limits of acceleration and torque at {place:g} m; raise them"
-                raise ProblemError(message, name="acceleration", value=low_x, limit=high_x, time=place)
-            least[k], top[k] = min(low_x, high_x), high_x
-    if least[0] > 0:
-        message = "no motion from rest keeps the limits of acceleration and torque at 0 m; raise them"
-        raise ProblemError(message, name="acceleration", value=float(least[0]), limit=0.0, time=0.0)
-    x = np.zeros(len(distance))
-    for k in range(len(h)):
-        u = min(float((above[k] + slope[k] * x[k]).min(initial=np.inf)), (top[k + 1] - x[k]) / (2 * h[k]))
-        x[k + 1] = min(max(x[k] + 2 * h[k] * u, least[k + 1]), top[k + 1])
+    h = np.diff(distance)[:, None]
+    begin, end = _Bounds.build(left), _Bounds.build(right)
+    most = caps.copy()
+    most[:-1] = begin.feasible(most[:-1])
+    most[1:] = end.feasible(most[1:])
+    # near a point of zero inertia a bound is steeper than the interval is short: one acceleration holds at both ends
+    p, q = (np.abs([side[:, :, seat] for side in (left, right)]) for seat in (0, 1))
+    active = q.max(axis=0) * np.maximum(caps[1:], caps[:-1])[:, None] > ACTIVE_USAGE
+    stiff = (active & (h * q > p).any(axis=0)).any(axis=1)
+    moved = right[stiff]
+    moved[:, :, 0] += 2 * h[stiff] * moved[:, :, 1]
+    both = _Bounds.build(np.concatenate([left[stiff], moved], axis=1))
+    most[:-1][stiff] = both.feasible(most[:-1][stiff])
+    padded = []
+    for own, fill, at_both in zip(begin, (0.0, -UNBOUNDED, UNBOUNDED), both, strict=True):
+        padded.append(np.append(own, np.full(own.shape, fill), axis=1))
+        padded[-1][stiff] = at_both
+    begin = _Bounds(*padded)
+    # the squared speed grows by w u at the beginning + z u at the end
+    w, z = np.where(stiff[:, None], 2 * h, h), np.where(stiff[:, None], 0.0, h)
+    of_begin, of_end = 1 + w * begin.slope, 1 - z * end.slope
+    backward = (of_begin, w * begin.low), (of_end, -z * end.low)
+    top = _greatest_squares(most[::-1], *((slope[::-1], offset[::-1]) for slope, offset in backward))[::-1]
+    x = _greatest_squares(top, (of_end, -z * end.high), (of_begin, w * begin.high))
+    if not x[1:-1].all():
+        place = float(distance[1 + int((x[1:-1] == 0).argmax())])
+        message = f"no motion keeps the limits of acceleration and torque at {place:g} m; raise them"
+        raise ProblemError(message, name="acceleration", value=0.0, limit=0.0, time=place)
+    total = np.diff(x) / h[:, 0]
+    (low, high, _), (low_end, high_end, _) = begin.at(x[:-1]), end.at(x[1:])
+    u = np.minimum(np.maximum(total / 2, np.maximum(low, total - high_end)), np.minimum(high, total - low_end))
+    u = np.where(stiff, total / 2, u)
+    return x, u, total - u
+
+
+def _greatest_squares(caps: Array, near: tuple[Array, Array], far: tuple[Array, Array]) -> Array:
+    """Return the greatest x (N + 1,) within caps with max(a x[k + 1] + b) <= min(c x[k] + d), from the first on.
+
+    Howard's policy iteration: all nodes are solved with the lines that are active at the last solution, until these are
+    the active ones.
+
+    Args:
+        caps: Upper bounds. Shape (N + 1,).
+        near, far: a and b, c and d. Shape (N, R) each.
+    """
+    each, x, bounds = np.arange(len(caps) - 1), caps, caps[1:].tolist()
+    for _ in each:
+        i, j = (near[0] * x[1:, None] + near[1]).argmax(axis=1), (far[0] * x[:-1, None] + far[1]).argmin(axis=1)
+        slope = near[0][each, i]
+        rises = slope > 0  # else the bound falls and does not limit x
+        slope = np.where(rises, slope, 1.0)
+        factor = np.where(rises, far[0][each, j], 0.0) / slope
+        shift = np.where(rises, far[1][each, j] - near[1][each, i], UNBOUNDED) / slope
+        value = float(caps[0])
+        values = [value]
+        for gain, more, cap in zip(factor.tolist(), shift.tolist(), bounds, strict=True):
+            value = gain * value + more
+            value = cap if value > cap else value if value > 0.0 else 0.0  # quicker than min and max
+            values.append(value)
+        before, x = x, np.array(values)
+        if np.abs(x - before).max() <= ROUNDING_SHARE * x.max():
+            break
     return x
-
-
-def _feasible_squares(p: Array, q: Array, low: Array, high: Array, caps: Array) -> tuple[Array, Array]:
-    """Return lower and upper bounds (N,) of the squared speeds at which the limits leave some acceleration possible."""
-    floor, ceiling = np.zeros(len(p)), caps.copy()
-    count = p.shape[1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for i in range(count):
-            for j in range(i, count):
-                # eliminating u from two rows leaves bounds on x
-                weight = np.where(p[:, i] == 0, 1.0, p[:, j]), np.where(p[:, i] == 0, 0.0, -p[:, i])
-                if i == j:
-                    weight = np.where(p[:, i] == 0, 1.0, 0.0), np.zeros(len(p))
-                of_x = weight[0] * q[:, i] + weight[1] * q[:, j]
-                least = sum(np.minimum(w * low[:, r], w * high[:, r]) for w, r in zip(weight, (i, j), strict=True))
-                greatest = sum(np.maximum(w * low[:, r], w * high[:, r]) for w, r in zip(weight, (i, j), strict=True))
-                ends = least / of_x, greatest / of_x
-                bounded = of_x != 0
-                ceiling = np.where(bounded, np.minimum(ceiling, np.fmax(*ends)), ceiling)
-                floor = np.where(bounded, np.maximum(floor, np.fmin(*ends)), floor)
-                ceiling = np.where(~bounded & ((least > 0) | (greatest < 0)) & (np.abs(weight[0]) > 0), -1.0, ceiling)
-    return floor, ceiling

@@ -16,8 +16,8 @@ import scipy
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError, SolveError
-from ocp.motion.schedule.grid import reachable_bounds
-from ocp.motion.schedule.limits import Rows
+from ocp.motion.schedule.grid import GAUSS, Grid, reachable_bounds
+from ocp.motion.schedule.limits import Rows, limit_rows
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.motion.schedule.ramps import reachability_passes
 from ocp.motion.schedule.window import (
@@ -33,7 +33,7 @@ from ocp.motion.schedule.window import (
     motion_profile,
 )
 from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
-from ocp.motion.tasks.speed_profile import Array, SpeedProfile, join_profiles
+from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, join_profiles, profile_between
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["ACTIVE_SHARE", "fastest_profile"]
@@ -48,6 +48,10 @@ class StretchSettings:
 
     Attributes:
         rounds: Largest number of rounds of tightening the limits.
+        unused: Share of the time by which intervals are longer whose middle uses no limit up though an end does, above
+            which they are halved.
+        exceeded: Share by which a motion without jerk limits may exceed limits between nodes: half of the promised
+            accuracy of 1e-3.
         accuracies: Relative accuracy of the travel time of a window in each round, no finer than the enforced limits
             still change; the last value serves all later rounds.
         around, few: Intervals on either side of a violated one that are planned again with it; only these are planned
@@ -63,6 +67,8 @@ class StretchSettings:
     """
 
     rounds: int = 20
+    unused: float = 1e-4
+    exceeded: float = 5e-4
     accuracies: tuple[float, ...] = (0.05, 1e-3, 1e-5, 1e-8)
     around: int = 40
     few: float = 1 / 6
@@ -87,7 +93,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
         ProblemError: No motion keeps the limits, with the distance at fault.
     """
     if not stretch.grid.sharp:
-        return _solve_window(Window.build(stretch, stretch.first, stretch.last, stretch.ends), stretch.last, None)[0]
+        return _without_jerk(stretch.grid)
     parts: list[SpeedProfile] = []
     begin, state, behind = stretch.first, stretch.ends[0], None
     while True:
@@ -125,11 +131,11 @@ def _solve_window(
         enforced.inherited = before.held.shape[2]
     to_seam, checked = seam - window.first, min(seam + SETTINGS.overlap // 2, window.last) - window.first
     x, slope = _tighten(window, enforced, seam, checked)
-    state = float(x[to_seam]), 0.0 if slope is None else float(slope[to_seam])
+    state = float(x[to_seam]), float(slope[to_seam])
     return motion_profile(window, x[: to_seam + 1], slope), state, enforced.after(to_seam)
 
 
-def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> tuple[Array, Array | None]:
+def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> Motion:
     """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
     If few intervals still violate limits, these are planned again with their neighbours, between fixed motions.
@@ -138,29 +144,21 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
         window, seam: As for `_solve_window`.
         enforced: Enforced limit rows and margins, changed in place.
         checked: Number of intervals, from the first, that must keep the limits.
-
-    Returns:
-        Squared speeds at the nodes, and their slopes if jerks are limited, else None.
     """
     every = np.arange(window.last - window.first)
-    sharp = window.grid.sharp
-    accuracies = SETTINGS.accuracies if sharp else SETTINGS.accuracies[-1:]
-    start, free = None, every
+    accuracies, start, free = SETTINGS.accuracies, None, every
     for number in range(SETTINGS.rounds):
         accuracy = accuracies[min(number, len(accuracies) - 1)]
         try:
-            if sharp:
-                x, slope = _with_jerk(window, enforced, seam, start, accuracy, free)
-            else:
-                x, slope = _without_jerk(window, enforced.margins), None
+            x, slope = _with_jerk(window, enforced, seam, start, accuracy, free)
         except ProblemError:
             if len(free) == len(every):
                 raise
             free = every  # too short for the change of motion
             continue
-        used, values = limit_usage(window, motion_profile(window, x, slope), free, start is not None or not sharp)
+        used, values = limit_usage(window, motion_profile(window, x, slope), free, start is not None)
         used /= _seam_shares(window, seam)[:, None]
-        if start is None and slope is not None:
+        if start is None:
             enforced.hold_near(used, values, window.rows[1].jerk[:, :, 0])
             start = x, slope
             continue
@@ -168,12 +166,9 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
         affected = np.asarray(violated.any(axis=(0, 2)))
         if not affected[:checked].any() and accuracy == accuracies[-1]:
             return x, slope
-        if slope is not None and number == 1:
+        if number == 1:
             enforced.release(values, window.rows[1].jerk[:, :, 0], seam - window.first)
-        held = violated if slope is None else enforced.hold(violated, values)
-        enforced.lower(used, held, window.rows[0], seam - window.first)
-        if slope is None:
-            continue
+        enforced.lower(used, enforced.hold(violated, values), window.rows[0], seam - window.first)
         start = x, slope
         near = np.flatnonzero(scipy.ndimage.maximum_filter1d(affected, 2 * SETTINGS.around + 1))
         free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
@@ -188,23 +183,79 @@ def _seam_shares(window: Window, seam: int) -> Array:
     return np.where(np.arange(window.first, window.last) < seam, 1.0, SETTINGS.seam)
 
 
-def _without_jerk(window: Window, margins: Margins) -> Array:
-    """Return the greatest squared speeds at a window's nodes for unlimited jerk, by a backward and a forward pass."""
-    grid = window.grid
-    left, right = window.rows[0], window.rows[-1]
-    h = np.diff(window.nodes)[:, None]
-    caps = np.minimum(_node_minimum(grid.requested) ** 2, _row_speed_caps(window) * _node_minimum(margins.speed) ** 2)
-    rows = left.acceleration, right.acceleration
-    p = np.concatenate([rows[0][:, :, 0], rows[1][:, :, 0] + 2 * h * rows[1][:, :, 1]], axis=1)
-    q, rest = (np.concatenate([side[:, :, seat] for side in rows], axis=1) for seat in (1, 2))
-    bound = np.concatenate([margins.acceleration] * 2, axis=1)
-    caps[[0, -1]] = 0.0
-    return reachability_passes(window.nodes, caps, p=p, q=q, low=-bound - rest, high=bound - rest)
+def _without_jerk(grid: Grid) -> SpeedProfile:
+    """Return the fastest motion along a path for unlimited jerk, by two passes on a grid that is refined in rounds.
+
+    An interval is halved while a limit is violated inside it, and in the first rounds where a limit is active at both
+    ends but none in the middle.
+
+    Raises:
+        ProblemError: A limit is violated in the shortest intervals too, with the distance.
+    """
+    s, requested = grid.distance, grid.requested
+    sides = grid.ends(0, len(requested))
+    middle = limit_rows(grid.path, grid.limits, grid.joints, (s[:-1] + s[1:]) / 2)
+    for _ in range(SETTINGS.rounds):
+        caps = np.minimum(_node_minimum(requested) ** 2, _row_speed_caps(*sides))
+        caps[[0, -1]] = 0.0
+        x, *rates = reachability_passes(s, caps, *(side.acceleration for side in sides))
+        profile = profile_between(s, np.sqrt(x), (rates[0], rates[1]))
+        used, peak = _usage_without_jerk(profile, (sides[0], middle, sides[1]), requested)
+        cut = peak > 1 + SETTINGS.exceeded
+        unused = np.where(used[[0, 2]].max(axis=0) > 1 - 2 * SETTINGS.exceeded, 1 - used[1], 0.0)
+        if unused @ np.diff(profile.t) > SETTINGS.unused * profile.duration:
+            cut |= unused > 2 * SETTINGS.exceeded
+        if not cut.any():
+            for fraction in GAUSS:
+                inside = profile.at_distance(s[:-1] + fraction * np.diff(s))
+                rows = limit_rows(grid.path, grid.limits, grid.joints, inside.distance)
+                cut |= np.abs(rows.usage(inside)).max(axis=1) > 1 + SETTINGS.exceeded
+            if not cut.any():
+                return profile
+        # both halves of an interval: its rows in the middle are at the end of one and at the beginning of the other
+        at = np.repeat(np.arange(len(cut)), 1 + cut)
+        second = np.flatnonzero(np.diff(at) == 0) + 1
+        new = np.union1d(second - 1, second)
+        s, requested = np.union1d(s, ((s[:-1] + s[1:]) / 2)[cut]), requested[at]
+        quarters = limit_rows(grid.path, grid.limits, grid.joints, ((s[:-1] + s[1:]) / 2)[new])
+        halves = middle.take(cut)
+        sides, middle = (sides[0].take(at), sides[1].take(at)), middle.take(at)
+        for rows, which, values in (
+            (sides[0], second, halves),
+            (sides[1], second - 1, halves),
+            (middle, new, quarters),
+        ):
+            for kind, own in zip(rows, values, strict=True):
+                kind[which] = own
+    worst = int(peak.argmax())
+    place, largest = float(profile.distance[worst]), float(peak[worst])
+    message = f"the limits are violated by {largest - 1:.2g} at {place:g} m, where the path or its joints bend sharply"
+    raise ProblemError(message, name="limits", value=largest, limit=1.0, time=place)
 
 
-def _row_speed_caps(window: Window) -> Array:
+def _usage_without_jerk(profile: SpeedProfile, rows: tuple[Rows, ...], requested: Array) -> tuple[Array, Array]:
+    """Return the largest usage of any limit at beginning, middle and end of each interval (3, N), and between (N,).
+
+    Each row is interpolated by a parabola through the three places.
+    """
+    t, s, v, a = (kind[:-1] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
+    first = LineMotion(t, s, v, a, profile.jerk)
+    inside = profile.at_distance((profile.distance[:-1] + profile.distance[1:]) / 2)
+    end = first.acceleration + profile.jerk * np.diff(profile.t)
+    last = LineMotion(profile.t[1:], profile.distance[1:], profile.speed[1:], end, profile.jerk)
+    motions = first, inside, last
+    values = np.stack([each.usage(motion) for each, motion in zip(rows, motions, strict=True)])
+    begin, half, final = values
+    slope, bend = final - begin, begin + final - 2 * half
+    vertex = np.where(np.abs(slope) < 2 * np.abs(bend), half - slope**2 / np.where(bend == 0, np.inf, 8 * bend), 0.0)
+    peak = np.maximum(np.abs(values).max(axis=(0, 2)), np.abs(vertex).max(axis=1))
+    used = np.maximum(np.abs(values).max(axis=2), [motion.speed / requested for motion in motions])
+    return used, np.maximum(peak, used.max(axis=0))
+
+
+def _row_speed_caps(left: Rows, right: Rows) -> Array:
     """Return the greatest squared speeds that the speed limits on both sides of each node permit."""
-    left, right = (window.rows[k].speed.max(axis=1, initial=0.0) for k in (0, -1))
+    left, right = (side.speed.max(axis=1, initial=0.0) for side in (left, right))
     with np.errstate(divide="ignore"):
         return np.asarray(np.maximum(np.append(left, 0.0), np.insert(right, 0, 0.0)) ** -2.0)
 
@@ -224,7 +275,7 @@ def _with_jerk(
     seam_shares = _seam_shares(window, seam)
     shares = enforced.margins.times(seam_shares)
     requested = grid.requested[begin:end] ** 2 * seam_shares**2
-    caps = np.minimum(_node_minimum(requested), _row_speed_caps(window) * _node_minimum(shares.speed) ** 2)
+    caps = np.minimum(_node_minimum(requested), _row_speed_caps(left, right) * _node_minimum(shares.speed) ** 2)
     reachable, rates = reachable_bounds(nodes, caps, left=left, right=right, at_rest=at_rest)
     # an interval next to rest has constant jerk and is not part of the program
     low, high = int(at_rest[0]), len(nodes) - int(at_rest[1])

@@ -25,8 +25,7 @@ class WindowSettings:
     Shares are fractions of the limits.
 
     Attributes:
-        room: Share of the limits reserved for what happens between the positions where they are enforced: half of the
-            promised accuracy of 1e-3.
+        room: Share of the limits reserved for what happens between the positions where they are enforced.
         near: Once a motion is known, limits of which it uses less than this share in an interval and beside it are left
             out.
         lowered: Largest factor by which a limit is lowered in a round.
@@ -36,7 +35,7 @@ class WindowSettings:
         fine: Parts into which an interval is split for that evaluation; even, so that the middle is an end of one.
     """
 
-    room: float = 5e-4
+    room: float = 1e-4
     near: float = 0.9
     lowered: float = 1.5
     bend: float = 1e-4
@@ -250,14 +249,10 @@ class EnforcedRows:
                 self.held[:, :, at[0][inherited], a + at[1][inherited]] = True
 
 
-def motion_profile(stretch: Stretch, x: Array, slope: Array | None) -> SpeedProfile:
-    """Return the speed profile through given squared speeds, and derivatives if given, at the first nodes of a part."""
+def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
+    """Return the speed profile through given squared speeds and derivatives at the first nodes of a part."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
-    v = np.sqrt(x)
-    if slope is not None:
-        return profile_through(s, v, slope[: len(x)] / 2)
-    t = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (v[:-1] + v[1:]))])
-    return SpeedProfile(t, s, v, np.append(np.diff(x) / (2 * np.diff(s)), 0.0), np.zeros(len(s) - 1))
+    return profile_through(s, np.sqrt(x), slope[: len(x)] / 2)
 
 
 def limit_usage(
@@ -273,9 +268,8 @@ def limit_usage(
     count, h = len(which), np.diff(window.nodes)[which]
     every, left = count == window.last - window.first, window.nodes[which]
     begin, before, here, after, end = window.rows if every else (rows.take(which) for rows in window.rows)
-    each = len(profile.jerk) // (window.last - window.first)
     # the halves meet where the jerk changes, near the middle; the rows there are interpolated by a parabola
-    at = profile.distance[1::2][which] if each == 2 else left + h / 2
+    at = profile.distance[1::2][which]
     f = (at - left) / h
     x = (f - INSIDE[1]) / (INSIDE[1] - INSIDE[0])
 
@@ -289,10 +283,8 @@ def limit_usage(
         t, s, v, a = (kind[place] for kind in (profile.t, profile.distance, profile.speed, profile.acceleration))
         return LineMotion(t, s, v, a, jerk)
 
-    first = states(each * which, profile.jerk[each * which])
-    last = states(each * (which + 1), profile.jerk[each * (which + 1) - 1])
-    if each == 1:  # the acceleration jumps at nodes; use the one before
-        last = last._replace(acceleration=first.acceleration)
+    first = states(2 * which, profile.jerk[2 * which])
+    last = states(2 * which + 2, profile.jerk[2 * which + 1])
     zero = np.zeros(count)
     places = np.concatenate([left + INSIDE[0] * h, at, left + INSIDE[2] * h])
     inside = profile.at_distance(places)

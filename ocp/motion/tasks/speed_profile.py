@@ -21,8 +21,8 @@ from ocp.errors import ProblemError, require
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
-    "Array", "LineMotion", "Phases", "SpeedProfile", "integrate_jerk", "join_profiles", "profile_through",
-    "ramp_distance", "ramp_phases", "ramp_time", "reachable_speed", "rest_profile", "segment_index",
+    "Array", "LineMotion", "Phases", "SpeedProfile", "integrate_jerk", "join_profiles", "profile_between",
+    "profile_through", "ramp_distance", "ramp_phases", "ramp_time", "reachable_speed", "rest_profile", "segment_index",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -232,6 +232,24 @@ def profile_through(distance: Array, speed: Array, acceleration: Array) -> Speed
     jerk = np.stack([first, second], axis=1).ravel()
     places = interleaved(distance, distance[:-1] + covered)
     return SpeedProfile(t, places, interleaved(speed, np.maximum(middle, 0.0)), interleaved(acceleration, rate), jerk)
+
+
+def profile_between(distance: Array, speed: Array, rates: tuple[Array, Array]) -> SpeedProfile:
+    """Return the speed profile through given nodes, with one segment of constant jerk between neighbouring nodes.
+
+    The time T over a distance h follows from h = (v0 + v1)/2 T - (a1 - a0)/12 T^2; the acceleration jumps at nodes.
+
+    Args:
+        distance, speed: Values at the nodes, in order. Shape (N + 1,).
+        rates: Approximate accelerations where each interval begins and ends: the change a1 - a0 is kept. Shape (N,).
+    """
+    h, mean = np.diff(distance), (speed[:-1] + speed[1:]) / 2
+    change = np.minimum(rates[1] - rates[0], 2 * mean**2 / h)
+    time = 2 * h / (mean + np.sqrt(mean**2 - change * h / 3))
+    acceleration = np.diff(speed) / time - change / 2
+    t = np.concatenate([[0.0], np.cumsum(time)])
+    last = acceleration[-1:] + change[-1:]
+    return SpeedProfile(t, distance, speed, np.concatenate([acceleration, last]), change / time)
 
 
 def join_profiles(parts: Sequence[SpeedProfile]) -> SpeedProfile:

@@ -44,6 +44,14 @@ def timed(program: Program) -> TimedProgram:
     return program.schedule(LIMITS, rapid=0.4)
 
 
+def test_curves_keep_the_acceleration_without_a_centripetal_limit_too(program: Program) -> None:
+    for each in program.schedule(LineLimits(0.5, 0.02, 2.0)).schedules:
+        if each is not None:
+            motion = each.at(np.linspace(0, each.duration, 20001))
+            across = motion.speed**2 * each.path.curvature(motion.distance)
+            assert max(np.abs(motion.acceleration).max(), across.max()) <= 0.02 * 1.001
+
+
 def test_the_stretches_are_those_of_the_file(program: Program, timed: TimedProgram) -> None:
     kinds = [type(each) for each in program.sections]
     assert kinds == [Rapid, Cut, Pause, Rapid, Pause, Rapid, Cut]
