@@ -15,7 +15,7 @@ from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 
 from models import FixedBase, Path, SmoothPath, planar_chain, smooth
 from ocp import joint_path
-from ocp.motion.schedule import JointLimits, LineLimits, Schedule, schedule
+from ocp.motion.schedule import JointLimits, LineLimits, Schedule, ToolLimits, schedule
 from tests.models.paths.task_paths import seeds
 from tests.ocp.problems import Array
 
@@ -202,3 +202,14 @@ def test_joints_keep_their_limits_where_their_accelerations_jump(seed: int) -> N
     joints = joint_path(FixedBase(planar_chain([1.0] * 10, [1.0] * 10)), (s, curve(s)), UNIT)
     limits = JointLimits(rng.uniform(1, 3, 10), 10 ** rng.uniform(0, 2, 10))
     assert greatest_usage(schedule(UNIT, replace(FREE, joints=limits), joints=joints)) <= 1.001
+
+
+@pytest.mark.parametrize("jerk", [np.inf, 50.0])
+def test_an_axis_moves_no_faster_than_its_limit_and_as_fast_where_that_is_what_limits(jerk: float) -> None:
+    """On a straight line the speed is the limit of the slowest axis divided by its share of the direction."""
+    line = smooth(Path.through([(0, 0, 0), (0.8, 0.6, 0.0)]), deviation=0.01)
+    limits = LineLimits(2.0, 5.0, jerk, tool=ToolLimits(velocity=(0.5, 0.3, 0.1)))
+    timed = schedule(line, limits)
+    motion = timed.at(np.linspace(0.0, timed.duration, 20_001))
+    assert motion.speed.max() == pytest.approx(0.5, rel=1e-3)  # along y: 0.3 / 0.6; along x 0.5 / 0.8
+    assert motion.speed.max() <= 0.5 * 1.001
