@@ -27,7 +27,7 @@ from ocp.app.check.data_checks import CleanedTrajectory, Fault
 from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
 from ocp.console import check_time
 from ocp.errors import ProblemError, require
-from ocp.motion.result.plan import ENDS
+from ocp.motion.result.plan import ENDS, describe_ends
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.values import Sampler
 from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
@@ -158,17 +158,13 @@ def limit_rows(
 
 def rest_row(motion: Motion, robot: Robot, joints: Indices) -> Row:
     """Return the row about the speed of the joints at both ends of a motion; the verdict is OK if they are at rest."""
-    speeds, texts = motion.end_speeds(), []
-    for verb, row in zip(("starts", "ends"), speeds, strict=True):
-        if row.any():
-            name = robot.joint_names[joints[int(row.argmax())]]
-            texts.append(f"{verb} at {row.max():.3g} {robot.joint(name).unit}/s ({name!r})")
-    end, column = np.unravel_index(int(speeds.argmax()), speeds.shape)
-    unit, time = robot.joint(robot.joint_names[joints[int(column)]]).unit, float(motion.t[[0, -1][int(end)]])
-    verdict, note = RowVerdict.OK if not texts else RowVerdict.INFO, "at rest"
-    if texts:
-        note = f"{' and '.join(texts)}, not at rest"
-    return Row(ENDS, float(speeds[end, column]), None, f"{unit}/s", time, verdict, note)
+    speeds, names = motion.end_speeds(), [robot.joint_names[k] for k in joints]
+    units = [robot.joint(name).unit for name in names]
+    end, column = (int(k) for k in np.unravel_index(int(speeds.argmax()), speeds.shape))
+    text = describe_ends(speeds, names, units)
+    verdict = RowVerdict.INFO if text else RowVerdict.OK
+    time = float(motion.t[[0, -1][end]])
+    return Row(ENDS, float(speeds[end, column]), None, f"{units[column]}/s", time, verdict, text or "at rest")
 
 
 class _Side(NamedTuple):

@@ -199,11 +199,14 @@ def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple
     The times are chosen so that the distances are nearly evenly spaced, also where the tool speeds up from rest.
 
     Raises:
-        ProblemError: The tasks leave the path, stand still on it, or do not cover it.
+        ProblemError: The tasks leave the path, stand still on it, or do not cover it; or the plan has several motions.
     """
     times = np.linspace(0.0, plan.horizon, samples)
     if not (plan.targets and hasattr(path, "at")):
         return length * plan.task_share(times), plan.at(times)["joints"]
+    if not hasattr(plan, "targets_at"):
+        words = f"{plan!r} consists of several motions: give (distances, joints) of one motion along the path instead"
+        raise ProblemError(words, name="plan", value=type(plan).__name__)
     distances = _distances_of_targets(plan, path, length, times)
     times = np.interp(np.linspace(0.0, length, samples), distances, times)
     return _distances_of_targets(plan, path, length, times), plan.at(times)["joints"]

@@ -10,7 +10,7 @@ import csv
 import io
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ from ocp.solution_data import call_registered
 from ocp.storage import table_head, write_arrays, write_text
 from ocp.tolerances import LIMIT_SHARE
 
-__all__ = ["CHECKED_TIMES", "ENDS", "Plan", "PlanSample"]
+__all__ = ["CHECKED_TIMES", "ENDS", "Plan", "PlanSample", "describe_ends"]
 
 ENDS = "speed at both ends"
 """Name of the audit finding that tells whether a motion starts and ends at rest."""
@@ -195,22 +195,16 @@ class Plan(ABC):
     def _with_rest_finding(self, audit: Audit) -> Audit:
         """Add to an audit how fast the joints move at both ends; a controller expects a motion that starts at rest."""
         ends = np.array([0.0, self.horizon])
-        speeds, largest = np.abs(self.at(ends)["rates"]), float(np.abs(self._values("rates")).max(initial=0.0))
-        texts = []
-        for verb, row in zip(("starts", "ends"), speeds, strict=True):
-            joint = int(np.argmax(row))
-            if row[joint] > LIMIT_SHARE * largest:
-                texts.append(f"{verb} at {row[joint]:.3g} {self._unit(joint)}/s ({self.names[joint]!r})")
-        place = np.unravel_index(int(np.argmax(speeds)), speeds.shape)
-        note = "not at rest" if texts else "starts and ends at rest"
-        unit = f"{self._unit(int(place[1]))}/s"
-        finding = Finding(ENDS, float(speeds[place]), None, float(ends[place[0]]), note, unit=unit)
-        remarks = (f"it {' and '.join(texts)}, not at rest",) if texts else ()
+        speeds = np.abs(self.at(ends)["rates"])
+        speeds[speeds <= LIMIT_SHARE * np.abs(self._values("rates")).max(initial=0.0)] = 0.0
+        end, joint = (int(k) for k in np.unravel_index(int(speeds.argmax()), speeds.shape))
+        text = describe_ends(speeds, self.names, [self._unit(k) for k in range(len(self.names))])
+        finding = Finding(ENDS, float(speeds[end, joint]), None, float(ends[end]), text or "at rest")
+        remarks = [f"it {text}"] if text else []
         if audit.optimal is None and self.gap is not None:
-            remarks = (f"its cost is at most {max(self.gap, 0.0):.2g} of itself above a lower bound", *remarks)
-        feasible = sum(each.verdict == "feasible" for each in audit.findings)
-        findings = (*audit.findings[:feasible], finding, *audit.findings[feasible:])
-        return replace(audit, findings=findings, remarks=(*audit.remarks, *remarks))
+            remarks.insert(0, f"its cost exceeds a lower bound by at most {100 * max(self.gap, 0.0):.2g} %")
+        finding = replace(finding, unit=f"{self._unit(joint)}/s")
+        return replace(audit, findings=(*audit.findings, finding), remarks=(*audit.remarks, *remarks))
 
     def _unit(self, joint: int) -> str:
         """Return the unit of a joint's position."""
@@ -375,6 +369,18 @@ class Plan(ABC):
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
         """Return the poses of the machine's tip at checked times (M,). Shape (M, 7)."""
         return tip_poses(self.machine, bases, joints)
+
+
+def describe_ends(speeds: Array, names: Sequence[str], units: Sequence[str]) -> str:
+    """Return a text about the fastest joints at the start and at the end of a motion, "" if all joints rest there.
+
+    Args:
+        speeds: Speeds of the joints at both ends, 0 at rest. Shape (2, n).
+        names, units: Names of the joints, and units of their positions.
+    """
+    fastest = [(verb, row, int(row.argmax())) for verb, row in zip(("starts", "ends"), speeds, strict=True)]
+    texts = [f"{verb} at {row[k]:.3g} {units[k]}/s ({names[k]!r})" for verb, row, k in fastest if row[k] > 0]
+    return f"{' and '.join(texts)}, not at rest" if texts else ""
 
 
 def audit_key(**settings: Any) -> str:

@@ -93,7 +93,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
         ProblemError: No motion keeps the limits, with the distance at fault.
     """
     if not stretch.grid.sharp:
-        return _without_jerk(stretch.grid)
+        return _without_jerk(stretch.grid)  # a path without jerk limits is one stretch
     parts: list[SpeedProfile] = []
     begin, state, behind = stretch.first, stretch.ends[0], None
     while True:

@@ -292,7 +292,9 @@ def test_an_exported_program_passes_the_check(kind: str, tmp_path: Path, capsys:
     status, out, _ = run(capsys, "check", folder / "seam.urdf", file, *period, "--json")
     data = json.loads(out)
     assert (status, data["faults"], data["rule"]) == (0, [], "linear")
-    assert data["duration"] == pytest.approx(2.2)
+    assert data["duration"] == pytest.approx(
+        2.0 + 0.1 / 1.0 + 0.1
+    )  # length / speed, and half of v/a + a/j for each ramp
     assert run(capsys, "export", folder / "seam.npz", file, "--joints", "wrist, elbow")[0] == 0  # over its own file
     assert read_trajectory(file, period=0.01).names == ("wrist", "elbow")
     file.write_text(file.read_text().replace("written by selfmotion", "mine"))

@@ -98,6 +98,17 @@ def test_a_tool_on_a_path_starts_and_ends_at_rest_unless_the_file_says_steady(tm
     np.testing.assert_allclose(durations, [2.0, 2.0 + 0.1 / 1.0 + 0.1, 2.0 + 0.1 / 0.5 + 0.1, 2.0 + 2 * np.sqrt(0.05)])
 
 
+def test_a_centripetal_limit_slows_the_tool_only_in_bends(tmp_path: Path) -> None:
+    """The default ramps hold with it as well, so that a straight path takes the same time."""
+    corner = "points = [[0.7, 0.1, 0.3], [0.7, 0.3, 0.3], [0.5, 0.3, 0.3]]\nspeed = 0.1\n"
+    limit = "centripetal = 0.1\n"
+    straight, slowed, free = (
+        read(tmp_path, f"[path]\n{text}").tasks.duration for text in (PATH + limit, corner + limit, corner)
+    )
+    assert straight == pytest.approx(2.0 + 0.1 / 1.0 + 0.1, rel=1e-3)
+    assert slowed > 1.02 * free
+
+
 @pytest.mark.parametrize(
     ("text", "line", "expected"),
     [

@@ -12,7 +12,7 @@ import pytest
 
 from models import FixedBase, FreeFloating, Joint, Link, Path, Robot, SmoothPath, smooth
 from models.robot.dynamics import inverse_dynamics
-from ocp import Collocation, Plan, ProblemError, TipTask, joint_path, minimum_velocity_problem, plan, solve
+from ocp import Collocation, Goal, Plan, ProblemError, TipTask, joint_path, minimum_velocity_problem, plan, solve
 from ocp.motion.builders.joint_spline import PlannedJoints
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.schedule import JointLimits, LineLimits, schedule
@@ -97,7 +97,7 @@ LINE = smooth(Path.through([(0.4, 0.0, 0.2), (0.5, 0.0, 0.35)]), 0.05)
 SPEED = LINE.length / 2.0
 
 
-def planned(tasks: TipTask | Sequence[TipTask], path: SmoothPath = LINE, **options: Any) -> Plan:
+def planned(tasks: TipTask | Sequence[Any], path: SmoothPath = LINE, **options: Any) -> Plan:
     return plan(arm(), tasks, start=angles(np.zeros(1), path)[0], scene=False, **options)
 
 
@@ -130,6 +130,14 @@ def test_a_plan_of_tasks_along_a_path_is_scheduled(kind: str, tmp_path: File) ->
     timed = schedule(path, LineLimits(0.5, 4.0, 100.0, joints=JointLimits(1.0, 5.0, 100.0)), joints=joints)
     assert timed.duration < result.horizon
     assert largest(timed, joints).max() <= 1.001
+
+
+def test_a_plan_of_several_motions_is_refused() -> None:
+    task = TipTask.along(LINE, SPEED, rows=(3, 5))
+    whole = planned([task, Goal(joints=angles(np.zeros(1), LINE)[0])])
+    with pytest.raises(ProblemError, match="several motions") as caught:
+        joint_path(arm(), whole, LINE)
+    assert caught.value.name == "plan"
 
 
 def test_a_plan_whose_tasks_do_not_run_along_the_path_is_refused() -> None:

@@ -80,6 +80,11 @@ def test_the_fastest_motion_takes_the_time_of_the_joint_that_needs_longest() -> 
     rates = np.abs(motion.at(np.linspace(0.0, motion.horizon, 400))["rates"])
     assert rates.max() <= most * (1 + 1e-6)
     assert motion.at([0.0, motion.horizon])["rates"] == pytest.approx(0.0, abs=1e-9)
+    audit = motion.audit()  # no multipliers show whether it is optimal, but the bound says how near it is
+    assert (audit.feasible, audit.optimal) == (True, None)
+    assert not [finding for finding in audit.findings if finding.verdict == "optimal"]
+    assert "its cost exceeds a lower bound by at most" in audit.sentence
+    assert "not at rest" not in audit.sentence
 
 
 @pytest.mark.parametrize("cost", [Cost(), LENGTH, TIME])
