@@ -26,14 +26,14 @@ from ocp.motion.local.ik_solver import idle_positions
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.plan.planner import clearance_for
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
-from ocp.motion.result.path_plan import PathPlan, PathPoses
+from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.dead_end import RelaxationKind, dead_end
-from ocp.motion.search.joint_space import TOLERANCE, JointSpace, TasksWithFixedJoints
+from ocp.motion.search.joint_space import TOLERANCE
 from ocp.motion.search.reconfigurations import SectionSearch, SectionSettings, Segment, fewest_segments, section_values
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings, checked_bound
+from ocp.motion.search.shortening import PathPoses, PathProblem, optimise_path, shorten_path
 from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength, Steps
-from ocp.motion.search.value import shorten_path
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
@@ -59,8 +59,9 @@ class WaypointSettings:
         first_steps: With two redundant joints, number of steps of a first search, which finds short paths.
         steps, strides: Approximate number of steps of the next two searches, and their least strides.
         max_paths: Largest number of paths of a search that are shortened, the lowest cost first.
-        widths: Initial and final spacing of the configurations of `shorten_path`, rad or m.
-        pose_tolerance: Largest pose error, m and rad, which the last width leaves.
+        widths: Initial and final spacing of the configurations of `shorten_path`, rad or m, before the path is brought
+            to a local optimum.
+        pose_tolerance: Largest pose error, m and rad.
         search, sections: Settings of the searches with at most one redundant joint, and with two.
     """
 
@@ -69,7 +70,7 @@ class WaypointSettings:
     steps: int = 20
     strides: tuple[int, int] = (10, 5)
     max_paths: int = 2
-    widths: tuple[float, float] = (0.06, 1e-6)
+    widths: tuple[float, float] = (0.06, 2e-3)
     pose_tolerance: float = 1e-6
     search: SearchSettings = field(default_factory=SearchSettings)
     sections: SectionSettings = field(default_factory=SectionSettings)
@@ -185,15 +186,15 @@ class _WaypointPlanner:
         self.seed, self.limits, self.joint_limits, self.cost = seed, limits, limits.joints, cost
         bounds = limits.bounds(machine)
         self.lower, self.upper = bounds.lower, bounds.upper
-        self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
-        pose = bind(machine, self._task(0))
-        equations = TasksWithFixedJoints(machine, pose.bound, tuple(np.flatnonzero(pose.idle).tolist()))
-        stationary = idle_positions(self.lower, self.upper)
-        targets = np.zeros((len(positions), 18))
-        targets[:, :3] = positions
-        targets[:, 6:15] = rotations.transpose(0, 2, 1).reshape(-1, 9)
-        targets = np.column_stack([targets, np.tile(stationary[pose.idle], (len(positions), 1))])
-        self.manifolds = SelfMotionManifolds(self.space, equations, targets)
+        self.poses, pose = PathPoses(positions, rotations, step), bind(machine, self._task(0))
+        options: dict[str, Any] = {
+            "bounds": bounds,
+            "idle": idle_positions(self.lower, self.upper),
+            "scene": self.scene,
+        }
+        self.problem = PathProblem.through_poses(machine, self.poses, cost, **options)
+        self.manifolds = self.problem.samples[0].manifolds
+        self.space = self.manifolds.space
         self._seed_cache = dict[int, Array]()
         if not 0 <= self.manifolds.size <= MAX_FREE_DIRECTIONS:
             words = f"{machine.robot.name}: {int((~pose.idle).sum())} joints for the {pose.size} rows of a pose"
@@ -267,10 +268,11 @@ class _WaypointPlanner:
             self.limits,
             best.cost,
             self.constraints,
-            PathPoses(self.positions, self.rotations, self.step),
+            self.poses,
             tuple(candidates),
             lower_bound or None,
             best.breaks,
+            self.cost,
         )
 
     def _candidate(self, path: _Path, is_best: bool) -> Candidate:
@@ -384,12 +386,10 @@ class _WaypointPlanner:
             return _Path(np.inf, failure, np.concatenate(distant), joints, break_numbers)
         paths = []
         for segment in chain:
-            rows = slice(int(chosen[segment.first]), int(chosen[segment.last]) + 1)
-            samples = [TimeSample(self.manifolds, k) for k in range(len(self.positions))[rows]]
-            limits, bounds = np.full_like(joints[rows][1:], self.step), (self.lower, self.upper)
-            times = np.arange(len(self.positions), dtype=float)[rows]
-            options: dict[str, Any] = {"bounds": bounds, "scene": self.scene, "widths": self.settings.widths}
-            paths.append(shorten_path(joints[rows], samples, Steps(times, self.cost, limits), **options))
+            first, last = int(chosen[segment.first]), int(chosen[segment.last])
+            problem = self.problem.restrict(first, last)
+            shortened = shorten_path(joints[first : last + 1], problem, self.settings.widths)
+            paths.append(optimise_path(shortened, problem))
         joints = np.concatenate(paths)
         steps = np.delete(self.cost.evaluate(np.diff(joints, axis=0), 1.0), list(break_numbers))
         return _Path(float(steps.sum()), *self._check_path(joints, break_numbers), joints, break_numbers)

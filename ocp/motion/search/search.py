@@ -30,8 +30,9 @@ from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.search.charts import Charts, SplitCharts, TimeSample, point_chart
 from ocp.motion.search.joint_space import MAX_STEP, TOLERANCE, JointSpace
+from ocp.motion.search.shortening import PENALTY, PathProblem, shorten_path
 from ocp.motion.search.steps import QuadraticBounds, Steps
-from ocp.motion.search.value import PENALTY, ChartGraph, shorten_path
+from ocp.motion.search.value import ChartGraph
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["MAX_FREE_DIRECTIONS", "AtlasSearch", "SearchSettings", "checked_bound"]
@@ -431,13 +432,12 @@ class AtlasSearch:
 
     def _shorten(self, path: Array | None, layers: list[Charts]) -> Array | None:
         """Shorten a path on the manifolds if the result is valid; return None if the path then exceeds step limits."""
-        bounds = self.space.lower, self.space.upper
         if path is None:
             return None
         if self.start is None:
             radius = max(float(charts.radii.max()) for charts in layers)
-            options: dict[str, Any] = {"bounds": bounds, "scene": self.scene, "widths": (radius / 2, radius / 64)}
-            shortened = shorten_path(path, self.samples, self._steps, **options)
+            problem = PathProblem(self.samples, self._steps, self.space.lower, self.space.upper, self.scene)
+            shortened = shorten_path(path, problem, (radius / 2, radius / 64))
             valid = all(self._project(k, joints) is not None for k, joints in enumerate(shortened))
             path = shortened if valid else path
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
