@@ -22,8 +22,12 @@ __all__ = [
     "StepCost", "least_in_box",
 ]  # fmt: skip
 
-MAX_CUTS = 8
-"""Number of tangents with which the minimum of a piecewise linear step cost is bracketed; each joint adds a kink."""
+INTERIOR_STEPS = 8
+"""Number of steps of the interior-point method for the multipliers of steps; each reduces the gap about tenfold."""
+CENTERING, STEP_SHARE = 0.1, 0.97
+"""Reduction of the gap at which a step aims, and share of the way to the boundary that a step takes at most."""
+NARROWEST = 1e-9
+"""Least half width of a box for the interior-point method, rad or m."""
 MAX_CONCAVITY = 0.5
 """Largest concavity of a cost bound, relative to the curvature of a step's cost; more concave bounds are flattened."""
 
@@ -179,6 +183,7 @@ class SquaredRates(StepCost):
             share = np.where(normal_cost > 0, np.clip(1 - loss / normal_cost, 0.0, 1.0), 0.0)
         multiplier *= share
         curve, excess = _raise_eigenvalues(curve + _dot(end_bends, multiplier[:, None, None]), -MAX_CONCAVITY / seconds)
+        curve = _separate(curve)
         # the deviation also shifts the ends along the chart
         slack = _symmetric_support(_rows_last(start.deviations), weighted_tangents)
         slack += _symmetric_support(_rows_last(end.deviations), weighted_tangents)
@@ -299,6 +304,8 @@ class SquaredRateBounds:
 
         With start coordinates t, the quadratic function is slope . t + t . curve . t / 2.
         """
+        if places.shape[1] > 2:
+            return places
         end_place = self._minimize_after(_rows_last(places))[2]
         gradient = -_apply_transposed(self.rotation, self.projection + end_place) / self.seconds
         square = _multiply_transposed(self.rotation, self.rotation) / self.seconds + self.level - _rows_last(curve)
@@ -312,7 +319,11 @@ def _rows_first(columns: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Homogeneous(StepCost):
-    """Step cost proportional to the length of the step; its lower bounds on charts of dimension 0 or 1 are affine.
+    """Step cost proportional to the length of the step, a norm of the weighted joint displacements.
+
+    By weak duality, any gradient p of the norm, of dual norm at most one, gives the lower bound p . d of the cost of a
+    step d. It is linear in the start and in the end of the step, but for the quadratic deviations of the manifolds.
+    These enter the curvature of the bounds, where they cancel from step to step as far as p does not change.
 
     Attributes:
         weights: Weights of the joint displacements, 0 to ignore a joint. Shape (n,).
@@ -321,44 +332,55 @@ class Homogeneous(StepCost):
     weights: Array
 
     @abstractmethod
-    def gradient(self, displacement: Array) -> Array:
-        """Return the gradients (P, n) of the cost with respect to the joint displacements (P, n)."""
+    def pool(self, values: Array) -> Array:
+        """Return sums (g, ..., P) of values (n, ..., P) over the joints whose largest displacement counts."""
 
     def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return lower bounds (P,) of step costs plus later costs, cost gradients (P, n), and step ends (P, 1)."""
-        count = len(delta)
-        if not target.tangents.shape[2]:
-            return self.evaluate(delta, 1.0) + after.least, self.gradient(delta), np.zeros((count, 0))
-        along, slope = target.tangents[:, :, 0], after.slope[:, 0]
-        box = target.low[:, 0], target.high[:, 0]
+        """Return lower bounds (P,) of step costs plus later costs, multipliers (P, n), and step ends (P, r).
 
-        def linearize(place: Array) -> list[Array]:
-            """Return the tangent of the cost at coordinates: these, cost gradient, value at 0 and total slope."""
-            gradient = self.gradient(delta + along * place[:, None])
-            return [place, gradient, (gradient * delta).sum(axis=1), (gradient * along).sum(axis=1) + slope]
+        Args: As in `minimal_steps`. The least cost of P steps is that of the linear programs
 
-        def intersect() -> Array:
-            """Return where the tangents at the ends of the bracket intersect, or the end at which the cost is least."""
-            with np.errstate(divide="ignore", invalid="ignore"):
-                crossing = np.clip(np.nan_to_num((first[2] - last[2]) / (last[3] - first[3])), first[0], last[0])
-            return np.where(first[3] >= 0, first[0], np.where(last[3] <= 0, last[0], crossing))
+            minimise  sum of s_g + slope . t,   s_g >= |w_j (delta_j + T_j . t)|,   low <= t <= high,
 
-        # each tangent cuts off a part of the bracket of the convex function
-        first, last = (linearize(place.copy()) for place in box)
-        for _ in range(MAX_CUTS):
-            tangent = linearize(intersect())
-            falling = (tangent[3] < 0) & (first[3] < 0) & (last[3] > 0)
-            rising = (tangent[3] >= 0) & (first[3] < 0) & (last[3] > 0)
-            for end, mask in ((first, falling), (last, rising)):
-                for part, new in zip(end, tangent, strict=True):
-                    part[mask] = new[mask]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share_at_crossing = np.nan_to_num(last[3] / (last[3] - first[3]))
-        share = np.where(first[3] >= 0, 1.0, np.where(last[3] <= 0, 0.0, share_at_crossing))
-        gradient, place = share[:, None] * first[1] + (1 - share[:, None]) * last[1], intersect()
-        slope_left = (gradient * along).sum(axis=1) + slope
-        least = np.minimum(slope_left * box[0], slope_left * box[1])
-        return (gradient * delta).sum(axis=1) + least + after.least, gradient, place[:, None]
+        with one s for each joint (sum) or for all (maximum). A primal-dual interior-point method solves all at once
+        (Wright 1997, Primal-Dual Interior-Point Methods, chapter 5); any of its iterates gives a valid bound.
+        """
+        weights, delta, slope = self.weights[:, None], _rows_last(delta), _rows_last(after.slope)
+        tangents, low, high = (_rows_last(part) for part in (target.tangents, target.low, target.high))
+        scaled, offset, r = weights[:, None] * tangents, weights * delta, len(low)
+        middle, half = (low + high) / 2, np.maximum((high - low) / 2, NARROWEST)
+        place, size = middle.copy(), float(self.weights.max()) * np.maximum(target.radii, NARROWEST)
+        value = offset + _apply(scaled, place)
+        above = (np.abs(value) if len(self.pool(value)) > 1 else np.abs(value).max(axis=0, keepdims=True)) + size
+        slacks = [above - value, above + value, place - middle + half, middle + half - place]
+        share = 0.5 / self.pool(np.ones(value.shape))
+        duals = [np.zeros(value.shape) + share, np.zeros(value.shape) + share, *([size / half / 2] * 2)]
+        for _ in range(INTERIOR_STEPS if r else 0):
+            gap = sum((slack * dual).sum(axis=0) for slack, dual in zip(slacks, duals, strict=True))
+            aim = CENTERING * gap / (2 * len(value) + 2 * r)
+            rates = [dual / slack for dual, slack in zip(duals, slacks, strict=True)]
+            aims = [aim / slack for slack in slacks]
+            total, lean = self.pool(rates[0] + rates[1]), self.pool((rates[1] - rates[0])[:, None] * scaled)
+            excess = (self.pool(aims[0] + aims[1]) - 1) / total
+            square = _multiply_transposed(scaled, (rates[0] + rates[1])[:, None] * scaled)
+            square -= _multiply_transposed(lean, lean / total[:, None])
+            square[np.arange(r), np.arange(r)] += rates[2] + rates[3]
+            right = slope + _apply_transposed(scaled, aims[0] - aims[1]) + _apply_transposed(lean, excess)
+            right += aims[3] - aims[2]
+            step = -_rows_last(np.linalg.solve(_rows_first(square), _rows_first(right)[:, :, None])[:, :, 0])
+            moved = _apply(scaled, step)
+            raised = excess - _apply(lean, step) / total
+            changes = [raised - moved, raised + moved, step, -step]
+            turns = [aims[i] - rates[i] * changes[i] - duals[i] for i in range(4)]
+            lengths = _longest_step(slacks, changes), _longest_step(duals, turns)
+            slacks = [part + lengths[0] * change for part, change in zip(slacks, changes, strict=True)]
+            duals = [part + lengths[1] * change for part, change in zip(duals, turns, strict=True)]
+            place = place + lengths[0] * step
+        multiplier = weights * (duals[0] - duals[1]) / np.maximum(self.pool(duals[0] + duals[1]), 1.0)
+        remaining = _apply_transposed(tangents, multiplier) + slope
+        least = np.minimum(remaining * low, remaining * high).sum(axis=0)
+        place = np.clip(place, low, high)
+        return _dot(multiplier, delta) + least + after.least, _rows_first(multiplier), _rows_first(place)
 
     def minimal_steps(
         self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
@@ -369,7 +391,10 @@ class Homogeneous(StepCost):
     def lower_bounds(
         self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
     ) -> StepBounds:
-        return HomogeneousBounds(self, delta, source, target, after)
+        charts = source.charts
+        middle = delta - np.einsum("pnr,pr->pn", charts.tangents, (charts.low + charts.high) / 2)
+        multiplier = self.minimize(middle, target.charts, after)[1]
+        return HomogeneousBounds(self, delta, source, target, after, multiplier)
 
 
 class PathLength(Homogeneous):
@@ -381,8 +406,8 @@ class PathLength(Homogeneous):
     def reach(self, cost: float, seconds: float) -> float:
         return float(cost / self.weights.min()) if (self.weights > 0).all() else np.inf
 
-    def gradient(self, displacement: Array) -> Array:
-        return np.asarray(self.weights * np.sign(displacement))
+    def pool(self, values: Array) -> Array:
+        return values
 
 
 class LargestMotion(Homogeneous):
@@ -394,39 +419,50 @@ class LargestMotion(Homogeneous):
     def reach(self, cost: float, seconds: float) -> float:
         return float(np.linalg.norm(cost / self.weights)) if (self.weights > 0).all() else np.inf
 
-    def gradient(self, displacement: Array) -> Array:
-        gradient, rows = np.zeros(displacement.shape), np.arange(len(displacement))
-        joint = (self.weights * np.abs(displacement)).argmax(axis=1)
-        gradient[rows, joint] = (self.weights * np.sign(displacement))[rows, joint]
-        return gradient
+    def pool(self, values: Array) -> Array:
+        return values.sum(axis=0, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBounds:
-    """Lower bounds of step costs proportional to length plus later costs, from `Homogeneous.lower_bounds`."""
+    """Lower bounds of step costs proportional to length plus later costs, from `Homogeneous.lower_bounds`.
+
+    Attributes:
+        multiplier: Multipliers of the steps that start in the middle of the boxes, which determine the curvature.
+    """
 
     cost: Homogeneous
     delta: Array
     source: CurvedCharts
     target: CurvedCharts
     after: QuadraticBounds
+    multiplier: Array
 
     def select(self, rows: Any) -> HomogeneousBounds:
         source, target, after = (self.source.select(rows), self.target.select(rows), self.after.select(rows))
-        return HomogeneousBounds(self.cost, self.delta[rows], source, target, after)
+        return HomogeneousBounds(self.cost, self.delta[rows], source, target, after, self.multiplier[rows])
 
     @property
     def curve(self) -> Array:
-        r = self.source.charts.tangents.shape[2]
-        return np.zeros((len(self.delta), r, r))
+        return -np.einsum("pn,pnab->pab", self.multiplier, self.source.bends)
 
     def at(self, places: Array) -> tuple[Array, Array]:
         source, target = self.source.charts, self.target.charts
         start = np.einsum("pnr,pr->pn", source.tangents, places)
-        cost, gradient, _ = self.cost.minimize(self.delta - start, target, self.after)
-        end_loss = np.einsum("pcn,pn->pc", target.deviations, gradient).min(axis=1, initial=0.0)
-        loss = np.einsum("pcn,pn->pc", source.deviations, gradient).max(axis=1, initial=0.0) - end_loss
-        return cost - loss, -np.einsum("pnr,pn->pr", source.tangents, gradient)
+        multiplier = self.cost.minimize(self.delta - start, target, self.after)[1]
+        square = self.after.curve + np.einsum("pn,pnab->pab", multiplier, self.target.bends)
+        slope = self.after.slope + np.einsum("pnr,pn->pr", target.tangents, multiplier)
+        least = least_in_box(slope, square, target.low, target.high)[0]
+        loss = np.einsum("pcn,pn->pc", self.source.rest, multiplier).max(axis=1, initial=0.0)
+        loss -= np.einsum("pcn,pn->pc", self.target.rest, multiplier).min(axis=1, initial=0.0)
+        # the curvature is that of another multiplier
+        change = np.einsum("pn,pnab->pab", multiplier - self.multiplier, self.source.bends)
+        extent = np.maximum(np.abs(source.low), np.abs(source.high))
+        loss += np.maximum(-_lowest_eigenvalue(-change), 0.0) * (extent**2).sum(axis=1) / 2
+        value = (multiplier * self.delta).sum(axis=1) + self.after.least + least - loss
+        slope = -np.einsum("pnr,pn->pr", source.tangents, multiplier)
+        curvature = np.einsum("pab,pb->pa", self.curve, places)
+        return value + (places * (slope + curvature / 2)).sum(axis=1), slope + curvature
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
         return places
@@ -436,11 +472,19 @@ StepBounds: TypeAlias = SquaredRateBounds | HomogeneousBounds
 """Lower bounds of the costs of P steps plus the costs after the steps, as functions of the start coordinates."""
 
 
+def _longest_step(values: list[Array], changes: list[Array]) -> Array:
+    """Return how far, at most 1, positive values may move along changes and stay positive, for each of P programs."""
+    shares = np.zeros(values[0].shape[1])
+    for value, change in zip(values, changes, strict=True):
+        np.maximum(shares, (-change / value).max(axis=0), out=shares)
+    return STEP_SHARE / np.maximum(shares, STEP_SHARE)
+
+
 def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the minima (P,) and minimisers (P, r) of P quadratic functions over boxes of at most two dimensions.
+    """Return the minima (P,) and minimisers (P, r) of P quadratic functions over boxes.
 
     The functions are slope . t + t . square . t / 2. Compared are the corners, the stationary points on the sides, and
-    the stationary point inside.
+    the stationary point inside. In more dimensions, the result is a lower bound of the minimum, see `_separate`.
     """
     least, place = _least_in_box(_rows_last(slope), _rows_last(square), _rows_last(low), _rows_last(high))
     return least, _rows_first(place)
@@ -451,6 +495,10 @@ def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple
     r, count = slope.shape
     if not r:
         return np.zeros(count), np.zeros(slope.shape)
+    if r > 2:
+        square = _separate(square)
+        parts = [_least_in_box(slope[[a]], square[[a], a][:, None], low[[a]], high[[a]]) for a in range(r)]
+        return np.sum([least for least, _ in parts], axis=0), np.concatenate([place for _, place in parts])
     convex = all(bool((square[axis, axis] > 0).all()) for axis in range(r))  # then the sides include the corners
     places: list[Any] = [] if convex else [[*side] for side in product(*zip(low, high, strict=True))]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -478,10 +526,24 @@ def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple
     return least, minimizer
 
 
+def _separate(square: Array) -> Array:
+    """Return diagonal matrices (r, r, P) below symmetric matrices, which are returned themselves if r < 3 (Gershgorin).
+
+    Each mixed term is at least minus the mean of both squares.
+    """
+    if len(square) < 3:
+        return square
+    diagonal = np.einsum("aap->ap", square)
+    diagonal = diagonal + np.abs(diagonal) - np.abs(square).sum(axis=1)
+    return np.asarray(diagonal[:, None] * np.eye(len(square))[:, :, None])
+
+
 def _lowest_eigenvalue(square: Array) -> Array:
-    """Return the least eigenvalues of symmetric matrices (P, r, r) with r at most two. Shape (P,)."""
+    """Return the least eigenvalues of symmetric matrices (P, r, r). Shape (P,)."""
     if square.shape[1] < 2:
         return np.asarray(square.sum(axis=(1, 2)))
+    if square.shape[1] > 2:
+        return np.asarray(np.linalg.eigvalsh(square)[:, 0])
     middle, half = (square[:, 0, 0] + square[:, 1, 1]) / 2, (square[:, 0, 0] - square[:, 1, 1]) / 2
     return np.asarray(middle - np.hypot(half, square[:, 0, 1]))
 
