@@ -30,10 +30,12 @@ from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.dead_end import RelaxationKind, dead_end
 from ocp.motion.search.joint_space import TOLERANCE
+from ocp.motion.search.lengths import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.reconfigurations import SectionSearch, SectionSettings, Segment, fewest_segments, section_values
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings, checked_bound
 from ocp.motion.search.shortening import PathPoses, PathProblem, optimise_path, shorten_path
-from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength, Steps
+from ocp.motion.search.steps import Steps
+from ocp.motion.search.task_search import TOO_MANY_CHARTS, lower_bound_along
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
@@ -44,8 +46,6 @@ __all__ = ["Reconfigurations", "plan_path"]
 Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
 
 WAYPOINT = "waypoint {:g}"
-TOO_MANY_CHARTS = "configurations"
-"""Value of the field `name` in the error of a search that needs too many charts of the self-motion manifold."""
 NO_PATH = "no path through the waypoints keeps all limits"
 
 
@@ -58,6 +58,8 @@ class WaypointSettings:
             next if no path found goes through all.
         first_steps: With two redundant joints, number of steps of a first search, which finds short paths.
         steps, strides: Approximate number of steps of the next two searches, and their least strides.
+        sample_loss: With two redundant joints, share of the cost of the best path that straight steps between the
+            waypoints of the lower bound may lose.
         max_paths: Largest number of paths of a search that are shortened, the lowest cost first.
         widths: Initial and final spacing of the configurations of `shorten_path`, rad or m, before the path is brought
             to a local optimum.
@@ -69,6 +71,7 @@ class WaypointSettings:
     first_steps: int = 6
     steps: int = 20
     strides: tuple[int, int] = (10, 5)
+    sample_loss: float = 0.01
     max_paths: int = 2
     widths: tuple[float, float] = (0.06, 2e-3)
     pose_tolerance: float = 1e-6
@@ -108,7 +111,7 @@ def plan_path(
     Args:
         machine: An arm on a fixed base with at most two redundant joints for the poses of its tip. If it has two,
             paths are searched on sections in which the joint nearest to the base has one of several values (see
-            `ocp.motion.search.reconfigurations`), and no bound is known.
+            `ocp.motion.search.reconfigurations`), and the bound on the whole manifolds.
         waypoints: Poses of the tip.
         cost: `length`, the sum of all joint displacements with the `weights` of the joints, or `time`, s, by the
             velocity limits of the joints, from waypoint to waypoint; None for the length.
@@ -187,11 +190,8 @@ class _WaypointPlanner:
         bounds = limits.bounds(machine)
         self.lower, self.upper = bounds.lower, bounds.upper
         self.poses, pose = PathPoses(positions, rotations, step), bind(machine, self._task(0))
-        options: dict[str, Any] = {
-            "bounds": bounds,
-            "idle": idle_positions(self.lower, self.upper),
-            "scene": self.scene,
-        }
+        idle = idle_positions(self.lower, self.upper)
+        options: dict[str, Any] = {"bounds": bounds, "idle": idle, "scene": self.scene}
         self.problem = PathProblem.through_poses(machine, self.poses, cost, **options)
         self.manifolds = self.problem.samples[0].manifolds
         self.space = self.manifolds.space
@@ -261,7 +261,11 @@ class _WaypointPlanner:
             reasons = "; ".join(dict.fromkeys(path.failure for path in paths))
             raise SolveError(f"{NO_PATH}{reasons and ': '}{reasons}", name="waypoints")
         candidates = [self._candidate(path, path is paths[0]) for path in paths]
-        best, lower_bound = paths[0], checked_bound(bound, paths[0].cost)
+        best = paths[0]
+        if self._section_joint is not None:
+            loss, settings = self.settings.sample_loss, self.settings.search
+            bound = lower_bound_along(self.problem, best.joints, loss, seeds=self._seeds, settings=settings)
+        lower_bound = checked_bound(bound, best.cost)
         return PathPlan(
             self.machine,
             best.joints,

@@ -20,8 +20,8 @@ from ocp.motion.builders.clearance import ClearanceConstraints, clearance_of
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.result.plan import Plan
 from ocp.motion.result.request import restored_request, stored_request
+from ocp.motion.search.lengths import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.shortening import PathPoses, PathProblem, optimality_of
-from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record

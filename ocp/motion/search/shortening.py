@@ -37,7 +37,8 @@ from ocp.console import time_left
 from ocp.motion.local.collisions import distances_along, near_pairs
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import TOLERANCE, JointSpace, TasksWithFixedJoints
-from ocp.motion.search.steps import Homogeneous, PathLength, Steps
+from ocp.motion.search.lengths import Homogeneous, PathLength
+from ocp.motion.search.steps import Steps
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.limits import JointBounds
 from ocp.motion.tasks.tip_task import TipTask

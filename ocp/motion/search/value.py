@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.checks import Array
+from ocp.console import check_time
 from ocp.motion.search.charts import Charts
 from ocp.motion.search.joint_space import MAX_STEP, JointSpace
 from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, StepBounds, Steps
@@ -197,6 +198,7 @@ class ChartGraph:
         places = np.clip(0.0, target.low, target.high)
         lowest, middle = self.minima(after, neighbour), after.at(places)
         for i, j in self.edges(k, neighbour):
+            check_time()
             feasible = np.isfinite(after.least[j]) & (known_costs[i] + lowest[j] < max_cost)
             i, j = i[feasible], j[feasible]
             if not i.size:
@@ -204,11 +206,19 @@ class ChartGraph:
             delta = self.space.difference(target.centers[j], source.centers[i])
             distances, spans = np.abs(delta), start_spans[i] + end_spans[j]
             lower = self.cost.evaluate(np.maximum(distances - spans, 0.0), seconds) + lowest[j]
-            upper = self.cost.evaluate(distances + spans, seconds) + middle[j]
+            upper = self.cost.evaluate(distances + start_spans[i], seconds) + middle[j]
+            upper = np.minimum(_least_of_groups(upper, i), max_cost - known_costs[i])
+            rows = np.flatnonzero(lower <= upper)
+            i, j, delta, upper, lower = i[rows], j[rows], delta[rows], upper[rows], lower[rows]
+            lower = np.maximum(
+                lower, self.cost.quick_bounds(delta, spans[rows], source.select(i), target.select(j), after.select(j))
+            )
             floor = np.full(len(source), np.inf)
             np.minimum.at(floor, i, lower)
-            promising = (lower <= _least_of_groups(upper, i)) & (known_costs[i] + lower < max_cost)
-            i, j, delta = i[promising], j[promising], delta[promising]
+            rows = np.flatnonzero((lower <= upper) & (known_costs[i] + lower < max_cost))
+            i, j, delta = i[rows], j[rows], delta[rows]
+            if not i.size:
+                continue
             ends = self.curved[k].select(i), self.curved[neighbour].select(j)
             steps = self.cost.lower_bounds(delta, *ends, after.select(j), seconds=seconds)
             if known_bounds is not None:

@@ -14,8 +14,9 @@ from models.checks import Array
 from ocp import TipTask
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
+from ocp.motion.search.lengths import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.shortening import PathProblem, optimality_of, optimise_path, shorten_path
-from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength, Steps
+from ocp.motion.search.steps import Steps
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.search.test_tight import (
     CLEARANCE,

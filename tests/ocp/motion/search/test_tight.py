@@ -14,8 +14,9 @@ from models import CollisionScene, CollisionShape, FixedBase, MovingObstacle, Sp
 from models.checks import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.search.charts import TimeSample
+from ocp.motion.search.lengths import PathLength
 from ocp.motion.search.shortening import PathProblem, shorten_path
-from ocp.motion.search.steps import PathLength, SquaredRates, Steps
+from ocp.motion.search.steps import SquaredRates, Steps
 from tests.ocp.motion.search.test_charts import moved, planar, sets_of
 
 START = np.array([0.5, 1.2, -1.4])

@@ -16,17 +16,9 @@ from models.checks import Array
 from ocp import TipTask, inverse_kinematics
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample, _rim
 from ocp.motion.search.joint_space import JointSpace
+from ocp.motion.search.lengths import LargestMotion, PathLength
 from ocp.motion.search.search import AtlasSearch
-from ocp.motion.search.steps import (
-    CurvedCharts,
-    LargestMotion,
-    PathLength,
-    QuadraticBounds,
-    SquaredRates,
-    StepCost,
-    Steps,
-    least_in_box,
-)
+from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, SquaredRates, StepCost, Steps, least_in_box
 from ocp.motion.search.value import GraphSettings, _bound_charts, _bound_with_rest, _secant_slopes
 from ocp.motion.tasks.equations import bind
 from tests.families import some
@@ -365,7 +357,7 @@ def test_bounds_on_a_chart_are_below_all_steps_from_it(kind: Any, free: int, mon
         rng.normal(size=count), rng.normal(size=(count, free)), 0.1 * (curve + curve.transpose(0, 2, 1))
     )
     whole, corners = _bound_with_rest(steps, out, rest), np.array(list(product((0.0, 1.0), repeat=free)))
-    monkeypatch.setattr("ocp.motion.search.steps.INTERIOR_STEPS", 20)  # so that the costs of steps are exact
+    monkeypatch.setattr("ocp.motion.search.lengths.INTERIOR_STEPS", 20)  # so that the costs of steps are exact
     for share in [*np.repeat(corners[:, None], groups, axis=1), *rng.uniform(size=(50, groups, free))]:
         place = boxes.low + (boxes.high - boxes.low) * share
         places = np.repeat(place, each, axis=0)
