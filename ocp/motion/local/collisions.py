@@ -97,44 +97,36 @@ def distances_along(
 
 
 def near_pairs(
-    scene: CollisionScene,
-    joints: Array,
-    reach: float,
-    *,
-    times: Array | None = None,
-    gradients: bool = True,
-    step: float = 1e-5,
+    scene: CollisionScene, joints: Array, reach: float, gradients: bool = True
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-    """Return the pairs of bodies of a machine on a fixed base that are closer than the clearance plus `reach`, m.
+    """Return the pairs of bodies, among fixed obstacles, that are closer than the clearance plus `reach`, m.
 
     Args:
-        scene: Collision scene.
+        scene: Collision scene of a machine on a fixed base.
         joints: Configurations. Shape (M, n).
         reach: Largest distance beyond the clearance, m.
-        times: Times of the configurations, s, if obstacles move. Shape (M,).
-        gradients: Whether gradients are computed; they are 0 otherwise.
-        step: Step of the finite differences, rad or m: the root of the rounding error of distances, 1e-10 m.
+        gradients: Whether gradients are computed, by finite differences; they are 0 otherwise.
 
     Returns:
         Configuration and pair of each, their distance beyond the clearance, m, shape (K,) each, and its gradient, shape
         (K, n).
     """
     (placements, bodies), n, near = prepared_pairs(scene), joints.shape[1], scene.clearance + reach
-    clock = np.zeros(len(joints)) if times is None else times
 
-    def frames_at(configurations: Array, clock: Array) -> Frames:
-        return frames_of(placements(np.zeros((len(configurations), 0)), configurations, clock[:, None])[0])
+    def frames_at(configurations: Array) -> Frames:
+        count = len(configurations)
+        return frames_of(placements(np.zeros((count, 0)), configurations, np.zeros((count, 1)))[0])
 
-    frames = frames_at(joints, clock)
+    frames = frames_at(joints)
     at, pair = np.nonzero(bodies.all_balls(frames) < near)
     gap = bodies.gaps(frames, at, pair, near)
     at, pair, gap = at[gap < near], pair[gap < near], gap[gap < near]
     gradient = np.zeros((len(at), n))
     if gradients and len(at):
         rows, index = np.unique(at, return_inverse=True)
-        moved = frames_at((joints[rows, None] + step * np.eye(n)).reshape(-1, n), np.repeat(clock[rows], n))
+        moved = frames_at((joints[rows, None] + SLIDING.difference * np.eye(n)).reshape(-1, n))
         places = (n * index[:, None] + np.arange(n)).ravel()
-        gradient = (bodies.gaps(moved, places, np.repeat(pair, n)).reshape(-1, n) - gap[:, None]) / step
+        gradient = (bodies.gaps(moved, places, np.repeat(pair, n)).reshape(-1, n) - gap[:, None]) / SLIDING.difference
     return at, pair, gap - scene.clearance, gradient
 
 

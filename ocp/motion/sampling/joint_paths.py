@@ -64,7 +64,6 @@ class StraightMotionSettings:
             is decided.
         tolerance: Distance by which the clearance may be missed, m: half of what the audit allows, so that motions may
             begin and end at the clearance itself.
-        difference: Step of finite differences, rad or m: the root of the rounding error of distances, 1e-10 m.
         block: Largest number of pairs of bodies, over all configurations, that are evaluated at once.
     """
 
@@ -72,7 +71,6 @@ class StraightMotionSettings:
     uneven: float = 0.05
     first: float = 0.4
     tolerance: float = CLEARANCE_TOLERANCE_M / 2
-    difference: float = 1e-5
     block: int = 1_000_000
 
 
@@ -107,7 +105,7 @@ class StraightMotions:
         """
         if self.scene is None:
             return np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, joints.shape[1]))
-        return near_pairs(self.scene, joints, reach, step=self.settings.difference)
+        return near_pairs(self.scene, joints, reach)
 
     def are_clear(self, starts: Array, ends: Array) -> NDArray[np.bool_]:
         """Return which straight motions are proven collision-free. Shape (M,).

@@ -128,17 +128,9 @@ class Homogeneous(StepCost):
     def lower_bounds(
         self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
     ) -> StepBounds:
-        start, end = source.charts, target.charts
-        middle = delta - np.einsum("pnr,pr->pn", start.tangents, (start.low + start.high) / 2)
-        multiplier = self.minimize(middle, end, after)[1]
-        square = after.curve + np.einsum("pn,pnab->pab", multiplier, target.bends)
-        slope = after.slope + np.einsum("pnr,pn->pr", end.tangents, multiplier)
-        least = after.least + (multiplier * delta).sum(axis=1) + least_in_box(slope, square, end.low, end.high)[0]
-        least -= np.einsum("pcn,pn->pc", source.rest, multiplier).max(axis=1, initial=0.0)
-        least += np.einsum("pcn,pn->pc", target.rest, multiplier).min(axis=1, initial=0.0)
-        slope = -np.einsum("pnr,pn->pr", start.tangents, multiplier)
-        curve = -np.einsum("pn,pnab->pab", multiplier, source.bends)
-        return HomogeneousBounds(QuadraticBounds(least, slope, curve))
+        charts = source.charts
+        middle = delta - np.einsum("pnr,pr->pn", charts.tangents, (charts.low + charts.high) / 2)
+        return HomogeneousBounds(self, delta, source, target, after, self.minimize(middle, target.charts, after)[1])
 
 
 class PathLength(Homogeneous):
@@ -169,22 +161,50 @@ class LargestMotion(Homogeneous):
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBounds:
-    """Quadratic lower bounds of step costs proportional to length plus later costs, from `Homogeneous.lower_bounds`."""
+    """Lower bounds of step costs proportional to length plus later costs, from `Homogeneous.lower_bounds`.
 
-    values: QuadraticBounds
+    On curves, the multipliers of each start are computed anew, since the cost has kinks. On manifolds of more
+    dimensions this would take too long.
+
+    Attributes:
+        multiplier: Multipliers of the steps that start in the middle of the boxes. Shape (P, n).
+    """
+
+    cost: Homogeneous
+    delta: Array
+    source: CurvedCharts
+    target: CurvedCharts
+    after: QuadraticBounds
+    multiplier: Array
 
     def select(self, rows: Any) -> HomogeneousBounds:
-        return HomogeneousBounds(self.values.select(rows))
+        source, target, after = (self.source.select(rows), self.target.select(rows), self.after.select(rows))
+        return HomogeneousBounds(self.cost, self.delta[rows], source, target, after, self.multiplier[rows])
 
     @property
     def curve(self) -> Array:
-        return self.values.curve
+        return np.asarray(-np.einsum("pn,pnab->pab", self.multiplier, self.source.bends))
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        return self.values.at(places), self.values.slope + np.einsum("pab,pb->pa", self.curve, places)
+        source, target, multiplier = self.source.charts, self.target.charts, self.multiplier
+        loss: Any = 0.0
+        if places.shape[1] == 1:
+            start = np.einsum("pnr,pr->pn", source.tangents, places)
+            multiplier = self.cost.minimize(self.delta - start, target, self.after)[1]
+            change = np.einsum("pn,pnab->pab", multiplier - self.multiplier, self.source.bends)[:, 0, 0]
+            loss = np.maximum(change, 0.0) * np.maximum(source.low**2, source.high**2)[:, 0] / 2
+        square = self.after.curve + np.einsum("pn,pnab->pab", multiplier, self.target.bends)
+        slope = self.after.slope + np.einsum("pnr,pn->pr", target.tangents, multiplier)
+        value = self.after.least + least_in_box(slope, square, target.low, target.high)[0] - loss
+        value += (multiplier * self.delta).sum(axis=1)
+        value -= np.einsum("pcn,pn->pc", self.source.rest, multiplier).max(axis=1, initial=0.0)
+        value += np.einsum("pcn,pn->pc", self.target.rest, multiplier).min(axis=1, initial=0.0)
+        slope = -np.einsum("pnr,pn->pr", source.tangents, multiplier)
+        curvature = np.einsum("pab,pb->pa", self.curve, places)
+        return value + (places * (slope + curvature / 2)).sum(axis=1), slope + curvature
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        return places  # the bounds are quadratic themselves
+        return places
 
 
 def _longest_step(values: list[Array], changes: list[Array]) -> Array:

@@ -83,7 +83,7 @@ class PathProblem:
         samples: Manifolds of the samples.
         steps: Steps between the samples.
         lower, upper: Limits of the joints. Shape (n,) each.
-        scene: Collision scene, or None.
+        scene: Collision scene, without moving obstacles for linear programs, or None.
         margin: Distance by which the clearance is exceeded, m.
     """
 
@@ -190,8 +190,7 @@ class PathProblem:
         if self.scene is None:
             return np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros((0, path.shape[1]))
         approach = 0.0 if change is None else float((self.scene.levers.joints @ change.T).max(initial=0.0))
-        times, wanted = self.steps.times, change is not None
-        at, _, distance, gradient = near_pairs(self.scene, path, approach + self.margin, times=times, gradients=wanted)
+        at, _, distance, gradient = near_pairs(self.scene, path, approach + self.margin, gradients=change is not None)
         return at, distance - self.margin, gradient
 
 

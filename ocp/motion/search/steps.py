@@ -111,10 +111,7 @@ class StepBounds(Protocol):
         """Return values (P,) and gradients (P, r) of the bounds at start coordinates (P, r)."""
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Improve start coordinates (P, r) towards a minimum of the bounds minus a quadratic function.
-
-        With start coordinates t, the quadratic function is slope . t + t . curve . t / 2.
-        """
+        """Return coordinates nearer to a minimum of the bounds minus slope . t + t . curve . t / 2, or the same."""
 
 
 class StepCost(ABC):

@@ -14,10 +14,11 @@ import scipy
 from models import FixedBase
 from models.checks import Array
 from ocp import TipTask, inverse_kinematics
+from ocp.console import time_limited
 from ocp.motion.search.charts import Charts, SelfMotionManifolds, TimeSample, _rim
 from ocp.motion.search.joint_space import JointSpace
 from ocp.motion.search.lengths import LargestMotion, PathLength
-from ocp.motion.search.search import AtlasSearch
+from ocp.motion.search.search import AtlasSearch, SearchSettings
 from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, SquaredRates, StepCost, Steps, least_in_box
 from ocp.motion.search.value import GraphSettings, _bound_charts, _bound_with_rest, _secant_slopes
 from ocp.motion.tasks.equations import bind
@@ -452,3 +453,40 @@ def test_the_least_of_a_quadratic_in_a_box_is_that_of_a_fine_grid(free: int) -> 
     assert least == pytest.approx(values.min(axis=1), abs=5e-3)
     assert ((place >= low) & (place <= high)).all()
     assert least == pytest.approx((place * (slope + np.einsum("pab,pb->pa", square, place) / 2)).sum(axis=1))
+
+
+@pytest.mark.parametrize("kind", [PathLength, LargestMotion])
+@pytest.mark.parametrize("seed", some(range(6), 1))
+def test_bounds_of_lengths_with_two_free_directions_are_below_brute_force(seed: int, kind: Any) -> None:
+    """Beside a grid over the first two of four joints; what memory allows is a bound already."""
+    rng = np.random.default_rng([7, seed])
+    lengths, weights, limit, count = rng.uniform(0.25, 0.6, 4), rng.uniform(0.5, 2.0, 4), 1.6, 3
+    machine, cost = planar(lengths, limit), kind(weights)
+    joints = rng.uniform(-1.0, 1.0, 4)
+    first = np.array(ca.DM(machine.tip_pose((), joints).position)).ravel()[:2]
+    places = first * np.linspace(1.0, 0.4, count)[:, None]
+    times, angles = np.linspace(0, SECONDS, count), np.linspace(-limit, limit, 36)
+    nodes = []
+    for place in places:
+        beyond = [
+            np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]]) @ place - [lengths[0], 0.0] for a in angles
+        ]
+        rest = [reached(lengths[1:], at, limit, 36) for at in beyond]
+        nodes.append(np.vstack([np.column_stack([np.full(len(r), a), r]) for a, r in zip(angles, rest, strict=True)]))
+    steps = machine.robot.velocity * np.diff(times)[:, None]
+    least = brute_force(nodes, cost, float(times[1]), steps[0])
+    equations = bind(machine, TipTask(position=[*places[0]], rows=[3, 4]))
+    space = JointSpace(machine, machine.robot.lower, machine.robot.upper, np.ones(4))
+    sets = SelfMotionManifolds(space, equations, np.array([np.r_[place, 0.0, 0.0, 0.0, 0.0] for place in places]))
+    bounds = []
+    for charts in (4000, 12_000):
+        search = AtlasSearch(
+            space, [TimeSample(sets, k) for k in range(count)], Steps(times, cost, steps),
+            seeds=lambda k: sets.seeds(k, True, k), settings=SearchSettings(charts=charts),
+        )  # fmt: skip
+        bounds.append(search.lower_bound(least))
+    assert 0.0 <= bounds[0] <= bounds[1] + 1e-9
+    assert bounds[1] <= least
+    assert bounds[1] > 0.3 * least
+    with time_limited(1e-9):
+        assert search.lower_bound(least) == 0.0
