@@ -105,7 +105,9 @@ class Homogeneous(StepCost):
         place = np.clip(place, low, high)
         return dot(multiplier, delta) + least + after.least, rows_first(multiplier), rows_first(place)
 
-    def quick_bounds(self, delta: Array, spans: Array, source: Charts, target: Charts, after: QuadraticBounds) -> Array:
+    def quick_bounds(
+        self, delta: Array, spans: Array, source: Charts, target: Charts, *, after: QuadraticBounds
+    ) -> Array:
         shares = np.clip(delta / np.maximum(spans, NARROWEST), -1.0, 1.0)
         multiplier = self.weights * shares / np.maximum(self.pool(np.abs(shares.T)), 1.0).T
         start = -np.einsum("pnr,pn->pr", source.tangents, multiplier)

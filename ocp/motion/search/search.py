@@ -346,10 +346,8 @@ class AtlasSearch:
     ) -> tuple[Array | None, float]:
         """Return the best path, which is improved if one is given, and a lower bound of the cost of all paths."""
         target, bound = 1 - self.gap, 0.0
-        coarse, remaining = (
-            best_path is not None,
-            np.zeros(len(self.times) - 1),
-        )  # least cost before and after each step
+        coarse = best_path is not None
+        remaining = np.zeros(len(self.times) - 1)  # least cost before and after each step
         known_bounds: list[QuadraticBounds] | None = None  # lower bounds of the cost-to-come
         while True:
             graph = self.graph(layers, min(max_cost, best_cost) - remaining)

@@ -415,8 +415,8 @@ class _LocalProgram:
         forces = self._fixed + pieces.T @ shares + limits.T @ pressures
         form = self._problem.curvature(self._path, self._tangents)
         curvature = np.einsum("kn,knab->kab", forces.reshape(samples, n), form) / self._weight
-        touching = pressures[len(pressures) - len(self._contacts) :] > PROGRAM.active * self._weight
-        curvature[np.unique(self._contacts[touching])] -= PROGRAM.contact * np.eye(r)
+        at_clearance = pressures[len(pressures) - len(self._contacts) :] > PROGRAM.active * self._weight
+        curvature[np.unique(self._contacts[at_clearance])] -= PROGRAM.contact * np.eye(r)
         # the pieces of a kink differ from their mean, weighted by the multipliers, only off the kink
         mean = (
             scipy.sparse.csr_array(

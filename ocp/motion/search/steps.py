@@ -135,7 +135,9 @@ class StepCost(ABC):
         The centres of the charts are `delta` (P, n) apart.
         """
 
-    def quick_bounds(self, delta: Array, spans: Array, source: Charts, target: Charts, after: QuadraticBounds) -> Array:
+    def quick_bounds(
+        self, delta: Array, spans: Array, source: Charts, target: Charts, *, after: QuadraticBounds
+    ) -> Array:
         """Return constant lower bounds (P,) of `lower_bounds` over the source box that take little time.
 
         The displacements of the joints differ from `delta` by at most `spans` (P, n).

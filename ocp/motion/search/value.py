@@ -210,9 +210,9 @@ class ChartGraph:
             upper = np.minimum(_least_of_groups(upper, i), max_cost - known_costs[i])
             rows = np.flatnonzero(lower <= upper)
             i, j, delta, upper, lower = i[rows], j[rows], delta[rows], upper[rows], lower[rows]
-            lower = np.maximum(
-                lower, self.cost.quick_bounds(delta, spans[rows], source.select(i), target.select(j), after.select(j))
-            )
+            boxes = source.select(i), target.select(j)
+            quick = self.cost.quick_bounds(delta, spans[rows], *boxes, after=after.select(j))
+            lower = np.maximum(lower, quick)
             floor = np.full(len(source), np.inf)
             np.minimum.at(floor, i, lower)
             rows = np.flatnonzero((lower <= upper) & (known_costs[i] + lower < max_cost))

@@ -239,10 +239,10 @@ def test_the_least_cost_of_steps_is_that_of_linear_programs(kind: Any, free: int
         least.append(scipy.optimize.linprog(objective, rows, np.append(-right, right), bounds=ends).fun)
     assert (value <= np.array(least) + 1e-9).all()
     np.testing.assert_allclose(value, least, atol=2e-4)
-    found = cost.evaluate(delta + np.einsum("pnr,pr->pn", into.tangents, place), 1.0) + (after.slope * place).sum(
+    primal = cost.evaluate(delta + np.einsum("pnr,pr->pn", into.tangents, place), 1.0) + (after.slope * place).sum(
         axis=1
     )
-    np.testing.assert_allclose(found, least, atol=2e-4)
+    np.testing.assert_allclose(primal, least, atol=2e-4)
     shares = np.abs(multiplier) / weights
     assert ((shares if kind is PathLength else shares.sum(axis=1)) <= 1 + 1e-12).all()
 
