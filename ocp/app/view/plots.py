@@ -11,13 +11,16 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from models.checks import Array
 from ocp.app.check.interpolation import Motion
-from ocp.app.view.appearance import COMPARED, FAULT, LIMIT, PLAN
+from ocp.app.view.appearance import COMPARED, LIMIT, PLAN
 from ocp.app.view.rendering import PICTURE_STYLE
+from ocp.app.view.report import KINDS, bounds_of, curve_samples, limits_in_view
 from ocp.errors import ProblemError, require
 from ocp.motion.local.accelerations import AccelerationSolution
 from ocp.motion.local.rates import LocalSolution
@@ -33,7 +36,6 @@ __all__ = [
     "Picture",
     "add_legend",
     "as_svg",
-    "draw_curves",
     "draw_joints",
     "draw_limits",
     "html_of_plan",
@@ -50,49 +52,21 @@ DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Line styles of the motions compared with a plan, so that colour is not the only distinction."""
 
 
-def draw_curves(
-    motion: Motion, bounds: JointBounds, *, names: Sequence[str], units: Sequence[str], faults: Sequence[Any] = ()
-) -> str:
-    """Return an SVG with position, velocity and acceleration of every joint over time, with their limits and faults."""
-    from matplotlib.figure import Figure
-
-    width, height = PICTURE_STYLE.width, 0.4 + 1.15 * len(names)
-    figure = Figure(figsize=(width, height))
-    # margins in inches, wide enough for the labels; a constrained layout takes as long as all else
-    figure.subplots_adjust(0.85 / width, 0.45 / height, 1 - 0.08 / width, 1 - 0.3 / height, wspace=0.5, hspace=0.22)
-    draw_joints(figure, {"": motion}, bounds, names=names, units=units, faults=faults)
-    return as_svg(figure)
-
-
 def draw_joints(
-    figure: Any,
-    motions: Mapping[str, Motion],
-    bounds: JointBounds,
-    *,
-    names: Sequence[str],
-    units: Sequence[str],
-    faults: Sequence[Any] = (),
+    figure: Any, motions: Mapping[str, Motion], bounds: JointBounds, *, names: Sequence[str], units: Sequence[str]
 ) -> None:
-    """Draw position, velocity and acceleration of every joint over time into an empty figure, with limits and faults.
+    """Draw position, velocity and acceleration of every joint over time into an empty figure, with their limits.
 
     The first of several motions is the plan; the others are compared with it.
     """
-    import matplotlib
-
-    kinds = [("position", ""), ("velocity", "/s"), ("acceleration", "/s²")]
     with matplotlib.rc_context(STYLE):
         grid: Any = figure.subplots(len(names), 3, squeeze=False, sharex=True)
-        for column, (kind, per) in enumerate(kinds):
-            samples = []
-            for number, motion in reversed([*enumerate(motions.values())]):  # the plan last, on top
-                own_times = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
-                times = np.unique(
-                    np.concatenate([np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), own_times])
-                )
-                quantity = motion.quantity(kind)
-                samples.append((number, times, None if quantity is None else quantity.pieces.at(times)))
-            limit = getattr(bounds, kind, None)
-            lower, upper = (bounds.lower, bounds.upper) if limit is None else (-limit, limit)
+        for column, (kind, per) in enumerate(KINDS.items()):
+            samples = [
+                (number, *curve_samples(motion, kind))
+                for number, motion in reversed([*enumerate(motions.values())])  # the plan last, on top
+            ]
+            lower, upper = bounds_of(bounds, kind)
             min_range = PICTURE_STYLE.flat * max(
                 (np.abs(values).max() for _, _, values in samples if values is not None), default=1.0
             )
@@ -103,9 +77,6 @@ def draw_joints(
                     if values is not None:
                         ax.plot(times, values[:, row], **line_style(number))
                 draw_limits(ax, lower[row], upper[row], min_range)
-                for fault in faults:
-                    if fault.name == name and fault.kind == kind and fault.time is not None:
-                        ax.axvline(fault.time, color=FAULT, lw=1.6)
                 ax.set_ylabel(f"{name if column == 0 else ''}\n{units[row]}{per}", fontsize=7)
                 ax.margins(x=0.01)
         for ax in grid[-1]:
@@ -119,24 +90,13 @@ def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
 
     Curves with a range smaller than `min_range` are drawn as constant.
     """
-    low, high = ax.dataLim.y0, ax.dataLim.y1
-    if not np.isfinite([low, high]).all():
-        low = high = 0.0
-    span = max(high - low, min_range) or 1.0
-    distant = []
-    for limit in (lower, upper):
-        if low - PICTURE_STYLE.limit_distance * span <= limit <= high + PICTURE_STYLE.limit_distance * span:
-            ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
-            low, high = min(low, limit), max(high, limit)
-        elif np.isfinite(limit):
-            distant.append(f"{limit:.3g}")
-    if distant:
-        words = f"limit{'s' if len(distant) > 1 else ''} {', '.join(distant)}"
-        place, side = (0.03, "bottom") if high == upper else (0.97, "top")  # not on the line of the upper limit
-        ax.annotate(words, (0.99, place), xycoords="axes fraction", ha="right", va=side, color=LIMIT, fontsize=6)
-    margin = max(0.06 * (high - low), 0.55 * (span - (high - low)))
-    space = 0.1 * span if distant else 0.0
-    ax.set_ylim(low - margin - space * (high == upper), high + margin + space * (high != upper))
+    view = limits_in_view(ax.dataLim.y0, ax.dataLim.y1, lower, upper, min_range)
+    for limit in view.lines:
+        ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
+    if view.text:
+        place, side = (0.03, "bottom") if view.text_below else (0.97, "top")
+        ax.annotate(view.text, (0.99, place), xycoords="axes fraction", ha="right", va=side, color=LIMIT, fontsize=6)
+    ax.set_ylim(view.low, view.high)
 
 
 def line_style(number: int) -> dict[str, Any]:
@@ -146,16 +106,12 @@ def line_style(number: int) -> dict[str, Any]:
 
 def add_legend(figure: Any, names: Sequence[str]) -> None:
     """Add a legend below a figure, with the names of the plan and of the motions compared with the plan."""
-    from matplotlib.lines import Line2D
-
     lines = [Line2D([], [], **line_style(number)) for number in range(len(names))]
     figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8)
 
 
 def as_svg(figure: Any) -> str:
     """Return a figure as an `svg` element for a page."""
-    import matplotlib
-
     stream = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "selfmotion"}):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
@@ -274,8 +230,6 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
     bounds, units = _bounds(solution)
     rows = -(-len(entries) // PICTURE_STYLE.columns)
     target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.35 * rows))
-    import matplotlib
-
     with matplotlib.rc_context(STYLE):
         grid: Any = target.subplots(rows, min(PICTURE_STYLE.columns, len(entries)), squeeze=False, sharex=True)
         for ax in grid.ravel()[len(entries) :]:
