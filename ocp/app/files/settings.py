@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,8 @@ from ocp.errors import ProblemError, require
 from ocp.motion.tasks.limits import Limits
 
 __all__ = [
-    "REQUIRED", "TomlTable", "obstacles_of", "read_joint_limits", "read_obstacles", "read_shape",
-    "read_toml", "rotation_of",
+    "REQUIRED", "TomlTable", "joint_values", "located_errors", "obstacles_of", "read_joint_limits", "read_obstacles",
+    "read_shape", "read_toml", "rotation_of",
 ]  # fmt: skip
 
 TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
@@ -145,11 +146,12 @@ class TomlTable:
     def numbers_by_name(self, name: str, expected: str) -> dict[str, float]:
         """Return the entry of this name as a dictionary of numbers by name; empty if the entry is missing."""
         table = self.table(name, expected)
-        values = {} if table is None else table._values
-        for key, value in values.items():
-            if table is not None and not np.isfinite(real(value)):
+        if table is None:
+            return {}
+        for key, value in table._values.items():
+            if not np.isfinite(real(value)):
                 raise table.error(key, f"{key} must be a number, not {value!r}")
-        return {key: float(value) for key, value in values.items()}
+        return {key: float(value) for key, value in table._values.items()}
 
     def texts(self, name: str, expected: str) -> tuple[str, ...]:
         """Return the entry of this name as a list of texts; empty if it is missing."""
@@ -172,10 +174,18 @@ class TomlTable:
         """Return the entry of this name, which may be of any type, without a check."""
         return self._read(name, default, "", lambda value: True)
 
-    def table(self, name: str, expected: str = "a table", default: Any = None) -> TomlTable | None:
+    def table(self, name: str, expected: str = "a table") -> TomlTable | None:
         """Return the nested table of this name, or None if it is missing."""
-        values = self._read(name, default, expected, lambda value: isinstance(value, dict))
-        return None if values is None else self._inner(values, name)
+        return self.required_table(name, expected) if name in self else None
+
+    def required_table(self, name: str, expected: str = "a table") -> TomlTable:
+        """Return the nested table of this name; raise ProblemError if it is missing."""
+        return self._inner(self._read(name, REQUIRED, expected, lambda value: isinstance(value, dict)), name)
+
+    def tables_by_name(self, name: str) -> dict[str, TomlTable]:
+        """Return all tables [name.KEY] that are nested in the required table of this name, by KEY."""
+        outer = self.required_table(name, f"tables, each headed [{'.'.join([*map(str, self.place), name])}.NAME]")
+        return {key: outer.required_table(key) for key in outer._values}
 
     def _inner(self, values: Any, *place: Any) -> TomlTable:
         """Return a nested table with its place in the file, so that its errors name the line."""
@@ -264,6 +274,38 @@ def _places(texts: Sequence[str]) -> dict[Place, int]:
     return lines
 
 
+@contextmanager
+def located_errors(entries: TomlTable, name: str | None = None) -> Iterator[None]:
+    """Add the file and an entry to errors raised inside the block: the named entry, or the one that the error names."""
+    try:
+        yield
+    except (ModelError, ProblemError) as error:
+        entry = error.name if name is None else name
+        located = entries.error(entry if entry is not None and entry in entries else None, str(error))
+        located.value, located.limit = error.value, error.limit
+        raise located from error
+
+
+def joint_values(
+    entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str, *, least: float | None = None
+) -> Any:
+    """Return an entry that gives numbers by joint as an array (n,); None if the entry is missing.
+
+    Joints without a number get `default`. If `least` is given, the entry may also be one number above `least` for all
+    joints, which is returned as it is.
+    """
+    if name not in entries:
+        return None
+    if least is not None and not isinstance(entries.raw(name), dict):
+        return entries.number(name, expected, least=least)
+    by_joint = entries.numbers_by_name(name, expected)
+    for joint in by_joint:
+        if joint not in names:
+            table = entries.required_table(name)
+            raise table.error(joint, f"the robot has no independent joint {joint!r}; it has {', '.join(names)}")
+    return np.array([by_joint.get(joint, default) for joint in names])
+
+
 # ---- joint limits ----------------------------------------------------------------------------------------------
 
 LIMIT_KINDS = {"velocity": "velocity", "acceleration": "acceleration", "jerk": "jerk", "effort": "torque"}
@@ -296,11 +338,8 @@ def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
     shapes = []
     for table in entries.tables("obstacle"):
         shape = table.choice("shape", SHAPES, REQUIRED)
-        try:
+        with located_errors(table):
             shapes.append(read_shape(table, shape, folder))
-        except ModelError as error:
-            name = error.name if error.name is not None and error.name in table else None
-            raise table.error(name, str(error)) from error
         table.done()
     return tuple(shapes)
 
