@@ -286,7 +286,9 @@ def run_task(
     progress("audit")
     audit = result.audit()
     write(result, outputs)
-    lines = [str(result), f"The plan {audit.sentence}.", *_output_lines(list(outputs.values()))]
+    hint = "no file is written: give -o FILE.npz, or [output] in the task file"
+    written = [f"written: {file}" for file in outputs.values()] or [hint]
+    lines = [str(result), f"The plan {audit.sentence}.", *written]
     data = {
         "passed": audit.passed,
         "verdict": audit.sentence,
@@ -319,11 +321,6 @@ def _segments(result: Plan) -> dict[str, Any]:
         ],
         "reconfigurations": [{name: getattr(each, name) for name in names} for each in result.reconfigurations],
     }
-
-
-def _output_lines(files: list[Path]) -> list[str]:
-    hint = "no file is written: give -o FILE.npz, or [output] in the task file"
-    return [f"written: {file}" for file in files] or [hint]
 
 
 def export_plan(

@@ -27,7 +27,10 @@ from models.checks import Array
 from ocp.errors import ProblemError
 from ocp.tolerances import LIMIT_SHARE
 
-__all__ = ["Indices", "Motion", "MotionQuantity", "PiecewisePolynomial", "Rule", "half_digits", "polynomial_maxima"]
+__all__ = [
+    "Indices", "Motion", "MotionQuantity", "PiecewisePolynomial", "Rule", "half_digits", "interpolate",
+    "polynomial_maxima",
+]  # fmt: skip
 
 Indices: TypeAlias = NDArray[np.intp]
 Rule: TypeAlias = Literal["linear", "cubic", "quintic"]
@@ -283,6 +286,11 @@ class Motion:
         middle = (begin + end) / 2
         edges = np.concatenate([[begin[0]], (middle[1:] + middle[:-1]) / 2, [end[-1]]])
         return MotionQuantity(PiecewisePolynomial(edges, table[:, None]), blur, False)
+
+
+def interpolate(times: Array, t: Array, values: Array) -> Array:
+    """Interpolate `values` (M, n), given at increasing times `t` (M,), linearly at other times (K,). Shape (K, n)."""
+    return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def half_digits(values: Array) -> Array:

@@ -18,7 +18,17 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, momentum, robot_inertia, simplify
+from models import (
+    FixedBase,
+    FreeFloating,
+    Machine,
+    Robot,
+    Standing,
+    inverse_dynamics,
+    momentum,
+    robot_inertia,
+    simplify,
+)
 from models.checks import Array, real
 from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
@@ -26,6 +36,7 @@ from models.spatial import cross, rotation_from_quaternion
 from ocp.app.check.data_checks import CleanedTrajectory, Fault
 from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
 from ocp.console import check_time
+from ocp.curves import rk4_step
 from ocp.errors import ProblemError, require
 from ocp.motion.result.plan import ENDS, describe_ends
 from ocp.motion.tasks.limits import JointBounds, Limits
@@ -37,12 +48,12 @@ __all__ = [
     "Row",
     "RowVerdict",
     "effort_rows",
-    "floating_base_rows",
-    "floating_torques",
     "integrate_base",
     "limit_rows",
     "limits_by_name",
+    "momentum_rows",
     "standing_rows",
+    "torque_expression",
     "torque_rows",
     "torque_samples",
 ]
@@ -286,14 +297,7 @@ def torque_rows(
     robot = machine.robot
     n = robot.dof
     q, v, a = (ca.SX.sym(name, n) for name in ("q", "v", "a"))
-    if isinstance(machine, FreeFloating):
-        torque = floating_torques(machine, q, v, a)
-    else:
-        bodies = simplify(robot, frozenset())
-        gravity = getattr(machine, "gravity_in_world", GRAVITY)
-        torque = inverse_dynamics(
-            bodies, q, v, a, wrenches=(), gravity=gravity, world_from_base=machine.world_from_base()
-        )
+    torque = torque_expression(machine, q, v, a)
     sampler = Sampler([q, v, a], [torque])
     times, *values = torque_samples(motion)
     if not len(times):
@@ -324,8 +328,19 @@ def torque_rows(
     return rows, faults
 
 
-def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.SX:
-    """Return the joint torques of a robot whose floating base moves so that momentum is conserved. Shape (n, 1)."""
+def torque_expression(machine: Machine, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.SX:
+    """Return the joint torques of a machine without external forces as functions of its joint motion. Shape (n, 1).
+
+    A floating base moves so that momentum is conserved.
+
+    Args:
+        machine: The machine.
+        q, v, a: Symbols of the joint positions, velocities and accelerations. Shape (n, 1) each.
+    """
+    if not isinstance(machine, FreeFloating):
+        gravity = getattr(machine, "gravity_in_world", GRAVITY)
+        frame = machine.world_from_base(())
+        return inverse_dynamics(simplify(machine.robot), q, v, a, wrenches=(), gravity=gravity, world_from_base=frame)
     base = ca.SX.sym("base", machine.base_size)
     rows = ca.SX(ca.DM.eye(6)[:, machine.twist_rows])
     twist = ca.mtimes(rows, machine.base_twist(base, q, v))
@@ -396,19 +411,6 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
     return rows, faults
 
 
-def floating_base_rows(
-    machine: FreeFloating, motion: Motion, base: Array | None
-) -> tuple[Array, list[Row], list[Fault]]:
-    """Return the configurations (M, base_size) of a floating base at the samples, and the table rows and faults of its
-    check.
-
-    If the file gives the base, its momentum is checked; otherwise it moves so that momentum is conserved.
-    """
-    if base is None:
-        return (*integrate_base(machine, motion), [])
-    return (base, *momentum_rows(machine, motion, base))
-
-
 def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
     """Integrate the motion of a floating base; return its configurations at the samples, (M, base_size), and table
     rows.
@@ -420,14 +422,10 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
     base, h = ca.SX.sym("base", size), ca.SX.sym("h")
     q, v = ca.SX.sym("q", n, 3), ca.SX.sym("v", n, 3)
 
-    def rate(at: int, value: ca.SX) -> ca.SX:
-        return machine.base_rate(value, q[:, at], v[:, at])
+    def rate(place: float, value: ca.SX) -> ca.SX:
+        return machine.base_rate(value, q[:, int(2 * place)], v[:, int(2 * place)])
 
-    k1 = rate(0, base)
-    k2 = rate(1, base + h / 2 * k1)
-    k3 = rate(1, base + h / 2 * k2)
-    k4 = rate(2, base + h * k3)
-    next_base = base + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    next_base = rk4_step(rate, base, h)
     if size == 7:
         next_base = ca.vertcat(next_base[:3], next_base[3:] / ca.norm_2(next_base[3:]))
     count = len(motion.t) - 1

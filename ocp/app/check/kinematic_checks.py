@@ -17,7 +17,7 @@ import numpy as np
 from models import CollisionScene, FixedBase, Machine, Robot
 from models.checks import Array
 from ocp.app.check.data_checks import SMALL_UNITS, THRESHOLDS, Fault, likely_unit
-from ocp.app.check.interpolation import Indices, Motion
+from ocp.app.check.interpolation import Indices, Motion, interpolate
 from ocp.app.check.joint_limits import Row, RowVerdict
 from ocp.app.files import Waypoints
 from ocp.audit.clearance import Clearance
@@ -192,8 +192,11 @@ def path_rows(
     times = np.append(motion.t[interval] + fraction * np.diff(motion.t)[interval], motion.t[-1])
 
     def tips(at: Array) -> list[Array]:
-        places = np.zeros((len(at), 0)) if bases is None else _interpolate(motion.t, bases, at)
-        return sampler(places, motion.position.at(at))
+        """Return positions and z axes of the tip at times (K,). Shape (K, 3) each."""
+        base_path = np.zeros((len(at), 0)) if bases is None else interpolate(at, motion.t, bases)
+        if base_path.shape[1] == 7:
+            base_path[:, 3:] /= np.linalg.norm(base_path[:, 3:], axis=1)[:, None]
+        return sampler(base_path, motion.position.at(at))
 
     corners = path.positions
     tip_path, axes = tips(times)
@@ -245,17 +248,8 @@ def _axes(path: Waypoints, parameter: Array) -> Array:
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    numbers = np.arange(len(at_waypoints))
-    axes = np.column_stack([np.interp(parameter, numbers, column) for column in at_waypoints.T])
+    axes = interpolate(parameter, np.arange(float(len(at_waypoints))), at_waypoints)
     return np.asarray(axes / np.maximum(np.linalg.norm(axes, axis=1), 1e-12)[:, None])
-
-
-def _interpolate(t: Array, values: Array, times: Array) -> Array:
-    """Interpolate base configurations linearly at times (K,), and normalise their quaternions. Shape (K, n)."""
-    interpolated = np.column_stack([np.interp(times, t, column) for column in values.T])
-    if values.shape[1] == 7:
-        interpolated[:, 3:] /= np.linalg.norm(interpolated[:, 3:], axis=1)[:, None]
-    return interpolated
 
 
 def _distances(points: Array, corners: Array) -> tuple[Array, Array]:

@@ -18,8 +18,9 @@ from ocp.app.check.joint_limits import (
     Row,
     RowVerdict,
     effort_rows,
-    floating_base_rows,
+    integrate_base,
     limit_rows,
+    momentum_rows,
     rest_row,
     standing_rows,
     torque_rows,
@@ -91,6 +92,11 @@ class Check:
         return not self.faults and not self.suspicions
 
     @property
+    def limited_rows(self) -> tuple[Row, ...]:
+        """Table rows of the checked quantities, except those that have no limit."""
+        return tuple(row for row in self.rows if row.verdict is not RowVerdict.UNLIMITED)
+
+    @property
     def sentence(self) -> str:
         """Verdict on the trajectory in one sentence."""
         names = [row.name for row in self.rows if row.verdict is RowVerdict.UNDECIDED]
@@ -118,11 +124,10 @@ class Check:
         if self.faults:
             lines.append("faults:")
             lines += [f"  {fault}" for fault in self.faults]
-        limited = [row for row in self.rows if row.verdict is not RowVerdict.UNLIMITED]
-        if limited:
-            width = max(len(row.name) for row in limited)
+        if self.limited_rows:
+            width = max(len(row.name) for row in self.limited_rows)
             lines.append(f"  {'':<{width}}  {'worst':>11}  {'limit':>10}  {'unit':<8}{'at, s':>10}")
-            for row in limited:
+            for row in self.limited_rows:
                 limit = "" if row.limit is None else f"{row.limit:.4g}"
                 time = "" if row.time is None else f"{row.time:.5g}"
                 line = f"  {row.name:<{width}}  {row.value:>11.5g}  {limit:>10}  {row.unit:<8}{time:>10}  {row.verdict}"
@@ -295,8 +300,12 @@ def check_trajectory(
                     f"the file gives {cleaned.base.shape[1]} entries of the base, the machine has {machine.base_size}"
                 )
                 raise ProblemError(words, name="base", value=cleaned.base.shape[1], limit=machine.base_size)
-            bases, base_rows, base_faults = floating_base_rows(machine, motion, cleaned.base)
-            add((base_rows, base_faults))
+            if cleaned.base is None:
+                bases, base_rows = integrate_base(machine, motion)
+                rows += base_rows
+            else:
+                bases = cleaned.base
+                add(momentum_rows(machine, motion, bases))
         elif isinstance(machine, Standing):
             progress("ground")
             add(standing_rows(machine, motion, limits.friction))

@@ -179,7 +179,9 @@ class _Reader:
         unit_before = self.unit
         self._set_modes(codes, words)
         if "F" in words:
-            self._set_feed(words.pop("F"))
+            if (feed := words.pop("F")) < 0:
+                self._refuse("the feed F is negative")
+            self.feed = feed / 60 if self.inverse_time else feed * UNITS[self.unit] / 60  # 1/s or m/s
             if self.unit != unit_before:
                 self._note("F is in the units of its own line")
         for letter, text in IGNORED_LETTERS.items():
@@ -252,15 +254,6 @@ class _Reader:
             why = "a second coordinate system, whose offset only the machine knows; write a separate program"
             self._refuse(f"{code_name(code)}: {why}")
         self._note(f"{code_name(code)}: its zero is the zero of the program")
-
-    def _set_feed(self, value: float) -> None:
-        """Set the feed in m/s, or in 1/s in inverse time mode."""
-        if value < 0:
-            self._refuse("the feed F is negative")
-        if self.inverse_time:
-            self.feed = value / 60  # 1/s
-        else:
-            self.feed = value * UNITS[self.unit] / 60
 
     def _dwell(self, words: dict[str, float]) -> None:
         """Add the pause of a G4, which lasts P seconds."""

@@ -218,9 +218,9 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
         ProblemError: A motion cannot be compared, or has other states and controls.
     """
     others = _motions_by_name(against)
-    own_widths = _widths(solution)
+    own_widths = _widths(solution.name, solution)
     for name, other in others.items():
-        widths = _widths(other) if isinstance(other, Solution) else _local_widths(name, other)
+        widths = _widths(name, other)
         expected = {name: own_widths.get(name) for name in (widths if isinstance(other, LocalSolution) else own_widths)}
         if widths != expected:
             words = f"plot: {name!r} has {widths}, the solution has {own_widths}"
@@ -265,20 +265,19 @@ def html_of_solution(solution: Solution) -> str:
     return f'<div style="max-width: 56rem"><p><b>{escape(head)}</b></p>{as_svg(plot_solution(solution))}{table}</div>'
 
 
-def _widths(solution: Solution) -> dict[str, int]:
-    """Return the number of entries of each state and control of a solution by name."""
-    return {name: values.shape[1] for name, values in {**solution.states, **solution.controls}.items()}
-
-
-def _local_widths(name: str, other: Any) -> dict[str, int]:
-    """Return how many curves base, joints and rates of a local motion (a result of `resolve`) have, by name."""
-    if not isinstance(other, LocalSolution):
+def _widths(name: str, motion: Any) -> dict[str, int]:
+    """Return the number of entries of each state and control of a solution, or of base, joints and rates of a result of
+    `resolve`, by name; raise ProblemError for any other object, which `name` denotes.
+    """
+    if isinstance(motion, LocalSolution):
+        return {entry: values.shape[1] for entry, values in _local(motion).items()}
+    if not isinstance(motion, Solution):
         words = (
-            f"plot: {name!r} is a {type(other).__name__}; a solution can be compared with a solution or a result of "
+            f"plot: {name!r} is a {type(motion).__name__}; a solution can be compared with a solution or a result of "
             "resolve"
         )
-        raise ProblemError(words, name="against", value=other)
-    return {entry: values.shape[1] for entry, values in _local(other).items()}
+        raise ProblemError(words, name="against", value=motion)
+    return {entry: values.shape[1] for entry, values in {**motion.states, **motion.controls}.items()}
 
 
 def _local(other: LocalSolution) -> dict[str, Array]:

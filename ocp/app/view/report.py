@@ -15,7 +15,7 @@ import numpy as np
 
 from models import Machine
 from models.checks import Array
-from ocp.app.check.interpolation import Motion
+from ocp.app.check.interpolation import Motion, interpolate
 from ocp.app.check.joint_limits import Row, RowVerdict
 from ocp.app.check.verdict import Check, audit_rows, verdict_of
 from ocp.app.view.appearance import (
@@ -169,7 +169,6 @@ def report_of_check(check: Check, machine: Machine, limits: Limits, scene: Scene
     units = [robot.joint(name).unit for name in check.joints]
     obstacles = obstacles_of_shapes(scene.obstacles)
     picture = draw_scene(machine, motion, base_path, obstacles, folders=scene.folders) if complete else b""
-    limited = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         f"{check.file} for {robot.name}",
         f"The trajectory {check.sentence}.",
@@ -178,7 +177,7 @@ def report_of_check(check: Check, machine: Machine, limits: Limits, scene: Scene
         tuple(str(fault) for fault in check.faults),
         picture,
         draw_curves(motion, bounds, names=check.joints, units=units, faults=check.faults),
-        (("Checked quantities", tuple(limited)),),
+        (("Checked quantities", check.limited_rows),),
         (
             *(f"unlimited: {item}" for item in check.unlimited),
             *(f"not checked: {item}" for item in check.unchecked),
@@ -199,7 +198,6 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     units = [joint.unit for joint in robot.moving_joints]
     cost = f"cost {plan.cost:.5g}" + ("" if plan.bound is None else f", none below {plan.bound:.5g}")
     count = [f"{len(plan.candidates)} candidates"] if len(plan.candidates) > 1 else []
-    limited = [row for row in check.rows if row.verdict is not RowVerdict.UNLIMITED]
     return Report(
         title,
         f"The plan {verdict.sentence}.",
@@ -208,7 +206,10 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
         tuple(str(fault) for fault in check.faults),
         draw_scene(machine, motion, base_path, obstacles_of_plan(plan, sample.t)),
         draw_curves(motion, bounds, names=plan.names, units=units, faults=check.faults),
-        (("The audit", tuple(audit_rows(audit))), (f"Samples every {period:g} s against the limits", tuple(limited))),
+        (
+            ("The audit", tuple(audit_rows(audit))),
+            (f"Samples every {period:g} s against the limits", check.limited_rows),
+        ),
         tuple(f"unlimited: {one}" for one in check.unlimited),
     )
 
@@ -339,7 +340,7 @@ def draw_scene(
     Moving obstacles are drawn at the final time; `obstacles` has them at uniform times of the motion.
     """
     times = np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points)
-    base = None if bases is None else np.column_stack([np.interp(times, motion.t, column) for column in bases.T])
+    base = None if bases is None else interpolate(times, motion.t, bases)
     frames = frames_along(machine, motion.position.at(times), base)
     appearance = appearance_of(machine.robot, folders)
     poses = [
