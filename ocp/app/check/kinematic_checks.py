@@ -33,7 +33,7 @@ MAX_REPORTED_PAIRS = 20
 
 
 def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
-    """Return the machine with joint limits that contain a motion, and with finite limits for all prismatic joints."""
+    """Return the machine with joint limits widened to contain a motion, and finite limits of all prismatic joints."""
     robot = machine.robot
     low, high = (getattr(motion.position.coefficients, side)(axis=(0, 1)) for side in ("min", "max"))
     joints = []
@@ -235,16 +235,14 @@ def path_rows(
 
 
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
-    """Return the table row for a value and its upper limit, which may be infinite."""
+    """Return the row, in the table of a check, of a value and its upper limit, which may be infinite."""
     bounded = bool(np.isfinite(limit))
     verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.INFO
     return Row(name, value, limit if bounded else None, unit, time, verdict)
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:
-    """Return the required z axes of the tool, shape (K, 3), at points of the path, which are given by fractional
-    waypoint numbers (K,).
-    """
+    """Return the z axes (K, 3) that waypoints require of the tool at points, given as fractional numbers (K,)."""
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -295,8 +293,7 @@ def doubtful_times(motion: Motion, velocity: Array) -> list[Fault]:
 
 
 def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool = True) -> list[Fault]:
-    """Return a suspicion if the columns of two joints seem exchanged, because swapping them makes the motion far
-    simpler.
+    """Return a suspicion if the columns of two joints seem exchanged: swapping them makes the motion far simpler.
 
     Either one joint is outside its limits most of the time, and all are inside after the exchange. Or the tip moves
     straight or at constant speed only after the exchange. The latter requires three joints that do not move in
@@ -350,7 +347,7 @@ def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool =
 
 
 def _exchange_fault(names: list[str], pair: tuple[int, int], evidence: str) -> Fault:
-    """Return the suspicion that two columns of the file are exchanged."""
+    """Return the suspicion that the columns of two joints, given by their indices, are exchanged in a file."""
     both = " and ".join(names[k] for k in pair)
     text = f"the columns of {both} look exchanged: then {evidence}, which is far from true as written"
     return Fault("suspicion", both, f"{text}; correct the names, or pass --names-confirmed")

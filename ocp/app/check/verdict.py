@@ -98,7 +98,7 @@ class Check:
 
     @property
     def sentence(self) -> str:
-        """Verdict on the trajectory in one sentence."""
+        """Verdict on the trajectory, as a sentence whose subject the caller adds: "meets all checked requirements"."""
         names = [row.name for row in self.rows if row.verdict is RowVerdict.UNDECIDED]
         but = f"; undetermined: {', '.join(names[:3])}{' ...' if len(names) > 3 else ''}" if names else ""
         unchecked = f"; not checked: {'; '.join(self.unchecked)}" if self.unchecked else ""
@@ -140,7 +140,7 @@ class Check:
         return "\n".join([*lines, f"The trajectory {self.sentence}."])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as a dictionary for JSON, without the samples."""
+        """Return the result of the check as a dictionary for JSON, without the samples of the motion."""
         data = {name: getattr(self, name) for name in ("file", "robot", "joints", "samples", "duration", "rule")}
         data |= {"passed": self.passed, "verdict": self.sentence}
         data |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "suspicions", "rows")}
@@ -187,7 +187,7 @@ class Interpretation:
 
     @property
     def seconds(self) -> float:
-        """Duration of one unit of the file's times, s."""
+        """Duration, s, of one unit of the times in the trajectory file."""
         unit = self.time_unit
         return UNITS[unit] if isinstance(unit, str) else 1.0 if unit is None else float(unit)
 
@@ -403,7 +403,7 @@ class PlanVerdict:
 
     @property
     def sentence(self) -> str:
-        """Verdict on the plan in one sentence."""
+        """Verdict on the plan, as a sentence whose subject the caller adds: "must not be run: ..."."""
         if not self.audit.feasible or self.check.passed:
             return self.audit.sentence
         first, count = self.check.faults[0], len(self.check.faults)
@@ -462,7 +462,7 @@ def _check_samples(
 
 
 def _worst(checks: Sequence[Check]) -> Check:
-    """Merge the checks of several motions: keep all faults and, for each quantity, the worst table row."""
+    """Merge the checks of several motions into one with all faults and, for each quantity, the worst table row."""
     rows: dict[str, Row] = {}
     for row in (row for check in checks for row in check.rows):
         if row.name not in rows or _severity(row) > _severity(rows[row.name]):

@@ -162,17 +162,17 @@ class _Reader:
         return Program(tuple(self.sections), self.start, notes)
 
     def _refuse(self, why: str, limit: Any = None) -> NoReturn:
-        """Raise a ProblemError about the current line."""
+        """Raise a ProblemError about the current line of the G-code file, with a reason."""
         raise line_error(self.file, self.block.number, self.block.text, why, limit=limit)
 
     def _note(self, text: str) -> None:
-        """Add a note about the current line."""
+        """Add a note about the current line of the G-code file to the notes of the program."""
         lines = self.note_lines.setdefault(text, [])
         if not lines or lines[-1] != self.block.number:
             lines.append(self.block.number)
 
     def _run(self) -> bool:
-        """Execute the current block and return whether it ends the program."""
+        """Execute the current line of G-code and return whether it ends the program."""
         words = dict(self.block.words)
         codes = {code for letter, code in self.block.codes if letter == "G"}
         self._check_groups(codes)
@@ -316,7 +316,7 @@ class _Reader:
         return target
 
     def _move(self, codes: set[int], words: dict[str, float]) -> None:
-        """Execute the motion of the current block."""
+        """Execute the motion of the current line of G-code, if it has coordinates."""
         if 800 in codes:
             self.motion = None
         for code in codes.intersection(MOTIONS):
@@ -391,7 +391,7 @@ class _Reader:
         self._add(arcs, target)
 
     def _add(self, segments: Sequence[Segment], reached: Array) -> None:
-        """Append path segments with the current feed."""
+        """Append segments to the current path, with the feed and the tolerance that apply to the current line."""
         if not self.feed:
             self._refuse("no feed is set; write F, or read with feed= in m/s")
         feed = self.feed * sum(segment.length for segment in segments) if self.inverse_time else self.feed

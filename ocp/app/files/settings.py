@@ -98,15 +98,15 @@ class TomlTable:
         return value
 
     def text(self, name: str, expected: str = "a text", default: Any = None) -> Any:
-        """Return the entry of this name after checking that it is a non-empty text."""
+        """Return the entry `name` after checking that it is a non-empty text."""
         return self._read(name, default, expected, lambda value: isinstance(value, str) and value != "")
 
     def flag(self, name: str, default: bool = False) -> bool:
-        """Return the entry of this name after checking that it is true or false."""
+        """Return the entry `name` after checking that it is true or false."""
         return bool(self._read(name, default, "true or false", lambda value: isinstance(value, bool)))
 
     def choice(self, name: str, known: Iterable[str], default: Any = None) -> Any:
-        """Return the entry of this name after checking that it is one of the known words."""
+        """Return the entry `name` after checking that it is one of the known words."""
         words = tuple(known)
         expected = "one of " + ", ".join(f'"{word}"' for word in words)
         return self._read(name, default, expected, lambda value: isinstance(value, str) and value in words)
@@ -114,7 +114,7 @@ class TomlTable:
     def number(
         self, name: str, expected: str, default: Any = None, *, least: float = -np.inf, most: float = np.inf
     ) -> Any:
-        """Return the entry of this name after checking that it is a number above `least` and at most `most`."""
+        """Return the entry `name` after checking that it is a number above `least` and at most `most`."""
 
         def fits(value: Any) -> bool:
             return bool(np.isfinite(real(value)) and least < real(value) <= most)
@@ -123,7 +123,7 @@ class TomlTable:
         return value if value is None or value is default else float(value)
 
     def count(self, name: str, expected: str, default: Any = None) -> Any:
-        """Return the entry of this name after checking that it is an integer, 0 or more."""
+        """Return the entry `name` after checking that it is an integer, 0 or more."""
 
         def fits(value: Any) -> bool:
             return isinstance(value, int) and not isinstance(value, bool) and value >= 0
@@ -131,7 +131,7 @@ class TomlTable:
         return self._read(name, default, expected, fits)
 
     def vector(self, name: str, size: int | None, expected: str, default: Any = None) -> Any:
-        """Return the entry of this name as a vector of `size` numbers, or of any length if `size` is None."""
+        """Return the entry `name` as a vector of `size` numbers, or of any length if `size` is None."""
 
         def fits(value: Any) -> bool:
             try:
@@ -144,7 +144,7 @@ class TomlTable:
         return value if value is None or value is default else np.array(value, dtype=float)
 
     def numbers_by_name(self, name: str, expected: str) -> dict[str, float]:
-        """Return the entry of this name as a dictionary of numbers by name; empty if the entry is missing."""
+        """Return the entry `name` as a dictionary of numbers by name; empty if the entry is missing."""
         table = self.table(name, expected)
         if table is None:
             return {}
@@ -154,14 +154,14 @@ class TomlTable:
         return {key: float(value) for key, value in table._values.items()}
 
     def texts(self, name: str, expected: str) -> tuple[str, ...]:
-        """Return the entry of this name as a list of texts; empty if it is missing."""
+        """Return the entry `name` as a list of texts; empty if it is missing."""
         texts = self._read(
             name, [], expected, lambda value: isinstance(value, list) and all(isinstance(one, str) for one in value)
         )
         return tuple(texts)
 
     def pairs(self, name: str, expected: str) -> list[tuple[str, str]]:
-        """Return the entry of this name as a list of pairs of texts; empty if it is missing."""
+        """Return the entry `name` as a list of pairs of texts; empty if it is missing."""
 
         def fits(value: Any) -> bool:
             return isinstance(value, list) and all(
@@ -171,19 +171,19 @@ class TomlTable:
         return [(one, other) for one, other in self._read(name, [], expected, fits)]
 
     def raw(self, name: str, default: Any = None) -> Any:
-        """Return the entry of this name, which may be of any type, without a check."""
+        """Return the entry `name`, which may be of any type, without a check."""
         return self._read(name, default, "", lambda value: True)
 
     def table(self, name: str, expected: str = "a table") -> TomlTable | None:
-        """Return the nested table of this name, or None if it is missing."""
+        """Return the nested table `name`, or None if it is missing."""
         return self.required_table(name, expected) if name in self else None
 
     def required_table(self, name: str, expected: str = "a table") -> TomlTable:
-        """Return the nested table of this name; raise ProblemError if it is missing."""
+        """Return the nested table `name`; raise ProblemError if it is missing."""
         return self._inner(self._read(name, REQUIRED, expected, lambda value: isinstance(value, dict)), name)
 
     def tables_by_name(self, name: str) -> dict[str, TomlTable]:
-        """Return all tables [name.KEY] that are nested in the required table of this name, by KEY."""
+        """Return all tables [name.KEY] that are nested in the required table `name`, by KEY."""
         outer = self.required_table(name, f"tables, each headed [{'.'.join([*map(str, self.place), name])}.NAME]")
         return {key: outer.required_table(key) for key in outer._values}
 
@@ -249,7 +249,7 @@ def read_toml(file: FileName) -> TomlTable:
 
 
 def _places(texts: Sequence[str]) -> dict[Place, int]:
-    """Return the line number of every table and entry of a file."""
+    """Return the line number of every table and entry of a TOML file, keyed by the names that lead to it."""
     lines: dict[Place, int] = {}
     counts: dict[Place, int] = {}
     table: Place = ()
@@ -276,7 +276,7 @@ def _places(texts: Sequence[str]) -> dict[Place, int]:
 
 @contextmanager
 def located_errors(entries: TomlTable, name: str | None = None) -> Iterator[None]:
-    """Add the file and an entry to errors raised inside the block: the named entry, or the one that the error names."""
+    """Add file, line and entry to errors raised in a `with` block: the given entry, or the one that the error names."""
     try:
         yield
     except (ModelError, ProblemError) as error:
@@ -334,7 +334,7 @@ def read_obstacles(file: FileName) -> tuple[Shape, ...]:
 
 
 def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
-    """Return the shapes of the [[obstacle]] entries; paths of mesh files are relative to `folder`."""
+    """Return the shapes that the [[obstacle]] tables of a TOML file describe; mesh files are relative to `folder`."""
     shapes = []
     for table in entries.tables("obstacle"):
         shape = table.choice("shape", SHAPES, REQUIRED)
@@ -345,13 +345,13 @@ def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
 
 
 def rotation_of(entries: TomlTable) -> Array:
-    """Return the rotation matrix of the entry `rpy` (roll, pitch, yaw); the identity if it is missing. Shape (3, 3)."""
+    """Return the rotation matrix (3, 3) of a table's entry `rpy` (roll, pitch, yaw, rad); the identity if missing."""
     angles = entries.vector("rpy", 3, "three angles, rad", (0.0, 0.0, 0.0))
     return np.array(rotation_from_rpy(*(float(angle) for angle in angles)), dtype=float)
 
 
 def read_shape(table: TomlTable, shape: str, folder: Path = Path()) -> Shape:
-    """Read a shape of a kind in SHAPES from a table; names of mesh files are relative to `folder`."""
+    """Return the shape, of a kind in SHAPES, that a table describes; names of mesh files are relative to `folder`."""
 
     def place(name: str = "position") -> Any:
         return table.vector(name, 3, "three numbers, m", REQUIRED)
@@ -434,7 +434,7 @@ def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> 
 
 
 def _joint_vector(robot: Robot, kind: str, limits: Mapping[str, float]) -> Array:
-    """Return one kind of limits of the independent joints, from the file's limits and the description. Shape (dof,)."""
+    """Return the limits (dof,) of independent joints, of one kind: those of a file, else of the robot description."""
     vector = np.full(robot.dof, np.inf)
     for name, (column, multiplier, _) in robot.couplings.items():
         joint = robot.joint(name)
@@ -445,7 +445,7 @@ def _joint_vector(robot: Robot, kind: str, limits: Mapping[str, float]) -> Array
 
 
 def _limit(file: FileName, joint: str, entry: Mapping[Any, Any], kind: str) -> float | None:
-    """Return a limit of a joint, infinite for no limit, or None if the entry does not give one."""
+    """Return a limit of a joint in joint_limits.yaml, infinite for no limit, or None if its entry gives none."""
     has, value = entry.get(f"has_{kind}_limits"), entry.get(f"max_{kind}")
     if has is not None and not isinstance(has, bool):
         words = f"{file}: joint {joint!r}: has_{kind}_limits must be true or false, not {repr(has)[:80]}"
@@ -461,7 +461,7 @@ def _limit(file: FileName, joint: str, entry: Mapping[Any, Any], kind: str) -> f
 
 
 def _factor(file: FileName, tree: Mapping[Any, Any], kind: str) -> float:
-    """Return the default scaling factor of the velocities or accelerations in a file."""
+    """Return the default scaling factor of velocities or accelerations that joint_limits.yaml states, else 1."""
     key = f"default_{kind}_scaling_factor"
     if not 0 < real(tree.get(key, 1.0)) <= 1:
         words = f"{file}: {key} must be a number above 0, at most 1, not {repr(tree[key])[:80]}"
@@ -470,7 +470,7 @@ def _factor(file: FileName, tree: Mapping[Any, Any], kind: str) -> float:
 
 
 def _unused_keys(entry: Mapping[Any, Any]) -> list[str]:
-    """Return the keys of a joint that are not used, misspelt keys with a suggestion."""
+    """Return the unused keys in a joint's entry of joint_limits.yaml, with a suggestion for each misspelt key."""
     used = [key for key, kind in UNUSED_KEYS.items() if key in entry and entry.get(f"has_{kind}_limits") is not False]
     unknown = [str(key) for key in entry if key not in LIMIT_KEYS and key not in OTHER_KEYS]
     similar = {key: get_close_matches(key[:80], LIMIT_KEYS, 1, 0.8) for key in unknown}

@@ -130,7 +130,7 @@ MOTIONS = ("path", "goal", "waypoints", "walk")
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Contents of a task file.
+    """Contents of a task file: a machine, its tasks, the options of the planner, and the files to write.
 
     Attributes:
         machine: Robot on its base.
@@ -197,7 +197,7 @@ def read_task(file: FileName, output_folder: FileName | None = None) -> Task:
 
 
 def _machine(entries: TomlTable, urdf: Path) -> Machine:
-    """Read the table [robot] and return the robot on its base."""
+    """Read the table [robot] of a task file and return the robot on its base."""
     tip = entries.text("tip", "the name of the link that carries the tip")
     if not urdf.is_file():
         raise entries.error("urdf", f"there is no file {urdf}; name the robot's URDF, from the task file's folder")
@@ -247,7 +247,7 @@ def _tasks(root: TomlTable, folder: Path, robot: Robot) -> Any:
 
 
 def _motion(root: TomlTable, kind: str, folder: Path, robot: Robot) -> Any:
-    """Read one table that describes a motion, whose name is one of MOTIONS."""
+    """Read the table of one motion, whose name `kind` is one of MOTIONS, and return what the planner takes."""
     entries = root.required_table(kind, f"a table [{kind}]")
     if kind == "path":
         motion: Any = _task(entries, folder)
@@ -262,7 +262,7 @@ def _motion(root: TomlTable, kind: str, folder: Path, robot: Robot) -> Any:
 
 
 def _goal(entries: TomlTable, names: tuple[str, ...]) -> Goal:
-    """Read the table [goal]."""
+    """Read the table [goal] of a task file and return the goal."""
     values: dict[str, Any] = {
         "position": entries.vector("position", 3, "three numbers, m"),
         "orientation": entries.vector("orientation", 4, "four numbers: a quaternion w, x, y, z"),
@@ -289,7 +289,7 @@ def _goal(entries: TomlTable, names: tuple[str, ...]) -> Goal:
 
 
 def _walk(entries: TomlTable, robot: Robot) -> Steps:
-    """Read the table [walk] and return the robot, its feet and the phases of the walk."""
+    """Read the table [walk] of a task file and return the steps of a robot: its feet and the phases of its walk."""
     feet, start, steps = {}, {}, []
 
     def foothold(table: TomlTable) -> Foothold:
@@ -316,7 +316,7 @@ def _walk(entries: TomlTable, robot: Robot) -> Steps:
 
 
 def _duration(entries: TomlTable, name: str) -> Any:
-    """Read a required duration, s, or the bounds and the guess of a free duration."""
+    """Read the required duration of a phase of a walk, s, or the bounds and the guess of a free duration."""
     expected = "a number above 0, s, or { least = 0.2, most = 2.0, guess = 0.5 }"
     if not isinstance(entries.raw(name), dict):
         return entries.number(name, expected, REQUIRED, least=0.0)
@@ -328,7 +328,7 @@ def _duration(entries: TomlTable, name: str) -> Any:
 
 
 def _waypoints(entries: TomlTable, folder: Path, names: tuple[str, ...]) -> Waypoints:
-    """Read the table [waypoints]."""
+    """Read the table [waypoints] of a task file and return the waypoints of the planner."""
     poses = _read_waypoints(entries, folder)
     if poses.orientations is None or poses.free_roll:
         words = "waypoints without a path need whole orientations: quaternions in columns qw, qx, qy, qz"
@@ -340,7 +340,7 @@ def _waypoints(entries: TomlTable, folder: Path, names: tuple[str, ...]) -> Wayp
 
 
 def _read_waypoints(entries: TomlTable, folder: Path) -> Any:
-    """Read the file of waypoints that the entry `file` names."""
+    """Read the file of waypoints that the entry `file` of a table names."""
     name = entries.text("file", "the name of a file of waypoints", REQUIRED)
     if not (folder / name).is_file():
         raise entries.error("file", f"there is no file {folder / name}; name it from the task file's folder")
@@ -349,7 +349,7 @@ def _read_waypoints(entries: TomlTable, folder: Path) -> Any:
 
 
 def _task(entries: TomlTable, folder: Path) -> TipTask:
-    """Read the table [path] and return the task of the tip."""
+    """Read the table [path] of a task file and return the task of the tip."""
     path = _read_path(entries, folder)
     speed = _path_limit(entries, "speed", "m/s", REQUIRED)
     timing, pace = _pace(entries, path, speed)
@@ -411,7 +411,7 @@ def _read_path(entries: TomlTable, folder: Path) -> SmoothPath:
 
 
 def _limits(entries: TomlTable, names: tuple[str, ...]) -> dict[str, Any]:
-    """Read the joint limits and return them as an option of the planner."""
+    """Read the table [limits] of a task file and return the limits as an option of the planner."""
     limits: dict[str, Any] = {}
     for quantity, unit in LIMIT_UNITS.items():
         expected = f"a number above 0, {unit}, or {{ joint = number }}"
@@ -423,7 +423,7 @@ def _limits(entries: TomlTable, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _cost(entries: TomlTable, names: tuple[str, ...]) -> dict[str, Any]:
-    """Read the weights of the cost and return them as an option of the planner."""
+    """Read the table [cost] of a task file and return the cost as an option of the planner."""
     expected = "a number of 0 or more, or { joint = number }"
     weights = joint_values(entries, "weights", names, 1.0, "numbers above 0 by joint: { elbow = 4 }", least=0.0)
     values: dict[str, Any] = {"weights": weights}
@@ -436,7 +436,7 @@ def _cost(entries: TomlTable, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _step_weights(entries: TomlTable, names: tuple[str, ...]) -> dict[str, Any]:
-    """Read the weights of the cost of a walk and return them as an option of the planner."""
+    """Read the table [cost] of the task file of a walk and return its weights as an option of the planner."""
     expected = "a number of 0 or more: the weight of this term"
     terms = {term.name: term.default for term in fields(StepWeights)}
     values = {name: entries.number(name, expected, weight, least=-1e-300) for name, weight in terms.items()}
@@ -484,7 +484,7 @@ def _read_scene(entries: TomlTable, folder: Path, obstacles: tuple[Shape, ...]) 
 
 
 def _outputs(entries: TomlTable | None, folder: Path) -> tuple[dict[str, Path], float]:
-    """Read the names of the output files by kind, and the sampling period."""
+    """Return the paths of the output files by kind, and the sampling period, s, from the table [output]."""
     if entries is None:
         return {}, 0.01
     outputs = {}

@@ -183,7 +183,7 @@ def _read_table(
 
 
 def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str, width: int) -> Array:
-    """Return the numbers of a table; empty cells become nan. Shape (M, width)."""
+    """Return the numbers in the rows of a table as an array (M, width), with nan for empty cells."""
     split = [split_cells(row, delimiter) for row in rows]
     for row, number, cells in zip(rows, numbers, split, strict=True):
         if len(cells) != width:
@@ -436,7 +436,7 @@ def _read_program(file: FileName, language: RobotLanguage, period: float | None)
 def _name_axis(
     language: RobotLanguage, joints: dict[str, tuple[str, float]], remark: re.Match[str], late: bool
 ) -> None:
-    """Store the joint and the unit of an axis that a comment states; raise ValueError if it is invalid."""
+    """Store the joint and the unit of a robot axis that a comment of a program states; raise ValueError if invalid."""
     axis, column, unit = remark.groups()
     if axis not in (*language.arm, *language.external):
         return  # any other comment
@@ -449,7 +449,7 @@ def _name_axis(
 
 
 def _axis_positions(language: RobotLanguage, text: str, joints: dict[str, tuple[str, float]]) -> list[float]:
-    """Return the positions of the joints, rad or m, from the numbers of a statement; raise ValueError if invalid."""
+    """Return the joint positions, rad or m, in a statement of a robot program; raise ValueError if they are invalid."""
     items = text.split(",")
     if language is ROBOT_LANGUAGES["krl"]:
         pairs = [(item[:2].upper(), item[2:].strip()) for item in items]

@@ -227,7 +227,7 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
 
 
 def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
-    """Return line number, text and cells of each row of a table; a comment that names the columns is the first row."""
+    """Return line number, text and cells of each row of a table; a comment that names its columns becomes row 0."""
     rows: list[tuple[int, str, list[str]]] = []
     delimiter: str | None = None
     last_comment = (0, "")
@@ -351,7 +351,7 @@ def _quaternions(file: FileName, values: Array, lines: NDArray[np.intp], texts: 
 
 
 def _axes(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
-    """Return tool axes as unit vectors; raise ProblemError if an axis is zero."""
+    """Return the tool axes (M, 3) of a table as unit vectors; raise ProblemError, with the line, if one is zero."""
     norm = np.linalg.norm(values, axis=1)
     if not (norm > 0).all():
         i = int((norm > 0).argmin())
@@ -360,7 +360,7 @@ def _axes(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequenc
 
 
 def _from_vectors(vectors: Array) -> Array:
-    """Convert rotation vectors to quaternions."""
+    """Convert rotation vectors (M, 3), rad, to unit quaternions (M, 4)."""
     angle = np.linalg.norm(vectors, axis=1)[:, None]
     return np.concatenate([np.cos(angle / 2), np.sinc(angle / 2 / np.pi) / 2 * vectors], axis=1)
 

@@ -167,13 +167,13 @@ def html_of_plan(plan: Plan) -> str:
 
 
 def _motion_of(plan: Plan) -> Motion:
-    """Return samples of a plan, dense enough for curves, as a Motion."""
+    """Return samples of a plan, dense enough for smooth curves, as a joint motion."""
     sample = plan.sample(plan.horizon / PICTURE_STYLE.curve_points)
     return Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
 
 
 def _comparison(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
-    """Return, as a Motion, what is plotted for comparison with a plan, and its cost (None if unknown)."""
+    """Return the joint motion of an object that is plotted for comparison with a plan, and its cost or None."""
     cost: float | None = None
     if isinstance(other, Plan):
         joints, motion, cost = other.names, _motion_of(other), other.cost
@@ -234,7 +234,7 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
         grid: Any = target.subplots(rows, min(PICTURE_STYLE.columns, len(entries)), squeeze=False, sharex=True)
         for ax in grid.ravel()[len(entries) :]:
             ax.remove()
-        curves = [_along(one) for one in (solution, *others.values())]
+        curves = [_curves_over_time(one) for one in (solution, *others.values())]
         for ax, (name, k) in zip(grid.ravel(), entries, strict=False):
             for number, curve in reversed([*enumerate(curves)]):
                 if name in curve:
@@ -286,7 +286,7 @@ def _local(other: LocalSolution) -> dict[str, Array]:
     return {name: values for name, values in samples.items() if values.shape[1]}
 
 
-def _along(motion: Any) -> dict[str, tuple[Array, Array]]:
+def _curves_over_time(motion: Any) -> dict[str, tuple[Array, Array]]:
     """Return times (s) and values of a motion's states and controls by name, including both one-sided values at nodes.
 
     States and controls of a phase are given over the interval of that phase.
@@ -333,7 +333,7 @@ def _motions_by_name(against: Any) -> dict[str, Any]:
 
 
 def _figure(figure: Any, size: tuple[float, float]) -> Any:
-    """Return a new figure, or the given figure if it is empty; raise ProblemError if it is invalid."""
+    """Return a new matplotlib figure, or a given figure after checking that it is empty, of a size in inches."""
     if figure is None:
         return Picture(figsize=size, layout="constrained")
     require.instance("plot: figure", figure, Figure)

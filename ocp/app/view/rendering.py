@@ -172,7 +172,7 @@ class Floor(NamedTuple):
 
 
 def parts_in_world(appearance: Appearance, frames: Frames, k: int) -> list[Part]:
-    """Return the surfaces of a robot in the world frame at sample k of a motion."""
+    """Return the surfaces of a robot in the world frame at the sample of index `k` of a motion."""
     parts = []
     for part in appearance.parts:
         rotation, position = frames.rotations[part.link][k], frames.positions[part.link][k]
@@ -344,7 +344,7 @@ def _repeat_numbers(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArra
 
 
 def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Yield ranges of consecutive items whose counts sum to about `batch_size`, to limit memory."""
+    """Yield ranges (first, last + 1) of consecutive items whose counts sum to about `batch_size`."""
     ends = np.cumsum(counts)
     begin = 0
     while begin < len(counts):
@@ -354,7 +354,7 @@ def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 
 def _blocks(cells: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
-    """Yield samples, given by their numbers, in blocks of at most `batch_size`."""
+    """Yield the given numbers of picture samples in blocks of at most `batch_size`."""
     size = PICTURE_STYLE.batch_size
     return (cells[begin : begin + size] for begin in range(0, len(cells), size))
 
@@ -372,7 +372,7 @@ class _Sun:
 
     @classmethod
     def on(cls, mesh: _Mesh, camera: Camera) -> _Sun:
-        """Return the light source of a scene, in a direction relative to the camera, with its depth map for shadows."""
+        """Return the sun of a scene, whose direction is relative to the camera, with the depth map for its shadows."""
         back = camera.axes[2]
         azimuth, elevation = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
         to_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])

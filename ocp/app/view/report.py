@@ -144,7 +144,7 @@ class Report:
 
 
 def _table(rows: Sequence[Row]) -> str:
-    """Return the rows of a check as an HTML table."""
+    """Return rows of a check or an audit as an HTML table."""
     head = "<tr><th>quantity</th><th class=n>worst</th><th class=n>limit</th><th>unit</th><th class=n>at, s</th>"
     lines = [
         f"<tr><td>{escape(row.name)}</td><td class=n>{row.value:.5g}</td>"

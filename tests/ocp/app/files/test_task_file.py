@@ -190,7 +190,7 @@ friction = 0.6
 """
 
 
-BENT_LEG = {"hip": -0.4, "knee": 0.8, "ankle": -0.4}
+CROUCHED_LEG = {"hip": -0.4, "knee": 0.8, "ankle": -0.4}
 
 
 def read_walk(folder: Path, text: str) -> Task:
@@ -216,7 +216,7 @@ def test_a_walk_has_the_feet_the_footholds_and_the_durations_of_its_table(tmp_pa
         assert sole is not None
         np.testing.assert_allclose(sole.vertices, rectangle((-0.08, 0.14), (-0.05, 0.05)).vertices)
     start = dict(zip(task.machine.robot.joint_names, task.options["start"], strict=True))
-    assert start == {f"{side}_{name}": q for side in ("left", "right") for name, q in BENT_LEG.items()}
+    assert start == {f"{side}_{name}": q for side in ("left", "right") for name, q in CROUCHED_LEG.items()}
     assert task.options["cost"] == StepWeights(torque=1e-4)
     assert task.options["limits"].friction == 0.6
     problem = plan_problem(task.machine, steps, start=task.options["start"], cost=task.options["cost"])
