@@ -38,23 +38,6 @@ from ocp.motion.tasks.limits import Limits
 from ocp.solution import Solution
 from ocp.storage import write_text
 
-__all__ = [
-    "EXPORT_KINDS",
-    "base_pose",
-    "check_period",
-    "export_plan",
-    "motions_of",
-    "read_robot",
-    "run_cache",
-    "run_check",
-    "run_completion",
-    "run_export",
-    "run_plan",
-    "run_report",
-    "run_task",
-    "run_view",
-]
-
 
 def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """Run `selfmotion check`: check a trajectory and write a report of it if requested."""

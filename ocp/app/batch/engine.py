@@ -30,20 +30,6 @@ from models.errors import ModelError
 from ocp.app.batch.result_store import Payload, canonical_text, digest_of, pack_result, unpack_result
 from ocp.errors import DetailedError, ProblemError, SolveError
 
-__all__ = [
-    "Engine",
-    "EngineSettings",
-    "Function",
-    "Job",
-    "Outcome",
-    "WorkerFailure",
-    "attempt",
-    "attempts",
-    "cached",
-    "checked_cluster",
-    "failure_payload",
-]
-
 Function = Callable[..., Any]
 CACHE_SIZE = 8
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}

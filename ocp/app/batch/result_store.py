@@ -36,18 +36,6 @@ from ocp.motion.plan import Plan
 from ocp.solution import Solution
 from ocp.storage import END_RECORD, checked_path, open_unlinked, write_whole
 
-__all__ = [
-    "STATUSES",
-    "Payload",
-    "ResultStore",
-    "as_data",
-    "canonical_text",
-    "digest_of",
-    "key_of",
-    "pack_result",
-    "unpack_result",
-]
-
 MAX_DEPTH = 64
 """Largest permitted nesting depth of the lists and dictionaries in tasks and results."""
 KINDS: dict[str, type[Plan] | type[Solution]] = {"Plan": Plan, "Solution": Solution}

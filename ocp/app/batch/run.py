@@ -25,8 +25,6 @@ from ocp.app.batch.result_store import STATUSES, Payload, ResultStore, canonical
 from ocp.app.batch.table import Batch, Result, row_of
 from ocp.errors import ProblemError, require
 
-__all__ = ["neighbours", "run_batch"]
-
 MAX_WORKERS = 4096
 
 

@@ -21,17 +21,6 @@ from ocp.app.files import RawTrajectory
 from ocp.errors import ProblemError
 from ocp.motion.tasks.limits import JointBounds
 
-__all__ = [
-    "PLANAR_BASE",
-    "SMALL_UNITS",
-    "THRESHOLDS",
-    "CleanedTrajectory",
-    "DataThresholds",
-    "Fault",
-    "clean_trajectory",
-    "likely_unit",
-]
-
 
 @dataclass(frozen=True)
 class DataThresholds:

@@ -27,11 +27,6 @@ from models.checks import Array
 from ocp.errors import ProblemError
 from ocp.tolerances import LIMIT_SHARE
 
-__all__ = [
-    "Indices", "Motion", "MotionQuantity", "PiecewisePolynomial", "Rule", "half_digits", "interpolate",
-    "polynomial_maxima",
-]  # fmt: skip
-
 Indices: TypeAlias = NDArray[np.intp]
 Rule: TypeAlias = Literal["linear", "cubic", "quintic"]
 

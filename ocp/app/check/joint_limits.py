@@ -43,21 +43,6 @@ from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.values import Sampler
 from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
 
-__all__ = [
-    "ORDERS",
-    "Row",
-    "RowVerdict",
-    "effort_rows",
-    "integrate_base",
-    "limit_rows",
-    "limits_by_name",
-    "momentum_rows",
-    "standing_rows",
-    "torque_expression",
-    "torque_rows",
-    "torque_samples",
-]
-
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
 """Checked quantities of a joint, and the suffix that turns rad or m into the unit of the quantity."""
 

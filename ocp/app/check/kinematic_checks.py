@@ -26,8 +26,6 @@ from ocp.motion.local.collisions import distances_along
 from ocp.problem.values import Sampler
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = ["clearance_rows", "doubtful_times", "exchanged_joints", "path_rows", "prove_clearance", "with_wide_limits"]
-
 MAX_REPORTED_PAIRS = 20
 """Largest number of pairs of bodies that are listed in the table of clearances."""
 

@@ -40,18 +40,6 @@ from ocp.motion.tasks.limits import Limits, unknown_limits
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 from ocp.tolerances import path_tolerance as default_tolerance
 
-__all__ = [
-    "Check",
-    "CheckTolerances",
-    "Fault",
-    "Interpretation",
-    "PlanVerdict",
-    "Row",
-    "audit_rows",
-    "check_trajectory",
-    "verdict_of",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Check:

@@ -32,16 +32,6 @@ from ocp.motion.plan import Plan
 from ocp.motion.schedule import JointTrajectory
 from ocp.storage import write_text, write_whole
 
-__all__ = [
-    "PROGRAM_UNITS",
-    "ROBOT_LANGUAGES",
-    "RobotLanguage",
-    "log_rerun",
-    "read_joint_messages",
-    "write_mcap",
-    "write_robot_program",
-]
-
 
 def _with_parts(fields: str, **parts: str) -> str:
     """Return the ROS 2 definition of a message type: its header, its fields, and the types that the fields use."""

@@ -40,8 +40,6 @@ from ocp.app.files.program import Cut, Note, Pause, Program, Rapid, Section, che
 from ocp.app.files.safe_files import FileName, line_error, read_lines
 from ocp.errors import ProblemError, require
 
-__all__ = ["read_gcode"]
-
 UNITS = {"mm": 1e-3, "inch": 0.0254}
 DEFAULT_GAPS_M = {"mm": 2 * np.sqrt(2) * 1e-5, "inch": 2 * np.sqrt(2) * 2.54e-5}
 """Largest difference of an arc's two end radii that rounding to 0.01 mm or 0.001 inch explains, by unit, m."""

@@ -26,24 +26,6 @@ from models.spatial import FULL_TURN
 from ocp.app.files.safe_files import FileName, line_error
 from ocp.tolerances import STANDSTILL
 
-__all__ = [
-    "GROUPS",
-    "IGNORED_CODES",
-    "IGNORED_LETTERS",
-    "MACHINE_CODES",
-    "MOTIONS",
-    "M_WORDS",
-    "PLANES",
-    "REPOST",
-    "UNSUPPORTED_CODES",
-    "ArcError",
-    "Block",
-    "arcs_about_center",
-    "center_from_radius",
-    "code_name",
-    "read_blocks",
-]
-
 PLANES = {170: (0, 1, 2), 180: (2, 0, 1), 190: (1, 2, 0)}
 """First axis, second axis and normal of the planes G17, G18, G19: right-handed, so that G3 turns about the normal."""
 RADIUS_SHARE = 1e-3

@@ -15,20 +15,6 @@ from models.paths.path import NO_ROTATION, Reversal, fit_splines
 from ocp.errors import ProblemError, require
 from ocp.motion.schedule import LineLimits, Schedule, schedule
 
-__all__ = [
-    "DEFAULT_TOLERANCE_M",
-    "Cut",
-    "Note",
-    "Pause",
-    "Program",
-    "ProgramMotion",
-    "Rapid",
-    "Section",
-    "TimedProgram",
-    "checked_reversal",
-    "smooth_path",
-]
-
 DEFAULT_TOLERANCE_M = 5e-5
 """Default deviation of a rounded path, m, which is a usual contour tolerance of machine tools."""
 

@@ -24,21 +24,6 @@ from models.files import INPUT_LIMITS, UnfitFile, open_regular, read_regular
 from ocp.errors import ProblemError
 from ocp.storage import read_arrays, table_joints
 
-__all__ = [
-    "MARK",
-    "SUFFIXES",
-    "FileName",
-    "checked_depth",
-    "checked_output",
-    "children_of",
-    "is_number",
-    "line_error",
-    "missing_package",
-    "read_lines",
-    "read_tree",
-    "split_cells",
-]
-
 FileName = str | PathLike[str]
 BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 QUOTED_CHARACTERS = 120

@@ -33,11 +33,6 @@ from ocp.app.files.safe_files import FileName, checked_depth, line_error, read_l
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.limits import Limits
 
-__all__ = [
-    "REQUIRED", "TomlTable", "joint_values", "located_errors", "obstacles_of", "read_joint_limits", "read_obstacles",
-    "read_shape", "read_toml", "rotation_of",
-]  # fmt: skip
-
 TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
 BETWEEN = re.compile(r"[,=\[\]{}#]")

@@ -113,8 +113,6 @@ from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import ramp_limits
 
-__all__ = ["Task", "read_task"]
-
 LIMIT_UNITS = {
     "velocity": "rad/s or m/s",
     "acceleration": "rad/s^2 or m/s^2",

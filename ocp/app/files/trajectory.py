@@ -37,8 +37,6 @@ from ocp.storage import joint_name, table_joints
 
 Indices: TypeAlias = NDArray[np.intp]
 
-__all__ = ["KINDS", "RawTrajectory", "read_trajectory"]
-
 KINDS = ("positions", "velocities", "accelerations", "efforts")
 WORDS = {
     **dict.fromkeys(("position", "positions", "pos", "q"), "positions"),

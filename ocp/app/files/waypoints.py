@@ -34,8 +34,6 @@ from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smooth_
 from ocp.app.files.safe_files import FileName, is_number, line_error, read_lines, split_cells
 from ocp.errors import ProblemError, require
 
-__all__ = ["Waypoints", "read_waypoints"]
-
 POSITION, QUATERNION, VECTOR = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
 AXIS = ("ax", "ay", "az")
 KINDS = (POSITION, QUATERNION, VECTOR, AXIS, ("time",))

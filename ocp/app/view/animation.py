@@ -32,12 +32,6 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.values import Sampler
 from ocp.solution import Solution, match_order
 
-__all__ = [
-    "PAGE_SETTINGS", "Animation", "ClosestPairs", "Curve", "GroundContact", "MotionSamples", "PageSettings",
-    "animate_plan", "animate_solution", "animate_trajectory", "cumulative_integral", "ground_contact",
-    "joint_curves", "machine_curves",
-]  # fmt: skip
-
 
 @dataclass(frozen=True, eq=False)
 class Curve:

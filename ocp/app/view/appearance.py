@@ -30,30 +30,6 @@ from ocp.problem.problem import Problem
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
 
-__all__ = [
-    "COMPARED",
-    "FAULT",
-    "LIMIT",
-    "PLAN",
-    "SCENE",
-    "SURFACE_STYLE",
-    "TIP",
-    "TIP_FRAME",
-    "Appearance",
-    "Frames",
-    "Obstacle",
-    "Part",
-    "Solid",
-    "SurfaceStyle",
-    "appearance_of",
-    "frames_along",
-    "obstacles_of",
-    "obstacles_of_plan",
-    "obstacles_of_shapes",
-    "part_of",
-    "rod",
-]
-
 
 @dataclass(frozen=True)
 class SurfaceStyle:

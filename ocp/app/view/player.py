@@ -34,8 +34,6 @@ from ocp.app.view.animation import PAGE_SETTINGS, Animation
 from ocp.app.view.appearance import TIP_FRAME, Appearance, Frames, appearance_of, frames_along, part_of
 from ocp.errors import ProblemError
 
-__all__ = ["Buffers", "Page", "PageServer", "build_page"]
-
 SCRIPTS = ("scene.js", "curves.js", "player.js")
 
 

@@ -31,20 +31,6 @@ from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "STYLE",
-    "Picture",
-    "add_legend",
-    "as_svg",
-    "draw_joints",
-    "draw_limits",
-    "html_of_plan",
-    "html_of_solution",
-    "line_style",
-    "plot_plan",
-    "plot_solution",
-]
-
 STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
 """Settings of matplotlib for all figures."""
 STYLE |= {"text.parse_math": False}  # a joint's name may contain a dollar

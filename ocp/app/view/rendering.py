@@ -20,10 +20,6 @@ from models.checks import Array
 from ocp.app.view.appearance import Appearance, Frames, Part
 from ocp.errors import ProblemError
 
-__all__ = [
-    "PICTURE_STYLE", "Camera", "Floor", "Layer", "PictureStyle", "encode_png", "parts_in_world", "render", "tube",
-]  # fmt: skip
-
 
 @dataclass(frozen=True)
 class PictureStyle:

@@ -36,11 +36,6 @@ from ocp.motion.plan import Plan
 from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import JointBounds, Limits
 
-__all__ = [
-    "KINDS", "LimitView", "Report", "bounds_of", "curve_samples", "draw_curves", "draw_scene", "limits_in_view",
-    "report_of_check", "report_of_plan",
-]  # fmt: skip
-
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """Content security policy of a report, under which no script runs and nothing is loaded."""
 SHOWN_ROWS = 8
