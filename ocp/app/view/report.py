@@ -271,14 +271,17 @@ def draw_curves(
     matplotlib is not used, because it takes longer to import than everything else in a report.
     """
     width, height, left, gap, top, pitch = 165.0, 92.0, 72.0, 56.0, 18.0, 108.0  # px: diagrams and what is around them
-    begin, duration = motion.t[0], motion.t[-1] - motion.t[0]
     parts = []
+
+    def place_of(time: Any) -> Any:
+        """Return the horizontal position of a time (s) or of several in a diagram, px."""
+        return width * (time - motion.t[0]) / (motion.t[-1] - motion.t[0])
+
     for column, (kind, per) in enumerate(KINDS.items()):
         times, values = curve_samples(motion, kind)
         lower, upper = bounds_of(bounds, kind)
         min_range = PICTURE_STYLE.flat * (1.0 if values is None else float(np.abs(values).max()))
-        x = width * (times - begin) / duration
-        marks = [(width * (time - begin) / duration, f"{time:.6g}") for time in _round_numbers(begin, motion.t[-1])]
+        marks = [(place_of(time), f"{time:.6g}") for time in _round_numbers(motion.t[0], motion.t[-1])]
         for row, name in enumerate(names):
             curve = np.full(1, np.nan) if values is None else values[:, row]
             view = limits_in_view(
@@ -295,10 +298,11 @@ def draw_curves(
                 parts.append(f'<path d="M0 {y:.1f}H{width:g}" style="stroke:{LIMIT};stroke-dasharray:5 2"/>')
             for fault in faults:
                 if fault.name == name and fault.kind == kind and fault.time is not None:
-                    place = width * (fault.time - begin) / duration
-                    parts.append(f'<path d="M{place:.1f} 0v{height:g}" style="stroke:{FAULT};stroke-width:2"/>')
+                    parts.append(
+                        f'<path d="M{place_of(fault.time):.1f} 0v{height:g}" style="stroke:{FAULT};stroke-width:2"/>'
+                    )
             if values is not None:
-                points = np.column_stack([x, height - scale * (curve - view.low)]).tolist()
+                points = np.column_stack([place_of(times), height - scale * (curve - view.low)]).tolist()
                 line = "L".join(f"{a:.1f} {b:.1f}" for a, b in points)
                 parts.append(f'<path d="M{line}" style="stroke:{PLAN};stroke-width:1.6"/>')
             if view.text:
@@ -323,7 +327,7 @@ def draw_curves(
 def _round_numbers(low: float, high: float) -> list[float]:
     """Return three to eight multiples of 1, 2 or 5 times a power of ten between two numbers, for the ticks of axes."""
     power = 10.0 ** np.floor(np.log10((high - low) / 3))
-    step = power * max(factor for factor in (1, 2, 5) if factor * power <= (high - low) / 3)
+    step = power * max((factor for factor in (1, 2, 5) if factor * power <= (high - low) / 3), default=1)
     return [float(k * step) for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]
 
 
