@@ -28,8 +28,8 @@ from models.robot.kinematics import (
     each_joint,
     frames_and_axes,
     joint_frames,
+    joint_vector,
     link_frames,
-    propagate_motions,
 )
 from models.robot.parts import Link, massless_error
 from models.robot.rebuild import simplify
@@ -379,16 +379,8 @@ def momentum(
     world_from_base: Placement | None = None,
 ) -> Expression:
     """Return the robot's angular momentum about a fixed point, and its linear momentum. Shape (6, 1), N m s and N s."""
-    frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = propagate_motions(robot, frames, axes, qd=qd, qdd=ca.DM(robot.dof, 1))
-    place = checked_vector("about", about, 3, "a point of the world")
-    total: Expression = ca.DM(6, 1)
-    for link in robot.links:
-        motion, inertia = motions[link.name], inertia_in_world(link, frames)
-        push = link.mass * motion.velocity
-        spin = ca.mtimes(inertia, motion.angular_velocity)
-        total = total + ca.vertcat(spin + cross(motion.center - place, push), push)
-    return ca.densify(total)
+    rates = joint_vector(robot, qd, "qd")
+    return _moved_to(about, ca.mtimes(momentum_matrix(robot, q, world_from_base), rates))
 
 
 @on_scalars
@@ -405,20 +397,10 @@ def momentum_rate(
 
     It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
     """
-    frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = propagate_motions(robot, frames, axes, qd=qd, qdd=qdd)
-    place = checked_vector("about", about, 3, "a point of the world")
-    total: Expression = ca.DM(6, 1)
-    for link in robot.links:
-        motion, inertia = motions[link.name], inertia_in_world(link, frames)
-        spin = motion.angular_velocity
-        force = link.mass * motion.acceleration
-        moment = ca.mtimes(inertia, motion.angular_acceleration) + cross(spin, ca.mtimes(inertia, spin))
-        total = total + ca.vertcat(moment + cross(motion.center, force), force)
-    return ca.densify(ca.vertcat(total[0:3] - cross(place, total[3:6]), total[3:6]))
+    return _moved_to(about, base_reaction(robot, q, qd, qdd, gravity=(0.0, 0.0, 0.0), world_from_base=world_from_base))
 
 
-def inertia_in_world(link: Link, frames: dict[str, Frame]) -> Expression:
-    """Return the rotational inertia of a link about its centre of mass, in world axes. Shape (3, 3)."""
-    turn = frames[link.name].rotation
-    return ca.mtimes([turn, ca.sparsify(ca.DM(link.inertia)), turn.T])
+def _moved_to(point: Expression, wrench: Expression) -> Expression:
+    """Return (moment about a point of the world, force), given (moment about the world's origin, force)."""
+    arm = checked_vector("about", point, 3, "a point of the world")
+    return ca.densify(ca.vertcat(wrench[0:3] - cross(arm, wrench[3:6]), wrench[3:6]))

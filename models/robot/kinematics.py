@@ -283,31 +283,6 @@ def link_motions(
 ) -> dict[str, LinkMotion]:
     """Return the motion of every link (`LinkMotion`), by link name, the root link first."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    return propagate_motions(robot, frames, axes, qd=qd, qdd=qdd)
-
-
-@on_scalars
-def center_of_mass_motion(
-    robot: Robot, q: Expression, qd: Expression, qdd: Expression, *, world_from_base: Placement | None = None
-) -> CenterOfMassMotion:
-    """Return the motion of the whole robot's centre of mass; raise ModelError if the robot has no mass."""
-    if require.instance("kinematics: robot", robot, Robot).total_mass == 0:
-        raise massless_error("hence no centre of mass")
-    motions = link_motions(robot, q, qd, qdd, world_from_base=world_from_base)
-    weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]
-    sums = (sum(parts, start=ca.DM(3, 1)) for parts in zip(*weighted, strict=True))
-    return CenterOfMassMotion(*(ca.densify(part / robot.total_mass) for part in sums))
-
-
-def propagate_motions(
-    robot: Robot,
-    frames: dict[str, Frame],
-    axes: dict[str, tuple[Expression, Expression]],
-    *,
-    qd: Expression,
-    qdd: Expression,
-) -> dict[str, LinkMotion]:
-    """Return the motion of every link, by name, propagated from the root link outwards."""
     rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
     # velocity and acceleration of the frame's origin, angular velocity, angular acceleration
     origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {robot.root: (ca.DM(3, 1),) * 4}
@@ -335,6 +310,19 @@ def propagate_motions(
         acceleration = acceleration + cross(turning, arm) + cross(spin, swing)
         motions[link.name] = LinkMotion(center, velocity + swing, acceleration, spin, turning)
     return motions
+
+
+@on_scalars
+def center_of_mass_motion(
+    robot: Robot, q: Expression, qd: Expression, qdd: Expression, *, world_from_base: Placement | None = None
+) -> CenterOfMassMotion:
+    """Return the motion of the whole robot's centre of mass; raise ModelError if the robot has no mass."""
+    if require.instance("kinematics: robot", robot, Robot).total_mass == 0:
+        raise massless_error("hence no centre of mass")
+    motions = link_motions(robot, q, qd, qdd, world_from_base=world_from_base)
+    weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]
+    sums = (sum(parts, start=ca.DM(3, 1)) for parts in zip(*weighted, strict=True))
+    return CenterOfMassMotion(*(ca.densify(part / robot.total_mass) for part in sums))
 
 
 TWIST_SIZE = 6

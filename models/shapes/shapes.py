@@ -185,7 +185,7 @@ class Box(_Posed):
 
     Attributes:
         size: Full length of the edges. Shape (3,), m; inf along an axis without ends, as for walls of a wind tunnel.
-            A box with an infinite edge has no core; only the distances of the captive trajectory rig accept it.
+            A box with an infinite edge has no core; it serves only as the walls around the captive trajectory rig.
         position: Centre. Shape (3,), m.
         rotation: Axes of the box as columns. Shape (3, 3).
 
