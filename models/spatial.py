@@ -169,23 +169,11 @@ def rotation_from_rpy(roll: Expression, pitch: Expression, yaw: Expression) -> E
     return ca.mtimes([rotation((0, 0, 1), yaw), rotation((0, 1, 0), pitch), rotation((1, 0, 0), roll)])
 
 
-def quaternion_about(axis: Expression, angle: Expression) -> Expression:
-    """Return the unit quaternion [w, x, y, z] of a rotation by `angle` (rad) about a unit vector. Shape (4, 1)."""
-    half = expression(angle) / 2
-    return ca.vertcat(ca.cos(half), ca.sin(half) * expression(axis))
-
-
 def quaternion_product(a: Expression, b: Expression) -> Expression:
     """Return the Hamilton product a b of quaternions [w, x, y, z]: rotate by b, then by a. Shape (4, 1)."""
     a, b = expression(a), expression(b)
     scalar = a[0] * b[0] - ca.dot(a[1:4], b[1:4])
     return ca.vertcat(scalar, a[0] * b[1:4] + b[0] * a[1:4] + cross(a[1:4], b[1:4]))
-
-
-def quaternion_conjugate(quaternion: Expression) -> Expression:
-    """Return the conjugate [w, -x, -y, -z], the inverse rotation of a unit quaternion. Shape (4, 1)."""
-    quaternion = expression(quaternion)
-    return ca.vertcat(quaternion[0], -quaternion[1:4])
 
 
 def rotation_from_quaternion(quaternion: Expression) -> Expression:
@@ -247,7 +235,7 @@ def angular_velocity_from_quaternion(quaternion: Expression, rate: Expression) -
     The inverse of quaternion_rate; the quaternion may have any non-zero norm.
     """
     quaternion = expression(quaternion)
-    product = quaternion_product(rate, quaternion_conjugate(quaternion))
+    product = quaternion_product(rate, ca.vertcat(quaternion[0], -quaternion[1:4]))
     return 2 * product[1:4] / ca.dot(quaternion, quaternion)
 
 
@@ -276,27 +264,6 @@ def motion_cross(velocity: Expression) -> Expression:
     v = expression(velocity)
     zero = type(v)(3, 3)
     return ca.vertcat(ca.horzcat(skew(v[0:3]), zero), ca.horzcat(skew(v[3:6]), skew(v[0:3])))
-
-
-def force_cross(velocity: Expression) -> Expression:
-    """Return the spatial cross product operator v x* on force vectors: -motion_cross(v)'. Shape (6, 6)."""
-    return -motion_cross(velocity).T
-
-
-def spatial_inertia(mass: Expression, center_of_mass: Expression, inertia: Expression) -> Expression:
-    """Return the spatial inertia of a rigid body about its frame's origin: the matrix from its twist to its momentum.
-
-    Args:
-        mass: kg.
-        center_of_mass: In the frame. Shape (3,), m.
-        inertia: About the centre of mass, in the frame's axes. Shape (3, 3), kg m^2.
-
-    Returns:
-        Shape (6, 6).
-    """
-    arm = skew(center_of_mass)
-    about_origin = expression(inertia) + mass * ca.mtimes(arm, arm.T)
-    return ca.vertcat(ca.horzcat(about_origin, mass * arm), ca.horzcat(mass * arm.T, mass * ca.DM.eye(3)))
 
 
 @on_scalars

@@ -138,9 +138,10 @@ def clearances(
         own = ca.vertcat(capsule.start, capsule.end, capsule.radius)
         if scene.walls is not None:
             distances[name, "walls"] = _distance_to_walls(capsule, scene.walls)
-        for kind, obstacles in (("solid", scene.solids), ("capsule", scene.capsules)):
-            for k, obstacle in enumerate(obstacles):
-                distances[name, f"{kind} {k}"] = pair_function(Capsule, type(obstacle))(own, column(obstacle))
+        obstacles: dict[str, Box | Capsule] = {f"solid {k}": box for k, box in enumerate(scene.solids)}
+        obstacles |= {f"capsule {k}": obstacle for k, obstacle in enumerate(scene.capsules)}
+        for label, obstacle in obstacles.items():
+            distances[name, label] = pair_function(Capsule, type(obstacle))(own, column(obstacle))
     if not distances:
         message = "clearances: the scene is empty; give walls, solids or capsules"
         raise ModelError(message, name="scene", value=scene)

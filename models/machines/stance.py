@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -203,15 +203,7 @@ class Stance(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> dict[str, Expression]:
         """Return the contact loads of all standing feet during a motion, given the loads of all but the first foot."""
-        reaction = base_reaction(
-            self.bodies,
-            q,
-            qd,
-            qdd,
-            wrenches=self._wrenches(others),
-            gravity=self._gravity,
-            world_from_base=self.world_from_base(),
-        )
+        reaction = base_reaction(self.bodies, q, qd, qdd, **self._forces(others))
         first = next(iter(self.footholds))
         moment, force = reaction[:3], reaction[3:]
         first_load = ca.vertcat(moment - cross(ca.DM(self.footholds[first].position), force), force)
@@ -221,21 +213,10 @@ class Stance(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> Expression:
         """Return the joint torques (or forces) of a motion, given the loads of all but the first foot. Shape (n, 1)."""
-        return inverse_dynamics(
-            self.bodies,
-            q,
-            qd,
-            qdd,
-            wrenches=self._wrenches(others),
-            gravity=self._gravity,
-            world_from_base=self.world_from_base(),
-        )
+        return inverse_dynamics(self.bodies, q, qd, qdd, **self._forces(others))
 
-    @property
-    def _gravity(self) -> Array:
-        return np.array([0.0, 0.0, -self.gravity])
-
-    def _wrenches(self, others: Mapping[str, Expression]) -> list[Wrench]:
+    def _forces(self, others: Mapping[str, Expression]) -> dict[str, Any]:
+        """Return loads of feet, gravity and pose of the root as keywords of `base_reaction` and `inverse_dynamics`."""
         others = require.mapping("stance: others", others)
         if set(others) != set(self.other_feet):
             message = f"stance: loads of the feet {list(self.other_feet)} are needed, not of {list(others)}"
@@ -245,7 +226,8 @@ class Stance(FixedBase):
             load = checked_vector(f"load of {name!r}", load, 6, "moment about the sole's origin and force")
             foot = self.feet[name]
             wrenches.append(Wrench(foot.link, load[3:], load[:3], foot.translation))
-        return wrenches
+        gravity = (0.0, 0.0, -self.gravity)
+        return {"wrenches": wrenches, "gravity": gravity, "world_from_base": self.world_from_base()}
 
     @cached_property
     def load_rows(self) -> dict[str, tuple[int, ...]]:

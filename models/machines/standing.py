@@ -139,10 +139,7 @@ class Standing(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
         """Return the ground's wrench on the foot: (moment about the world's origin, force). Shape (6, 1), N m, N."""
-        robot = self.bodies(wrenches)
-        return base_reaction(
-            robot, q, qd, qdd, wrenches=wrenches, gravity=self.gravity_in_world, world_from_base=self.world_from_base()
-        )
+        return base_reaction(self.bodies(wrenches), q, qd, qdd, **self._forces(wrenches))
 
     def zero_moment_point(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
@@ -158,10 +155,11 @@ class Standing(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
         """Return the joint torques (or forces) that a motion requires, by inverse dynamics. Shape (n, 1), N m or N."""
-        robot = self.bodies(wrenches)
-        return inverse_dynamics(
-            robot, q, qd, qdd, wrenches=wrenches, gravity=self.gravity_in_world, world_from_base=self.world_from_base()
-        )
+        return inverse_dynamics(self.bodies(wrenches), q, qd, qdd, **self._forces(wrenches))
+
+    def _forces(self, wrenches: Sequence[Wrench]) -> dict[str, Any]:
+        """Return wrenches, gravity and pose of the foot as keywords of `base_reaction` and `inverse_dynamics`."""
+        return {"wrenches": wrenches, "gravity": self.gravity_in_world, "world_from_base": self.world_from_base()}
 
     def stability_index(self, point: Expression) -> Expression:
         """Return the stability indices of a zero moment point in x and y. Shape (2, 1).

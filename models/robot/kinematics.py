@@ -63,23 +63,22 @@ def checked_vector(label: str, value: Expression, size: int, meaning: str) -> Ex
     return value
 
 
-def checked_placement(placement: Placement | None) -> Frame:
-    """Return the pose of the root link as a frame (the identity if None); raise ModelError if the pose is invalid."""
+def checked_placement(placement: Placement | None, label: str = "world_from_base") -> Frame:
+    """Return a pose (rotation, position) as a frame, the identity if None; raise ModelError if the pose is invalid."""
     if placement is None:
         return Frame(ca.DM.eye(3), ca.DM(3, 1))
+    name = argument_of(label)
     try:
         orientation, position = map(expression, placement)
     except NOT_NUMBERS as error:
-        message = f"world_from_base must be (rotation, position), not {placement!r}"
-        raise ModelError(message, name="world_from_base", value=placement) from error
-    if orientation.shape != (3, 3) or position.shape != (3, 1):
-        message = f"world_from_base has the shapes {orientation.shape}, {position.shape}; (3, 3), (3, 1) expected"
-        raise ModelError(
-            message, name="world_from_base", value=(orientation.shape, position.shape), limit=((3, 3), (3, 1))
-        )
+        message = f"{label} must be (rotation, position), not {placement!r}"
+        raise ModelError(message, name=name, value=placement) from error
+    shapes, expected = (orientation.shape, position.shape), ((3, 3), (3, 1))
+    if shapes != expected:
+        message = f"{label} has parts of shapes {shapes}, expected {expected}"
+        raise ModelError(message, name=name, value=shapes, limit=expected)
     if not all(part.is_regular() for part in (orientation, position) if isinstance(part, ca.DM)):
-        message = f"world_from_base {placement!r} is not finite"
-        raise ModelError(message, name="world_from_base", value=placement)
+        raise ModelError(f"{label} {placement!r} is not finite", name=name, value=placement)
     return Frame(orientation, position)
 
 

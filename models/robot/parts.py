@@ -64,13 +64,9 @@ class CollisionShape:
             raise ModelError(f"{owner}: size {size.tolist()} scales it to nothing", name="size", value=size)
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
-        if not mesh:
-            self._check_size(size, owner)
+        if not mesh and not isinstance(self, VisualShape):
+            warn_of_millimetres(f"{owner}: size", size)
         object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
-
-    def _check_size(self, size: Array, owner: str) -> None:
-        """Warn if an entry of the size looks like millimetres."""
-        warn_of_millimetres(f"{owner}: size", size)
 
     def placed(self, rotation: Array, translation: Array) -> Self:
         """Return the shape in another frame, given the pose of its link in that frame: shapes (3, 3) and (3,), m."""
@@ -102,9 +98,6 @@ class VisualShape(CollisionShape):
             message = f"visual {self.kind}: color {color.tolist()} has entries outside 0 to 1"
             raise ModelError(message, name="color", value=color, limit=(0.0, 1.0))
         object.__setattr__(self, "color", color)
-
-    def _check_size(self, size: Array, owner: str) -> None:
-        """Accept shapes of any size, because they are for display only."""
 
 
 @dataclass(frozen=True, eq=False)

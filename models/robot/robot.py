@@ -319,10 +319,6 @@ class Robot:
             name = path[-1].parent
         return tuple(reversed(path))
 
-    def print(self) -> None:
-        """Print `str(robot)`: the tree with masses and finite limits."""
-        print(self)
-
     def __repr__(self) -> str:
         return f"<Robot {self.name!r}: {len(self.links)} links, {self.dof} degrees of freedom, tip on {self.tip}>"
 

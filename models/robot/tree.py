@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 from warnings import warn
 
 import numpy as np
@@ -268,15 +268,12 @@ def joint_limits(joints: Sequence[Joint], couplings: Mapping[str, JointCoupling]
 X, Y, Z = np.eye(3)
 
 
-class JointChain(NamedTuple):
-    """Serial joints that replace a joint with several degrees of freedom, and the massless links between them."""
-
-    links: tuple[Link, ...]
-    joints: tuple[Joint, ...]
+Parts: TypeAlias = tuple[tuple[Link, ...], tuple[Joint, ...]]
+"""Links and joints of a robot."""
 
 
-def planar_joint(place: Joint, axis: Array | None) -> JointChain:
-    """Return a planar joint as a chain of the joints "NAME_x", "NAME_y" and "NAME_angle".
+def replace_planar(place: Joint, axis: Array | None, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
+    """Return the links and joints of a robot with a planar joint replaced by the joints NAME_x, NAME_y, NAME_angle.
 
     The plane is the one through the joint frame across the axis, the xy plane without an axis. For any other axis, the
     frame is turned by the least rotation that takes its z axis to the axis or the opposite direction.
@@ -284,49 +281,20 @@ def planar_joint(place: Joint, axis: Array | None) -> JointChain:
     Args:
         place: Fixed joint with the name, links and frame of the planar one.
         axis: Normal of the plane in the joint frame, of any nonzero length, shape (3,); or None.
+        links, joints: Of the robot, with that joint.
     """
     normal = Z if axis is None or not np.any(axis) else axis / np.linalg.norm(axis)
     normal = normal if normal[2] >= 0 else -normal
     tilt = least_rotation(Z, normal)
     steps: list[tuple[str, Kind, Array]] = [("x", "prismatic", tilt @ X), ("y", "prismatic", tilt @ Y)]
-    return _chain(place, [*steps, ("angle", "continuous", normal)])
+    return _replace_by_chain(place, [*steps, ("angle", "continuous", normal)], links, joints)
 
 
-def floating_joint(place: Joint) -> JointChain:
-    """Return a floating joint as a chain of the joints "NAME_x" to "NAME_z", "NAME_yaw", "NAME_pitch", "NAME_roll".
-
-    Args:
-        place: Fixed joint with the name, links and frame of the floating one.
-    """
-    slides: list[tuple[str, Kind, Array]] = [("x", "prismatic", X), ("y", "prismatic", Y), ("z", "prismatic", Z)]
-    return _chain(place, [*slides, ("yaw", "continuous", Z), ("pitch", "continuous", Y), ("roll", "continuous", X)])
-
-
-def _chain(place: Joint, steps: Sequence[tuple[str, Kind, Array]]) -> JointChain:
-    """Return a chain of joints with one degree of freedom each, from the suffix, kind and axis of each joint."""
-    links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
-    ends = [place.parent, *(link.name for link in links), place.child]
-    joints = []
-    for k, (suffix, kind, axis) in enumerate(steps):
-        frame = {"translation": place.translation, "rotation": place.rotation} if k == 0 else {}
-        joints.append(Joint(f"{place.name}_{suffix}", kind, ends[k], ends[k + 1], axis=axis, **frame))
-    return JointChain(tuple(links), tuple(joints))
-
-
-def replace_joint(
-    place: Joint, chain: JointChain, links: Sequence[Link], joints: Sequence[Joint]
-) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
-    """Return the links and joints of a robot after replacing one joint by a chain of joints."""
-    others = [(each,) if each is not place else chain.joints for each in joints]
-    return (*links, *chain.links), tuple(each for group in others for each in group)
-
-
-def replace_floating(
-    place: Joint, links: Sequence[Link], joints: Sequence[Joint]
-) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
+def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
     """Return the links and joints of a robot without a floating joint, see `models.robot.urdf.read_urdf`.
 
-    If it connects the whole robot to a massless root, both are omitted; otherwise a chain replaces it.
+    If the joint connects the whole robot to a massless root, both are omitted. Otherwise it is replaced by the joints
+    NAME_x, NAME_y, NAME_z, NAME_yaw, NAME_pitch and NAME_roll.
 
     Args:
         place: Fixed joint with the name, links and frame of the floating one.
@@ -338,7 +306,9 @@ def replace_floating(
     base = next((link for link in links if link.name == place.parent), None)
     alone = all(joint is place for joint in joints if place.parent in (joint.parent, joint.child))
     if base is None or not alone or base.mass or base.inertia.any():
-        return replace_joint(place, floating_joint(place), links, joints)
+        steps: list[tuple[str, Kind, Array]] = [("x", "prismatic", X), ("y", "prismatic", Y), ("z", "prismatic", Z)]
+        steps += [("yaw", "continuous", Z), ("pitch", "continuous", Y), ("roll", "continuous", X)]
+        return _replace_by_chain(place, steps, links, joints)
     if base.collisions:
         message = (
             f"link {base.name!r}, from which joint {place.name!r} lets the robot float, is left out with its "
@@ -346,3 +316,21 @@ def replace_floating(
         )
         warn(ModelWarning(message, name=base.name, value=len(base.collisions)), stacklevel=4)
     return tuple(link for link in links if link is not base), tuple(joint for joint in joints if joint is not place)
+
+
+def _replace_by_chain(
+    place: Joint, steps: Sequence[tuple[str, Kind, Array]], links: Sequence[Link], joints: Sequence[Joint]
+) -> Parts:
+    """Return the links and joints of a robot with one joint replaced by several joints of one degree of freedom each.
+
+    `steps` has the suffix of the name, the kind and the axis of each new joint; the links between them are massless.
+    """
+    new_links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
+    ends = [place.parent, *(link.name for link in new_links), place.child]
+    chain = [
+        Joint(f"{place.name}_{suffix}", kind, ends[k], ends[k + 1], axis=axis)
+        for k, (suffix, kind, axis) in enumerate(steps)
+    ]
+    chain[0] = replace(chain[0], translation=place.translation, rotation=place.rotation)
+    at = joints.index(place)
+    return (*links, *new_links), (*joints[:at], *chain, *joints[at + 1 :])

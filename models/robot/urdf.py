@@ -26,7 +26,7 @@ from models.checks import MAX_LISTED, Array, require, warn_of_degrees
 from models.errors import ModelError, ModelWarning
 from models.files import INPUT_LIMITS, parse_xml, read_regular
 from models.robot.parts import MOMENTS, SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
-from models.robot.tree import planar_joint, replace_floating, replace_joint
+from models.robot.tree import replace_floating, replace_planar
 
 Source: TypeAlias = str | os.PathLike[str]
 InertiaRule: TypeAlias = Literal["warn", "as_given"]
@@ -120,7 +120,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
         if (kind := element.get("type")) == "floating":
             links, joints = replace_floating(joint, links, joints)
         elif kind == "planar":
-            links, joints = replace_joint(joint, planar_joint(joint, _axis(element)), links, joints)
+            links, joints = replace_planar(joint, _axis(element), links, joints)
     omission_warning(omitted, f"file {os.fspath(source)!r}" if is_file else "the given text")
     tip = _only(tree, "tip", "the robot")
     tip_name = None if tip is None else text_of(tip, "link", "the robot")
@@ -458,31 +458,27 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
 
 def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
     """Return an attribute of an element as one number, possibly inf or nan; raise ModelError if it is no number."""
-    return _numbers(element, key, owner, 1)[0]
+    return float(numbers_of(element, key, owner, 1, finite=False)[0])
 
 
-def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int) -> Array:
-    """Return an attribute of an element as `count` finite numbers; raise ModelError for any other content."""
-    values = _numbers(element, key, owner, count)
-    if not all(map(isfinite, values)):
-        raise ModelError(f"{_where(element, key, owner)} is not finite", name=key, value=element.get(key))
-    return np.array(values)
+def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int, *, finite: bool = True) -> Array:
+    """Return an attribute of an element as `count` numbers; raise ModelError for any other content.
 
-
-def _numbers(element: ElementTree.Element, key: str, owner: str, count: int) -> list[float]:
+    Args:
+        owner: Description of the element, for messages.
+        finite: Refuse inf and nan as well.
+    """
     text = text_of(element, key, owner)
+    place = f"{owner}: {key}={text!r} of <{element.tag}>"
     try:
         if "_" in text:  # Python would read 1_0 as ten
             raise ValueError
         values = [float(word) for word in text.split()]
     except ValueError:
         hint = f": {XACRO}" if "${" in text or "$(" in text else ""
-        raise ModelError(f"{_where(element, key, owner)} is not numeric{hint}", name=key, value=text) from None
+        raise ModelError(f"{place} is not numeric{hint}", name=key, value=text) from None
     if len(values) != count:
-        message = f"{_where(element, key, owner)} has {len(values)} numbers, not {count}"
-        raise ModelError(message, name=key, value=text, limit=count)
-    return values
-
-
-def _where(element: ElementTree.Element, key: str, owner: str) -> str:
-    return f"{owner}: {key}={element.get(key)!r} of <{element.tag}>"
+        raise ModelError(f"{place} has {len(values)} numbers, not {count}", name=key, value=text, limit=count)
+    if finite and not all(map(isfinite, values)):
+        raise ModelError(f"{place} is not finite", name=key, value=text)
+    return np.array(values)

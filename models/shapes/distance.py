@@ -23,6 +23,7 @@ import numpy as np
 from models.checks import Array, require
 from models.errors import ModelError
 from models.files import INPUT_LIMITS
+from models.robot.kinematics import checked_placement
 from models.shapes.cores import (
     BoxCore,
     SegmentCore,
@@ -113,7 +114,10 @@ def distance(
         function = pair_function(type(first), type(second), rounding)
         return function(column(first, first_frame), column(second, second_frame))
     require.nonnegative("distance: rounding", rounding, unit="m")
-    places = [*_placement(first_frame, "first_frame"), *_placement(second_frame, "second_frame")]
+    places = [
+        *checked_placement(first_frame, "distance: first_frame"),
+        *checked_placement(second_frame, "distance: second_frame"),
+    ]
     return expression(_distance_with_hull(*places, first=first, second=second, rounding=float(rounding)))
 
 
@@ -128,7 +132,7 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
     """
     checked_shape("column: shape", shape)
     _check_kind(type(shape), "shape")
-    turn, place = _placement(frame, "frame")
+    turn, place = checked_placement(frame, "distance: frame")
     if isinstance(shape, Sphere | Capsule):
         return ca.vertcat(*(place + ca.mtimes(turn, ca.DM(point)) for point in shape.core), shape.radius)
     if isinstance(shape, HalfSpace):
@@ -248,20 +252,6 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
             raise ModelError(message, name="values", value=value.shape, limit=(1, 1))
     stacked, least = ca.vertcat(*values), reduce(ca.fmin, values)
     return least - width * ca.log(ca.sum1(ca.exp((least - stacked) / width)))
-
-
-def _placement(frame: Frame | None, what: str) -> tuple[Expression, Expression]:
-    if frame is None:
-        return ca.DM.eye(3), ca.DM(3, 1)
-    require.instance(f"distance: {what}", frame, tuple)
-    parts = tuple(map(expression, frame))
-    shapes = [part.shape for part in parts]
-    if shapes != [(3, 3), (3, 1)]:
-        message = f"distance: {what} has parts of shapes {shapes}, expected (3, 3) and (3, 1)"
-        raise ModelError(message, name=what, value=shapes, limit=[(3, 3), (3, 1)])
-    if any(isinstance(part, ca.DM) and not part.is_regular() for part in parts):
-        raise ModelError(f"distance: {what} is not finite", name=what, value=frame)
-    return parts
 
 
 def _check_kind(kind: Any, what: str) -> None:

@@ -21,6 +21,7 @@ from models.robot.urdf import parse_urdf, text_of
 from models.shapes.bodies import Body, JointStep, RigidParts, lever_arms
 from models.shapes.hull import gap_along, nearest_directions
 from models.shapes.shapes import Box, Shape
+from models.spatial import rotation_matrices
 
 
 class Reason(StrEnum):
@@ -287,7 +288,8 @@ class _PairClassifier:
             if two_joints:
                 self._by_hulls[key] = hulls.check_on_grid(self.low, self.high)
             else:
-                self._by_hulls[key] = hulls.overlap_everywhere(self.configurations)
+                collides = (hulls.bounds(self.configurations)[0] <= 0).all()
+                self._by_hulls[key] = ALWAYS if collides else None
         if (hull_reason := self._by_hulls[key]) is not None:
             return hull_reason, False
         if reason == COVERED:
@@ -368,10 +370,6 @@ class _BodyPair:
             points = np.clip((nearest[:, None] + offsets).reshape(-1, len(columns)), start, end)
             step = step / 4
         return NEVER
-
-    def overlap_everywhere(self, configurations: Array) -> Reason | None:
-        """Return ALWAYS (always in collision) if the bodies collide in all given configurations, else None."""
-        return None if (self.bounds(configurations)[0] > 0).any() else ALWAYS
 
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
         """Return lower bounds of the distance at given joint vectors, and whether each needed more than bounding balls.
@@ -467,14 +465,6 @@ def _grid(values: Array, dimension: int) -> Array:
     return np.stack(np.meshgrid(*[values] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
 
 
-def _axis_rotations(axis: Array, angle: Array) -> Array:
-    """Return rotation matrices about a unit axis for k angles (rad). Shape (k, 3, 3)."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    sine, rest = np.sin(angle)[:, None, None], (1 - np.cos(angle))[:, None, None]
-    return np.asarray(np.eye(3) + sine * cross + rest * (cross @ cross))
-
-
 def _poses_behind(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
     """Return the poses of the rigid part behind a joint from those of the part before it, at joint vectors q."""
     (turn, shift), (column, ratio, offset) = above, robot.couplings[step.joint.name]
@@ -483,7 +473,7 @@ def _poses_behind(robot: Robot, above: Poses, step: JointStep, q: Array) -> Pose
     turn = turn @ step.rotation
     if step.joint.kind == "prismatic":
         return turn, shift + position[:, None] * (turn @ step.joint.axis)
-    return turn @ _axis_rotations(np.asarray(step.joint.axis), position), shift
+    return turn @ rotation_matrices(position[:, None] * step.joint.axis), shift
 
 
 def _relative_poses(first: Poses, second: Poses) -> Poses:
