@@ -357,26 +357,6 @@ class StandingMotion:
             "peak_joint_torque": float(np.abs(self.joint_torques).max()),
         }
 
-    def __str__(self) -> str:
-        lines = [f"Motion of {self.t[-1]:g} s: {'stands' if self.stands else 'DOES NOT STAND'}"]
-        for quantity, values, violated in (
-            ("vertical ground force, N", self.ground_force[:, 2], ~(self.ground_force[:, 2] > 0)),
-            ("zero moment point inside the foot by, m", self.foot_margin, ~(self.foot_margin >= -ROUNDING)),
-            ("stability index", self.index.min(axis=1), np.zeros(len(self.t), dtype=bool)),
-            ("distance to the joint limits", -self.joint_excess, ~(self.joint_excess <= ROUNDING)),
-        ):
-            k = int(np.argmin(values))
-            violation = f", violated from {self.t[violated][0]:.4g} s on" if violated.any() else ""
-            lines.append(f"  {quantity:<42} least {values[k]:>10.4g} at {self.t[k]:.4g} s{violation}")
-        for quantity, values in (
-            ("joint velocity", self.joint_velocities),
-            ("joint acceleration", self.joint_accelerations),
-            ("joint torque", self.joint_torques),
-        ):
-            k = int(np.abs(values).max(axis=1).argmax())
-            lines.append(f"  {quantity:<42} peak  {np.abs(values[k]).max():>10.4g} at {self.t[k]:.4g} s")
-        return "\n".join(lines)
-
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
     """Return the CasADi Function that computes the derived quantities of a `StandingMotion` by name.

@@ -178,17 +178,11 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
         casadi Function (state (2), coefficients (3 (degree + 1)), steps (2, m)) -> state (2). Coefficients are in
         ascending order, three entries a power: the first rows of `Blend.coefficients`, flattened.
     """
-    number = require.count("mapping: corrections", corrections, 0, MAX_TERMS)
-    return _predictor_corrector(require.choice("blend: degree", degree, (3, 5)), number)
-
-
-@lru_cache(maxsize=16)
-def _predictor_corrector(degree: int, corrections: int) -> Any:
     state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
     start_rate = rate(u)
-    guess = _predict(state, steps, start_rate)
-    for _ in range(corrections):
+    guess = state[0] + (steps[0] + step) / start_rate  # eq. (15)
+    for _ in range(require.count("mapping: corrections", corrections, 0, MAX_TERMS)):
         guess = u + 2 * step / (start_rate + rate(guess))
     return ca.Function("predictor_corrector", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
 
@@ -205,15 +199,10 @@ def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
     )
     if not numbers:
         raise ModelError("mapping: nodes is empty; give one number for each Newton step", name="nodes", value=nodes)
-    return _gauss_newton(require.choice("blend: degree", degree, (3, 5)), numbers)
-
-
-@lru_cache(maxsize=16)
-def _gauss_newton(degree: int, nodes: tuple[int, ...]) -> Any:
     state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
-    guess = _predict(state, steps, rate(u))
-    for number in nodes:
+    guess = state[0] + (steps[0] + step) / rate(u)  # eq. (15)
+    for number in numbers:
         width = guess - u
         mean = sum(float(w) * rate(u + float(x) * width) for x, w in zip(*gauss_rule(number), strict=True))
         guess = guess - (width * mean - step) / rate(guess)
@@ -248,14 +237,12 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
 
 
 def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
+    """Return symbols of state, coefficients and steps of a mapping, and the function from u to the speed |dr/du|."""
+    degree = require.choice("blend: degree", degree, (3, 5))
     sizes = {"state": 2, "coefficients": 3 * (degree + 1), "steps": 2}
     state, coefficients, steps = (ca.SX.sym(name, size) for name, size in sizes.items())
     derivative = _derivative(ca.reshape(coefficients, 3, degree + 1))
     return state, coefficients, steps, lambda u: ca.norm_2(_horner(derivative, u))
-
-
-def _predict(state: Any, steps: Any, rate: Any) -> Any:
-    return state[0] + (steps[0] + steps[1]) / rate  # eq. (15)
 
 
 def exponential(vector: Any) -> Any:

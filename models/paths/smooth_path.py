@@ -138,11 +138,6 @@ class SmoothPath:
         return np.diff(self.bounds)
 
     @cached_property
-    def blend_starts(self) -> NDArray[np.intp]:
-        """Index in `bounds` of the distance at which each blend begins. Shape (V,)."""
-        return np.flatnonzero(self.piece_blend >= 0)
-
-    @cached_property
     def cell_bounds(self) -> Array:
         """Distance along the path at which each quadrature interval (cell) of the curves begins. Shape (C,), m."""
         before = np.cumsum(self.cells.length) - self.cells.length
@@ -157,7 +152,7 @@ class SmoothPath:
         if not isinstance(vertex, int | np.integer) or isinstance(vertex, bool) or not 0 <= vertex < count:
             message = f"vertex {vertex!r} does not exist; the path has {count}"
             raise ModelError(message, name="vertex", value=vertex, limit=count)
-        piece = int(self.blend_starts[vertex])
+        piece = int(np.flatnonzero(self.piece_blend == vertex)[0])
         return Blend(
             self.path.start[vertex + 1],
             float(self.path.corner_angles()[vertex]),
