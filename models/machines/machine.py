@@ -107,7 +107,9 @@ class FixedBase:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        require_joints(self.robot)
+        if require.instance("machine: robot", self.robot, Robot).dof == 0:
+            names = [link.name for link in self.robot.links]
+            raise ModelError(f"the robot of the links {names} has no moving joint", name="robot", value=names)
         owner = "fixed base"
         object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
         object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
@@ -203,14 +205,6 @@ def _with_robot(machine: Machine) -> Any:
         message = f"{type(machine).__name__} is no dataclass with a field 'robot', which cannot be replaced"
         raise ModelError(message, name="machine", value=machine)
     return machine
-
-
-def require_joints(robot: Robot) -> None:
-    """Raise ModelError unless the argument is a robot with a moving joint."""
-    require.instance("machine: robot", robot, Robot)
-    if robot.dof == 0:
-        names = [link.name for link in robot.links]
-        raise ModelError(f"the robot of the links {names} has no moving joint", name="robot", value=names)
 
 
 def with_wheels(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from math import cos, pi
 from pathlib import Path
-from typing import Any, Self, TypeAlias, cast
+from typing import Any, ClassVar, Self, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -30,7 +30,13 @@ CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in
 
 
 class _SweptCore:
-    """A convex solid: all points within `swept_radius` of the convex hull of its core points."""
+    """A convex solid: all points within `swept_radius` of the convex hull of its core points.
+
+    POINTS and AXES name the fields that are points, and directions or matrices of directions, in its frame.
+    """
+
+    POINTS: ClassVar[tuple[str, ...]] = ("position",)
+    AXES: ClassVar[tuple[str, ...]] = ()
 
     @property
     def core(self) -> Array:
@@ -42,22 +48,20 @@ class _SweptCore:
         """Distance that the shape extends beyond the convex hull of its core, m."""
         return 0.0
 
+    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
+        """Return the shape in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
+        turn = require.rotation("shape: rotation", rotation)
+        shift = require.array("shape: translation", translation, (3,))
+        own = copy(self)  # shares the hull, which is costly to compute
+        for name in (*self.POINTS, *self.AXES):
+            moved = turn @ getattr(self, name)
+            object.__setattr__(own, name, freeze(moved + shift if name in self.POINTS else moved))
+        return own
+
     def reach(self, point: ArrayInput) -> float:
         """Return the largest distance of the shape's points from a given point (3,), m; inf for an unbounded shape."""
         centre = require.array("shape: point", point, (3,))
         return float(np.linalg.norm(self.core - centre, axis=1).max()) + self.swept_radius
-
-
-class _Posed(_SweptCore):
-    """Base class of shapes with a position and a rotation of their own."""
-
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
-        """Return the shape in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        own: Any = copy(self)  # shares the hull, which is costly to compute
-        object.__setattr__(own, "position", freeze(turn @ own.position + shift))
-        object.__setattr__(own, "rotation", freeze(turn @ own.rotation))
-        return cast(Self, own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +93,6 @@ class Sphere(_SweptCore):
         """Radius of the sphere, m."""
         return self.radius
 
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Sphere:
-        """Return the sphere in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        return Sphere(self.radius, turn @ self.position + shift)
-
 
 @dataclass(frozen=True, eq=False)
 class Capsule(_SweptCore):
@@ -110,6 +109,7 @@ class Capsule(_SweptCore):
     radius: float
     start: ArrayInput
     end: ArrayInput
+    POINTS: ClassVar[tuple[str, ...]] = ("start", "end")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "radius", require.nonnegative("capsule: radius", self.radius, unit="m"))
@@ -129,14 +129,9 @@ class Capsule(_SweptCore):
         """Radius of the capsule, m."""
         return self.radius
 
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Capsule:
-        """Return the capsule in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        return Capsule(self.radius, turn @ self.start + shift, turn @ self.end + shift)
-
 
 @dataclass(frozen=True, eq=False)
-class Cylinder(_Posed):
+class Cylinder(_SweptCore):
     """A solid cylinder about its own z axis.
 
     Distances use the circumscribed regular prism of SIDES sides. The edges of the prism exceed the cylinder by
@@ -157,6 +152,7 @@ class Cylinder(_Posed):
     length: float
     position: ArrayInput = None
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+    AXES: ClassVar[tuple[str, ...]] = ("rotation",)
 
     def __post_init__(self) -> None:
         for name in ("radius", "length"):
@@ -180,7 +176,7 @@ class Cylinder(_Posed):
 
 
 @dataclass(frozen=True, eq=False)
-class Box(_Posed):
+class Box(_SweptCore):
     """A solid box.
 
     Attributes:
@@ -197,6 +193,7 @@ class Box(_Posed):
     size: ArrayInput
     position: ArrayInput = (0.0, 0.0, 0.0)
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+    AXES: ClassVar[tuple[str, ...]] = ("rotation",)
 
     def __post_init__(self) -> None:
         size = require.array("box: size", self.size, (3,), unit="m", entries="numbers", sign="positive")
@@ -235,6 +232,8 @@ class HalfSpace(_SweptCore):
 
     normal: ArrayInput
     point: ArrayInput = None
+    POINTS: ClassVar[tuple[str, ...]] = ("point",)
+    AXES: ClassVar[tuple[str, ...]] = ("normal",)
 
     def __post_init__(self) -> None:
         normal = require.array("half-space: normal", self.normal, (3,))
@@ -249,11 +248,6 @@ class HalfSpace(_SweptCore):
         """A point on the boundary plane. Shape (1, 3), m."""
         return np.array([self.point])
 
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> HalfSpace:
-        """Return the half-space in a new frame, given the pose of its old frame in the new one: (3, 3) and (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        return HalfSpace(turn @ self.normal, turn @ self.point + shift)
-
     def reach(self, point: ArrayInput) -> float:
         """Return inf, because a half-space is unbounded."""
         require.array("half-space: point", point, (3,))
@@ -261,7 +255,7 @@ class HalfSpace(_SweptCore):
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh(_Posed):
+class Mesh(_SweptCore):
     """The convex hull of a triangle mesh; cavities and holes are filled.
 
     Attributes:
@@ -285,6 +279,7 @@ class Mesh(_Posed):
     file: str | Path | None = None
     scale: ArrayInput = 1.0
     hull: Hull = field(init=False, repr=False)
+    AXES: ClassVar[tuple[str, ...]] = ("rotation",)
 
     def __post_init__(self) -> None:
         if self.file is not None:
@@ -348,11 +343,6 @@ def _place(value: ArrayInput, owner: str, what: str = "position") -> Array:
     if value is None:
         raise ModelError(f"{owner}: {what} is missing; give its coordinates, shape (3,), m", name=what, value=None)
     return require.array(f"{owner}: {what}", value, (3,))
-
-
-def _motion(rotation: ArrayInput, translation: ArrayInput) -> tuple[Array, Array]:
-    turn = require.rotation("shape: rotation", rotation)
-    return turn, require.array("shape: translation", translation, (3,))
 
 
 @dataclass(frozen=True, eq=False)
