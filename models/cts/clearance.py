@@ -45,7 +45,7 @@ def _distance_to_walls(capsule: LinkCapsule, walls: Box) -> Expression:
 
 @dataclass(frozen=True)
 class ClearanceSearch:
-    """Settings of the search for a collision-free roll angle.
+    """Settings of the search for the roll angle of least cost at which the rig collides with nothing.
 
     Attributes:
         samples: Number of rolls in the grid.

@@ -85,7 +85,7 @@ class ConstraintCheck(NamedTuple):
     slide_upper: Expression
 
     def all_but_slide(self) -> Expression:
-        """Return whether all constraints but the limits of joint 1 (the slide) are satisfied."""
+        """Return whether all reach constraints and joint limits but those of joint 1 (the slide) are satisfied."""
         return ca.logic_and(self.pitch_joints(), ca.logic_and(self.yaw, self.yaw_angles))
 
     def pitch_joints(self) -> Expression:
@@ -142,7 +142,7 @@ def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
 def check_constraints(
     rig: Rig, target: Expression, configuration: RigConfiguration, *, c: Expression, s: Expression
 ) -> ConstraintCheck:
-    """Return which reach constraints and joint limits a configuration satisfies; angles are compared by cosines."""
+    """Return which reach constraints and joint limits a rig configuration satisfies, by comparing cosines of angles."""
     p = configuration
     pair3 = _difference(ca.sin(target[3]), -ca.cos(target[3]), p.sin2, p.cos2)  # yaw - pi/2 - q2
     pair5 = _difference(-ca.sin(target[4]), ca.cos(target[4]), p.sin4, p.cos4)  # pitch + pi/2 - q4

@@ -248,7 +248,7 @@ def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
 
 
 def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: float = 5.0) -> dict[str, Any]:
-    """Return the casadi Functions of a rig's kinematics, by name.
+    """Return the casadi Functions of a rig's forward and inverse kinematics, by name, for tables or export to C.
 
     `.map(samples)` applies a Function to a table. forward: (joints) -> (pose). inverse: (target, roll) -> (joints,
     reach), see `rig.inverse`. corner: (target, roll) -> (P_G). arc_ends, feasible: see `roll_interval_functions`.

@@ -75,7 +75,7 @@ class Harmonics(NamedTuple):
         return Harmonics(0.0, self.b1, -self.a1, 2 * self.b2, -2 * self.a2)
 
     def slope_bound(self) -> Expression:
-        """Return an upper bound of the magnitude of the second derivative, hypot(a1, b1) + 4 hypot(a2, b2)."""
+        """Return an upper bound of the polynomial's second derivative in magnitude, hypot(a1, b1) + 4 hypot(a2, b2)."""
         return ca.sqrt(self.a1**2 + self.b1**2) + 4 * ca.sqrt(self.a2**2 + self.b2**2)
 
 
@@ -143,7 +143,7 @@ def roots(f: Harmonics, steps: int = ROOTS.polish_steps) -> list[Point]:
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
-    """Return the rotation of axes that removes the mixed term x y of a polynomial, and the coefficients in these axes.
+    """Return the rotation that removes the mixed term x y of a polynomial on the unit circle, and its new coefficients.
 
     The rotation is (cosine, sine). With (x, y) on the unit circle f = a0 + p x + q y + r (x^2 - y^2), r > 0, in the
     rotated axes. `shift` is added to a2, so that the second harmonic has a direction.

@@ -145,13 +145,13 @@ class FixedBase:
 
     @cached_property
     def _pose_function(self) -> Any:
-        """Cached CasADi Function from joint positions to the tip's pose, because rebuilding the expression is slow."""
+        """CasADi Function from joint positions to the tip's pose, built once because that takes long."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_pose", [q], [*map(ca.densify, tip_pose(self.robot, q, self.world_from_base()))])
 
     @cached_property
     def _jacobian_function(self) -> Any:
-        """Cached CasADi Function from joint positions to the Jacobian of the tip."""
+        """CasADi Function from joint positions to the geometric Jacobian of the tip, built once."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_jacobian", [q], [tip_jacobian(self.robot, q, self.world_from_base())])
 
@@ -176,7 +176,7 @@ class FixedBase:
 def with_tip(
     machine: Machine, link: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Machine:
-    """Return the same machine with its tip at a frame fixed in any link, including the root.
+    """Return the machine with its tip at another frame, which is fixed in any of its links.
 
     Args:
         machine: A FixedBase, a FreeFloating, or any frozen dataclass with a field `robot`.

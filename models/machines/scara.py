@@ -243,7 +243,7 @@ class ScaraPath:
         return self.scara.names
 
     def at(self, distance: ArrayInput) -> JointsAlong:
-        """Return joint positions with continuous angles, and derivatives, at given arc lengths, shape (M,), m."""
+        """Return joint positions, with continuous angles, and three derivatives at arc lengths (M,), m, on the path."""
         s = self.path.checked_distance(distance)
         values = [np.array(v).T for v in self.rates.map(len(s))(*_poses(self.path, s))]
         table_s, table_q = self.table
@@ -350,7 +350,7 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
 
 
 def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:
-    """Return arc length and value at which a sampled function has its maximum (sign 1) or minimum (-1).
+    """Return the place (arc length) and value of the maximum (sign 1) or minimum (-1) of a function, given samples.
 
     The extremum is refined between the samples.
 

@@ -169,7 +169,7 @@ class Stance(FixedBase):
 
     @cached_property
     def bodies(self) -> Robot:
-        """The robot with links merged that fixed joints connect: the dynamics are the same and faster to evaluate."""
+        """The robot with links that fixed joints connect merged, whose dynamics are the same and faster to evaluate."""
         return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:
@@ -264,7 +264,9 @@ class Stance(FixedBase):
         return rows_of_feet
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """Return all six components of a foot's load from those in `load_rows`; the others are zero. Shape (6, 1)."""
+        """Return all six components of a foot's load from those in `load_rows`; the others are always zero. Shape (6,
+        1).
+        """
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:

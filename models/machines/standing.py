@@ -52,7 +52,7 @@ def wrenches_at(external: External | None, time: Expression, tip: Expression) ->
 
 
 class ZmpRows(NamedTuple):
-    """Coefficients of the joint acceleration constraint that fixes the zero moment point at a given position.
+    """Coefficients of the linear condition on joint accelerations that keeps the zero moment point at a given position.
 
     J_m q'' + q'^T H_m q' = C, equation (18) of the paper. Row 0 fixes x, row 1 y, as moments about the position, N m.
 
@@ -67,7 +67,7 @@ class ZmpRows(NamedTuple):
     right: Expression
 
     def needed(self, qd: Expression) -> Expression:
-        """Return the moments that joint accelerations must produce to fix the zero moment point. Shape (2, 1), N m.
+        """Return the moments, about the zero moment point, that joint accelerations must produce. Shape (2, 1), N m.
 
         They are J_m q'' = C - q'^T H_m q'.
         """
@@ -125,7 +125,7 @@ class Standing(FixedBase):
         return np.array([0.0, 0.0, -self.gravity])
 
     def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
-        """Return the robot with links merged that fixed joints connect, except links on which wrenches act."""
+        """Return the robot with links that fixed joints connect merged, except links on which given wrenches act."""
         keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
         if keep not in self._bodies:
             self._bodies[keep] = simplify(self.robot, keep)
@@ -401,7 +401,7 @@ def standing_motion(
 
 
 def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, *, qdd: Array) -> dict[str, Array]:
-    """Evaluate the result of `motion_function` at M times; return the outputs by name.
+    """Evaluate a function that `motion_function` returned at M times, and return its outputs by name.
 
     Shape (M, k), or (M,) for scalars.
     """

@@ -60,7 +60,7 @@ def turn_function(path: SmoothPath) -> Any:
 
 
 def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
-    """Return the table column for the interval between knots that contains a distance, found by binary search.
+    """Return the column of a table that belongs to the interval between knots in which a distance lies (binary search).
 
     The tables are interpolants, since CasADi copies a constant matrix whenever it evaluates a function.
     """
@@ -165,7 +165,7 @@ def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
 
 
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
-    """Return the predictor-corrector mapping from the distance along a blend to the curve parameter u.
+    """Return the casadi Function that steps the curve parameter u along a blend by a predictor and several correctors.
 
     Lee, Ryu, Cheong 2006: predictor (15), then `corrections` correctors (13). The mapping does not control its error:
     with the trapezoid rule (12) the sample drifts from its distance.
@@ -188,7 +188,7 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """Return a function that computes the parameter u of a blend at an arc length, by quadrature and Newton steps.
+    """Return the casadi Function that steps the curve parameter u along a blend by quadrature and Newton steps.
 
     The predictor is equation (15), the Newton steps solve for the arc length. Arguments and result as for
     `predictor_corrector`, except `nodes`: the number of quadrature nodes over one control step, for each Newton step.

@@ -68,7 +68,7 @@ class Line:
 
     @property
     def tangent(self) -> Array:
-        """Unit tangent at the start. Shape (3,)."""
+        """Unit tangent of the line. Shape (3,)."""
         return np.asarray((self.end - self.start) / self.length)
 
     @property
@@ -78,7 +78,7 @@ class Line:
 
 
 class _Circular:
-    """Properties that arcs and helices share."""
+    """Radius, start normal and end point, which arcs and helices compute in the same way."""
 
     start: ArrayInput
     center: ArrayInput
@@ -90,7 +90,7 @@ class _Circular:
 
     @property
     def normal(self) -> Array:
-        """Unit normal at the start, towards the axis. Shape (3,)."""
+        """Unit normal of the arc or helix at its start, towards the axis. Shape (3,)."""
         return np.asarray((self.center - self.start) / self.radius)
 
     @property
@@ -192,7 +192,7 @@ class Arc(_Circular):
 
     @property
     def tangent(self) -> Array:
-        """Unit tangent at the start. Shape (3,)."""
+        """Unit tangent of the arc at its start. Shape (3,)."""
         return np.cross(self.normal, self.axis)
 
     @property
@@ -243,7 +243,7 @@ class Helix(_Circular):
 
     @property
     def tangent(self) -> Array:
-        """Unit tangent at the start. Shape (3,)."""
+        """Unit tangent of the helix at its start. Shape (3,)."""
         tangential = self.radius * self.sweep * np.cross(self.normal, self.axis)
         return np.asarray((tangential + self.rise * self.axis) / self.length)
 

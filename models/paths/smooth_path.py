@@ -247,11 +247,7 @@ class SmoothPath:
 
     def _parameter(self, s: Array) -> tuple[NDArray[np.intp], Array]:
         cell = np.maximum(np.searchsorted(self.cell_bounds, s, side="right") - 1, 0)
-        curve, length = self.cells.curve[cell], self.cells.length[cell]
-        inside = np.clip(s - self.cell_bounds[cell], 0.0, length)
-        return curve, parameter(
-            self.coefficients[curve], self.cells.start[cell], self.cells.width[cell], length=length, distance=inside
-        )
+        return parameter(self.coefficients, self.cells, cell, s - self.cell_bounds[cell])
 
     def _at(self, s: Array) -> tuple[Array, ...]:
         piece = self._piece(s)
@@ -298,7 +294,8 @@ class SmoothPath:
 
     @cached_property
     def charts(self) -> tuple[Array, Array]:
-        """Tool orientation on each segment and blend: reference quaternions and polynomials of the rotation vector.
+        """Tool orientation on each segment and blend: reference quaternions, and polynomials of the rotation vector
+        from them.
 
         Shapes (P, 4) and (P, 6, 3). The variable of the polynomials is distance / length.
         """

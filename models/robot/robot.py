@@ -26,7 +26,7 @@ from models.robot.tree import (
     lock_with_followers,
     require_unique,
     reroot_tree,
-    ties_to_leaders,
+    resolve_mimics,
     tree_order,
 )
 from models.robot.urdf import Description, InertiaRule, Source, numbers_of, parse_urdf, read_urdf, text_of
@@ -118,7 +118,7 @@ class Robot:
         mimic: MimicRule = "couple",
         inertia: InertiaRule = "warn",
     ) -> Robot:
-        """Read a robot from a URDF description; `models.robot.urdf.read_urdf` documents contents and defaults.
+        """Read a robot from a URDF text or file; `models.robot.urdf.read_urdf` documents contents and default values.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
@@ -156,7 +156,7 @@ class Robot:
         lock: Mapping[str, float] | None = None,
         mimic: MimicRule = "couple",
     ) -> Robot:
-        """Read a robot from an MJCF description with the package `mujoco`, the extra `mujoco`.
+        """Read a robot in MJCF, the XML format of MuJoCo, from a text or file with the package `mujoco`.
 
         `models.robot.mjcf.read_mjcf` documents contents and defaults. `excluded_pairs` reads the pairs of bodies that
         the description excludes from contact.
@@ -188,7 +188,7 @@ class Robot:
         tip_translation: ArrayInput,
         tip_rotation: ArrayInput,
     ) -> Robot:
-        """Return the robot of a description; the arguments are those of from_urdf."""
+        """Return the robot of a URDF or MJCF description with the requested root, tip, locked and mimic joints."""
         require.choice("robot: mimic", mimic, get_args(MimicRule))
         joints = description.joints
         if mimic == "free":
@@ -200,7 +200,7 @@ class Robot:
                 raise require.unknown("joint", name, names)
         joints = lock_with_followers(joints, positions)
         if mimic == "lock":
-            joints = lock_with_followers(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
+            joints = lock_with_followers(joints, {name: tie.offset for name, tie in resolve_mimics(joints).items()})
         links = description.links
         if root is not None:
             original = cls(links, joints, tip=links[0].name)  # validates the tree before it is rerooted
@@ -235,7 +235,7 @@ class Robot:
 
     @cached_property
     def couplings(self) -> dict[str, JointCoupling]:
-        """Coupling of each moving joint, including mimic joints, to an entry of the joint vector, by joint name."""
+        """How each moving joint's position follows from an entry of the joint vector, by joint name."""
         return joint_couplings(self.joints)
 
     @property

@@ -29,21 +29,21 @@ PARALLEL = 1e-18
 
 
 class SegmentCore(NamedTuple):
-    """Core of a sphere (its centre) or of a capsule (the two ends of its segment)."""
+    """The point or segment from which a ball or capsule arises by sweeping a sphere: one point, or the two ends."""
 
     points: tuple[Triple, ...]
 
 
 class BoxCore(NamedTuple):
-    """Core of a box: its centre, axes and half edge lengths."""
+    """A box in distance formulas, given by its centre, axes and half edge lengths."""
 
     centre: Triple
     axes: tuple[Triple, ...]
     half: Triple
 
 
-def no_stop(value: Expression) -> Expression:
-    """Return the value unchanged; used as `StopGradient` where all derivatives are kept."""
+def keep_gradient(value: Expression) -> Expression:
+    """Return an expression unchanged; it takes the place of `StoppedGradients` where all derivatives are kept."""
     return value
 
 
@@ -286,7 +286,7 @@ def _without_derivative(s: Expression) -> Expression:
 
 
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
-    """Return 1 for the component of `over` whose magnitude is largest relative to its size, 0 for the others."""
+    """Return, for each of three components, 1 if its magnitude is the largest relative to its size, else 0."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])
@@ -296,7 +296,7 @@ def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
 def _edge_squares(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, stop_gradient: StopGradient
 ) -> list[Expression]:
-    """Return the squared distances of the edges of one box from another box.
+    """Return the squared distances of the twelve edges of a box from another box, in whose axes the first is given.
 
     Together with the corners of the other box they suffice: from a closest point inside a face one can slide along the
     face, at constant distance, to a corner or an edge.
@@ -312,7 +312,7 @@ def _edge_squares(
 
 
 def _corner_squares(first: BoxCore, second: BoxCore, stop_gradient: StopGradient) -> list[Expression]:
-    """Return the squared distances of the corners of one box from another box."""
+    """Return the squared distances of the eight corners of the first box from the second box."""
     centre, axes, halves = _in_box_axes(first, second)
     reaches = [triple(h * part for part in axis) for axis, h in zip(axes, halves, strict=True)]
     squares = []

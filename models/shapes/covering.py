@@ -80,7 +80,7 @@ CoverShape: TypeAlias = Capsule | Box
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """One of the shapes that cover a mesh.
+    """A capsule or box that, alone or together with others, covers a mesh, and how far it protrudes.
 
     Attributes:
         shape: Capsule or box in the frame of the mesh.
@@ -92,7 +92,7 @@ class Cover:
 
 
 def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
-    """Return capsules, or one box, that together contain every point of a mesh.
+    """Return capsules, or one box, that together contain every point of a triangle mesh.
 
     The result is deterministic. It is cached in a file by the content of the mesh, see `models.files`.
 
@@ -186,7 +186,7 @@ def _fit_capsule(points: Array) -> Capsule:
 
 
 def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, float, float, Array, Array]:
-    """Return the capsule around points that parameters describe: volume, radius, ends, axis, and a point of the axis.
+    """Return volume, radius, ends, axis and a point of the axis of the capsule around points for given parameters.
 
     The parameters, shape (5,), are two slopes of the axis (near z), its position across, and the root of the excess
     radius. A radius larger than the enclosing cylinder's lets the caps begin earlier.
@@ -292,7 +292,7 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
 
 
 def _grid(points: Array) -> tuple[Array, float]:
-    """Return sample points in a box 1.5 times as large as the extent of given points, and the volume of the box.
+    """Return sample points spread evenly in a box 1.5 times as large as given points' extent, and the box's volume.
 
     They serve to estimate covered volumes: the box contains nearly all of the covers. Shape (k, 3).
     """
@@ -396,7 +396,7 @@ def _overhang(shape: CoverShape, hull: Array) -> float:
 
 
 def _hull_vertices(points: Array) -> Array:
-    """Return the vertices of the convex hull; of a large mesh, only extreme points, which overestimates overhangs."""
+    """Return the vertices of the convex hull of a mesh's points; of a large mesh, only some extreme points."""
     if len(points) > SETTINGS.max_triangles:
         points = points[_extreme_indices(points, _principal_axes(points), 2 * SETTINGS.extremes)]
     try:
@@ -444,7 +444,7 @@ def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes
 
 
 def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:
-    """Return a shape of the normalised mesh in the mesh's units, enlarged by a bound of the rounding errors."""
+    """Return a shape of a mesh scaled to size 1 in the mesh's own units, enlarged by a bound of the rounding errors."""
     margin = 16 * float(np.finfo(float).eps * (np.abs(middle).max() + size))
     if isinstance(shape, Capsule):
         return Capsule(shape.radius * size + margin, middle + size * shape.start, middle + size * shape.end)

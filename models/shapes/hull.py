@@ -73,7 +73,7 @@ def convex_hull(points: Array) -> Hull:
 
 
 def cached_hull(points: Array) -> Hull:
-    """Return the convex hull of points as `convex_hull` does, from a file if it was computed before."""
+    """Return the convex hull of points, read from the disk cache if it was computed before."""
     key = cache_key(source_version(__name__), "hull", points)
     try:
         vertices, faces, normals, offsets = (np.asarray(part) for part in load_value(key))
@@ -299,7 +299,7 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each simplex, the barycentric weights of the point nearest to the origin, and this point.
+    """Return, for each of K tetrahedra, the barycentric weights of the point nearest to the origin, and this point.
 
     Shape (K, 4, 3) to (K, 4) and (K, 3). The vertices may coincide. Only faces that contain the last vertex are tried.
     """

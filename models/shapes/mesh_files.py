@@ -414,7 +414,7 @@ def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
 
 
 def _check_numbers(file: Path, root: ElementTree.Element) -> None:
-    """Reject elements that pycollada reads only in part or misinterprets; normalise the axes of rotations."""
+    """Raise ModelError for elements of a Collada document that pycollada misreads; normalise the axes of rotations."""
     for part in root.iter():
         several = part.tag in ("triangles", "polylist") and len(part.findall("p")) > 1
         if several or part.tag in ("lookat", "skew", "ph"):
@@ -444,7 +444,7 @@ def _check_numbers(file: Path, root: ElementTree.Element) -> None:
 
 
 def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
-    """Replace instances of nodes by the nodes; limit the number of nodes, because nested instances multiply it."""
+    """Replace instances of nodes in a Collada document by the nodes; raise ModelError if these become too many."""
     nodes = {each.get("id"): each for each in root.iter("node")}
     counts: dict[ElementTree.Element, int] = {}
 
@@ -470,7 +470,7 @@ def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
 
 
 def _materials_document(document: ElementTree.Element) -> ElementTree.Element:
-    """Return a Collada document with only the materials and their diffuse colours, without images.
+    """Return a Collada document with only the materials of a given one and their diffuse colours, without images.
 
     All materials are opaque, because programs disagree on what an opacity means.
     """

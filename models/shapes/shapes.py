@@ -81,7 +81,7 @@ class Sphere(_SweptCore):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "radius", require.positive("sphere: radius", self.radius, unit="m"))
-        object.__setattr__(self, "position", _place(self.position, "sphere"))
+        object.__setattr__(self, "position", _checked_position(self.position, "sphere"))
 
     @property
     def core(self) -> Array:
@@ -158,7 +158,7 @@ class Cylinder(_SweptCore):
         for name in ("radius", "length"):
             size = require.positive(f"cylinder: {name}", getattr(self, name), unit="m")
             object.__setattr__(self, name, size)
-        object.__setattr__(self, "position", _place(self.position, "cylinder"))
+        object.__setattr__(self, "position", _checked_position(self.position, "cylinder"))
         object.__setattr__(self, "rotation", require.rotation("cylinder: rotation", self.rotation))
 
     @property
@@ -177,7 +177,7 @@ class Cylinder(_SweptCore):
 
 @dataclass(frozen=True, eq=False)
 class Box(_SweptCore):
-    """A solid box.
+    """A solid box at a pose of its own, whose edges may be infinite.
 
     Attributes:
         size: Full length of the edges. Shape (3,), m; inf along an axis without ends, as for walls of a wind tunnel.
@@ -198,7 +198,7 @@ class Box(_SweptCore):
     def __post_init__(self) -> None:
         size = require.array("box: size", self.size, (3,), unit="m", entries="numbers", sign="positive")
         object.__setattr__(self, "size", size)
-        object.__setattr__(self, "position", _place(self.position, "box"))
+        object.__setattr__(self, "position", _checked_position(self.position, "box"))
         object.__setattr__(self, "rotation", require.rotation("box: rotation", self.rotation))
         if np.isinf(size).all():
             raise ModelError("box: every edge is infinite; there is no outside", name="size", value=size)
@@ -241,7 +241,7 @@ class HalfSpace(_SweptCore):
         if not 0 < length < np.inf:
             raise ModelError(f"half-space: normal {normal.tolist()} has no direction", name="normal", value=normal)
         object.__setattr__(self, "normal", freeze(np.asarray(normal / length)))
-        object.__setattr__(self, "point", _place(self.point, "half-space", "point"))
+        object.__setattr__(self, "point", _checked_position(self.point, "half-space", "point"))
 
     @property
     def core(self) -> Array:
@@ -306,7 +306,7 @@ class Mesh(_SweptCore):
             message = f"mesh: scale {scale.tolist()} has a zero; every axis needs a nonzero factor"
             raise ModelError(message, name="scale", value=scale, limit=0.0)
         object.__setattr__(self, "scale", scale)
-        object.__setattr__(self, "position", _place(self.position, "mesh"))
+        object.__setattr__(self, "position", _checked_position(self.position, "mesh"))
         object.__setattr__(self, "rotation", require.rotation("mesh: rotation", self.rotation))
         used = vertices if self.faces is None else vertices[np.unique(self.faces)]
         object.__setattr__(self, "hull", convex_hull(used * scale))
@@ -332,14 +332,14 @@ KINDS = (Sphere, Capsule, Cylinder, Box, HalfSpace, Mesh)
 
 
 def checked_shape(label: str, value: Any) -> Shape:
-    """Return the value after checking that it is a shape; raise ModelError otherwise."""
+    """Return the value after checking that it is a shape, such as a Box; raise ModelError otherwise."""
     if not isinstance(value, KINDS):
         names = ", ".join(kind.__name__ for kind in KINDS)
         raise require.invalid(label, f"a shape ({names})", value, names)
     return value
 
 
-def _place(value: ArrayInput, owner: str, what: str = "position") -> Array:
+def _checked_position(value: ArrayInput, owner: str, what: str = "position") -> Array:
     if value is None:
         raise ModelError(f"{owner}: {what} is missing; give its coordinates, shape (3,), m", name=what, value=None)
     return require.array(f"{owner}: {what}", value, (3,))
@@ -398,7 +398,7 @@ class MovingObstacle:
             require.rotation("moving: rotation", turn)
 
     def frame(self, time: Expression) -> Frame:
-        """Return the frame of the shape in the world at a time (s)."""
+        """Return the pose of the moving shape's frame in the world at a time (s)."""
         return Frame(*self._at(time))
 
     def check(self, begin: float, end: float) -> None:
