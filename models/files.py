@@ -35,8 +35,6 @@ from xml.parsers import expat
 
 import numpy as np
 
-__all__ = ["INPUT_LIMITS", "InputLimits", "UnfitFile", "open_regular", "parse_xml", "read_regular"]
-
 
 @dataclass(frozen=True)
 class InputLimits:

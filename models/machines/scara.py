@@ -27,8 +27,6 @@ from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
 from models.spatial import FULL_TURN, Expression, Frame, rotation
 
-__all__ = ["Elbow", "JointsAlong", "Scara", "ScaraPath", "scara_along"]
-
 Elbow: TypeAlias = Literal["left", "right"]
 QUILL = 2
 

@@ -26,8 +26,6 @@ from models.robot.rebuild import reroot, simplify, subtree
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross
 
-__all__ = ["Foot", "Foothold", "Stance"]
-
 SAMPLES = 5
 """Number of random motions sampled to find which load components and centers of pressure the joints can change."""
 

@@ -37,29 +37,6 @@ from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
 from models.spatial import Expression
 
-__all__ = [
-    "GAUSS_NODES",
-    "GAUSS_WEIGHTS",
-    "PAPER_SHAPE",
-    "BlendKind",
-    "Cells",
-    "arc_length",
-    "best_shape",
-    "cells",
-    "checked_shape",
-    "corner_shape",
-    "cubic",
-    "curvature",
-    "derivatives_by_arc_length",
-    "gamma",
-    "gauss_rule",
-    "parameter",
-    "polynomial",
-    "quintic",
-    "rest_to_rest",
-    "speed",
-]  # fmt: skip
-
 BlendKind: TypeAlias = Literal["cubic", "quintic"]
 Ends: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 End: TypeAlias = tuple[Array, Array, Array]

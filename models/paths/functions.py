@@ -23,8 +23,6 @@ from models.paths.smooth_path import SmoothPath
 from models.paths.splines import SERIES_TERMS
 from models.spatial import angular_velocity_from_quaternion, quaternion_product
 
-__all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
-
 MAX_TERMS = 100
 """Largest allowed number of corrector steps or quadrature nodes, since a mapping's expression grows with them."""
 

@@ -37,8 +37,6 @@ from models.paths.splines import (
 )  # fmt: skip
 from models.spatial import rotation_from_quaternion
 
-__all__ = ["FittedPath", "Path", "Reversal", "fit_splines", "split_at_reversals"]
-
 SMALLEST_ANGLE = 1e-6
 """Interior angle (rad) below which a corner is a reversal, because its blend would be curved too sharply.
 

@@ -31,8 +31,6 @@ from models.paths.smooth_path import SmoothPath
 from models.paths.splines import Spline
 from models.spatial import FULL_TURN
 
-__all__ = ["Overlap", "smooth"]
-
 Overlap: TypeAlias = Literal["shrink", "refuse"]
 
 

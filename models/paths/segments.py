@@ -22,8 +22,6 @@ from models.errors import ModelError
 from models.paths.splines import Spline
 from models.spatial import FULL_TURN
 
-__all__ = ["Arc", "Helix", "Line", "Segment", "screw", "screw_axes"]
-
 SHORTEST_SEGMENT = 1e-9
 """Shortest length of a segment, m."""
 

@@ -22,8 +22,6 @@ from models.paths.blends import BlendKind, Cells, curvature, derivatives_by_arc_
 from models.paths.path import Path
 from models.paths.splines import Spline, along_piece, chart
 
-__all__ = ["Blend", "PathPoint", "SmoothPath", "Turn"]
-
 BLOCK_SIZE = 50_000
 """Number of samples processed at once; it bounds the memory use."""
 

@@ -40,22 +40,6 @@ from models.paths.blends import (
     speed,
 )
 
-__all__ = [
-    "SERIES_TERMS",
-    "Polyline",
-    "Spline",
-    "SplineTable",
-    "along_piece",
-    "chart",
-    "distances_from_chord",
-    "exponential",
-    "fit_spline",
-    "product",
-    "rotate",
-    "simplify_polyline",
-]
-
-
 SERIES_TERMS = 18
 
 

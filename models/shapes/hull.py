@@ -21,9 +21,6 @@ from models.checks import ROUNDING, Array, freeze
 from models.errors import ModelError
 from models.files import cache_key, load_value, source_version, store_value
 
-__all__ = ["gap_along", "is_box", "nearest_directions"]
-
-
 GAP_TOLERANCE = 1e-12
 """Relative difference between a distance and its lower bound, the gap, at which the distance search ends."""
 DEGENERATE = 1e-14

@@ -31,8 +31,6 @@ from models.checks import Array, require
 from models.errors import ModelError
 from models.files import INPUT_LIMITS, UnfitFile, parse_xml, read_regular
 
-__all__ = ["read_collada"]
-
 Faces: TypeAlias = NDArray[np.intp]
 
 STL_HEADER_BYTES = 84
