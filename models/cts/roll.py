@@ -92,10 +92,6 @@ class ConstraintCheck(NamedTuple):
         """Return whether, at the roll angle, the pitch link reaches the target, and joints 4 to 6 are within limits."""
         return ca.logic_and(self.pitch, self.pitch_angles)
 
-    def angles(self) -> Expression:
-        """Return whether the revolute joints 2 to 6 are within their limits."""
-        return ca.logic_and(self.pitch_angles, self.yaw_angles)
-
     def slide(self) -> Expression:
         """Return whether joint 1 (the slide) is within its limits."""
         return ca.logic_and(self.slide_lower, self.slide_upper)
@@ -194,7 +190,8 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
     axle, e_c, _ = corner_circle(rig, target)
     ends = []
     for sine, code in _pitch_sines(rig, target, branch):
-        c = (-rig.pitch_link * sine - axle[2]) / _not_zero(rig.goose_neck * e_c[2])
+        lever = rig.goose_neck * e_c[2]
+        c = (-rig.pitch_link * sine - axle[2]) / (lever + ca.if_else(ca.fabs(lever) < 1e-150, 1e-150, 0.0))
         c = ca.fmin(ca.fmax(c, -1.0), 1.0)
         s = ca.sqrt((1 - c) * (1 + c))
         ends += [Candidate(c, s, code), Candidate(c, -s, code)]
@@ -345,10 +342,6 @@ def _difference(cos_a: Expression, sin_a: Expression, sin_b: Expression, cos_b: 
     return cos_a * cos_b + sin_a * sin_b, sin_a * cos_b - cos_a * sin_b
 
 
-def _not_zero(x: Expression) -> Expression:
-    return x + ca.if_else(ca.fabs(x) < 1e-150, 1e-150, 0.0)
-
-
 def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
     """Return a casadi Function that computes the roll angles at which joint 1 is at its lower or upper limit.
 
@@ -431,7 +424,9 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
     first = ca.fmin(ca.fmax(previous, start), end)
     minimum = minimize_convex(f, gain, previous, (start, end), start=first, steps=12)  # from a good start
     convex = ca.Function("convex", [target, previous], [ca.repmat(minimum, 5, 1)])
-    bounds = [start, *_sort_four(_inflections(f, gain, start, end)), end]
+    inflections = roots(f.derivative().derivative()._replace(a0=2 * gain))
+    turns = [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in inflections]
+    bounds = [start, *_sort_four(turns), end]
     minima = [minimize_convex(f, gain, previous, (a, b), start=(a + b) / 2, steps=20) for a, b in pairwise(bounds)]
     by_intervals = ca.Function("pieces", [target, previous], [ca.vertcat(*minima)])
     is_convex = ca.Function("is_convex", [target], [2 * gain >= f.slope_bound()])
@@ -455,13 +450,6 @@ def minimize_convex(
         newton = x - value / curvature
         x = ca.if_else(ca.logic_and(newton >= a, newton <= b), newton, (a + b) / 2)
     return x
-
-
-def _inflections(f: Harmonics, gain: float, start: Expression, end: Expression) -> list[Expression]:
-    """Return the roll angles from `start` to `end` at which cost index I2 has an inflection, where I1'' = -2 gain."""
-    bend = f.derivative().derivative()
-    points = roots(bend._replace(a0=2 * gain))
-    return [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in points]
 
 
 def _sort_four(values: list[Expression]) -> list[Expression]:

@@ -21,7 +21,6 @@ from models.checks import Array, ArrayInput, require, warn_of_degrees
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Avoidance, collision_free_inverse
 from models.cts.rig import (
-    BRANCHES,
     HOME,
     Branch,
     Rig,
@@ -213,31 +212,6 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
     meets = check_constraints(rig, target, configuration_at(rig, target, c, s, branch=branch), c=c, s=s)
     inside = ca.logic_and(meets.all_but_slide(), meets.slide())
     return ends, ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
-
-
-def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Branch, Array]]:
-    """Return every branch of inverse kinematics that reaches a target with a given roll angle, with joint positions.
-
-    Joint limits are not checked. The joint positions have shape (6,).
-
-    Raises:
-        ModelError: The target or roll is not finite, or no branch reaches the pose (names the link).
-    """
-    require.instance("rig: rig", rig, Rig)
-    row = checked_targets([target])[0]
-    require.number("rig: roll", roll)
-    solutions, margins = [], []
-    for branch in BRANCHES:
-        joints, reach = inverse(rig, ca.DM(row), ca.DM(roll), branch)
-        margins.append(np.array(reach).ravel())
-        if (margins[-1] >= 0).all():
-            solutions.append((branch, np.array(joints).ravel()))
-    if not solutions:
-        pitch, yaw = np.max(margins, axis=0)
-        link, shortage = ("pitch", -pitch * rig.pitch_link) if pitch < 0 else ("yaw", -yaw * rig.yaw_link_1)
-        message = f"target {row.tolist()} with roll {roll} rad: the {link} link is {shortage:.4g} m too short"
-        raise ModelError(message, name=f"{link} link", value=shortage, limit=0.0)
-    return solutions
 
 
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:

@@ -31,7 +31,7 @@ from models.robot.kinematics import (
     link_frames,
     reduce_to_joint_vector,
 )
-from models.robot.parts import Link, massless_error
+from models.robot.parts import massless_error
 from models.robot.rebuild import simplify
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, on_scalars, skew
@@ -211,7 +211,9 @@ def _efforts(
     motions = _motions_in_links(robot, joints, qd, qdd, gravity, ground, base_twist, base_acceleration)
     for link in robot.links:
         acceleration, field = motions[link.name]
-        first_moment, second_moment = _mass_sums(link)
+        center, about_center = link.center_of_mass, np.trace(link.inertia) / 2 * np.eye(3) - link.inertia
+        first_moment = constant(link.mass * center)
+        second_moment = constant(about_center + link.mass * np.outer(center, center))
         turned = ca.mtimes(field, second_moment)
         moment = ca.vertcat(turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1])
         force = link.mass * acceleration + ca.mtimes(field, first_moment)
@@ -278,15 +280,6 @@ def _motions_in_links(
         origin[joint.child] = (spin, turning, acceleration)
         fields[joint.child] = (acceleration, _field(spin, turning))
     return fields
-
-
-def _mass_sums(link: Link) -> tuple[Expression, Expression]:
-    """Return the first and second mass moments of a link, the sums of m x and m x x' over its points x, in its frame.
-    Shapes (3, 1), kg m, and (3, 3), kg m^2.
-    """
-    center, inertia = link.center_of_mass, link.inertia
-    about_center = np.trace(inertia) / 2 * np.eye(3) - inertia
-    return constant(link.mass * center), constant(about_center + link.mass * np.outer(center, center))
 
 
 def _field(spin: Expression, turning: Expression) -> Expression:

@@ -69,25 +69,21 @@ class Robot:
         require_unique((link.name for link in links), "link")
         require_unique((joint.name for joint in joints), "joint")
         joints = lock_with_followers(joints, {})
-        edges = [(joint.name, joint.parent, joint.child) for joint in joints]
-        root = find_root([link.name for link in links], edges)
+        names, edges = [link.name for link in links], [(joint.name, joint.parent, joint.child) for joint in joints]
+        root = find_root(names, edges)
         object.__setattr__(self, "root", root)
         object.__setattr__(self, "links", links)
         object.__setattr__(self, "joints", tuple(joints[i] for i in tree_order(root, edges)))
-        object.__setattr__(self, "tip", self._find_tip())
+        if self.tip is None:
+            object.__setattr__(self, "tip", self._leaves[0] if len(self._leaves) == 1 else None)
+        elif not isinstance(self.tip, str) or self.tip not in names:
+            raise require.unknown("tip link", self.tip, names)
         object.__setattr__(
             self, "tip_translation", require.array(f"{owner}: tip_translation", self.tip_translation, (3,))
         )
         object.__setattr__(self, "tip_rotation", require.rotation(f"{owner}: tip_rotation", self.tip_rotation))
         warn_of_millimetres(f"{owner}: tip_translation", self.tip_translation)
         _ = self._limits  # raises if mimic joints leave a joint no position
-
-    def _find_tip(self) -> str | None:
-        names = [link.name for link in self.links]
-        if self.tip is not None and (not isinstance(self.tip, str) or self.tip not in names):
-            raise require.unknown("tip link", self.tip, names)
-        leaves = self._leaves
-        return self.tip if self.tip is not None else leaves[0] if len(leaves) == 1 else None
 
     @property
     def _leaves(self) -> list[str]:

@@ -275,14 +275,10 @@ def _segment_box_square(
             pull, rise = pull + taken * (u[k] * (middle[k] - nearest[k])), rise + taken * squares[k]
         remaining = [keep * (1 - taken) for keep, taken in zip(remaining, added, strict=True)]
         s = _clip(-pull / rise, -0.5, 0.5)
-        s = _without_derivative(s) if step < 2 else stop_gradient(s)
+        # rounded to a multiple of 2^-53, so that its derivative is zero
+        s = ca.floor(s * 2.0**53) / 2.0**53 if step < 2 else stop_gradient(s)
     square = _point_box_square(along(middle, s, u), half, stop_gradient)
     return square + weight * s**2 if weight else square
-
-
-def _without_derivative(s: Expression) -> Expression:
-    """Return a position along a segment, rounded to a multiple of 2^-53 so that its derivative is zero."""
-    return ca.floor(s * 2.0**53) / 2.0**53
 
 
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:

@@ -335,17 +335,14 @@ def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) ->
         assert not isinstance(core, PlaneCore)
         middle, shares = dot(normal, subtract(core.centre, point)), in_axes(normal, core.axes)
         if isinstance(core, HullCore):
-            return middle + _smooth_minimum([dot(shares, _scalars(vertex)) for vertex in core.hull.vertices], rounding)
+            heights = [dot(shares, _scalars(vertex)) for vertex in core.hull.vertices]
+            smooth = rounding > 0 and len(heights) > 1
+            return middle + (
+                soft_minimum(heights, rounding / log(len(heights))) if smooth else reduce(ca.fmin, heights)
+            )
         reaches = [h * share for h, share in zip(core.half, shares, strict=True)]
     slack = rounding / len(reaches) if reaches else 0.0
     return middle - sum(smooth_abs(reach, slack) for reach in reaches)
-
-
-def _smooth_minimum(values: Sequence[Expression], rounding: float) -> Expression:
-    """Return the smallest of several values, or a smooth lower bound that is at most `rounding` smaller."""
-    if rounding == 0 or len(values) == 1:
-        return reduce(ca.fmin, values)
-    return soft_minimum(values, rounding / log(len(values)))
 
 
 def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
