@@ -267,8 +267,6 @@ class Search:
         result = evaluate_unless(self._infeasible(), (SOLUTION_SIZE, 1))(solved, answer, target)
         return ca.Function("thorough", [target, previous, first, columns[0]], [result])
 
-    # ---- candidates ------------------------------------------------------------------------------------------
-
     def _cheap_ends(self) -> Any:
         """Return the Function that compares the incumbent with the ends of roll intervals that have a closed form.
 
@@ -450,8 +448,6 @@ class Search:
 
     def _configuration(self, target: Expression, c: Expression, s: Expression) -> RigConfiguration:
         return configuration_at(self.rig, target, c, s, branch=self.branch)
-
-    # ---- answers ---------------------------------------------------------------------------------------------
 
     def _finish(self) -> Any:
         """Return the Function of target, previous roll and incumbent that computes joint positions at the incumbent."""

@@ -153,9 +153,6 @@ class RigConfiguration(NamedTuple):
     q1: Expression
 
 
-# ---- forward ---------------------------------------------------------------------------------------------------
-
-
 def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
     """Return link frames 0 to 6 and the tool frame in the world as products of Denavit-Hartenberg transformations.
 
@@ -210,9 +207,6 @@ def task_jacobian(rig: Rig, q: Expression) -> Expression:
     joints = ca.SX.sym("q", 6)
     jacobian = ca.Function("task_jacobian", [joints], [ca.jacobian(forward(rig, joints)[:5], joints)])
     return jacobian(q)
-
-
-# ---- inverse ---------------------------------------------------------------------------------------------------
 
 
 def goose_neck_corner(rig: Rig, target: Expression, roll: Expression) -> Expression:

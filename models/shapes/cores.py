@@ -47,9 +47,6 @@ def keep_gradient(value: Expression) -> Expression:
     return value
 
 
-# ---- vectors -------------------------------------------------------------------------------------------------------
-
-
 def triple(entries: Iterable[Expression]) -> Triple:
     """Return three entries as a tuple (x, y, z)."""
     x, y, z = entries
@@ -85,9 +82,6 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
     return ca.fmin(ca.fmax(x, low), high)
 
 
-# ---- from squares to distances, from gaps to depths -----------------------------------------------------------------
-
-
 def _root(square: Expression, excess: float = 0.0) -> Expression:
     """Return a distance from its square, or a lower bound of it if the square is too large by up to `excess` > 0."""
     root = ca.sqrt(square + (excess or KINK**2))
@@ -119,9 +113,6 @@ def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopG
         return largest
     largest, width = stop_gradient(largest), rounding / log(len(gaps))
     return largest + width * ca.log(sum(ca.exp((gap - largest) * (1 / width)) for gap in gaps)) - rounding
-
-
-# ---- points and segments --------------------------------------------------------------------------------------------
 
 
 def distance_of_segments(
@@ -159,9 +150,6 @@ def _segments_square(gap: Triple, u: Triple, v: Triple, weight: float, stop_grad
     difference = along(along(gap, s, u), -t, v)
     square = dot(difference, difference)
     return square + weight * ((s - 0.5) ** 2 + (t - 0.5) ** 2) if weight else square
-
-
-# ---- beside a box ---------------------------------------------------------------------------------------------------
 
 
 def distance_to_box(

@@ -162,9 +162,6 @@ def exceedance(shape: CoverShape, points: Array) -> Array:
     return np.asarray(own.max(axis=1))
 
 
-# ------------------------------------------------------------------------------------------------- one capsule
-
-
 def _fit_capsule(points: Array) -> Capsule:
     """Return a capsule of nearly least volume around points; the optimisation uses only the extreme points."""
     frame = _principal_axes(points)
@@ -250,9 +247,6 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
     share = np.clip((points - start) @ along / max(float(along @ along), 1e-300), 0, 1)
     square = (points - start - share[:, None] * along) ** 2
     return np.asarray(np.sqrt(square[:, 0] + square[:, 1] + square[:, 2]))  # faster than a norm of three columns
-
-
-# ------------------------------------------------------------------------------------------------------- splits
 
 
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
@@ -341,9 +335,6 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
     return np.concatenate(low), np.concatenate(high)
 
 
-# ------------------------------------------------------------------------------------------------------- a box
-
-
 def _fit_box(points: Array, extreme_points: Array) -> Box:
     """Return a box of nearly least volume around points.
 
@@ -379,9 +370,6 @@ def _fit_box(points: Array, extreme_points: Array) -> Box:
     return Box(np.maximum(high - low, SETTINGS.thinnest), frame @ ((low + high) / 2), frame)
 
 
-# --------------------------------------------------------------------------------------------------- overhang
-
-
 def _overhang(shape: CoverShape, hull: Array) -> float:
     """Return how far a shape extends beyond a convex hull, sampled at points of its surface, m."""
     around = _sphere_points(SETTINGS.samples)
@@ -403,9 +391,6 @@ def _hull_vertices(points: Array) -> Array:
         return convex_hull(points).vertices
     except ModelError:  # flat: no hull with a volume
         return points
-
-
-# ---------------------------------------------------------------------------------------------------- helpers
 
 
 def _principal_axes(points: Array) -> Array:

@@ -260,9 +260,6 @@ def _check_kind(kind: Any, what: str) -> None:
         raise ModelError(f"distance: {what} must be one of {names}, not {kind!r}", name=what, value=kind, limit=names)
 
 
-# ---- cores --------------------------------------------------------------------------------------------------------
-
-
 def _distance_of_columns(
     kinds: tuple[Any, Any], entries: Sequence[Sequence[Expression]], rounding: float, stop_gradient: StopGradient
 ) -> Any:
@@ -321,9 +318,6 @@ def _scalars(vector: Expression) -> Triple:
 def _as_number(entry: Expression) -> Expression:
     """Return a scalar expression, converted to a float if it is constant."""
     return float(entry) if entry.is_constant() else entry
-
-
-# ---- half-spaces and hulls ------------------------------------------------------------------------------------------
 
 
 def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) -> Expression:

@@ -198,9 +198,6 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
     return Triangles(vertices[used], faces.reshape(-1, 3), colors)
 
 
-# ------------------------------------------------------------------------------------------------------------- STL
-
-
 def _read_stl(file: Path, data: bytes) -> Triangles:
     """Read a binary or text STL file, told apart by the size of the file, since both kinds may begin with "solid"."""
     count = (
@@ -262,9 +259,6 @@ def distinct_rows(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp
     which = np.empty(len(rows), dtype=np.intp)
     which[order] = np.cumsum(is_new) - 1
     return order[is_new], which
-
-
-# ------------------------------------------------------------------------------------------------------------- OBJ
 
 
 def _read_obj(file: Path, data: bytes) -> Triangles:

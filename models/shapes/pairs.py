@@ -230,9 +230,6 @@ def _random_configurations(robot: Robot, low: Array, high: Array, count: int, rn
     return np.asarray(start + (end - start) * rng.random((count, robot.dof)))  # rng.uniform refuses 0.0 to -0.0
 
 
-# ------------------------------------------------------------------------------------------------- one pair of bodies
-
-
 Poses: TypeAlias = tuple[Array, Array]
 """Rotations and positions of a rigid part at k configurations. Shapes (k, 3, 3) and (k, 3), m."""
 
