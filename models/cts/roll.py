@@ -98,7 +98,7 @@ class ConstraintCheck(NamedTuple):
 
 
 class ArcEndLevel(NamedTuple):
-    """A value of cos q2 at which an interval of feasible roll angles may end.
+    """A value of cos q2, the cosine of joint angle 2, at which an interval of feasible roll angles may end.
 
     Attributes:
         cosine: The value.
@@ -119,7 +119,10 @@ def limit_code(joint: int, upper: bool) -> int:
 
 
 def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
-    """Return the cost index I1 as a trigonometric polynomial of the roll angle. Equation (36) of Lee, Lee 2017."""
+    """Return the cost index I1, a squared distance from the tunnel's centre, as harmonics of the roll angle.
+
+    Equation (36) of Lee, Lee 2017.
+    """
     axle, e_c, e_s = corner_circle(rig, target)
     offset = axle - ca.DM(tunnel.center)
     weight = ca.DM(tunnel.scale)
@@ -203,7 +206,7 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
 
 
 def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel]:
-    """Return the values of cos q2 at which an interval of feasible roll angles may end.
+    """Return the values of cos q2, of joint angle 2, at which an interval of feasible roll angles may end.
 
     They are due to the limits of joints 2 and 3 and to the reach of the yaw link.
     """
@@ -257,7 +260,7 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
-    """Return the values of sin q4 at which a feasible roll interval may end, each with the code of the active limit."""
+    """Return the values of sin q4, of joint 4, at which feasible roll angles may end, with codes of the limits."""
     sines: list[tuple[Expression, int]] = []
     for sign in (-1, 1):
         if _allows(rig, 4, sign * np.pi / 2):
@@ -294,7 +297,7 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return a casadi Function that evaluates cos q2, q1 and cos q4 at a roll angle, and derivatives of the first two.
+    """Return a casadi Function from target and roll to the rig's cos q2, q1 and cos q4, with slopes of the first two.
 
     (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4); a slope is a derivative with
     respect to the roll. Other functions take the Function as their argument `chart`.
@@ -307,12 +310,12 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 
 def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Return the roll angle at which cos q2 (`output` 0) or q1 (`output` 2) has a given value, by Newton steps."""
+    """Return the roll angle at which the rig's cos q2 (`output` 0) or q1 (2) has a given value, by Newton steps."""
     return polish(point, chart_residual(chart, target, output, value))
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the roll angle at which cos q2 reaches a limit, on the feasible side despite rounding errors.
+    """Return the roll angle at which cos q2, of joint 2, reaches a limit, on the feasible side despite rounding errors.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     is satisfied above the value, -1 if below.
@@ -412,7 +415,7 @@ def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]
 
 
 def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
-    """Return a casadi Function from target and previous roll to five roll angles, among them all minima of I2.
+    """Return a casadi Function from target and previous roll to five rolls, among them all minima of the cost index I2.
 
     I2 = I1 + gain (roll - previous)^2. Output shape (5, 1), rad. If I2 is convex there is one minimum. Otherwise the
     window of rolls is split where I1'' = -2 gain, and each convex interval has its own minimum.
@@ -438,7 +441,7 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
 def minimize_convex(
     f: Harmonics, gain: float, previous: Expression, bracket: Point, *, start: Expression, steps: int
 ) -> Expression:
-    """Return the roll angle of least I2 on an interval where I2 is convex, by Newton steps in a shrinking bracket."""
+    """Return the roll angle of least cost index I2 on an interval where I2 is convex, by Newton steps in a bracket."""
     a, b = bracket
     slope, bend = f.derivative(), f.derivative().derivative()
     x = start

@@ -224,7 +224,7 @@ class CollisionScene:
 
     @property
     def labels(self) -> tuple[tuple[str, str], ...]:
-        """Names of the two bodies of each checked pair."""
+        """Names of the two bodies of each pair that is checked for collision."""
         return tuple((self.bodies[i].name, self.bodies[j].name) for i, j, _ in self.pairs)
 
     def pair_names(self, pair: int) -> tuple[str, str]:
@@ -272,7 +272,7 @@ class CollisionScene:
         pairs: Sequence[int] | None = None,
         rounding: float = 0.0,
     ) -> Expression:
-        """Return the signed distances of n pairs of bodies. Shape (n, 1), m.
+        """Return the signed distances of pairs of bodies for a configuration of the machine. Shape (n, 1), m.
 
         They are exact or lower bounds, see `distance`. For two hulls of meshes the distance is that of their covers, a
         lower bound.

@@ -96,7 +96,7 @@ class FreeFloating:
 
     @property
     def base_size(self) -> int:
-        """Length of the base configuration: 3 for a planar base, 7 for a spatial one."""
+        """Length of the base configuration: 3 for a planar base (x, y, angle), 7 for a spatial one."""
         return 3 if self.base == "planar" else 7
 
     @property

@@ -77,12 +77,12 @@ class Scara:
 
     @property
     def outer(self) -> float:
-        """Largest distance of the tool from the shoulder axis, m."""
+        """Largest distance of the arm's tool from its shoulder axis, m."""
         return self.upper_arm + self.forearm
 
     @property
     def inner(self) -> float:
-        """Smallest distance of the tool from the shoulder axis, m."""
+        """Smallest distance of the arm's tool from its shoulder axis, m."""
         return abs(self.upper_arm - self.forearm)
 
     @cached_property

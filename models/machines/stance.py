@@ -273,7 +273,7 @@ class Stance(FixedBase):
         return ca.mtimes(turn, load[:3]), ca.mtimes(turn, load[3:])
 
     def pressure(self, name: str, load: Expression) -> Expression:
-        """Return the force that presses a sole on its foothold, positive in contact. Shape (1, 1), N."""
+        """Return the force that presses a foot's sole on its foothold, positive in contact. Shape (1, 1), N."""
         return self.load_in_sole(name, load)[1][2]
 
     def edge_moments(self, name: str, load: Expression, margin: float = 0.0) -> Expression:

@@ -305,7 +305,7 @@ class StandingMotion:
 
     @property
     def friction(self) -> Array:
-        """Coefficient of friction that the motion requires; inf without contact. Shape (M,).
+        """Coefficient of friction that the motion requires at each sample; inf without contact. Shape (M,).
 
         It is the horizontal over the vertical ground force.
         """
@@ -316,17 +316,17 @@ class StandingMotion:
 
     @property
     def stays_on_ground(self) -> bool:
-        """Whether the vertical ground force is always positive."""
+        """Whether the vertical force of the ground on the foot is positive throughout the motion."""
         return bool((self.ground_force[:, 2] > 0).all())
 
     @property
     def stays_in_foot(self) -> bool:
-        """Whether the zero moment point stays in the support polygon of the foot."""
+        """Whether the zero moment point stays in the support polygon of the foot throughout the motion."""
         return bool((self.foot_margin >= -ROUNDING).all())
 
     @property
     def stays_in_limits(self) -> bool:
-        """Whether all joints stay within their position limits."""
+        """Whether all joints stay within their position limits throughout the motion."""
         return bool((self.joint_excess <= ROUNDING).all())
 
     @property

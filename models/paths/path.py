@@ -118,7 +118,7 @@ class Path:
 
     @property
     def length(self) -> float:
-        """Sum of the lengths of the segments, before corners are rounded, m."""
+        """Sum of the lengths of the path's segments, before corners are rounded, m."""
         return float(self.lengths.sum())
 
     @property
@@ -163,7 +163,7 @@ class Path:
 
     @cached_property
     def is_spline(self) -> NDArray[np.bool_]:
-        """Whether each segment is a spline. Shape (n,)."""
+        """Whether each segment of the path is a spline. Shape (n,), bool."""
         return np.array([isinstance(segment, Spline) for segment in self.segments])
 
     @cached_property
@@ -171,7 +171,7 @@ class Path:
         return SplineTable.of(self.segments, np.cumsum(self.lengths) - self.lengths)
 
     def corner_angles(self) -> Array:
-        """Return the interior angle at each vertex, which is pi for a continuous tangent. Shape (n - 1,), rad."""
+        """Return the path's interior angle at each vertex, pi if the tangent is continuous. Shape (n - 1,), rad."""
         index = np.arange(len(self.segments) - 1)
         return _angles(self.at(index, self.lengths[:-1])[1], self.tangent[1:])
 

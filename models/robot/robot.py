@@ -255,7 +255,7 @@ class Robot:
 
     @property
     def total_mass(self) -> float:
-        """Mass of all links, kg."""
+        """Mass of all links of the robot, kg."""
         return float(sum(link.mass for link in self.links))
 
     @cached_property

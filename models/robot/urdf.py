@@ -65,7 +65,7 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """The content of a URDF or MJCF file.
+    """Content of a robot description (URDF or MJCF): name, links, joints and tip.
 
     Attributes:
         name: Name of the robot; "robot" if the file has none.

@@ -77,7 +77,7 @@ def distance(
     *,
     rounding: float = 0.0,
 ) -> Expression:
-    """Return the signed distance of two shapes as an expression, m. Shape (1, 1).
+    """Return the signed distance of two shapes, at poses that may be symbols, as an expression, m. Shape (1, 1).
 
     The distance is negative for overlapping shapes; its gradient points out of the overlap. Without rounding it is
     exact for spheres, capsules, boxes and half-spaces, and for a mesh or a cylinder (as its prism) beside a half-space.

@@ -95,7 +95,7 @@ def checked_pairs(
     seed: int = 0,
     samples: int = 1000,
 ) -> Pairs:
-    """Return the pairs of a robot's bodies that may collide in some configuration but do not collide in all.
+    """Return the pairs of a robot's bodies to check for collision: those that may collide but do not always.
 
     Not checked are:
 

@@ -85,7 +85,7 @@ class Sphere(_SweptCore):
 
     @property
     def core(self) -> Array:
-        """Centre of the sphere. Shape (1, 3), m."""
+        """Centre of the sphere, as an array of one point. Shape (1, 3), m."""
         return np.array([self.position])
 
     @property
@@ -245,7 +245,7 @@ class HalfSpace(_SweptCore):
 
     @property
     def core(self) -> Array:
-        """A point on the boundary plane. Shape (1, 3), m."""
+        """A point on the half-space's boundary plane. Shape (1, 3), m."""
         return np.array([self.point])
 
     def reach(self, point: ArrayInput) -> float:
@@ -322,7 +322,7 @@ class Mesh(_SweptCore):
 
     @property
     def core(self) -> Array:
-        """Vertices of the convex hull in the frame of the shape. Shape (m, 3), m."""
+        """Vertices of the mesh's convex hull in the frame of the shape. Shape (m, 3), m."""
         return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
 
 
