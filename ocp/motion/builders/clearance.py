@@ -28,22 +28,6 @@ from ocp.problem.problem import Problem
 from ocp.problem.values import Sampler, constant
 from ocp.solution import Solution
 
-__all__ = [
-    "APART",
-    "CLEARANCE",
-    "LOOKS",
-    "MARGIN",
-    "ROUNDING",
-    "ClearanceConstraints",
-    "Constraints",
-    "Separating",
-    "clearance_of",
-    "collision_error",
-    "is_clearance",
-    "solve_with_clearance",
-    "widen_margins",
-]  # fmt: skip
-
 CLEARANCE, APART = "clearance", "apart"
 """Name prefixes of the clearances that the audit proves (CLEARANCE) and of separation constraints (APART)."""
 ROUNDING = 3e-3

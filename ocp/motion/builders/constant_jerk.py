@@ -39,11 +39,6 @@ from ocp.problem.values import Sampler
 from ocp.solution import Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "ConstantJerkMotion", "TorqueLimits", "least_durations", "segment_durations", "stopping_motion",
-    "synchronised_motion",
-]  # fmt: skip
-
 NODES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 """Interpolation nodes of a phase, as fractions of its duration; four suffice because positions are cubic in time."""
 

@@ -34,8 +34,6 @@ from ocp.direct.guess import Samples
 from ocp.errors import ProblemError, require
 from ocp.problem.problem import Problem
 
-__all__ = ["RollObstacles", "RollSettings", "least_cost_roll", "roll_problem", "spline_targets"]
-
 Targets = Callable[[Any], Any]
 LARGEST_SINE = 1 - 1e-9  # largest magnitude of the sine of q4 and the cosine of q2: the rig is just within reach
 

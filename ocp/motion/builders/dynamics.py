@@ -47,8 +47,6 @@ from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
-__all__ = ["DynamicsSetup", "dynamics_problem", "end_velocities"]
-
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 
 

@@ -47,12 +47,6 @@ from ocp.refinement import split
 from ocp.solution import Guess, Solution
 from ocp.tightening import WARM_START_OPTIONS, largest_excess, solve_at_switches, tighten
 
-__all__ = [
-    "POINTS", "SolveSettings", "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of",
-    "phase_names",
-    "solve_dynamics", "within_limits",
-]  # fmt: skip
-
 
 @remembers_request("dynamics phases")
 @interruptible

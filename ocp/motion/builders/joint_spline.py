@@ -25,8 +25,6 @@ from ocp.motion.schedule import PathLike
 from ocp.motion.tasks.speed_profile import Array
 from ocp.solution import Solution
 
-__all__ = ["PlannedJoints", "joint_path"]
-
 DEGREE = 5
 DERIVATIVES = 3
 ROW_OPERATIONS = {

@@ -41,8 +41,6 @@ from ocp.motion.tasks.speed_profile import Array, SpeedProfile, integrate_jerk
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["Fastest", "TimingProblem", "minimum_time_problem", "solve_minimum_time"]
-
 IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
 
 

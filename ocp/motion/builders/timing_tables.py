@@ -30,19 +30,6 @@ from ocp.motion.schedule.limits import (
 from ocp.motion.schedule.planner import schedule
 from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, segment_index
 
-__all__ = [
-    "Columns",
-    "demand_of_intervals",
-    "distinct",
-    "largest_demand",
-    "path_columns",
-    "reference_mesh",
-    "reference_motion",
-    "speed_limit",
-    "subdivide",
-    "table",
-]
-
 Columns = Callable[[Array], Array]
 """Type of a function that returns C quantities of a path, shape (M, C), at times (M,) of the reference motion."""
 

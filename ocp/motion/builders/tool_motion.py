@@ -33,8 +33,6 @@ from ocp.motion.tasks.tip_task import TipTask, is_holonomic
 from ocp.problem.problem import Problem
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "ToolMotionSetup", "stretches_of", "tool_motion_problem"]
-
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
 """Names of variables of a problem with free time: the time, and derivatives of joint positions and of the time.
 

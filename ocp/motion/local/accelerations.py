@@ -30,11 +30,6 @@ from ocp.motion.tasks.limits import checked_point, is_finite
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
 
-__all__ = [
-    "AccelerationOptions", "AccelerationSolution", "Law", "Layer", "Stabiliser", "Stop", "accelerations",
-    "checked_law", "resolve_accelerations",
-]  # fmt: skip
-
 Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilised"]
 
 

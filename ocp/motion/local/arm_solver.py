@@ -21,8 +21,6 @@ from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
 from ocp.motion.local.closed_forms import SCARA, SIX, PoseSolver, closed_forms
 from ocp.motion.local.elimination import elimination_of
 
-__all__ = ["ArmSolver", "arm_solver", "sample_shares"]
-
 STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
 """Increments of the sampled parameters, as fractions of their ranges; irrational, so that no sample repeats."""
 

@@ -21,8 +21,6 @@ from models.checks import Array
 from models.spatial import Frame, cross, expression, rotation
 from ocp.problem.values import Sampler
 
-__all__ = ["TURN", "Chain", "Motion", "Solutions", "SymbolicAxis", "compose", "inverse"]
-
 TURN = 2 * np.pi
 """Angle of a full turn, rad."""
 

@@ -31,8 +31,6 @@ from models.spatial import Frame, cross, rotation_matrices
 from ocp.motion.local.chain import Chain, Motion, Solutions, SymbolicAxis, compose, inverse
 from ocp.problem.values import Sampler
 
-__all__ = ["ClosedForm", "Mask", "PoseSolver", "closed_forms", "is_scara"]
-
 Mask: TypeAlias = NDArray[np.bool_]
 
 

@@ -22,16 +22,6 @@ from ocp.problem.hulls import BodyPairs, Hull, frames_of
 from ocp.problem.values import Sampler
 from ocp.tolerances import STANDSTILL
 
-__all__ = [
-    "Collision",
-    "checked_collision_scene",
-    "distances_along",
-    "find_collisions",
-    "prepared_pairs",
-    "scene_hulls",
-    "slide_apart",
-]
-
 
 class Collision(NamedTuple):
     """A pair of bodies whose distance is below the clearance.

@@ -30,8 +30,6 @@ from models.checks import Array
 from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
 from ocp.motion.local.closed_forms import SIX, Mask, PoseSolver
 
-__all__ = ["Elimination", "elimination_of", "solve_opening"]
-
 SAMPLES = 2 * np.pi / 3 * np.arange(3)
 """Angles h at which a function is sampled to find its coefficients of 1, cos h and sin h."""
 NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])

@@ -21,18 +21,6 @@ from ocp.motion.local.closed_forms import SIX, PoseSolver, is_scara
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import ANGULAR, LINEAR, TipTask
 
-__all__ = [
-    "IkBranches",
-    "IkConfigurations",
-    "IkSolver",
-    "Incompleteness",
-    "PreparedArm",
-    "ToolFreedom",
-    "idle_positions",
-    "ik_branches",
-    "ik_configurations",
-]
-
 ROTATION_TOLERANCE = 1e-6
 """Largest accepted entry of R R^T - 1 for a rotation matrix R."""
 

@@ -24,16 +24,6 @@ from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = [
-    "IK_OPTIONS",
-    "IkOptions",
-    "IkSolution",
-    "Unreachable",
-    "describe_miss",
-    "inverse_kinematics",
-    "inverse_kinematics_at",
-]
-
 LARGEST_SEED = 2**64
 
 

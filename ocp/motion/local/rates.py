@@ -31,8 +31,6 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
 from ocp.problem.values import Sampler, symbols_of
 
-__all__ = ["LocalMotion", "LocalSolution", "RateOptions", "least_rates", "resolve", "track_tasks"]
-
 MAX_INTEGRATOR_STEPS = 20000
 """Largest number of integrator steps between two samples; a smooth motion takes some tens."""
 

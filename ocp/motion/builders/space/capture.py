@@ -56,8 +56,6 @@ from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-__all__ = ["Capture", "Cone", "Grasp", "capture_machines", "capture_problem", "chained_capture", "solve_capture"]
-
 APPROACH, DETUMBLE = "approach", "detumble"
 POINTS = Collocation(8, degree=4, scheme="legendre")
 

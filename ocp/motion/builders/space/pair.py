@@ -34,22 +34,6 @@ from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
 from ocp.problem.values import constant
 
-__all__ = [
-    "State",
-    "checked_pair",
-    "free_motion",
-    "grasp_wrench",
-    "guess_approach",
-    "guess_braking",
-    "guessed_horizon",
-    "join_target",
-    "motion_of",
-    "pair_momentum",
-    "require_capacity",
-    "require_reach",
-    "wheel_capacity",
-]
-
 
 def join_target(chaser: Robot, target: Robot) -> Robot:
     """Attach the target to the chaser's robot as an additional link; the tip frames of both robots coincide.

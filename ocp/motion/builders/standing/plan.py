@@ -39,8 +39,6 @@ from ocp.problem.problem import Problem
 from ocp.solution import Solution
 from ocp.tightening import tighten
 
-__all__ = ["Attempt", "guess_in_time", "solve_standing", "solve_steps"]
-
 COARSE = Collocation(4, degree=2, scheme="legendre")
 COARSE_IPOPT = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
 """IPOPT options of the solves on a coarse mesh, which determine durations to about a percent."""

@@ -68,8 +68,6 @@ from ocp.motion.tasks.limits import (
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 
-__all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_cost", "standing_problem"]
-
 
 @dataclass(frozen=True)
 class Weights:

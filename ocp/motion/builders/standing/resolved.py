@@ -28,8 +28,6 @@ from ocp.motion.local.rates import resolve
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.solution import Solution
 
-__all__ = ["StepsMotion", "resolve_steps", "steps_motion"]
-
 SAMPLES = 101
 
 

@@ -26,19 +26,6 @@ from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = [
-    "PLACED",
-    "StancePhase",
-    "Steps",
-    "Swing",
-    "check_placed",
-    "first_guess",
-    "foot_task",
-    "foothold_equations",
-    "standing_configuration",
-    "walk",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class StancePhase:

@@ -27,8 +27,6 @@ from ocp.motion.tasks.limits import Following, IndexAtLeast, JointBounds, Pinned
 from ocp.motion.tasks.tip_task import retime_task
 from ocp.motion.tasks.tracks import on_symbols
 
-__all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_inside", "task_demand"]
-
 
 @dataclass(frozen=True)
 class StartSettings:

@@ -37,8 +37,6 @@ from ocp.motion.tasks.limits import Limits
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem, remembers_request
 
-__all__ = ["StepWeights", "steps_problem"]
-
 GROUND_TOLERANCE = 0.01  # share of the clearance that a sole may be below the ground where it lifts and lands
 GUESSED_LIFT = 1.5  # height of a foot halfway in the guess, over the clearance
 
