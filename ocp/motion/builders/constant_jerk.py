@@ -45,22 +45,16 @@ NODES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 
 @dataclass(frozen=True)
 class ConstantJerkSettings:
-    """Settings of motions that consist of phases of constant jerk.
+    """Settings of motions that consist of phases of constant jerk."""
 
-    Attributes:
-        still: Duration of a motion that stays where it is, s, since the horizon of a problem must be positive.
-        ramp_share: Time in which joints with neither an acceleration nor a jerk limit reach their largest rate, as a
-            share of the time at that rate.
-        unlimited_rate: Rate of joints without any of these limits, rad/s or m/s.
-        samples: Number of samples of each phase at which torques are evaluated.
-        torque_share: Share of the limits of torque and power that is used there, since torques may be larger between
-            the samples.
-    """
-
+    # duration of a motion that stays where it is, s, since the horizon of a problem must be positive
     still: float = 1e-3
+    # time in which joints with neither an acceleration nor a jerk limit reach their largest rate, as a share of the
+    # time at that rate
     ramp_share: float = 5e-4
-    unlimited_rate: float = 1.0
-    samples: int = 16
+    unlimited_rate: float = 1.0  # rate of joints without any of these limits, rad/s or m/s
+    samples: int = 16  # number of samples of each phase at which torques are evaluated
+    # share of the limits of torque and power that is used there, since torques may be larger between the samples
     torque_share: float = 0.995
 
 

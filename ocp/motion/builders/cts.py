@@ -40,29 +40,17 @@ LARGEST_SINE = 1 - 1e-9  # largest magnitude of the sine of q4 and the cosine of
 
 @dataclass(frozen=True)
 class RollGuessSettings:
-    """Settings of the search for an initial guess of the roll on finer and finer grids of times and roll angles.
+    """Settings of the search for an initial guess of the roll on finer and finer grids of times and roll angles."""
 
-    Attributes:
-        times: Number of times of the grid.
-        price: Cost of a violation, per m, rad or unit of a sine.
-        margin: Distance beyond the clearance, in widths of the smooth minimum.
-        rolls: Number of rolls of the grid in a full turn.
-        tube_side: Number of rolls of a finer grid on each side of the last path.
-        tube_finer: Factor by which each finer grid has smaller steps.
-        tube_levels: Number of finer grids.
-        largest_roll: Largest distance from the start at which a roll with limits is searched, rad.
-        steps_by_rate: Grid steps that the rate limit should allow from one time to the next.
-    """
-
-    times: int = 65
-    price: float = 1e3
-    margin: float = 2.0
-    rolls: int = 120
-    tube_side: int = 8
-    tube_finer: int = 4
-    tube_levels: int = 3
-    largest_roll: float = 2 * FULL_TURN
-    steps_by_rate: float = 2.0
+    times: int = 65  # number of times of the grid
+    price: float = 1e3  # cost of a violation, per m, rad or unit of a sine
+    margin: float = 2.0  # distance beyond the clearance, in widths of the smooth minimum
+    rolls: int = 120  # number of rolls of the grid in a full turn
+    tube_side: int = 8  # number of rolls of a finer grid on each side of the last path
+    tube_finer: int = 4  # factor by which each finer grid has smaller steps
+    tube_levels: int = 3  # number of finer grids
+    largest_roll: float = 2 * FULL_TURN  # largest distance from the start at which a roll with limits is searched, rad
+    steps_by_rate: float = 2.0  # grid steps that the rate limit should allow from one time to the next
 
 
 SEARCH = RollGuessSettings()

@@ -194,18 +194,13 @@ ROWS = r"(?P<phase>[^.;:,\n]*?\.)?(?P<quantity>joints|velocities|accelerations|j
 
 @dataclass(frozen=True)
 class HoldingSettings:
-    """Settings of the search for a plan that satisfies its limits between the nodes of the mesh.
+    """Settings of the search for a plan that satisfies its limits between the nodes of the mesh."""
 
-    Attributes:
-        meshes: Largest number of meshes, each finer than the one before.
-        splits: Number of parts of an interval whose tightened limit costs too much; 3 reduce this cost to a ninth.
-        excess: Largest excess of a limit between the nodes, in its own unit.
-        cost_increase: Largest relative increase of the cost by tightened limits; above it, nodes at switches help more.
-    """
-
-    meshes: int = 3
+    meshes: int = 3  # largest number of meshes, each finer than the one before
+    # number of parts of an interval whose tightened limit costs too much; 3 reduce this cost to a ninth
     splits: int = 3
-    excess: float = 1e-5
+    excess: float = 1e-5  # largest excess of a limit between the nodes, in its own unit
+    # largest relative increase of the cost by tightened limits; above it, nodes at switches help more
     cost_increase: float = 1e-3
 
 

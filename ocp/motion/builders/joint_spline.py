@@ -47,19 +47,13 @@ They are called with the operands and the output array.
 
 @dataclass(frozen=True)
 class SplineSettings:
-    """Settings of the spline of joint positions along a path.
+    """Settings of the spline of joint positions along a path."""
 
-    Attributes:
-        path_tolerance: Largest distance of a task from its path, as a share of the path's length.
-        path_samples: Number of points of a path to which targets are compared, to find those that belong to the path.
-        projections: Number of Newton steps by which targets are projected onto the path.
-        batch: Number of path points whose torques are computed together.
-    """
-
-    path_tolerance: float = 1e-6
+    path_tolerance: float = 1e-6  # largest distance of a task from its path, as a share of the path's length
+    # number of points of a path to which targets are compared, to find those that belong to the path
     path_samples: int = 200
-    projections: int = 8
-    batch: int = 1024
+    projections: int = 8  # number of Newton steps by which targets are projected onto the path
+    batch: int = 1024  # number of path points whose torques are computed together
 
 
 SPLINE = SplineSettings()

@@ -46,17 +46,12 @@ IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Settings of the mesh refinement in `solve_minimum_time`.
+    """Settings of the mesh refinement in `solve_minimum_time`."""
 
-    Attributes:
-        demand: Largest accepted relative excess of a limit in an interval.
-        defect: Largest accepted error of integration in an interval, relative to its distance and to the top speed.
-        parts: Largest number of parts of an interval in one refinement.
-    """
-
-    demand: float = 2e-4
+    demand: float = 2e-4  # largest accepted relative excess of a limit in an interval
+    # largest accepted error of integration in an interval, relative to its distance and to the top speed
     defect: float = 1e-6
-    parts: int = 8
+    parts: int = 8  # largest number of parts of an interval in one refinement
 
 
 REFINEMENT = RefinementSettings()

@@ -36,25 +36,16 @@ Columns = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class TableSettings:
-    """Settings of the tables of path quantities, and of the mesh of the minimum-time problem.
+    """Settings of the tables of path quantities, and of the mesh of the minimum-time problem."""
 
-    Attributes:
-        degree: Degree of the polynomials of a table.
-        accuracy: Largest error of a tabulated quantity, relative to its largest value.
-        smallest_cell: Width of an interval that is not halved further, relative to the whole.
-        halvings: Largest number of halvings of an interval.
-        points: Points of an interval at which ratios to limits are evaluated, ten for each collocation point and node.
-        beside_jump: Distance of nodes from a jump of the path's derivatives, relative to the whole time.
-        same_node: Distance of nodes that count as one, relative to the whole time.
-    """
-
-    degree: int = 7
-    accuracy: float = 1e-8
-    smallest_cell: float = 1e-9
-    halvings: int = 40
+    degree: int = 7  # degree of the polynomials of a table
+    accuracy: float = 1e-8  # largest error of a tabulated quantity, relative to its largest value
+    smallest_cell: float = 1e-9  # width of an interval that is not halved further, relative to the whole
+    halvings: int = 40  # largest number of halvings of an interval
+    # points of an interval at which ratios to limits are evaluated, ten for each collocation point and node
     points: int = 40
-    beside_jump: float = 1e-6
-    same_node: float = 1e-7
+    beside_jump: float = 1e-6  # distance of nodes from a jump of the path's derivatives, relative to the whole time
+    same_node: float = 1e-7  # distance of nodes that count as one, relative to the whole time
 
 
 TABLES = TableSettings()

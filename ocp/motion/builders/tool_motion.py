@@ -44,18 +44,13 @@ ERRORS, START_ERRORS = "task errors", "start errors"
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """Settings of the feedback of pose errors, and of relaxed tasks, from which a motion may deviate at a cost.
+    """Settings of the feedback of pose errors, and of relaxed tasks, from which a motion may deviate at a cost."""
 
-    Attributes:
-        decay: Largest decay of a pose error over a mesh interval, as a power of e; faster decay needs a finer mesh.
-        intervals: Least number of intervals of the mesh in a stretch.
-        closed_gap: Pose error at the beginning of a task below which there is no gap to close, m and rad.
-        relaxation: Velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s.
-    """
-
+    # largest decay of a pose error over a mesh interval, as a power of e; faster decay needs a finer mesh
     decay: float = 4.0
-    intervals: int = 8
-    closed_gap: float = 1e-6
+    intervals: int = 8  # least number of intervals of the mesh in a stretch
+    closed_gap: float = 1e-6  # pose error at the beginning of a task below which there is no gap to close, m and rad
+    # velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s
     relaxation: float = 1e-5
 
 

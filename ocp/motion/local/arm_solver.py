@@ -27,25 +27,16 @@ STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """Settings of the choice of the redundant joints that are sampled.
+    """Settings of the choice of the redundant joints that are sampled."""
 
-    Attributes:
-        max_samples: Largest number of sampled parameters.
-        max_solvers: Largest number of choices of the sampled joints in closed form, and by elimination.
-        trials: Number of random configurations at which choices are compared.
-        seed: Seed of these configurations and of the axes of auxiliary joints.
-        slide_range: Prismatic joints without limits are sampled this far on either side of 0, m.
-        auxiliary: Largest position of an auxiliary joint that is refined at zero, rad.
-        excess: Largest excess over a limit that counts as rounding and is clipped, rad or m.
-    """
-
-    max_samples: int = 6
+    max_samples: int = 6  # largest number of sampled parameters
+    # largest number of choices of the sampled joints in closed form, and by elimination
     max_solvers: tuple[int, int] = (6, 2)
-    trials: int = 32
-    seed: int = 0
-    slide_range: float = 1.0
-    auxiliary: float = 1e-3
-    excess: float = 1e-9
+    trials: int = 32  # number of random configurations at which choices are compared
+    seed: int = 0  # seed of these configurations and of the axes of auxiliary joints
+    slide_range: float = 1.0  # prismatic joints without limits are sampled this far on either side of 0, m
+    auxiliary: float = 1e-3  # largest position of an auxiliary joint that is refined at zero, rad
+    excess: float = 1e-9  # largest excess over a limit that counts as rounding and is clipped, rad or m
 
 
 ARM = ArmSettings()

@@ -27,34 +27,22 @@ TURN = 2 * np.pi
 
 @dataclass(frozen=True)
 class NewtonSettings:
-    """Settings of Newton's method for inverse kinematics; lengths are relative to the size of the arm.
+    """Settings of Newton's method for inverse kinematics; lengths are relative to the size of the arm."""
 
-    Attributes:
-        steps: Largest number of steps.
-        trial_steps: Number of steps after which each one must make progress.
-        progress: Factor by which a step then reduces the error; near a double root it is 4.
-        precision: Pose error at which the iteration ends, also in rad.
-        exact: Largest pose error of a solution, also in rad.
-        rough: Pose error above which a candidate is dropped, also in rad.
-        largest_step: Largest change of a joint in a step, rad or m.
-        damping: Added to the squared singular values of the Jacobian, so that steps stay finite at singularities.
-        singular: Least singular value of the Jacobian of a regular solution. Below it a further solution may lie so
-            near that rounding errors hide it.
-        same: Distance below which two solutions count as one, rad or m.
-        near: Distance up to which two solutions count as one if the pose is exact halfway between them.
-    """
-
-    steps: int = 30
-    trial_steps: int = 5
-    progress: float = 1.5
-    precision: float = 1e-13
-    exact: float = 1e-10
-    rough: float = 0.5
-    largest_step: float = 1.0
+    steps: int = 30  # largest number of steps
+    trial_steps: int = 5  # number of steps after which each one must make progress
+    progress: float = 1.5  # factor by which a step then reduces the error; near a double root it is 4
+    precision: float = 1e-13  # pose error at which the iteration ends, also in rad
+    exact: float = 1e-10  # largest pose error of a solution, also in rad
+    rough: float = 0.5  # pose error above which a candidate is dropped, also in rad
+    largest_step: float = 1.0  # largest change of a joint in a step, rad or m
+    # added to the squared singular values of the Jacobian, so that steps stay finite at singularities
     damping: float = 1e-14
+    # least singular value of the Jacobian of a regular solution. Below it a further solution may lie so near that
+    # rounding errors hide it
     singular: float = 1e-5
-    same: float = 1e-7
-    near: float = 1e-2
+    same: float = 1e-7  # distance below which two solutions count as one, rad or m
+    near: float = 1e-2  # distance up to which two solutions count as one if the pose is exact halfway between them
 
 
 NEWTON = NewtonSettings()

@@ -36,17 +36,11 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class NearbySettings:
-    """Settings of the search for missing IK solutions of a pose by solving poses near this pose.
+    """Settings of the search for missing IK solutions of a pose by solving poses near this pose."""
 
-    Attributes:
-        pairs: Number of pairs of nearby poses for each pose.
-        distance: Typical distance of nearby poses, rad and share of the size of the arm.
-        seed: Seed of the directions of nearby poses.
-    """
-
-    pairs: int = 2
-    distance: float = 1e-3
-    seed: int = 0
+    pairs: int = 2  # number of pairs of nearby poses for each pose
+    distance: float = 1e-3  # typical distance of nearby poses, rad and share of the size of the arm
+    seed: int = 0  # seed of the directions of nearby poses
 
 
 NEARBY = NearbySettings()
@@ -127,19 +121,13 @@ SIX, SCARA = 6, 4
 
 @dataclass(frozen=True)
 class FormSettings:
-    """Tolerances of the closed forms; lengths are relative to the size of the arm.
+    """Tolerances of the closed forms; lengths are relative to the size of the arm."""
 
-    Attributes:
-        straight: Up to this much, also in rad, axes count as meeting or parallel; Newton's method refines.
-        near: Residual up to which rough solutions are refined: near a double solution they are that inaccurate.
-        vanishing: Size of the coefficients of an equation below which each angle solves it.
-        nearby: Distance up to which two roots may be close to each other, rad.
-    """
-
-    straight: float = 1e-8
+    straight: float = 1e-8  # up to this much, also in rad, axes count as meeting or parallel; Newton's method refines
+    # residual up to which rough solutions are refined: near a double solution they are that inaccurate
     near: float = 1e-3
-    vanishing: float = 1e-8
-    nearby: float = 0.05
+    vanishing: float = 1e-8  # size of the coefficients of an equation below which each angle solves it
+    nearby: float = 0.05  # distance up to which two roots may be close to each other, rad
 
 
 FORMS = FormSettings()

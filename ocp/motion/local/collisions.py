@@ -162,20 +162,14 @@ def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -
 
 @dataclass(frozen=True)
 class SlidingSettings:
-    """Settings of `slide_apart`, which moves configurations out of collision along self-motions.
+    """Settings of `slide_apart`, which moves configurations out of collision along self-motions."""
 
-    Attributes:
-        steps: Largest number of steps.
-        difference: Step of the finite differences, rad or m: the root of the rounding error of distances, 1e-10 m.
-        longest: Longest step of a joint, rad or m.
-        damping: Damping relative to the size of the gradients.
-        spare: Distance in excess of the clearance, so that correcting the tips does not use up the clearance, m.
-    """
-
-    steps: int = 12
+    steps: int = 12  # largest number of steps
+    # step of the finite differences, rad or m: the root of the rounding error of distances, 1e-10 m
     difference: float = 1e-5
-    longest: float = 0.25
-    damping: float = 0.1
+    longest: float = 0.25  # longest step of a joint, rad or m
+    damping: float = 0.1  # damping relative to the size of the gradients
+    # distance in excess of the clearance, so that correcting the tips does not use up the clearance, m
     spare: float = 2e-3
 
 

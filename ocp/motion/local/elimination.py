@@ -55,34 +55,24 @@ PRODUCTS = _half_angle_products()
 
 @dataclass(frozen=True)
 class EliminationSettings:
-    """Settings of inverse kinematics by elimination.
+    """Settings of inverse kinematics by elimination."""
 
-    Attributes:
-        rank: Singular values of the eliminated products below this share of the largest count as zero.
-        regular: Reciprocal condition number below which an eigenvalue problem counts as singular.
-        real: Distance of exp(i h) from the unit circle below which an angle h may be real: the accuracy of double
-            eigenvalues of an ill-conditioned problem.
-        probably_real: Distance below which a multiple eigenvalue counts as real.
-        surely_real: Distance below which a simple eigenvalue is real.
-        simple: Deviation of an eigenvector from the products of one solution below which its eigenvalue is simple.
-        poles: Angles h at which the half-angle may be infinite; for each pose the best-conditioned one is taken.
-        same: Distance of a solution from a configuration of the trial below which they are the same, rad or m.
-        trials: Number of random configurations of the trial.
-        openings: Largest number of eigenvalue problems that are solved at a doubtful pose.
-        seed: Seed of the trial.
-    """
-
-    rank: float = 1e-9
-    regular: float = 1e-11
+    rank: float = 1e-9  # singular values of the eliminated products below this share of the largest count as zero
+    regular: float = 1e-11  # reciprocal condition number below which an eigenvalue problem counts as singular
+    # distance of exp(i h) from the unit circle below which an angle h may be real: the accuracy of double eigenvalues
+    # of an ill-conditioned problem
     real: float = 3e-2
-    probably_real: float = 1e-4
-    surely_real: float = 1e-7
+    probably_real: float = 1e-4  # distance below which a multiple eigenvalue counts as real
+    surely_real: float = 1e-7  # distance below which a simple eigenvalue is real
+    # deviation of an eigenvector from the products of one solution below which its eigenvalue is simple
     simple: float = 1e-4
+    # angles h at which the half-angle may be infinite; for each pose the best-conditioned one is taken
     poles: tuple[float, ...] = (0.3, 1.9, 3.5, 5.1)
+    # distance of a solution from a configuration of the trial below which they are the same, rad or m
     same: float = 1e-5
-    trials: int = 12
-    openings: int = 3
-    seed: int = 0
+    trials: int = 12  # number of random configurations of the trial
+    openings: int = 3  # largest number of eigenvalue problems that are solved at a doubtful pose
+    seed: int = 0  # seed of the trial
 
 
 ELIMINATION = EliminationSettings()

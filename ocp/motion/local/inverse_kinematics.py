@@ -29,24 +29,15 @@ LARGEST_SEED = 2**64
 
 @dataclass(frozen=True)
 class IkSettings:
-    """Settings of the Levenberg-Marquardt iterations, and of the choice among their solutions.
+    """Settings of the Levenberg-Marquardt iterations, and of the choice among their solutions."""
 
-    Attributes:
-        slide_spread: Range of the starts of prismatic joints without limits, m.
-        first_damping: Damping of the first step.
-        least_damping: Least damping.
-        most_damping: Damping at which a start is abandoned.
-        growth: Factor of the damping after a step that fails.
-        shrinkage: Factor of the damping after a step that succeeds.
-        slide_count: Number of solutions in collision that are moved along their self-motions if no solution is free.
-    """
-
-    slide_spread: float = 1.0
-    first_damping: float = 1e-2
-    least_damping: float = 1e-12
-    most_damping: float = 1e8
-    growth: float = 4.0
-    shrinkage: float = 0.25
+    slide_spread: float = 1.0  # range of the starts of prismatic joints without limits, m
+    first_damping: float = 1e-2  # damping of the first step
+    least_damping: float = 1e-12  # least damping
+    most_damping: float = 1e8  # damping at which a start is abandoned
+    growth: float = 4.0  # factor of the damping after a step that fails
+    shrinkage: float = 0.25  # factor of the damping after a step that succeeds
+    # number of solutions in collision that are moved along their self-motions if no solution is free
     slide_count: int = 8
 
 

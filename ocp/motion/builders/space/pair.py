@@ -119,25 +119,15 @@ Guesses = dict[str, Any]
 
 @dataclass(frozen=True)
 class GuessSettings:
-    """Settings of the initial guess of a capture.
+    """Settings of the initial guess of a capture."""
 
-    Attributes:
-        steps: Integration steps of a motion.
-        durations: Number of durations tried if the time is free, evenly spaced in their logarithms.
-        tolerance: Distance to the grasp that counts as reached, m and rad.
-        meeting: Fraction of the approach after which the tip moves with the target.
-        closing: Fraction of the approach after which the tip approaches the grasp along the axis.
-        damping: Damping of the pseudo-inverse, m and 1.
-        newton_steps: Newton steps for the final wheel speeds, which depend on the final attitude.
-    """
-
-    steps: int = 200
-    durations: int = 9
-    tolerance: float = 1e-3
-    meeting: float = 0.75
-    closing: float = 0.5
-    damping: float = 0.05
-    newton_steps: int = 4
+    steps: int = 200  # integration steps of a motion
+    durations: int = 9  # number of durations tried if the time is free, evenly spaced in their logarithms
+    tolerance: float = 1e-3  # distance to the grasp that counts as reached, m and rad
+    meeting: float = 0.75  # fraction of the approach after which the tip moves with the target
+    closing: float = 0.5  # fraction of the approach after which the tip approaches the grasp along the axis
+    damping: float = 0.05  # damping of the pseudo-inverse, m and 1
+    newton_steps: int = 4  # newton steps for the final wheel speeds, which depend on the final attitude
 
 
 GUESS = GuessSettings()

@@ -46,27 +46,17 @@ COARSE_IPOPT = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
 
 @dataclass(frozen=True)
 class PaceSettings:
-    """Settings of the check, on a coarse mesh, whether footsteps are possible in their requested durations.
+    """Settings of the check, on a coarse mesh, whether footsteps are possible in their requested durations."""
 
-    Attributes:
-        iterations: Largest number of iterations with the requested durations; solvable cases took 31 to 51.
-        error: Relative error of a duration on so coarse a mesh; 3 and 12 intervals differ by up to 0.016.
-        price: Cost of doubling a duration, over that of accelerations and rates of 1 rad in that time.
-        guess: Guess of a duration, over the requested one.
-        longest: Upper bound of a duration, over the requested one.
-        samples: Number of samples of a phase at which active limits are searched.
-        active: Distance of a quantity from its limit, over its range along the motion, at which this counts as active.
-        names: Largest number of limits named in a message.
-    """
-
-    iterations: int = 60
-    error: float = 0.05
-    price: float = 1e4
-    guess: float = 5.0
-    longest: float = 50.0
-    samples: int = 21
+    iterations: int = 60  # largest number of iterations with the requested durations; solvable cases took 31 to 51
+    error: float = 0.05  # relative error of a duration on so coarse a mesh; 3 and 12 intervals differ by up to 0.016
+    price: float = 1e4  # cost of doubling a duration, over that of accelerations and rates of 1 rad in that time
+    guess: float = 5.0  # guess of a duration, over the requested one
+    longest: float = 50.0  # upper bound of a duration, over the requested one
+    samples: int = 21  # number of samples of a phase at which active limits are searched
+    # distance of a quantity from its limit, over its range along the motion, at which this counts as active
     active: float = 0.01
-    names: int = 3
+    names: int = 3  # largest number of limits named in a message
 
 
 PACE = PaceSettings()

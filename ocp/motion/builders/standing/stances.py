@@ -226,20 +226,14 @@ IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
 
 @dataclass(frozen=True)
 class ConfigurationSettings:
-    """Settings of the search for a standing configuration.
+    """Settings of the search for a standing configuration."""
 
-    Attributes:
-        near: Weight of a joint's squared distance from its initial position, 1/rad^2.
-        over: Weight of the squared distance of the center of mass from its goal, 1/m^2: 1 cm costs less than a tenth of
-            a radian.
-        gap: Largest gap between a foot and its foothold, m or rad.
-        steps: Number of time steps in the guess of a phase.
-    """
-
-    near: float = 1.0
+    near: float = 1.0  # weight of a joint's squared distance from its initial position, 1/rad^2
+    # weight of the squared distance of the center of mass from its goal, 1/m^2: 1 cm costs less than a tenth of a
+    # radian
     over: float = 300.0
-    gap: float = 1e-9
-    steps: int = 40
+    gap: float = 1e-9  # largest gap between a foot and its foothold, m or rad
+    steps: int = 40  # number of time steps in the guess of a phase
 
 
 CONFIGURATIONS = ConfigurationSettings()

@@ -30,21 +30,13 @@ from ocp.motion.tasks.tracks import on_symbols
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Settings of the check whether a motion can start from rest, and of the initial guess.
+    """Settings of the check whether a motion can start from rest, and of the initial guess."""
 
-    Attributes:
-        violation: Relative violation of a limit that is tolerated.
-        largest_acceleration: Bound of unlimited accelerations, rad/s^2 or m/s^2.
-        damping: Damping of null-space velocities in the guess, 1/s.
-        steps: Number of time steps of the guess.
-        largest_speed: Speed of a local motion near a singularity at which the guess stops, rad/s or m/s.
-    """
-
-    violation: float = 1e-6
-    largest_acceleration: float = 1e6
-    damping: float = 2.0
-    steps: int = 400
-    largest_speed: float = 100.0
+    violation: float = 1e-6  # relative violation of a limit that is tolerated
+    largest_acceleration: float = 1e6  # bound of unlimited accelerations, rad/s^2 or m/s^2
+    damping: float = 2.0  # damping of null-space velocities in the guess, 1/s
+    steps: int = 400  # number of time steps of the guess
+    largest_speed: float = 100.0  # speed of a local motion near a singularity at which the guess stops, rad/s or m/s
 
 
 STARTS = StartSettings()
