@@ -221,7 +221,8 @@ def roll_problem(
         if np.isfinite(obstacles.clearance):
             violation += ca.fmax(obstacles.clearance + SEARCH.margin * obstacles.softness - gap, 0)
     t = np.linspace(0, horizon, SEARCH.times)
-    rows = np.array(_curve(targets, symbols).map(len(t))(t[None]))
+    time = symbols.sym("time")
+    rows = np.array(ca.Function("target", [time], [_target_at(targets, time)]).map(len(t))(t[None]))
     status = np.array(optimal_inverse(rig, tunnel, settings.branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
     if status.any():
         first = int(np.flatnonzero(status)[0])
@@ -249,10 +250,10 @@ def roll_problem(
     problem.horizon(horizon)
     problem.dynamics(roll, rate)
     problem.dynamics(rate, acceleration)
-    target = _column(targets, problem.time)
+    target = _target_at(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Return an expression with the tool target at the symbolic time and the roll of the problem substituted."""
+        """Return an expression of target and roll as a function of the problem's time and roll."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
@@ -269,8 +270,10 @@ def roll_problem(
     return problem
 
 
-def _column(targets: Targets, time: Any) -> Any:
-    """Return a user's tool target (5, 1) at a symbolic time; raise ProblemError if it is invalid."""
+def _target_at(targets: Targets, time: Any) -> Any:
+    """Return the tool target (5, 1) that a user's function gives at a symbolic time; raise ProblemError if it is
+    invalid.
+    """
     try:
         target = expression(targets(time))
     except RuntimeError:  # interpolants do not take SX symbols
@@ -286,14 +289,8 @@ def _column(targets: Targets, time: Any) -> Any:
     return target
 
 
-def _curve(targets: Targets, symbols: Any) -> Any:
-    """Convert the user's function that returns tool targets to a casadi Function of time."""
-    time = symbols.sym("time")
-    return ca.Function("target", [time], [_column(targets, time)])
-
-
 def _violation(value: Any, lower: Any, upper: Any) -> Any:
-    """Return the summed violation of lower and upper bounds by values of an expression."""
+    """Return by how much the values of an expression exceed lower and upper bounds, summed over the values."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
 
 
@@ -308,7 +305,8 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll of the rig that minimises the integral of a cost and of the weighted squared roll rate.
+    """Return the roll of the rig at given times that minimises the integral of a cost and of the weighted squared roll
+    rate.
 
     The roll is found by dynamic programming. Shape (samples,), rad.
 
@@ -362,9 +360,8 @@ def least_cost_roll(
 
 
 def _lowest_cost_path(stage: Array, away: Any, spans: Array, rate_weight: float, rate_limit: float, step: float) -> Any:
-    """Return the lowest-cost path through a grid of times and rolls, as the index of the roll at each time.
-
-    Roll rates beyond the limit are penalised.
+    """Return the index of the roll at each time of the lowest-cost path through a grid of times and rolls, in which
+    rates beyond the limit are penalised.
     """
     weights = np.convolve(np.append(spans, 0), [0.5, 0.5])[: len(stage)]
     weights[[0, -1]] = np.maximum(weights[[0, -1]], spans[[0, -1]] / 2)

@@ -132,7 +132,7 @@ def dynamics_problem(
         raise ProblemError(words, name="control", value=control, limit="jerk")
     free = isinstance(horizon, FreeTime)
     duration = require.positive("horizon", horizon.guess if isinstance(horizon, FreeTime) else horizon)
-    ends = _Ends.take(machine, bounds, (start, end), (setup.start_velocity, setup.end_velocity), setup.start_base)
+    ends = _Ends.checked(machine, bounds, (start, end), (setup.start_velocity, setup.end_velocity), setup.start_base)
     tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     equations = bind(machine, tasks) if tasks else None
     if equations is not None:
@@ -148,7 +148,10 @@ def dynamics_problem(
         _declare_end_base(problem, machine, motion.base, setup.end_base)
     loads: dict[str, Any] = {"friction": setup.friction, "wrenches": setup.wrenches, "gravity": setup.gravity}
     torques = joint_torques(machine, motion[:4], **loads)
-    running = _declare_actuators(problem, machine, motion, torques, bounds, cost)
+    limit_torques(problem, machine.robot, torques, bounds.torque)
+    running = running_cost(machine, cost, motion[:4], jerks=motion.jerks, torques=torques)
+    if cost.energy or np.isfinite(bounds.power).any():
+        running += limit_power(problem, torques * motion.rates, bounds, cost)
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
     if setup.clearance_constraints is not None:
@@ -181,7 +184,7 @@ class _Ends:
     start: Array
 
     @classmethod
-    def take(
+    def checked(
         cls, machine: Motors, bounds: JointBounds, joints: tuple[Any, Any], velocities: tuple[Any, Any], base: Any
     ) -> _Ends:
         n, hint = machine.joint_size, "keep within them, or leave that end free: nan"
@@ -206,14 +209,18 @@ class _Ends:
         return np.where(np.isnan(self.last), self.start, self.last)
 
     def quintic(self, duration: float, order: int) -> Any:
-        """Return the quintic joint motion used as guess, or for `order` > 0 its derivative, as a function of time."""
+        """Return the quintic joint motion from rest to rest of the initial guess or its derivative of an order, as a
+        function of time.
+        """
         shape = QUINTIC.deriv(order) if order else QUINTIC
         begin = self.start if order == 0 else np.zeros(len(self.start))
         return lambda t: begin + (self.end - self.start) * shape(t / duration) / duration**order
 
 
 class _Motion(NamedTuple):
-    """Symbols of the states and controls of a problem, and the time derivative of the base configuration."""
+    """Symbols of the states and controls of a motion: base configuration, joint positions, velocities, accelerations
+    and jerks, and the rate of the base.
+    """
 
     base: Any
     joints: Any
@@ -262,22 +269,9 @@ def _declare_motion(
     return _Motion(base, joints, rates, second, jerks, base_rate)
 
 
-def _declare_actuators(
-    problem: Problem, machine: Motors, motion: _Motion, torques: Any, bounds: JointBounds, cost: Cost
-) -> Any:
-    """Declare the torque and power limits of a problem, and return its running cost."""
-    limit_torques(problem, machine.robot, torques, bounds.torque)
-    running = running_cost(machine, cost, motion[:4], jerks=motion.jerks, torques=torques)
-    if cost.energy or np.isfinite(bounds.power).any():
-        running += limit_power(problem, torques * motion.rates, bounds, cost)
-    return running
-
-
 def _checked_end(name: str, value: Any, n: int) -> Array:
-    """Return the user's positions or velocities at one end of a motion as numbers, nan where free. Shape (n,).
-
-    Raises:
-        ProblemError: The value has another size, or is infinite.
+    """Return positions or velocities that a user gives for one end of a motion as numbers (n,), nan where free; raise
+    ProblemError if the size is wrong or a number infinite.
     """
     if value is None:
         return np.full(n, np.nan)
@@ -289,11 +283,10 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return, for the solver, scales of reaction wheel angles, speeds, accelerations and jerks; nan for other joints.
-
-    Rotors are light and turn fast. Their scales are a quarter of the saturation speed and of the motor torque, or what
-    1 N m s and 1 N m cause where these are unlimited. Shape (4, n).
+    """Return scales for the solver of the angles, speeds, accelerations and jerks of reaction wheels, nan for other
+    joints. Shape (4, n).
     """
+    # rotors are light and turn fast: a quarter of saturation speed and motor torque, or what 1 N m s and 1 N m cause
     scales = np.full((4, robot.dof), np.nan)
     for name, inertia in find_wheels(robot).items():
         k = robot.joint_names.index(name)

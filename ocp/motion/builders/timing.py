@@ -79,7 +79,9 @@ class TimingProblem:
 
     @property
     def method(self) -> Collocation:
-        """Collocation with constant jerk in each interval, which prevents overshoot between the collocation points."""
+        """Collocation method with constant jerk in each interval, so that the jerk does not overshoot between the
+        points.
+        """
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:
@@ -118,8 +120,8 @@ class TimingProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class Fastest:
-    """Fastest motion along a path, with its minimum-time problem and solution.
+class FastestMotion:
+    """FastestMotion motion along a path, with its minimum-time problem and solution.
 
     Attributes:
         schedule: Motion as from ocp.motion.schedule, without a list of dips.
@@ -149,7 +151,7 @@ def solve_minimum_time(
     intervals: int = 200,
     rounds: int = 6,
     options: dict[str, Any] | None = None,
-) -> Fastest:
+) -> FastestMotion:
     """Plan the fastest motion along a path from rest to rest under all limits.
 
     The duration is an upper bound of the least time. Jerks held over intervals cannot follow a limit exactly, which
@@ -175,13 +177,13 @@ def solve_minimum_time(
         solution = solve(timing.problem, timing.method, guess=solution, options={**IPOPT, **options})
         profile = timing.profile(solution)
         demand = demand_of_intervals(path, limits, joints, profile)
-        parts = _refinement(profile, demand)
+        parts = _parts_of_intervals(profile, demand)
         if number == rounds or parts.max() == 1:
             break
         mesh = tuple(subdivide(np.array(timing.mesh), parts).tolist())
         timing = TimingProblem(timing.problem, mesh, timing.units, timing.reference, timing.span)
     assert solution is not None
-    return Fastest(Schedule(path, limits, profile, (), joints), solution, timing, float(demand.max()))
+    return FastestMotion(Schedule(path, limits, profile, (), joints), solution, timing, float(demand.max()))
 
 
 @interruptible
@@ -244,9 +246,8 @@ def _declare(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the minimum-time problem over an interval of the path parameter theta, in scaled units.
-
-    `along` is the function of theta that returns the reference speed and the values of `path_columns`.
+    """Declare the minimum-time problem over an interval of the path parameter theta, in scaled units; `along` is the
+    function of theta that returns the reference speed and the values of `path_columns`.
     """
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
@@ -288,9 +289,8 @@ def _declare(
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Return the ratios of centripetal acceleration and joint velocities, accelerations and jerks to their limits.
-
-    `values` are the reference speed and the values of `path_columns`; v, a, j are path speed, acceleration and jerk.
+    """Return the ratios of centripetal acceleration and joint velocities, accelerations and jerks to their limits at
+    path speed v, acceleration a and jerk j; `values` are the reference speed and the values of `path_columns`.
     """
     demands: dict[str, Any] = {}
     if np.isfinite(limits.centripetal):
@@ -311,10 +311,9 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
     return demands
 
 
-def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
-    """Return the number of parts into which to split each mesh interval, from limit violation and integration error.
-
-    Both decrease with the square of the length of the interval.
+def _parts_of_intervals(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
+    """Return the number of parts into which to split each mesh interval, from limit violation and integration error,
+    which decrease with the square of the length of the interval.
     """
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)

@@ -122,7 +122,7 @@ def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None,
     """
     usage = np.abs(limit_rows(path, limits, joints, motion.distance, torques=False).usage(motion))
     usage[:, 0] **= 2  # the speed at the centripetal limit, of which the acceleration is the square
-    return np.maximum(motion.speed / speed_limit(path, limits, motion.distance), usage.max(axis=1))
+    return np.asarray(np.maximum(motion.speed / speed_limit(path, limits, motion.distance), usage.max(axis=1)))
 
 
 def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:

@@ -141,7 +141,8 @@ def declare_actuators(
     pace: Any,
     suffix: str = "",
 ) -> tuple[Any, Any, Any]:
-    """Declare joint velocities and accelerations within actuator limits; return both and the running cost per second.
+    """Declare joint velocities and accelerations within actuator limits; return their symbols and the running cost per
+    second.
 
     The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
     "power" where these are limited or weighted.
@@ -196,7 +197,7 @@ def weights_torques(cost: Cost) -> bool:
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
-    """Return the cost per second of a motion, without the terms of duration and positive power.
+    """Return the cost per second of a motion, without the terms of duration and positive power, as an expression.
 
     Args:
         machine: The machine.

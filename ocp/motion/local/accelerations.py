@@ -119,7 +119,7 @@ class AccelerationOptions:
         require.positive("speed_limit", self.speed_limit)
 
     def zmp_target(self, machine: Standing) -> Callable[[Any], Any]:
-        """Return the desired zero moment point of a machine as a checked function of time."""
+        """Return the desired zero moment point (x, y) of a machine, m, as a function of time that checks its value."""
         zmp = machine.most_stable_point if self.zmp is None else self.zmp
         if callable(zmp):
             return lambda time: checked_point(zmp(time), "zmp")
@@ -135,25 +135,21 @@ class _TaskHierarchy:
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add equations `rows` q'' = `target` that the joint accelerations q'' shall satisfy with the least change."""
+        """Add the task `rows` q'' = `target`, which changes the joint accelerations q'' as little as possible in the
+        null space of all tasks added before.
+        """
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
         self.projector = self.projector - ca.mtimes(inverse, projected)
 
     def add_free(self, direction: Any) -> None:
-        """Add joint accelerations that are projected onto the null space of all tasks added before."""
+        """Add joint accelerations after projecting them onto the null space of all tasks added before."""
         self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
-def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
-    """Raise ProblemError if a redundancy resolution law is unknown, or needs more joints than the machine has.
-
-    Args:
-        machine: The machine.
-        size: Number of rows of all tasks.
-        law, layers: As for `resolve_accelerations`.
-    """
+def _check_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
+    """Raise ProblemError if a law is unknown or, with `size` rows of tasks, needs more joints than the machine has."""
     require.choice("law", law, get_args(Law))
     axes = len(machine.moving_directions)
     tasks = {"the tip": size, "the zero moment point": 0 if law == "pseudo_inverse" else axes}
@@ -221,7 +217,8 @@ def accelerations(
 
 
 def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
-    """Return matrix and right side of linear equations of joint accelerations that stabilise the centre of mass.
+    """Return the matrix and the right side of linear equations for the joint accelerations that keep a machine upright,
+    see `Stabiliser`.
 
     `right` is C of equation (18), minus the moment of weight and wrenches about `place`, y*: it vanishes for a centre
     of mass at y*, and -C / (M g) is the distance of the centre of mass beyond y*.
@@ -341,7 +338,7 @@ def resolve_accelerations(
     duration, n = require.positive("horizon", horizon), machine.joint_size
     own = AccelerationOptions() if options is None else require.instance("options", options, AccelerationOptions)
     begin, joints, base = Start.of_known(start, machine)
-    checked_law(machine, equations.size, law, own.layers)
+    _check_law(machine, equations.size, law, own.layers)
     require.positive("step", step)
     checked_tasks(equations, base, joints, duration)
     check_length(equations, base, duration)
@@ -378,13 +375,13 @@ def resolve_accelerations(
     while done < steps and stopped is None:
         count = min(STEPS_PER_CALL, steps - done)
         states = np.array(advance(count)(values, (done * width + width * np.arange(count))[None, :])).T
-        stopped = recorder.add((done + np.arange(1, count + 1)) * width, states)
+        stopped = recorder.add(np.asarray((done + np.arange(1, count + 1)) * width), states)
         values, done = states[-1], done + count
     return AccelerationSolution(law, *recorder.results(), stopped)
 
 
 class _Recorder:
-    """Recorder of the samples of a motion up to its first failure."""
+    """Recorder of the samples of a simulated motion until a sample fails: lift-off, too fast, or not finite."""
 
     def __init__(self, motion: Any, law: Any, stop_at_lift_off: bool, speed_limit: float) -> None:
         self._motion, self._law = motion, law
@@ -392,7 +389,9 @@ class _Recorder:
         self._records: list[dict[str, Array]] = []
 
     def add(self, times: Array, states: Array) -> Stop | None:
-        """Evaluate and record samples of the motion; return a Stop for the first one that fails, else None."""
+        """Record samples of the motion up to the first one that fails; return the reason of its failure, or None if
+        none fails.
+        """
         n = states.shape[1] // 2
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
@@ -420,7 +419,7 @@ class _Recorder:
         return Stop("divergence", at, words)
 
     def results(self) -> tuple[StandingMotion, Array]:
-        """Return the recorded motion, and the norm of its pose errors at each sample. Shape (M,)."""
+        """Return the recorded motion, and the norm of the pose errors of its tips at each sample. Shape (M,)."""
         joined = {name: np.concatenate([record[name] for record in self._records]) for name in self._records[0]}
         gap = joined.pop("gap")
         return StandingMotion(**joined), gap

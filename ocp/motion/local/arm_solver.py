@@ -27,7 +27,7 @@ STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """Settings of the choice of the redundant joints that are sampled."""
+    """Settings of the choice of redundant joints, whose positions are sampled in inverse kinematics."""
 
     max_samples: int = 6  # largest number of sampled parameters
     # largest number of choices of the sampled joints in closed form, and by elimination
@@ -43,7 +43,9 @@ ARM = ArmSettings()
 
 
 def sample_shares(first: int, count: int, dimension: int) -> Array:
-    """Return samples in [0, 1) of a low-discrepancy sequence, from index `first` on. Shape (count, dimension)."""
+    """Return `count` points of a low-discrepancy sequence in [0, 1)^dimension, from index `first` on. Shape (count,
+    dimension).
+    """
     return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
 
 
@@ -121,7 +123,7 @@ class ArmSolver:
 
     @cached_property
     def _windows(self) -> _Windows:
-        """Intervals of one full turn within the joint ranges, into which the angles of solutions are shifted."""
+        """Intervals of one full turn within the joint ranges, into which the angles of IK solutions are shifted."""
         below, above, revolute = np.isfinite(self.lower), np.isfinite(self.upper), self.chain.revolute
         both, lower, upper = below & above & revolute, self.lower - ARM.excess, self.upper + ARM.excess
         low = np.where(below, lower, upper - TURN)
@@ -136,7 +138,9 @@ class ArmSolver:
 
 @lru_cache(maxsize=256)
 def _whole_turns(counts: tuple[int, ...]) -> Array:
-    """Return all combinations of 0 to count - 1 whole turns of several joints, rad. Shape (combinations, joints)."""
+    """Return all combinations of 0 to count - 1 whole turns of several joints, rad; each joint has its own count. Shape
+    (combinations, joints).
+    """
     return np.asarray(TURN * np.indices(counts).reshape(len(counts), -1).T)
 
 
@@ -197,15 +201,10 @@ def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = No
 
 
 def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
-    """Return how well conditioned inverse kinematics is for each choice of redundant joints; larger is better.
-
-    This is the geometric mean, at random configurations, of the least singular value of the Jacobian of the others.
+    """Return, for each choice of redundant joints, the geometric mean over random configurations of the least singular
+    value of the Jacobian of the other joints.
     """
-    rng = np.random.default_rng(ARM.seed)
-    joints = rng.uniform(-np.pi, np.pi, (ARM.trials, len(chain.axes)))
-    joints[:, ~chain.revolute] *= chain.size / np.pi
-    positions, rotations = chain.poses(joints)
-    _, jacobian = chain.linearize(joints, chain.order, Motion(rotations, positions))
+    _, jacobian = chain.linearize(*chain.random_configurations(ARM.trials, ARM.seed), chain.order)
     columns = [[k for k, j in enumerate(chain.order) if j not in redundant] for redundant in choices]
     values = [np.linalg.svd(jacobian[:, :, each], compute_uv=False)[:, -1] for each in columns]
     return np.exp(np.log(np.maximum(values, 1e-300)).mean(axis=1)) if values else np.zeros(0)

@@ -88,6 +88,12 @@ def idle_positions(lower: Array, upper: Array) -> Array:
     return np.asarray(np.where(np.isfinite(middle), middle, np.clip(0.0, lower, upper)))
 
 
+def joint_range(machine: Machine, limits: bool) -> tuple[Array, Array]:
+    """Return the position limits of the joints, infinite if `limits` is False. Shape (n,) each, rad or m."""
+    unlimited = np.full(machine.joint_size, np.inf)
+    return (machine.robot.lower, machine.robot.upper) if limits else (-unlimited, unlimited)
+
+
 class IkSolver:
     """Solver of all IK configurations of an arm on a fixed base, prepared for any number of poses.
 
@@ -137,9 +143,7 @@ class IkSolver:
             raise ProblemError(str(error), **vars(error)) from error
         if not np.linalg.norm(axis) > 0:
             raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
-        unbounded = np.full(machine.joint_size, np.inf)
-        lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-        prepared = PreparedArm.of(tip, lower, upper, free=free, tool_axis=axis, within=float(within))
+        prepared = PreparedArm.of(tip, *joint_range(machine, limits), free=free, tool_axis=axis, within=float(within))
         if prepared is None:
             words = f"{machine.robot.name}: no six joints on a fixed base determine the tip; use inverse_kinematics"
             raise ProblemError(words, name="machine", value=machine)
@@ -176,7 +180,7 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class PreparedArm:
-    """Arm prepared for repeated inverse kinematics by an `IkSolver`.
+    """Arm with the solver of its inverse kinematics and the part of the tip's orientation that a task leaves free.
 
     Attributes:
         arm: Solver of the arm.
@@ -268,9 +272,8 @@ class PreparedArm:
         return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
 
     def _rotations(self, shares: Array) -> Array:
-        """Return samples of those rotations of the tip, in the tip frame, that the task leaves free. Shape (S, 3, 3).
-
-        `shares` (S, 1) or (S, 3) are fractions of full turns of roll and azimuth, and of the area of the cone's cap.
+        """Return samples of those rotations of the tip, in the tip frame, that the task leaves free, from fractions of
+        full turns of roll and azimuth and of the area of the cone's cap. Shape (S, 3, 3).
         """
         rolled = rotation_matrices(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
@@ -283,7 +286,9 @@ class PreparedArm:
 
 
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
-    """Return tip positions (N, 3) and rotations (N, 3, 3) after checks; raise ProblemError if they are invalid."""
+    """Return tip positions (N, 3) and rotation matrices (N, 3, 3) given by a user; raise ProblemError if they are
+    invalid.
+    """
     places, turns = np.asarray(positions, dtype=float), np.asarray(rotations, dtype=float)
     single = places.ndim == 1
     places, turns = (places[None], turns[None]) if single else (places, turns)
@@ -344,7 +349,7 @@ class IkBranches:
         return IkConfigurations(joints, np.zeros(len(joints), dtype=np.intp), tuple(names), (reason,))
 
     def _rotation(self, targets: Array) -> Array:
-        """Return a rotation of the tip that satisfies the task. Shape (3, 3)."""
+        """Return a rotation of the tip that satisfies the targets of the task. Shape (3, 3)."""
         if self._task.direction is not None:
             axis, direction = np.array(self._task.tool_axis), targets[6:9] / np.linalg.norm(targets[6:9])
             return least_rotation(axis, direction)
@@ -406,9 +411,8 @@ def ik_configurations(
     require.flag("limits", limits)
     if not np.isfinite(real(time)):
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
-    equations, unbounded = bind(machine, task), np.full(machine.joint_size, np.inf)
-    lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    branches = ik_branches(equations, lower, upper)
+    equations = bind(machine, task)
+    branches = ik_branches(equations, *joint_range(machine, limits))
     if branches is None:
         words = "ik_configurations needs the pose of the tip of an arm on a fixed base; use inverse_kinematics"
         raise ProblemError(words, name="task", value=task)

@@ -19,7 +19,7 @@ from models.checks import NOT_NUMBERS, Array, floats, real
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import Collision, checked_collision_scene, slide_apart, worst_collisions
-from ocp.motion.local.ik_solver import ik_branches
+from ocp.motion.local.ik_solver import ik_branches, joint_range
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
@@ -46,7 +46,7 @@ IK_SETTINGS = IkSettings()
 
 @dataclass(frozen=True, eq=False)
 class IkOptions:
-    """Options of inverse kinematics.
+    """Options of `inverse_kinematics`: base configuration, joint limits, accuracy and number of iterations.
 
     Attributes:
         base: Base configuration, shape (base_size,); the machine's base_home() if None.
@@ -70,11 +70,6 @@ class IkOptions:
         require.positive("tolerance", self.tolerance)
         require.positive("apart", self.apart)
         require.count("iterations", self.iterations, least=1)
-
-    def joint_range(self, machine: Machine) -> tuple[Array, Array]:
-        """Return the lower and upper limits of the joints, infinite where none apply. Shape (n,) each."""
-        unlimited = np.full(machine.joint_size, np.inf)
-        return (machine.robot.lower, machine.robot.upper) if self.limits else (-unlimited, unlimited)
 
 
 IK_OPTIONS = IkOptions()
@@ -182,7 +177,7 @@ def inverse_kinematics(
         raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
     size = machine.joint_size
     base_values = checked_configuration(machine, np.zeros(size), options.base)[1]
-    lower, upper = options.joint_range(machine)
+    lower, upper = joint_range(machine, options.limits)
     first = sample_starts(machine, lower, upper, int(starts), near=near, seed=seed)
     targets = np.array(equations.target_function()(float(time))).ravel()
     if not np.isfinite(targets).all():
@@ -230,7 +225,7 @@ def inverse_kinematics_at(
     Raises:
         Unreachable: No start leads to the pose.
     """
-    lower, upper = options.joint_range(equations.machine)
+    lower, upper = joint_range(equations.machine, options.limits)
     first = sample_starts(equations.machine, lower, upper, starts, near=near, seed=seed)
     return _MultiStart(equations, np.zeros(0), targets, lower, upper, options).solve(first, starts)
 
@@ -247,12 +242,10 @@ class _MultiStart:
     options: IkOptions = IK_OPTIONS
 
     def solve(self, first: Array, random: int) -> list[IkSolution]:
-        """Return the distinct IK solutions to which initial guesses (K, n) lead, sorted by decreasing quality.
+        """Return the distinct IK solutions to which initial guesses (K, n) lead, sorted by decreasing quality; raise
+        Unreachable if there is none.
 
         Unlimited angles that result from the last `random` guesses are wrapped to -pi .. pi.
-
-        Raises:
-            Unreachable: There is no solution.
         """
         lower, upper = self.lower, self.upper
         q, error = self.iterate(first)
@@ -267,9 +260,8 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return IK solutions (K, n) on all branches, and how many random initial guesses shall be tried in addition.
-
-        The list is empty if no solver of all branches exists.
+        """Return IK solutions (K, n) on all branches, none if there is no solver of all branches, and how many random
+        initial guesses shall be tried in addition.
         """
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
@@ -420,10 +412,8 @@ def _closest_collisions(
 def _collision_free(
     solutions: list[IkSolution], collisions: list[Collision | None], scene: CollisionScene, time: float
 ) -> list[IkSolution]:
-    """Return the collision-free IK solutions.
-
-    Raises:
-        Unreachable: There are none.
+    """Return the collision-free IK solutions; raise Unreachable, naming the pair of bodies closest to the clearance, if
+    there are none.
     """
     free = [solution for solution, collision in zip(solutions, collisions, strict=True) if collision is None]
     if free:

@@ -15,6 +15,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from models import CollisionScene, Machine
 from models.checks import NOT_NUMBERS, Array, floats, real
@@ -80,16 +81,10 @@ class LocalSolution:
         rates = np.array([np.interp(time, self.t, column) for column in self.joint_rates.T])
         if len(self.t) == 1:
             return {"base": self.base[0], "joints": self.joints[0], "joint_rates": rates}
-        k = int(np.clip(np.searchsorted(self.t, time) - 1, 0, len(self.t) - 2))
-        step = self.t[k + 1] - self.t[k]
-        s = (time - self.t[k]) / step
-
-        def hermite(value: Array, rate: Array) -> Array:
-            mean = (value[k + 1] - value[k]) / step
-            correction = (1 - s) * (rate[k] - mean) + s * (mean - rate[k + 1])
-            return np.asarray(value[k] + step * s * (mean + (1 - s) * correction))
-
-        base, joints = hermite(self.base, self.base_rates), hermite(self.joints, self.joint_rates)
+        base, joints = (
+            scipy.interpolate.CubicHermiteSpline(self.t, values, slopes)(time)
+            for values, slopes in ((self.base, self.base_rates), (self.joints, self.joint_rates))
+        )
         return {"base": base, "joints": joints, "joint_rates": rates}
 
 
@@ -231,7 +226,7 @@ class _Model:
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
     def integrator(self, start: float, times: Array, tolerance: float) -> Any:
-        """Return the integrator of state and cost from `start` to the given times."""
+        """Return the integrator of state and cost from the time `start` to the given times."""
         problem = {"t": self.time, "x": self.state, "ode": self.ode, "quad": self.running}
         return _cvodes(problem, start, times, tolerance)
 
@@ -251,7 +246,7 @@ def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: floa
 
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
-    """Return states and costs at all times that the integration reaches, and the reason if it stops early."""
+    """Return states and costs at all sample times that an integration reaches, and the reason if it stops early."""
     try:
         result = model.integrator(times[0], times[1:], tolerance)(x0=first)
         states = np.vstack([first, np.array(result["xf"]).T])
@@ -284,7 +279,7 @@ def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> t
 def _report(
     machine: Machine, model: _Model, times: Array, states: Array, costs: Array, tolerance: float, stopped: str | None
 ) -> LocalSolution:
-    """Evaluate all outputs along integrated states and return them as a `LocalSolution`."""
+    """Return integrated states and costs as a `LocalSolution` with all quantities along the motion."""
     rates = np.array(model.rate.map(len(times))(times[None, :], states.T)).T
     tip, jacobians, error = (np.array(value) for value in model.outputs.map(len(times))(times[None, :], states.T))
     base_size, size = machine.base_size, error.size // len(times)
@@ -410,7 +405,9 @@ def track_tasks(
     bases, configurations, errors = [base_now], [joints_now], list[Array]()
 
     def linearise(k: int) -> tuple[Array, Array, Array, Array]:
-        """Return Jacobians (K, m, n), task velocities (K, m), pose errors (K, m) and largest residuals at times[k]."""
+        """Return Jacobians (K, m, n), task velocities (K, m), pose errors (K, m) and largest residuals (K,) at time
+        sample k.
+        """
         jacobian, right, error, residual, *leaning = task(base_now, joints_now, targets[:, k])
         matrix = jacobian.reshape(count, machine.joint_size, equations.size).transpose(0, 2, 1)
         errors_along = np.abs(residual).max(axis=1, initial=0.0)

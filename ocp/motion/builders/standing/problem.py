@@ -239,11 +239,11 @@ def standing_problem(
     if rests[1]:
         rows = ~equations.pose_rows if tip_level == "position" else None
         resting = rates_at_rest(equations, (), guess["joints"].values[-1], rows)
-    motion, jerks = _motion(problem, machine.robot, bounds, begin, resting, guess, setup)
+    motion, jerks = _declare_motion(problem, machine.robot, bounds, begin, resting, guess, setup)
     joints, velocities, accelerations = motion
     progress: tuple[Any, ...] = (problem.time,)
     if along_parameter:
-        progress = _progress(problem, rests, guess)
+        progress = _declare_progress(problem, rests, guess)
     _constrain_tips(problem, equations, motion, progress, tip_level, not rests[0])
 
     wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
@@ -276,7 +276,9 @@ def _constrain_tips(
     tip_level: str,
     moving: bool,
 ) -> None:
-    """Constrain the tips to their tasks, by poses or by accelerations; `moving` is true for a start not at rest."""
+    """Constrain the tips to the poses or accelerations of their tasks, and to their velocities if `moving` at the
+    start.
+    """
     none, (joints, velocities, accelerations) = ca.DM(0, 1), motion
     targets = equations.targets(*progress[:2])
     if tip_level == "position":
@@ -299,7 +301,7 @@ def declare_horizon(problem: Problem, horizon: float | FreeTime) -> Any:
     return problem.horizon(float(horizon))
 
 
-def _motion(
+def _declare_motion(
     problem: Problem,
     robot: Robot,
     bounds: JointBounds,
@@ -308,7 +310,9 @@ def _motion(
     guess: Mapping[str, Any],
     setup: StandingSetup,
 ) -> tuple[tuple[Any, Any, Any], Any]:
-    """Declare joint positions, velocities and accelerations, and jerks if these are controls; return the symbols."""
+    """Declare the states and controls of the joints: positions, velocities, accelerations, and jerks if these are
+    controls; return the symbols.
+    """
     n = len(begin)
     joints = problem.state(
         "joints", n, initial=begin, terminal=setup.end, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"],
@@ -332,7 +336,7 @@ def _motion(
     return (joints, velocities, accelerations), jerks
 
 
-def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
+def _declare_progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
     """Declare the path parameter, which runs from 0 to 1; return the parameter, its rate and its acceleration."""
     at = problem.state("path", initial=0.0, terminal=1.0, lower=0.0, upper=1.0, guess=guess["path"])
     first, last = (0.0 if rest else None for rest in rests)

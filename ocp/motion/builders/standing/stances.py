@@ -219,7 +219,7 @@ def walk(
     return tuple(phases)
 
 
-PLACED = 1e-6
+PLACEMENT_TOLERANCE = 1e-6
 """Largest accepted gap between a foot and its foothold at the start, m or rad."""
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
 
@@ -239,11 +239,15 @@ class ConfigurationSettings:
 CONFIGURATIONS = ConfigurationSettings()
 
 
-def foothold_equations(stance: Stance, footholds: dict[str, Foothold]) -> TaskEquations:
+def foothold_equations(stance: Stance, footholds: Mapping[str, Foothold] | None = None) -> TaskEquations:
     """Return task equations that keep feet on footholds, for the pose components that the joints can change.
 
-    The first foot of the stance, at which the machine is rooted, must not be among the feet.
+    Args:
+        stance: Model of the machine with at least two feet on the ground, rooted at the first of them.
+        footholds: Footholds by foot, without the first foot of the stance; None for all other feet of the stance.
     """
+    if footholds is None:
+        footholds = {name: stance.footholds[name] for name in stance.other_feet}
     tasks = [foot_task(stance, name, foothold.position, foothold.rotation) for name, foothold in footholds.items()]
     return bind(stance, tasks)
 
@@ -284,7 +288,7 @@ def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array
     q, none = ca.SX.sym("q", stance.joint_size), ca.DM(0, 1)
     gap: Any = none
     if stance.other_feet:
-        equations = foothold_equations(stance, {name: stance.footholds[name] for name in stance.other_feet})
+        equations = foothold_equations(stance)
         gap = equations.error(none, q, ca.DM(equations.target_function()(0.0)))
     cost = CONFIGURATIONS.near * ca.sumsqr(q - begin)
     if over is not None:
@@ -306,15 +310,15 @@ def check_placed(stance: Stance, joints: Array) -> None:
     """Raise ProblemError if a foot is off its foothold in a start configuration, given in the stance's joint order."""
     if not stance.other_feet:
         return
-    equations = foothold_equations(stance, {name: stance.footholds[name] for name in stance.other_feet})
+    equations = foothold_equations(stance)
     errors = np.array(ca.DM(equations.error(ca.DM(0, 1), joints, equations.target_function()(0.0))))
     gap = float(np.abs(errors).max())
-    if gap > PLACED:
+    if gap > PLACEMENT_TOLERANCE:
         words = (
             f"start: a foot is {gap:.3g} (m or rad) away from its foothold; "
             "standing_configuration(stance, near) finds joints that put it there"
         )
-        raise ProblemError(words, name="start", value=gap, limit=PLACED)
+        raise ProblemError(words, name="start", value=gap, limit=PLACEMENT_TOLERANCE)
 
 
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:
@@ -359,7 +363,9 @@ def _raised_poses(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]
 
 
 def _interpolate(configurations: Array, seconds: float) -> dict[str, Any]:
-    """Return a smooth rest-to-rest motion through 2 or 3 configurations as a guess of the states and controls."""
+    """Return a smooth rest-to-rest motion through 2 or 3 configurations (k, n) as a guess of joint states and
+    accelerations.
+    """
     share = np.linspace(0.0, 1.0, CONFIGURATIONS.steps + 1)
     first, last = configurations[0], configurations[-1]
     values = first + (last - first) * rest_to_rest(share)[:, None]

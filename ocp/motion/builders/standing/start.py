@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from models.checks import Array
 from models.machines.machine import Machine
@@ -148,7 +149,8 @@ def check_loads(
 
 
 def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) -> tuple[Array, Array]:
-    """Return matrix and right side of the equations that tasks impose on joint accelerations at a start from rest.
+    """Return matrix and right side of the linear equations that tasks impose on the joint accelerations at a start from
+    rest.
 
     Along a parameter the acceleration in the path's direction is free, and only the equations across it remain.
     """
@@ -171,7 +173,9 @@ def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) 
 
 
 def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
-    """Return the half-planes, as inward normals and offsets, that must contain the zero moment point."""
+    """Return the half-planes, as inward normals and offsets, in which a rule requires the zero moment point of a
+    standing machine to be.
+    """
     edges = list(zip(*foot_edges(machine, zmp), strict=True))
     unit = np.eye(2)
     if isinstance(zmp, IndexAtLeast):
@@ -189,7 +193,7 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 def _least_violations(
     at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """Return the violations of torque and ground limits that minimise their sum; None if the tasks are impossible."""
+    """Return the violations of torque and ground limits with the least sum; None if the tasks are impossible."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):
@@ -198,18 +202,13 @@ def _least_violations(
     matrix = np.block([[slopes, np.eye(m), -np.eye(m)], [rows, np.zeros((len(rows), 2 * m))]])
     lower, upper = np.concatenate([low - at_rest, wanted]), np.concatenate([high - at_rest, wanted])
     reach = np.minimum(largest, STARTS.largest_acceleration)
-    sizes = np.concatenate([np.zeros(n), np.ones(2 * m)])
-    settings = {"error_on_fail": False, "highs": {"output_flag": False}}
-    shape = {"a": ca.DM(matrix).sparsity(), "h": ca.Sparsity(n + 2 * m, n + 2 * m)}
-    solver = ca.conic("start", "highs", shape, settings)
-    result = solver(
-        a=ca.DM(matrix), g=sizes, lba=lower, uba=upper,
-        lbx=np.concatenate([-reach, np.zeros(2 * m)]), ubx=np.concatenate([reach, np.full(2 * m, np.inf)]),
-    )  # fmt: skip
-    if not solver.stats()["success"]:
-        return None
-    slack = np.array(result["x"]).ravel()[n:]
-    return np.asarray(slack[:m] + slack[m:])
+    largest_values = np.concatenate([reach, np.full(2 * m, np.inf)])
+    solved = scipy.optimize.milp(
+        np.concatenate([np.zeros(n), np.ones(2 * m)]),
+        constraints=scipy.optimize.LinearConstraint(matrix, lower, upper),
+        bounds=scipy.optimize.Bounds(np.concatenate([-reach, np.zeros(2 * m)]), largest_values),
+    )
+    return None if solved.x is None else np.asarray(solved.x[n : n + m] + solved.x[n + m :])
 
 
 def local_guess(
