@@ -16,11 +16,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import CollisionScene, ModelError
-from models.checks import Array, real
+from models import CollisionScene
+from models.checks import Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance, Track, clearance_along
-from ocp.errors import ProblemError, SolveError, require
+from ocp.errors import ProblemError, SolveError, problem_errors, require
 from ocp.motion.local.collisions import Collision, find_collisions, scene_hulls
 from ocp.problem.declarations import Variable
 from ocp.problem.hulls import Separation, frames_of
@@ -56,17 +56,10 @@ class ClearanceConstraints:
 
     def __post_init__(self) -> None:
         require.instance("clearance_constraints: scene", self.scene, CollisionScene)
-        for pair, margin in require.mapping("clearance_constraints: margins", self.margins, object).items():
-            if not np.isfinite(real(margin)):
-                words = f"clearance_constraints: margins must be finite numbers in m, not {margin!r}"
-                raise ProblemError(words, name="margins", value=margin)
-            if (
-                isinstance(pair, bool)
-                or not isinstance(pair, int | np.integer)
-                or not 0 <= pair < len(self.scene.pairs)
-            ):
-                words = f"clearance_constraints: there is no pair {pair!r}; the scene has {len(self.scene.pairs)}"
-                raise ProblemError(words, name="margins", value=pair, limit=len(self.scene.pairs))
+        margins = require.mapping("clearance_constraints: margins", self.margins, object)
+        if margins:
+            require.indices("clearance_constraints: pairs of margins", list(margins), len(self.scene.pairs))
+            require.array("clearance_constraints: margins", list(margins.values()), unit="m")
 
     def with_pairs(self, pairs: Sequence[int]) -> ClearanceConstraints:
         """Return a copy of the constraints that also separates the pairs of bodies with the given indices."""
@@ -119,10 +112,8 @@ class ClearanceConstraints:
         scene, time, states = self.scene, begin + pace * problem.time, problem.declared.states
         _check_limits(scene, states[joints])
         if horizon is not None:
-            try:
+            with problem_errors():
                 scene.check_motions(begin, begin + pace * horizon)
-            except ModelError as error:
-                raise ProblemError(str(error), **vars(error)) from error
         elif scene.has_moving_obstacles:
             words = "a moving obstacle needs a known time; give a horizon in s, or a fixed obstacle"
             raise ProblemError(words, name="obstacles")
@@ -240,9 +231,7 @@ def is_clearance(name: Any) -> bool:
 
 
 def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
-    """Return an error that names the colliding bodies if collisions are all that a solution's audit finds wrong, else
-    None.
-    """
+    """Return an error that names colliding bodies if a solution fails its audit only because of them, else None."""
     failures = audit.failures
     if not failures or any(finding.name not in audit.clearances for finding in failures):
         return None

@@ -240,9 +240,7 @@ class TorqueLimits:
         self._samplers: dict[bool, Sampler] = {}
 
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> Array:
-        """Return the torques of the joints whose torque or power is limited, at M samples of a motion. Shape (M, L), N
-        m or N.
-        """
+        """Return the torques, N m or N, of the L joints in `limited` at M samples of a motion. Shape (M, L)."""
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
     def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
@@ -342,9 +340,7 @@ def segment_durations(changes: Array, bounds: JointBounds) -> Array:
 
 
 def _finite_limits(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
-    """Return velocity, acceleration and jerk limits of joints, in which the limits that a velocity profile needs are
-    finite.
-    """
+    """Return velocity, acceleration and jerk limits of joints; those that a velocity profile needs are finite."""
     velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
     jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
     velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
@@ -354,9 +350,7 @@ def _finite_limits(distances: Array, bounds: JointBounds) -> tuple[Array, Array,
 
 
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest velocity profiles (K,) of straight joint motions with displacements (K, n), for the covered
-    fraction of the displacement.
-    """
+    """Return the fastest profiles (K,) of the fraction that straight motions cover of displacements (K, n)."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [

@@ -20,8 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import ModelError
-from models.checks import NOT_NUMBERS, Array, floats, real
+from models.checks import Array, real
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, proximity_cost
 from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, configuration_at, joints_of
@@ -31,7 +30,7 @@ from models.shapes.distance import soft_minimum
 from models.spatial import FULL_TURN, expression
 from ocp.console import interruptible
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, problem_errors, require
 from ocp.problem.problem import Problem
 
 Targets = Callable[[Any], Any]
@@ -68,14 +67,9 @@ def spline_targets(times: Any, targets: Any) -> Targets:
         ProblemError: There are fewer than 4 samples, the times do not increase, or the targets have another shape or
             are not finite.
     """
-    try:
-        t = floats(times)
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"times {times!r} are not numeric", name="times", value=times) from error
-    try:
+    t = require.array("times", times)
+    with problem_errors():
         rows = checked_targets(targets)
-    except ModelError as error:
-        raise ProblemError(str(error), name=error.name, value=error.value) from error
     if t.shape != (len(rows),) or len(t) < 4 or not (np.diff(t) > 0).all():
         message = f"times of shape {t.shape} must increase, one for each of the {len(rows)} targets, 4 at least"
         raise ProblemError(message, name="times", value=t, limit=(len(rows),))
@@ -106,11 +100,10 @@ class RollSettings:
 
     def __post_init__(self) -> None:
         for name in ("rate_weight", "acceleration_weight", "rate_limit", "acceleration_limit"):
-            _check_nonnegative(name, getattr(self, name), finite=name.endswith("weight"))
-        try:
+            entries: Any = "finite" if name.endswith("weight") else "numbers"
+            require.array(f"roll_problem: {name}", getattr(self, name), (), entries=entries, sign="nonnegative")
+        with problem_errors("roll_problem: "):
             object.__setattr__(self, "branch", checked_branch(self.branch))
-        except ModelError as error:
-            raise ProblemError(f"roll_problem: {error}", name=error.name, value=error.value) from error
         if self.symbols not in (ca.SX, ca.MX):
             words = f"roll_problem: symbols must be casadi.SX or casadi.MX, not {self.symbols!r}"
             raise ProblemError(words, name="symbols", value=self.symbols)
@@ -140,23 +133,13 @@ class RollObstacles:
 
     def __post_init__(self) -> None:
         require.instance("roll_problem: scene", self.scene, CollisionScene)
-        _check_nonnegative("clearance_weight", self.clearance_weight, finite=True)
+        require.nonnegative("roll_problem: clearance_weight", self.clearance_weight)
         require.positive("roll_problem: clearance_width", self.clearance_width)
         require.positive("roll_problem: softness", self.softness)
         if self.radii is not None:
             require.instance("roll_problem: radii", self.radii, Radii)
-        try:
+        with problem_errors("roll_problem: "):
             checked_clearance(self.clearance)
-        except ModelError as error:
-            raise ProblemError(f"roll_problem: {error}", name=error.name, value=error.value) from error
-
-
-def _check_nonnegative(name: str, value: Any, *, finite: bool) -> None:
-    """Raise ProblemError if a weight or limit is negative, or if a number that must be finite is infinite."""
-    number = real(value)
-    if not number >= 0 or (finite and np.isinf(number)):
-        message = f"roll_problem: {name} must be a number that is not negative, not {value!r}"
-        raise ProblemError(message, name=name, value=value, limit=0.0)
 
 
 @interruptible
@@ -271,9 +254,7 @@ def roll_problem(
 
 
 def _target_at(targets: Targets, time: Any) -> Any:
-    """Return the tool target (5, 1) that a user's function gives at a symbolic time; raise ProblemError if it is
-    invalid.
-    """
+    """Return the tool target (5, 1) of a user's function at a symbolic time; raise ProblemError if it is invalid."""
     try:
         target = expression(targets(time))
     except RuntimeError:  # interpolants do not take SX symbols
@@ -305,8 +286,7 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll of the rig at given times that minimises the integral of a cost and of the weighted squared roll
-    rate.
+    """Return the roll of the rig over time with the least integral of a cost and of the weighted squared roll rate.
 
     The roll is found by dynamic programming. Shape (samples,), rad.
 

@@ -421,9 +421,7 @@ def _first_within_limits(
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Solve a problem on a mesh, and then with nodes at the switches of the plan; yield a label and the plan or error
-    of each.
-    """
+    """Solve on a mesh, then with nodes at the switches of the plan; yield a label and the plan or error of each."""
     warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)
@@ -439,9 +437,7 @@ def _attempts(
 def _tighten_limits(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
-    """Tighten limits until a plan satisfies the original limits between mesh nodes, too; return this plan, or the
-    error.
-    """
+    """Tighten limits until a plan satisfies the original ones between mesh nodes; return this plan, or the error."""
     if largest_excess(problem, plan) <= MESH_SETTINGS.excess:
         return plan
     own, largest = (

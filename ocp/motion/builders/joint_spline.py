@@ -104,8 +104,7 @@ class PlannedJoints:
         return _Along(*(self.curves(places, order) for order in range(4)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Return the coefficients of the joint torques at distances (M,) along the path, m, see `_Torques`. Shape (M,
-        n) each.
+        """Return the coefficients `_Torques` of the joint torques at distances (M,), m. Shape (M, n) each.
 
         Raises:
             ProblemError: The base of the machine moves, or distances are invalid, see `at`.
@@ -118,10 +117,7 @@ class PlannedJoints:
 
     def _check_distance(self, distance: Any) -> Array:
         """Clip distances to the path; raise ProblemError if a distance is off the path by more than rounding errors."""
-        try:
-            s = np.atleast_1d(floats(distance))
-        except NOT_NUMBERS as error:
-            raise ProblemError(f"distance {distance!r} is not numeric", name="distance", value=distance) from error
+        s = np.atleast_1d(require.array("distance", distance, entries="any"))
         slack = 1e-9 * self.length
         wrong = s[~((s >= -slack) & (s <= self.length + slack))]
         if s.ndim != 1 or wrong.size:
@@ -234,9 +230,7 @@ def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> 
 
 
 def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, Array]:
-    """Return path distances (M,) and joint positions (M, n), from a solution at evenly spaced times or given and
-    checked.
-    """
+    """Return path distances (M,) and joint positions (M, n) of a solution or of given samples, after checking them."""
     if isinstance(plan, tuple):
         try:
             s, joints = (floats(part) for part in plan)

@@ -79,9 +79,7 @@ class TimingProblem:
 
     @property
     def method(self) -> Collocation:
-        """Collocation method with constant jerk in each interval, so that the jerk does not overshoot between the
-        points.
-        """
+        """Collocation method with constant jerk in each interval, which does not overshoot between the points."""
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:

@@ -257,9 +257,7 @@ class _Motion:
         return stretch.duration / self.horizon
 
     def declare_states(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare joint positions and, if the base moves, the base configuration in one stretch as states; return base
-        and joints.
-        """
+        """Declare joint positions and, if the base moves, its configuration in one stretch; return base and joints."""
         machine, begins, ends = self.machine, stretch is self.stretches[0], stretch is self.stretches[-1]
         place: Any = np.zeros(0)
         if machine.base_size:
@@ -273,9 +271,7 @@ class _Motion:
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
 
     def declare_velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
-        """Declare the joint velocities in one stretch; return the symbols of velocities and accelerations, and the
-        running cost.
-        """
+        """Declare the joint velocities in one stretch; return velocities, accelerations and running cost."""
         assert self.setup.actuation is not None
         begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.setup.actuation.rests))
         cost = self.setup.actuation.cost or Cost(weights=self.setup.weights)
@@ -285,9 +281,7 @@ class _Motion:
         return declare_actuators(self.problem, self.machine, self.horizon, (place, joints), **options)
 
     def declare_task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare velocity errors of relaxed tasks as controls; return errors and their cost, both 0 if no task is
-        relaxed.
-        """
+        """Declare velocity errors of relaxed tasks as controls; return errors and cost, both 0 without such tasks."""
         assert stretch.equations is not None
         if not self.setup.relaxed or not stretch.equations.size:
             return 0, 0
@@ -305,8 +299,7 @@ class _Motion:
 
 
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
-    """Declare states, controls and constraints in one time interval of fixed duration in which the active tasks do not
-    change.
+    """Declare states, controls and constraints in one time interval of fixed duration with the same active tasks.
 
     Return the states that continue in the next stretch, the running cost, and the Jacobian of the coordinates that this
     stretch fixes at its end (see `_pose_jacobian`); `known` is that of the stretch before, or None.

@@ -141,8 +141,7 @@ def declare_actuators(
     pace: Any,
     suffix: str = "",
 ) -> tuple[Any, Any, Any]:
-    """Declare joint velocities and accelerations within actuator limits; return their symbols and the running cost per
-    second.
+    """Declare joint velocities and accelerations within actuator limits; return both and the running cost per second.
 
     The states are "velocities", and "accelerations" if the controls are "jerks". The path constraints are "torques" and
     "power" where these are limited or weighted.

@@ -27,7 +27,7 @@ from ocp.motion.local.rates import least_rates
 from ocp.motion.tasks.checks import check_length, checked_tasks
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Start
-from ocp.motion.tasks.limits import checked_point, is_finite
+from ocp.motion.tasks.limits import checked_point
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
 
@@ -54,9 +54,7 @@ class Layer:
     def __post_init__(self) -> None:
         require.choice("layer: index", self.index, ("joint_limits", "manipulability"))
         require.choice("layer: form", self.form, ("assigned", "gradient"))
-        if not is_finite(self.demand):
-            words = f"layer {self.index!r}: demand must be a number, not {self.demand!r}"
-            raise ProblemError(words, name="demand", value=self.demand)
+        require.number("layer: demand", self.demand)
 
 
 @dataclass(frozen=True)
@@ -77,10 +75,7 @@ class Stabiliser:
     gradient: float = 0.0
 
     def __post_init__(self) -> None:
-        poles = self.poles if isinstance(self.poles, Sequence | np.ndarray) else ()
-        if len(poles[:4]) != 3 or not all(is_finite(pole) and pole > 0 for pole in poles):
-            words = f"stabiliser: poles must be three positive numbers, not {self.poles!r}"
-            raise ProblemError(words, name="poles", value=self.poles, limit=0.0)
+        require.array("stabiliser: poles", self.poles, (3,), sign="positive")
         for gain in ("damping", "gradient"):
             require.nonnegative(f"stabiliser: {gain}", getattr(self, gain))
 
@@ -389,9 +384,7 @@ class _Recorder:
         self._records: list[dict[str, Array]] = []
 
     def add(self, times: Array, states: Array) -> Stop | None:
-        """Record samples of the motion up to the first one that fails; return the reason of its failure, or None if
-        none fails.
-        """
+        """Record samples of the motion up to the first one that fails; return why it fails, None if none fails."""
         n = states.shape[1] // 2
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))

@@ -43,9 +43,7 @@ ARM = ArmSettings()
 
 
 def sample_shares(first: int, count: int, dimension: int) -> Array:
-    """Return `count` points of a low-discrepancy sequence in [0, 1)^dimension, from index `first` on. Shape (count,
-    dimension).
-    """
+    """Return `count` points of a low-discrepancy sequence in [0, 1)^dimension, from index `first` on."""
     return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
 
 

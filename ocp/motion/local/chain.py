@@ -94,9 +94,7 @@ class SymbolicAxis(NamedTuple):
         return self._replace(direction=ca.mtimes(motion.rotation, self.direction), point=motion.point(self.point))
 
     def frame(self, position: Any) -> Frame:
-        """Return the rigid motion that a joint position causes: a rotation about the axis or, if prismatic, a shift
-        along it.
-        """
+        """Return the rigid motion that a joint position causes: a rotation about the axis or, if prismatic, a shift."""
         if not self.revolute:
             return Frame(ca.DM.eye(3), self.direction * position)
         turn = rotation(self.direction, position)
@@ -184,9 +182,7 @@ class Chain:
         return cls(axes, points, revolute, position, np.array(ca.DM(pose.rotation)), order, size)
 
     def extend(self, axes: Array, points: Array) -> Chain:
-        """Return a copy of the chain with k more revolute joints before the tip, given by axes and points on them (k,
-        3).
-        """
+        """Return the chain with k further revolute joints before the tip, given by axes and points on them (k, 3)."""
         n, count = len(self.axes), len(axes)
         return replace(
             self,
@@ -203,9 +199,7 @@ class Chain:
 
     @cached_property
     def _tip_function(self) -> Sampler:
-        """Function of joint positions and a goal pose that returns the pose error, the Jacobian and the pose of the
-        tip; it takes and returns rotation matrices row by row.
-        """
+        """Function of joint positions and a goal pose that returns pose error, Jacobian and pose of the tip."""
         joints, turn, shift = ca.SX.sym("q", len(self.axes)), ca.SX.sym("turn", 9), ca.SX.sym("shift", 3)
         frame, moved = Frame(ca.DM.eye(3), ca.DM(3, 1)), list[SymbolicAxis]()
         for j in self.order:
@@ -312,9 +306,7 @@ class Chain:
 
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the index pairs of IK solutions of the same pose; `pose` is the increasing pose index of each solution.
-    Shapes (P,).
-    """
+    """Return the index pairs of IK solutions with equal entries in `pose`, the increasing pose index. Shapes (P,)."""
     if not len(pose) or pose[0] == pose[-1]:
         return _pairs(len(pose))
     first = np.arange(len(pose))[:, None]

@@ -280,9 +280,7 @@ def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
 
 
 def is_scara(chain: Chain) -> bool:
-    """Return whether a chain has the four joints of a SCARA: three parallel revolute ones and a prismatic one along
-    them.
-    """
+    """Return whether a chain is a SCARA: three parallel revolute joints and a prismatic one along them."""
     return len(chain.order) == SCARA and bool(_scara_forms(chain))
 
 
@@ -323,8 +321,7 @@ def _meeting_point(chain: Chain, triple: tuple[int, ...]) -> tuple[Array, float]
 
 @cache
 def _pair_solver() -> Any:
-    """Return the CasADi function that solves two equations a [cos, sin](first) + b [cos, sin](second) = c for two
-    angles.
+    """Return the CasADi function that solves a [cos, sin](first) + b [cos, sin](second) = c for two angles.
 
     The singular value decomposition b = L diag(s) R, in closed form, separates the angles: with a' = L' a and c' = L' c
     the remainders w = c' - a' [cos, sin](first) satisfy (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1, a trigonometric polynomial

@@ -250,9 +250,7 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
 
 
 def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
-    """Return a kinematic loop opened at a joint: the joints before that joint, transformed by the inverse goal motion,
-    come last.
-    """
+    """Return a kinematic loop opened at a joint; the joints before it, transformed by the inverse goal, come last."""
     back = goal.inverse
     joints = [axes[(first + i) % SIX] for i in range(SIX)]
     return _Loop([axis.moved(back) if i >= SIX - first else axis for i, axis in enumerate(joints)], goal, size)
@@ -359,9 +357,7 @@ def _inverses(matrices: Array) -> Array:
 
 
 def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpening) -> _Candidates:
-    """Return candidate IK solutions of a kinematic loop opened at a joint, from the real eigenvalues of the resulting
-    problem.
-    """
+    """Return candidate IK solutions of a kinematic loop opened at a joint, from real eigenvalues of its problem."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)
     matrices = _matrices(singular_vectors[:, :, opening.rank :], remaining, opening.roles)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FixedBase, Machine, ModelError
-from models.checks import Array, ArrayInput, real
+from models import FixedBase, Machine
+from models.checks import Array, ArrayInput
 from models.machines.machine import with_tip
 from models.spatial import least_rotation, rotation_matrices
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, problem_errors, require
 from ocp.motion.local.arm_solver import ARM, ArmSolver, arm_solver, sample_shares
 from ocp.motion.local.chain import TURN, Chain
 from ocp.motion.local.closed_forms import SIX, PoseSolver, is_scara
@@ -136,11 +136,9 @@ class IkSolver:
             require.positive("within", within, below=np.pi)
         require.flag("limits", limits)
         require.count("samples", samples, 1)
-        try:
+        with problem_errors():
             tip = machine if link is None else with_tip(machine, link, require.array("IkSolver: point", point, (3,)))
-            axis = require.array("IkSolver: tool_axis", tool_axis, (3,))
-        except ModelError as error:
-            raise ProblemError(str(error), **vars(error)) from error
+        axis = require.array("IkSolver: tool_axis", tool_axis, (3,))
         if not np.linalg.norm(axis) > 0:
             raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
         prepared = PreparedArm.of(tip, *joint_range(machine, limits), free=free, tool_axis=axis, within=float(within))
@@ -286,9 +284,7 @@ class PreparedArm:
 
 
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
-    """Return tip positions (N, 3) and rotation matrices (N, 3, 3) given by a user; raise ProblemError if they are
-    invalid.
-    """
+    """Return a user's tip positions (N, 3) and rotations (N, 3, 3); raise ProblemError if they are invalid."""
     places, turns = np.asarray(positions, dtype=float), np.asarray(rotations, dtype=float)
     single = places.ndim == 1
     places, turns = (places[None], turns[None]) if single else (places, turns)
@@ -409,8 +405,7 @@ def ik_configurations(
     """
     require.count("samples", samples, 1)
     require.flag("limits", limits)
-    if not np.isfinite(real(time)):
-        raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
+    require.number("time", time, unit="s")
     equations = bind(machine, task)
     branches = ik_branches(equations, *joint_range(machine, limits))
     if branches is None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene, Machine
-from models.checks import NOT_NUMBERS, Array, floats, real
+from models.checks import Array
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import Collision, checked_collision_scene, slide_apart, worst_collisions
@@ -173,8 +173,7 @@ def inverse_kinematics(
     require.count("seed", seed, 0, LARGEST_SEED)
     if scene is not None:
         checked_collision_scene(scene, machine, options.limits)
-    if not np.isfinite(real(time)):
-        raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
+    require.number("time", time, unit="s")
     size = machine.joint_size
     base_values = checked_configuration(machine, np.zeros(size), options.base)[1]
     lower, upper = joint_range(machine, options.limits)
@@ -311,11 +310,8 @@ def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, *, n
     span = np.where(prismatic, IK_SETTINGS.slide_spread, np.pi)
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
     high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
-    try:
-        first = np.zeros((0, size)) if near is None else np.atleast_2d(floats(near))
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"near {near!r} is not numeric", name="near", value=near, limit=(size,)) from error
-    if first.ndim != 2 or first.shape[1] != size or not np.isfinite(first).all():
+    first = np.zeros((0, size)) if near is None else np.atleast_2d(require.array("near", near))
+    if first.ndim != 2 or first.shape[1] != size:
         words = f"near has shape {first.shape}, ({size},) or (k, {size}) of finite numbers expected"
         raise ProblemError(words, name="near", value=first, limit=(size,))
     starts = np.vstack([first, low + (high - low) * rng.random((count, size))])
@@ -412,9 +408,7 @@ def _closest_collisions(
 def _collision_free(
     solutions: list[IkSolution], collisions: list[Collision | None], scene: CollisionScene, time: float
 ) -> list[IkSolution]:
-    """Return the collision-free IK solutions; raise Unreachable, naming the pair of bodies closest to the clearance, if
-    there are none.
-    """
+    """Return the collision-free IK solutions; raise Unreachable, naming a pair of bodies, if there are none."""
     free = [solution for solution, collision in zip(solutions, collisions, strict=True) if collision is None]
     if free:
         return free

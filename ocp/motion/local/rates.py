@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 
 from models import CollisionScene, Machine
-from models.checks import NOT_NUMBERS, Array, floats, real
+from models.checks import Array, real
 from models.files import INPUT_LIMITS
 from models.spatial import solve_spd
 from ocp.console import interruptible
@@ -193,11 +193,8 @@ def _sample_times(samples: Any, horizon: float) -> Array:
             words = f"samples must be at least 2 points or an array of times, not {samples!r}"
             raise ProblemError(words, name="samples", value=samples, limit=2)
         return np.linspace(0.0, horizon, int(count))
-    try:
-        times = floats(samples)
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"samples {samples!r} are not times", name="samples", value=samples) from error
-    if times.ndim != 1 or len(times) < 2 or times[0] != 0 or not np.isclose(times[-1], horizon, rtol=1e-12):
+    times = require.array("samples", samples, ("times",), least=2)
+    if times[0] != 0 or not np.isclose(times[-1], horizon, rtol=1e-12):
         words = f"samples must be times from 0 to the horizon {horizon:g} s"
         raise ProblemError(words, name="samples", value=times, limit=(0.0, horizon))
     if not (np.diff(times) > 0).all():
@@ -405,9 +402,7 @@ def track_tasks(
     bases, configurations, errors = [base_now], [joints_now], list[Array]()
 
     def linearise(k: int) -> tuple[Array, Array, Array, Array]:
-        """Return Jacobians (K, m, n), task velocities (K, m), pose errors (K, m) and largest residuals (K,) at time
-        sample k.
-        """
+        """Return Jacobians (K, m, n), task velocities and pose errors (K, m), and residuals (K,) at time sample k."""
         jacobian, right, error, residual, *leaning = task(base_now, joints_now, targets[:, k])
         matrix = jacobian.reshape(count, machine.joint_size, equations.size).transpose(0, 2, 1)
         errors_along = np.abs(residual).max(axis=1, initial=0.0)

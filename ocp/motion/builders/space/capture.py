@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, center_of_mass, find_wheels
-from models.checks import NOT_NUMBERS, Array, floats, real
+from models.checks import Array
 from models.spatial import Expression
 from ocp.console import interruptible
 from ocp.direct.discretisation import Collocation
@@ -81,17 +81,11 @@ class Cone:
     depth: float = 0.01
 
     def __post_init__(self) -> None:
-        try:
-            direction = floats(self.direction).ravel()
-        except NOT_NUMBERS:
-            direction = np.zeros(0)
-        if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction) > 0:
-            words = f"cone: direction must be three numbers, not all zero, not {self.direction!r}"
-            raise ProblemError(words, name="direction", value=self.direction)
+        direction = require.array("cone: direction", self.direction, (3,))
+        if not direction.any():
+            raise ProblemError("cone: direction must not be zero", name="direction", value=self.direction)
         object.__setattr__(self, "direction", direction / np.linalg.norm(direction))
-        if not require.positive("cone: half_angle", self.half_angle) < np.pi / 2:
-            words = f"cone: half_angle must be below pi/2, not {self.half_angle}"
-            raise ProblemError(words, name="half_angle", value=self.half_angle, limit=np.pi / 2)
+        require.positive("cone: half_angle", self.half_angle, below=np.pi / 2)
         require.positive("cone: length", self.length)
         require.positive("cone: depth", self.depth)
 
@@ -124,8 +118,7 @@ class Grasp:
 
     def __post_init__(self) -> None:
         for name, limit in vars(self).items():
-            if not real(limit) > 0:
-                raise ProblemError(f"grasp: {name} must be positive, not {limit!r}", name=name, value=limit, limit=0.0)
+            require.array(f"grasp: {name}", limit, (), entries="numbers", sign="positive")
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,9 +337,7 @@ class _Capture:
 
     @property
     def arm_weights(self) -> Array:
-        """Factors of the joint positions at the start of the detumbling: 0 for wheels, which restart at angle 0, else
-        1. Shape (n,).
-        """
+        """Factors of joint positions at the start of the detumbling: 0 for wheels, which restart at 0, else 1."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 

@@ -133,9 +133,7 @@ GUESS = GuessSettings()
 
 
 def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
-    """Return the configurations (M, base_size) of a freely floating body at evenly spaced times (M,), s, by a Runge-
-    Kutta method of order 4.
-    """
+    """Return the configurations (M, base_size) of a freely floating body at evenly spaced times (M,), s."""
     b, step, none = ca.SX.sym("b", target.base_size), times[1] - times[0], ca.DM(0, 1)
     rate = ca.Function("rate", [b], [target.base_rate(b, none, none)])
     after = ca.Function("after", [b], [rk4_step(lambda _, x: rate(x), b, step)])
@@ -144,8 +142,7 @@ def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
 
 
 def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:
-    """Set the initial guess of the approach of a capture; if its duration is free, try several until the tip gets to
-    the grasp.
+    """Set the initial guess of an approach; if its duration is free, try several until the tip gets to the grasp.
 
     Args:
         start: State of the capture; free velocities are guessed as zero.
@@ -192,9 +189,7 @@ class _TipTracker:
         self.fastest = constant(states["velocities"].upper)
 
     def follow(self, times: Array, path: tuple[Array, Array], joints: Array, base: Array) -> tuple[float, Guesses]:
-        """Track a tip path with the arm at constant wheel speeds; return the final pose error, m and rad, and the
-        motion as an initial guess.
-        """
+        """Track a tip path at constant wheel speeds; return the final pose error, m and rad, and the guess."""
         places, turns = path
         step = times[1]
         speed = self.rates.copy()
@@ -220,9 +215,7 @@ class _TipTracker:
 
 
 def _pose_gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
-    """Return rotation vector and displacement from an actual to a desired tip pose, rad and m, in world axes. Shape
-    (6,).
-    """
+    """Return rotation vector and displacement, rad and m, from an actual to a desired tip pose in world. Shape (6,)."""
     return np.concatenate(
         [scipy.spatial.transform.Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()]
     )
@@ -450,9 +443,7 @@ def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
 
 
 def _longest_distance(robot: Robot, link: str, point: object) -> float:
-    """Return an upper bound of the distance of a link's point from the robot's root, m; inf with unlimited prismatic
-    joints.
-    """
+    """Return an upper bound of the distance of a link's point from the root, m; inf with unlimited prismatic joints."""
     length = float(np.linalg.norm(np.asarray(point, dtype=float)))
     for joint in robot.path_to(link):
         slides = max(abs(joint.lower), abs(joint.upper)) if joint.kind == "prismatic" else 0.0

@@ -213,14 +213,12 @@ class Attempt:
         solution: Plan, or last iterate; None if there is neither.
         failure: Reason why the solution is no plan; None if it is one.
         exceeded: Whether its only failures are inequalities exceeded between the points of the grid.
-        collision: Error that bodies collide, if that is its only failure.
     """
 
     name: str
     solution: Solution | None
     failure: SolveError | None = None
     exceeded: bool = False
-    collision: SolveError | None = None
 
 
 @interruptible
@@ -345,8 +343,6 @@ def _first_accepted(
         for attempt in _attempts(problem, level, mesh, settings, judge, guess, diagnosed=diagnosed):
             if attempt.failure is None and attempt.solution is not None:
                 return attempt.solution
-            if attempt.collision:
-                raise attempt.collision
             last = attempt.solution or last
             reasons.append(f"{attempt.name}: {attempt.failure}")
             failure = attempt.failure or failure
@@ -377,8 +373,7 @@ def _attempts(
     *,
     diagnosed: bool,
 ) -> Iterator[Attempt]:
-    """Solve one formulation from a guess on finer and finer meshes and yield each attempt; the caller stops at an
-    accepted one.
+    """Solve one formulation on finer and finer meshes and yield each attempt; the caller stops at an accepted one.
 
     With `diagnosed`, a first solve that fails searches for conflicting constraints, which takes long.
     """
@@ -421,8 +416,10 @@ class _Judge:
             return Attempt(name, solution, ended)
         audit = solution.audit(tolerances=self.tolerances)
         if not audit.passed and audit.failures:  # a plan of undetermined optimality is accepted
+            if collision := collision_error(audit, solution):
+                raise collision
             exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
-            return Attempt(name, solution, audit_error(audit, solution), exceeded, collision_error(audit, solution))
+            return Attempt(name, solution, audit_error(audit, solution), exceeded)
         return Attempt(name, solution, self.pose_error(audit))
 
 

@@ -155,8 +155,7 @@ def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion
 def sample_stance(
     steps: Steps, stance: Stance, motion: tuple[Array, ...], foot_loads: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return, by name, the quantities of `StepsMotion` along a motion in one stance, such as torques, loads and
-    margins.
+    """Return, by name, the quantities of `StepsMotion` along a motion in one stance: torques, loads and margins.
 
     Shape (M, ...) each.
 

@@ -17,11 +17,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import Foot, Foothold, ModelError, Robot, Stance
+from models import Foot, Foothold, Robot, Stance
 from models.checks import Array
 from models.paths import rest_to_rest
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, problem_errors, require
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
@@ -129,10 +129,8 @@ class Steps:
                     raise ProblemError(words, name=name, value=k)
         object.__setattr__(self, "feet", feet)
         object.__setattr__(self, "phases", phases)
-        try:
+        with problem_errors():
             _ = self.stances
-        except ModelError as error:
-            raise ProblemError(str(error), **vars(error)) from error
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -363,9 +361,7 @@ def _raised_poses(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]
 
 
 def _interpolate(configurations: Array, seconds: float) -> dict[str, Any]:
-    """Return a smooth rest-to-rest motion through 2 or 3 configurations (k, n) as a guess of joint states and
-    accelerations.
-    """
+    """Return a smooth rest-to-rest motion through 2 or 3 configurations (k, n) as a guess of joint variables."""
     share = np.linspace(0.0, 1.0, CONFIGURATIONS.steps + 1)
     first, last = configurations[0], configurations[-1]
     values = first + (last - first) * rest_to_rest(share)[:, None]

@@ -149,8 +149,7 @@ def check_loads(
 
 
 def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) -> tuple[Array, Array]:
-    """Return matrix and right side of the linear equations that tasks impose on the joint accelerations at a start from
-    rest.
+    """Return matrix and right side of the linear equations that tasks impose on joint accelerations at rest.
 
     Along a parameter the acceleration in the path's direction is free, and only the equations across it remain.
     """
@@ -173,9 +172,7 @@ def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) 
 
 
 def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
-    """Return the half-planes, as inward normals and offsets, in which a rule requires the zero moment point of a
-    standing machine to be.
-    """
+    """Return the half-planes, as inward normals and offsets, in which the zero moment point is required to be."""
     edges = list(zip(*foot_edges(machine, zmp), strict=True))
     unit = np.eye(2)
     if isinstance(zmp, IndexAtLeast):

@@ -23,13 +23,12 @@ import casadi as ca
 import numpy as np
 
 from models.checks import Array
-from models.errors import ModelError
 from models.machines.stance import Stance
 from models.paths import rest_to_rest
 from models.robot.kinematics import joint_limit_index
 from ocp.console import interruptible
-from ocp.errors import ProblemError, require
-from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
+from ocp.errors import ProblemError, problem_errors, require
+from ocp.motion.builders.standing.problem import FreeTime, declare_horizon, declare_joints
 from ocp.motion.builders.standing.stances import (
     PLACEMENT_TOLERANCE,
     Steps,
@@ -40,7 +39,7 @@ from ocp.motion.builders.standing.stances import (
 )
 from ocp.motion.builders.standing.start import start_inside
 from ocp.motion.tasks.checks import rates_at_rest
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem, remembers_request
 
@@ -126,10 +125,8 @@ def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, 
     guesses = first_guess(steps, begin, GUESSED_LIFT * steps.clearance)
     problems = {}
     for k, name in enumerate(steps.names):
-        try:
+        with problem_errors(f"phase {name!r}: "):
             problems[name] = _declare_phase(steps, k, own if k == 0 else None, guesses[k], weights, limits)
-        except ModelError as error:
-            raise ProblemError(f"phase {name!r}: {error}", **vars(error)) from error
     whole = Phases("steps", problems)
     for k, (before, after) in enumerate(zip(steps.names[:-1], steps.names[1:], strict=True)):
         old, new = steps.order(steps.stances[k]), steps.order(steps.stances[k + 1])
@@ -152,20 +149,8 @@ def _declare_phase(
     stationary: Any = None
     if last:
         stationary = np.zeros(n) if equations is None else rates_at_rest(equations, (), guess["joints"].values[-1])
-    joints = problem.state(
-        "joints", n, initial=start, lower=bounds["lower"], upper=bounds["upper"], guess=guess["joints"],
-        unit=robot.unit(),
-    )  # fmt: skip
-    rates = problem.state(
-        "velocities", n, initial=None if start is None else 0.0, terminal=stationary, lower=-bounds["velocity"],
-        upper=bounds["velocity"], guess=guess["velocities"], unit=robot.unit("/s"),
-    )  # fmt: skip
-    largest = bounds["acceleration"]
-    second = problem.control(
-        "accelerations", n, lower=-largest, upper=largest, guess=guess["accelerations"], unit=robot.unit("/s^2")
-    )
-    problem.dynamics(joints, rates)
-    problem.dynamics(rates, second)
+    starts, ends = (start, None if start is None else 0.0), (None, stationary)
+    joints, rates, second, _ = declare_joints(problem, robot, bounds, guess, starts=starts, ends=ends)
     if equations is not None:
         gap = equations.acceleration(none, joints, rates, second, progress=(problem.time,))
         problem.path("feet", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
@@ -185,7 +170,7 @@ def _declare_phase(
     for name, load in loads.items():
         _limit_load(problem, stance, name, load, steps.margin, limits)
     torques = stance.joint_torques(joints, rates, second, foot_loads)
-    effort = bounds["torque"]
+    effort = bounds.torque
     limited = np.flatnonzero(np.isfinite(effort)).tolist()
     if limited:
         problem.path("torques", torques[limited], lower=-effort[limited], upper=effort[limited], unit=robot.effort_unit)
@@ -199,7 +184,7 @@ def _declare_phase(
     return problem
 
 
-def _stance_bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
+def _stance_bounds(steps: Steps, stance: Stance, limits: Limits) -> JointBounds:
     """Return the limits of joints and actuators by name, reordered from the robot's joint order to that of a stance."""
     order = steps.order(stance)
     bounds = limits.bounds(stance, ("velocity", "torque"))._asdict()
@@ -207,13 +192,11 @@ def _stance_bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Ar
         explicit = getattr(limits, name, None) if name not in ("lower", "upper") else None
         if explicit is not None and np.size(explicit) != 1:
             bounds[name] = np.asarray(explicit, dtype=float).ravel()[order]
-    return bounds
+    return JointBounds(**bounds)
 
 
 def _declare_load(problem: Problem, stance: Stance, name: str) -> Any:
-    """Declare the load on a foot other than the first as a control, and return the whole load on this foot. Shape (6,
-    1).
-    """
+    """Declare the load on a foot other than the first as a control, and return the load. Shape (6, 1)."""
     rows = stance.load_rows[name]
     share = stance.weight / len(stance.footholds)
     guess = [share * (row == 5) for row in rows]
@@ -263,9 +246,7 @@ def _constrain_swing(
 
 
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the indices of distinct components of a constraint of joint positions; in planar machines, corners of
-    soles coincide.
-    """
+    """Return the indices of constraints of joints that differ; in planar machines, corners of soles coincide."""
     rng = np.random.default_rng(0)
     others = [
         symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in ca.vertsplit(joints))
@@ -278,9 +259,7 @@ def _distinct_rows(rows: Any, joints: Any) -> list[int]:
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return the distances of the center of mass from the edges of the support that the joints can change. Shape (k,
-    1), m.
-    """
+    """Return the distances, m, of the center of mass from support edges, if the joints change them. Shape (k, 1)."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))

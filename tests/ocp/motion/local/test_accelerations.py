@@ -443,9 +443,9 @@ def test_requests_that_cannot_be_right_are_refused(changes: dict[str, Any], mess
     [
         (lambda: Layer("reach", 1.0), "index must be .* not 'reach'"),  # type: ignore[arg-type]
         (lambda: Layer("joint_limits", 1.0, "soft"), "form must be .* not 'soft'"),  # type: ignore[arg-type]
-        (lambda: Layer("joint_limits", np.nan), "demand must be a number"),
-        (lambda: Stabiliser((4.0, 4.0, -1.0)), "three positive numbers"),
-        (lambda: Stabiliser("fast"), "three positive numbers"),  # type: ignore[arg-type]
+        (lambda: Layer("joint_limits", np.nan), "demand must be a finite number"),
+        (lambda: Stabiliser((4.0, 4.0, -1.0)), "poles .* is not positive"),
+        (lambda: Stabiliser("fast"), "poles .* is not numeric"),  # type: ignore[arg-type]
         (lambda: AccelerationOptions(speed_limit=-1.0), "speed_limit must be positive"),
         (lambda: AccelerationOptions(null_damping=-1.0), "null_damping must be"),
         (lambda: AccelerationOptions(layers=("limits",)), "layers must be a list of Layer"),  # type: ignore[arg-type]
