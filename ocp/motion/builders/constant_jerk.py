@@ -240,7 +240,7 @@ class TorqueLimits:
         self._samplers: dict[bool, Sampler] = {}
 
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> Array:
-        """Return the torques, N m or N, of the L joints in `limited` at M samples of a motion. Shape (M, L)."""
+        """Return the torques, N m or N, of the L joints with limited torque or power at M samples. Shape (M, L)."""
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
     def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:

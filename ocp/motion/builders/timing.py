@@ -101,7 +101,7 @@ class TimingProblem:
         pace = (self.reference.at(begin + horizon * inside).speed / speed).reshape(-1, len(points))
         durations = horizon * np.diff(breaks) * (pace @ weights) / 2
         s = self.reference.at(begin + horizon * breaks).distance
-        first, last = self.ends
+        first, last = _ends(self.reference, self.span)
         ramps = 3 * first / v[0], 3 * last / v[-1]
         return SpeedProfile(
             np.concatenate([[0.0], np.cumsum([ramps[0], *durations, ramps[1]])]),
@@ -110,11 +110,6 @@ class TimingProblem:
             np.concatenate([[0.0], a, [0.0]]),
             np.concatenate([[a[0] * v[0] / (3 * first)], jerk, [-a[-1] * v[-1] / (3 * last)]]),
         )
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """Lengths of the parts of the path, m, in which the motion starts and stops with constant jerk."""
-        return _ends(self.reference, self.span)
 
 
 @dataclass(frozen=True, eq=False)

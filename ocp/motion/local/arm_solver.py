@@ -9,9 +9,8 @@ if there are still fewer than six, which must stay at zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,34 +103,26 @@ class ArmSolver:
 
     def _within_limits(self, solutions: Solutions, turns: bool) -> Solutions:
         """Return the IK solutions within the limits and, with `turns`, all whole-turn shifts that keep the limits."""
-        windows, order = self._windows, list(self.chain.order)
-        start, shiftable = windows.low if turns else windows.middle, windows.shiftable
+        below, above, order = np.isfinite(self.lower), np.isfinite(self.upper), list(self.chain.order)
+        both, lower, upper = below & above & self.chain.revolute, self.lower - ARM.excess, self.upper + ARM.excess
+        start = np.where(
+            below, lower, upper - TURN
+        )  # lower end of the interval of one turn into which angles are shifted
+        if not turns:
+            start[both] = (self.lower[both] + self.upper[both]) / 2 - np.pi
+        shiftable = np.flatnonzero((below | above) & self.chain.revolute)
         joints = solutions.joints.copy()
-        joints[:, shiftable] += TURN * np.ceil((start - joints[:, shiftable]) / TURN)
-        good = ((joints >= windows.lower) & (joints <= windows.upper))[:, order].all(axis=1)
-        rows, joints, several = np.flatnonzero(good), joints[good], windows.several
+        joints[:, shiftable] += TURN * np.ceil((start[shiftable] - joints[:, shiftable]) / TURN)
+        good = ((joints >= lower) & (joints <= upper))[:, order].all(axis=1)
+        rows, joints, several = np.flatnonzero(good), joints[good], np.flatnonzero(both & (upper - lower >= TURN))
         if turns and several.size:
-            counts = 1 + ((windows.upper[several] - joints[:, several]) // TURN).astype(int)
+            counts = 1 + ((upper[several] - joints[:, several]) // TURN).astype(int)
             shifts = list(map(_whole_turns, map(tuple, counts.tolist())))
             copies = np.repeat(np.arange(len(rows)), [len(each) for each in shifts])
             rows, joints = rows[copies], joints[copies]
             joints[:, several] += np.concatenate(shifts) if shifts else 0.0
-        np.clip(joints, windows.lowest, windows.highest, out=joints)
+        joints[:, order] = np.clip(joints[:, order], self.lower[order], self.upper[order])
         return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
-
-    @cached_property
-    def _windows(self) -> _Windows:
-        """Intervals of one full turn within the joint ranges, into which the angles of IK solutions are shifted."""
-        below, above, revolute = np.isfinite(self.lower), np.isfinite(self.upper), self.chain.revolute
-        both, lower, upper = below & above & revolute, self.lower - ARM.excess, self.upper + ARM.excess
-        low = np.where(below, lower, upper - TURN)
-        middle = low.copy()
-        middle[both] = (self.lower[both] + self.upper[both]) / 2 - np.pi
-        shiftable = np.flatnonzero((below | above) & revolute)
-        moving = np.isin(np.arange(len(lower)), self.chain.order)
-        several = np.flatnonzero(both & (upper - lower >= TURN))
-        lowest, highest = np.where(moving, self.lower, -np.inf), np.where(moving, self.upper, np.inf)
-        return _Windows(lower, upper, lowest, highest, low[shiftable], middle[shiftable], shiftable, several)
 
 
 @lru_cache(maxsize=256)
@@ -140,27 +131,6 @@ def _whole_turns(counts: tuple[int, ...]) -> Array:
     (combinations, joints).
     """
     return np.asarray(TURN * np.indices(counts).reshape(len(counts), -1).T)
-
-
-class _Windows(NamedTuple):
-    """Intervals of one full turn of revolute joints, into which angles are shifted to be within the position limits.
-
-    Attributes:
-        lower, upper: Limits, beyond which lies only rounding. Shape (n,).
-        lowest, highest: Limits of the joints that move the tip. Shape (n,).
-        low, middle: Lower ends of the lowest windows, and of those in the middle of the limits. Shape (s,).
-        shiftable: Indices of the joints that have a limit. Shape (s,).
-        several: Indices of the joints that can make a whole turn within the limits.
-    """
-
-    lower: Array
-    upper: Array
-    lowest: Array
-    highest: Array
-    low: Array
-    middle: Array
-    shiftable: NDArray[np.intp]
-    several: NDArray[np.intp]
 
 
 def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = None) -> ArmSolver | None:

@@ -216,7 +216,7 @@ class Chain:
         error = ca.mtimes(ca.reshape(turn, 3, 3).T, tip.rotation.T)
         axial = ca.if_else(ca.trace(error) < 1, 3.0, ca.inv_skew(error))
         errors = ca.vertcat(axial, (shift - tip.position) / self.size)
-        outputs = [errors, ca.horzcat(*columns), tip.position, tip.rotation.T]
+        outputs = [errors, ca.horzcat(*columns), tip.position, tip.rotation.T]  # rotations row by row
         return Sampler([joints, turn, shift], outputs)
 
     def poses(self, joints: Array) -> tuple[Array, Array]:
@@ -306,7 +306,7 @@ class Chain:
 
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the index pairs of IK solutions with equal entries in `pose`, the increasing pose index. Shapes (P,)."""
+    """Return the index pairs of IK solutions of one pose; `pose` is the increasing pose index of each. Shapes (P,)."""
     if not len(pose) or pose[0] == pose[-1]:
         return _pairs(len(pose))
     first = np.arange(len(pose))[:, None]

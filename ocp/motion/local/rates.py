@@ -222,11 +222,6 @@ class _Model:
         outputs = [machine.tip_pose(base, joints).position, jacobian, equations.error(base, joints, targets)]
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
-    def integrator(self, start: float, times: Array, tolerance: float) -> Any:
-        """Return the integrator of state and cost from the time `start` to the given times."""
-        problem = {"t": self.time, "x": self.state, "ode": self.ode, "quad": self.running}
-        return _cvodes(problem, start, times, tolerance)
-
     def one_interval(self, tolerance: float) -> Any:
         """Return an integrator over any one interval between samples; its parameters are start time and duration, s."""
         span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
@@ -245,7 +240,8 @@ def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: floa
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
     """Return states and costs at all sample times that an integration reaches, and the reason if it stops early."""
     try:
-        result = model.integrator(times[0], times[1:], tolerance)(x0=first)
+        problem = {"t": model.time, "x": model.state, "ode": model.ode, "quad": model.running}
+        result = _cvodes(problem, times[0], times[1:], tolerance)(x0=first)
         states = np.vstack([first, np.array(result["xf"]).T])
         costs = np.concatenate([[0.0], np.array(result["qf"]).ravel()])
         if np.isfinite(states).all() and np.isfinite(costs).all():

@@ -246,7 +246,7 @@ def _constrain_swing(
 
 
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the indices of constraints of joints that differ; in planar machines, corners of soles coincide."""
+    """Return the indices of the distinct rows of a constraint; in planar machines, corners of soles coincide."""
     rng = np.random.default_rng(0)
     others = [
         symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in ca.vertsplit(joints))
@@ -259,7 +259,7 @@ def _distinct_rows(rows: Any, joints: Any) -> list[int]:
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return the distances, m, of the center of mass from support edges, if the joints change them. Shape (k, 1)."""
+    """Return those distances, m, of the center of mass from support edges that the joints can change. Shape (k, 1)."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))
