@@ -38,7 +38,7 @@ from ocp.motion.plan.planner import PlanOptions
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.solved_plan import Part, PhasedPlan, SolvedPlan, parts_of_phases
 from ocp.motion.search.configurations import PlannerSettings
-from ocp.motion.tasks.checks import check_rest, clip_to_limits, horizon_of
+from ocp.motion.tasks.checks import are_at_rest, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import Limits
@@ -338,8 +338,8 @@ def plan_to_stand(
             raise ProblemError(words, name=f"task {number}", value=(task.begin, task.end), limit=(0.0, duration))
     equations = bind(machine, all_tasks)
     setup = StandingSetup(
-        start_velocity=_rest(equations, 0.0),
-        end_velocity=_rest(equations, duration),
+        start_velocity="rest" if are_at_rest(equations, 0.0) else "free",
+        end_velocity="rest" if are_at_rest(equations, duration) else "free",
         external=wrenches,
         clearance_constraints=constraints,
         symbols=ca.SX if _takes_scalars(equations) else ca.MX,
@@ -385,15 +385,6 @@ class _StandingSolver(Solver):
         assert best is not None
         parts = (Part(0.0, self.duration, ""),)
         return SolvedPlan(self.machine, best, parts, tuple(candidates)).with_targets(self.tasks)
-
-
-def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
-    """Return the condition on the joint velocities at a time: "rest" if the tips are at rest, else "free"."""
-    try:
-        check_rest(equations, time)
-    except ProblemError:
-        return "free"
-    return "rest"
 
 
 def _takes_scalars(equations: TaskEquations) -> bool:

@@ -22,7 +22,7 @@ from models.checks import Array
 from ocp.console import report
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.tool_motion import Stretch, stretches_of
+from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.local.rates import LocalMotion
@@ -51,7 +51,7 @@ from ocp.motion.search.held_joints import (
 )
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
-from ocp.motion.tasks.checks import check_rest, checked_tasks, clip_to_limits, horizon_of
+from ocp.motion.tasks.checks import are_at_rest, checked_tasks, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Start
 from ocp.motion.tasks.limits import Limits
@@ -427,21 +427,10 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
         actuator_limits=checked_limits if limits_actuators(checked_limits) else None,
     )
     smooth = limits_actuators(checked_limits) or weights_actuators(own_cost)
-    return replace(request, rests=_rests(request)) if smooth else request
-
-
-def _rests(request: PlanRequest) -> tuple[bool, bool]:
-    """Return whether the tips are at rest at the start and at the end of a motion along tasks."""
-
-    def rest(stretch: Stretch, time: float) -> bool:
-        try:
-            if stretch.equations is not None:
-                check_rest(stretch.equations, time)
-        except ProblemError:
-            return False
-        return True
-
-    return rest(request.stretches[0], 0.0), rest(request.stretches[-1], request.horizon)
+    if not smooth:
+        return request
+    rests = are_at_rest(stretches[0].equations, 0.0), are_at_rest(stretches[-1].equations, duration)
+    return replace(request, rests=rests)
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:

@@ -455,10 +455,9 @@ def _path_weights(weights: Any, size: int) -> Array:
     """Check the weights of the joints in the path length, and return the weight of each joint. Shape (size,)."""
     if weights is None:
         return np.ones(size)
-    array = require.array("weights", weights, (size,), meaning="one for each joint")
-    if not ((array >= 0).all() and array.any()):
-        words = f"weights {array.tolist()} must be non-negative and not all 0"
-        raise ProblemError(words, name="weights", value=array, limit=0.0)
+    array = require.array("weights", weights, (size,), sign="nonnegative", meaning="one for each joint")
+    if not array.any():
+        raise ProblemError("weights are all 0; one at least must be positive", name="weights", value=array, limit=0.0)
     return array
 
 

@@ -160,7 +160,7 @@ class TaskEquations:
     def residual(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
         """Return the residual J u - b of the task equation at joint rates u. Shape (size, 1)."""
         rows = []
-        for part, target in self._with_targets(targets):
+        for part, target in self.by_task(targets):
             twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
             if part.task.velocity is not None:
                 rows.append(task_rows(part, base, joints, twist) - target)
@@ -249,7 +249,7 @@ class TaskEquations:
     def error(self, base: Any, joints: Any, targets: Any) -> Any:
         """Return the pose errors (target minus pose) of all tasks, m and rad; 0 for velocity tasks. Shape (size, 1)."""
         rows = []
-        for part, target in self._with_targets(targets):
+        for part, target in self.by_task(targets):
             if part.task.velocity is not None:
                 rows.append(ca.DM(part.task.size, 1))
             else:
@@ -270,7 +270,7 @@ class TaskEquations:
         vector. Velocity tasks have no entries.
         """
         rows: list[Any] = [ca.DM(0, 1)]
-        for part, target in self._with_targets(targets):
+        for part, target in self.by_task(targets):
             task = part.task
             if not task.is_pose:
                 continue
@@ -300,7 +300,7 @@ class TaskEquations:
     def misses(self, base: Any, joints: Any, targets: Any) -> tuple[float, float]:
         """Return the largest position error, m, and orientation error, rad, of the tips at numeric arguments."""
         distance = angle = 0.0
-        for part, target in self._with_targets(ca.DM(targets)):
+        for part, target in self.by_task(ca.DM(targets)):
             task = part.task
             if not task.is_pose:
                 continue
@@ -319,7 +319,7 @@ class TaskEquations:
     def cone_cosines(self, base: Any, joints: Any, targets: Any) -> Any:
         """Return the cosine of the angle between tool axis and cone axis for each task with a cone. Shape (k, 1)."""
         rows: list[Any] = [ca.DM(0, 1)]
-        for part, target in self._with_targets(targets):
+        for part, target in self.by_task(targets):
             if part.task.within is not None:
                 rows.append(self._cosine(part, base, joints, target))
         return ca.densify(ca.vertcat(*rows))
@@ -352,8 +352,8 @@ class TaskEquations:
                 rows.append(pose_error_rows(bound, base, joints, targets))
         return ca.vertcat(*rows)
 
-    def _with_targets(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
-        """Yield pairs of a task and its own part of the stacked targets of all tasks."""
+    def by_task(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
+        """Yield each task together with the task's own rows of the stacked targets of all tasks."""
         at = 0
         for part in self.bound:
             size = target_size(part.task)

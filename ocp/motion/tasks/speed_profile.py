@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.checks import NOT_NUMBERS, floats, short_repr
+from models.checks import NOT_NUMBERS, Array, floats, short_repr
 from ocp.errors import ProblemError, require
 from ocp.tolerances import ROUNDING_SHARE
 
@@ -25,7 +25,6 @@ __all__ = [
     "profile_through", "ramp_distance", "ramp_phases", "ramp_time", "reachable_speed", "rest_profile", "segment_index",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Phases = tuple[tuple[float, float], ...]
 """Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
 

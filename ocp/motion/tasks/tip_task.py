@@ -20,7 +20,8 @@ from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, short_repr
 from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, rotation_from_quaternion, skew
 from ocp.errors import ProblemError, require
-from ocp.motion.tasks.tracks import Track, path_tracks, reparametrize, rest_to_rest_speed
+from ocp.motion.tasks.speed_profile import rest_profile
+from ocp.motion.tasks.tracks import Track, checked_speed, path_tracks, ramp_limits, reparametrize
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
 __all__ = ["Axes", "Roll", "TipTask", "Velocity", "retime_task"]
@@ -180,7 +181,8 @@ class TipTask:
         elif steady:
             _refuse_ramps("a steady motion has no ramps", acceleration=acceleration, jerk=jerk)
         else:
-            speed = rest_to_rest_speed(path, speed, acceleration, jerk)
+            require.instance("path", path, SmoothPath)
+            speed = rest_profile(path.length, checked_speed(speed), *ramp_limits(acceleration, jerk))
         tracks = path_tracks(path, speed)
         attributes: dict[str, Any] = {"position": tracks.position, "duration": tracks.duration, "breaks": tracks.breaks}
         if path.path.oriented and not {"direction", "orientation"} & set(others):
@@ -291,12 +293,23 @@ class BoundTask(NamedTuple):
     reference: Machine | None
 
 
+def target_rows(task: TipTask) -> dict[str, tuple[slice, slice]]:
+    """Return the rows of a pose task's target column that hold each target, and the rows of the target's velocity.
+
+    By name, as far as given: "position" (3 rows), "orientation" (9 rows, a rotation matrix by columns) and "direction"
+    (3 rows). A velocity or an angular velocity has 3 rows.
+    """
+    rows, at = dict[str, tuple[slice, slice]](), 0
+    for name, size in (("position", 3), ("orientation", 9), ("direction", 3)):
+        if getattr(task, name) is not None:
+            rows[name] = slice(at, at + size), slice(at + size, at + size + 3)
+            at += size + 3
+    return rows
+
+
 def target_size(task: TipTask) -> int:
     """Return the number of target values of a task in the stacked column of the targets of all tasks."""
-    if task.velocity is not None:
-        return task.size
-    sizes = [(task.position, 6), (task.orientation, 12), (task.direction, 6)]
-    return sum(size for track, size in sizes if track is not None)
+    return task.size if task.velocity is not None else max(rates.stop for _, rates in target_rows(task).values())
 
 
 def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
@@ -304,14 +317,10 @@ def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
 
     Either part is None if the task does not prescribe it.
     """
-    translation, at = None, 0
-    if task.position is not None:
-        translation, at = (targets[0:3], targets[3:6]), 6
-    if task.orientation is not None:
-        return translation, (ca.reshape(targets[at : at + 9], 3, 3), targets[at + 9 : at + 12])
-    if task.direction is not None:
-        return translation, (targets[at : at + 3], targets[at + 3 : at + 6])
-    return translation, None
+    parts = {name: (targets[values], targets[rates]) for name, (values, rates) in target_rows(task).items()}
+    if "orientation" in parts:
+        parts["orientation"] = ca.reshape(parts["orientation"][0], 3, 3), parts["orientation"][1]
+    return parts.get("position"), parts.get("orientation", parts.get("direction"))
 
 
 def reference_pose(part: BoundTask, base: Any, joints: Any) -> Frame | None:
