@@ -29,7 +29,16 @@ from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import cost_of_motion, solve_with_accelerations
 from ocp.motion.plan.candidate_queue import Solver
-from ocp.motion.result.candidate import Candidate, MotionSample, Reason, Rejection, Seed, Stage, collision_reason
+from ocp.motion.result.candidate import (
+    Candidate,
+    MotionSample,
+    Reason,
+    Rejection,
+    Seed,
+    Stage,
+    collision_reason,
+    shortfall_reason,
+)  # fmt: skip
 from ocp.motion.result.plan import audit_key
 from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan, parts_of
@@ -136,7 +145,7 @@ class CandidateSolver(Solver):
         solution = candidate.solution
         if solution is not None and candidate.seed.relaxed:
             samples = self._motion_samples(solution)
-        return Reason.of_shortfall(self.request, samples)
+        return shortfall_reason(self.request, samples)
 
     def _turned_over(self, solution: Solution) -> Reason | None:
         """Return a rejection reason if the tool at a free start is turned by more than 90 degrees from its target."""
@@ -231,7 +240,7 @@ class CandidateSolver(Solver):
         worst = audit.failures[0]
         if candidate.seed.relaxed and not audit.feasible:
             samples = self._motion_samples(solution)
-            reason = Reason.of_shortfall(self.request, samples)
+            reason = shortfall_reason(self.request, samples)
             return candidate.with_rejection(replace(reason, kind=Rejection.AUDIT))
         words = f"{worst.name} {worst.value:.2g}"
         return candidate.with_rejection(

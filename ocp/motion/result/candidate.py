@@ -26,7 +26,10 @@ from ocp.motion.local.rates import LocalMotion
 from ocp.motion.search.configurations import PlanRequest
 from ocp.solution import Solution
 
-__all__ = ["Candidate", "MotionSample", "Reason", "Rejection", "Seed", "Stage", "collision_reason"]
+__all__ = [
+    "Candidate", "MotionSample", "Reason", "Rejection", "Seed", "Stage", "collision_reason",
+    "shortfall_reason",
+]  # fmt: skip
 
 
 class Stage(IntEnum):
@@ -101,11 +104,6 @@ class Reason:
         details: dict[str, Any] = {name: float(x) for name, x in numbers.items() if isinstance(x, int | float)}
         name = getattr(error, "name", None)
         return cls(kind, str(error).split("\n")[0], None if name is None else str(name), **details)
-
-    @classmethod
-    def of_shortfall(cls, request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
-        """Return the reason for a motion that misses its tasks: the worst rate over its limit, or the largest error."""
-        return _limit_reason(request, samples) or _describe_shortfall(request, samples)
 
 
 def collision_reason(pair: Collision | ClosestPair, limit: float, remedy: str = "") -> Reason:
@@ -322,8 +320,13 @@ def _limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reas
     return max(reasons, key=lambda entry: entry[0])[1] if reasons else None
 
 
-def _describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
-    """Return a rejection reason for a motion that misses its tasks: time, pose error, and a joint at its limit."""
+def shortfall_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
+    """Return the reason for rejecting a motion that misses its tasks: a rate beyond its limit, or the largest error.
+
+    The largest pose error is described together with a joint that is at its limit at that time.
+    """
+    if (reason := _limit_reason(request, samples)) is not None:
+        return reason
     sample, k, misses = samples[0], 0, (0.0, 0.0)
     for each in samples:
         distances, angles = each.misses()
