@@ -30,7 +30,7 @@ from ocp.motion.plan.declared_plans import (
     plan_to_stand,
 )  # fmt: skip
 from ocp.motion.plan.planner import PlanOptions, checked_request, clearance_for, plan_request
-from ocp.motion.plan.sequence import SequenceRequest, plan_consecutive, plan_in_segments
+from ocp.motion.plan.sequence import plan_consecutive, plan_in_segments
 from ocp.motion.plan.waypoints import plan_path
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.plan import Plan
@@ -139,7 +139,7 @@ def _plan(
     seed: int,
 ) -> Plan:
     """Select the planner for the tasks, and call this planner with the arguments of `plan`."""
-    options: dict[str, Any] = {"cost": cost, "limits": limits, "seed": seed}
+    options = PlanOptions(start, cyclic, cost, limits, search, seed)
     wrenches = scene.wrenches if isinstance(scene, Scene) else None
     if wrenches is not None and (not isinstance(machine, Standing) or isinstance(tasks, Steps)):
         words = "scene: wrenches act on a machine that stands and does tasks; for an arm on a fixed base, give them in "
@@ -148,12 +148,11 @@ def _plan(
     if isinstance(tasks, Waypoints):
         _check_unused("a path through waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
         arm = require.instance("machine", machine, FixedBase)
-        return plan_path(arm, tasks, scene=scene, **options)
-    options["start"] = start
+        return plan_path(arm, tasks, cost=cost, limits=limits, scene=scene, seed=seed)
     if search == "segments":
         _check_unused("search='segments'", cyclic=cyclic or None)
         arm = require.instance("machine", machine, FixedBase)
-        return plan_in_segments(arm, tasks, horizon, scene=scene, **options)
+        return plan_in_segments(arm, tasks, horizon, options, scene=scene)
     if isinstance(tasks, Steps):
         _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
         _check_unused("a walk, whose feet stand on footholds,", scene=scene or None)
@@ -162,10 +161,8 @@ def _plan(
         if horizon is not None:
             require.choice("horizon", horizon, ("free",))
         _check_unused("a sequence of goals and tasks", cyclic=cyclic or None)
-        own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
-        return plan_consecutive(own, tasks)
+        return plan_consecutive(machine, tasks, options, scene=scene, free=horizon is not None)
     constraints = clearance_for(machine, limits, scene)
-    own_options = PlanOptions(start, cyclic, cost, limits, search, seed)
     if isinstance(tasks, Capture):
         _check_unused("a capture, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
         return plan_capture(machine, tasks, start=start, cost=cost, limits=limits, constraints=constraints)
@@ -173,16 +170,15 @@ def _plan(
     if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
         _check_unused("a motion to goals", cyclic=cyclic or None)
         if len(goals) == 1:
-            return plan_goal(machine, goals[0], horizon, own_options, constraints=constraints)
+            return plan_goal(machine, goals[0], horizon, options, constraints=constraints)
         moving = constraints is not None and constraints.scene.has_moving_obstacles
         is_open = horizon is None or (isinstance(horizon, str) and horizon == "free")
         if isinstance(machine, FixedBase) and is_open and not moving and _are_separate(goals):
-            own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
-            return plan_consecutive(own, goals)
-        return plan_sequence(machine, goals, horizon, own_options, constraints=constraints)
+            return plan_consecutive(machine, goals, options, scene=scene, free=horizon is not None)
+        return plan_sequence(machine, goals, horizon, options, constraints=constraints)
     if isinstance(machine, Standing):
-        return plan_to_stand(machine, tasks, horizon, own_options, constraints=constraints, wrenches=wrenches)
-    request = checked_request(machine, tasks, horizon, own_options)
+        return plan_to_stand(machine, tasks, horizon, options, constraints=constraints, wrenches=wrenches)
+    request = checked_request(machine, tasks, horizon, options)
     return plan_request(replace(request, clearance_constraints=constraints))
 
 
@@ -199,8 +195,7 @@ def _are_separate(goals: Sequence[Any]) -> bool:
 def _is_sequence(tasks: Any) -> bool:
     """Return whether the argument `tasks` lists consecutive motions: goals mixed with tasks, or several lists of tasks.
 
-    Raises:
-        ProblemError: A part is neither a goal nor tasks.
+    If one of these motions is neither a goal nor tasks, raise ProblemError.
     """
     if not isinstance(tasks, Sequence) or isinstance(tasks, str):
         return False

@@ -8,7 +8,6 @@ an optimal control problem. A motion that stops at the corners of the path is th
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,7 +16,7 @@ import numpy as np
 
 from models import FixedBase
 from models.checks import Array
-from ocp.console import TimeLimitReached, time_left, time_limited
+from ocp.console import TimeLimitReached, report, time_left, time_limited
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -107,7 +106,6 @@ class GoalRequest:
         clearance_constraints: Collision scene; None if collisions are not checked.
         seed: Seed of the random searches.
         time_limit: Wall time, s; None for the processor time of the settings.
-        progress: Function that is called with a text at each stage; None for none.
         settings: Settings.
     """
 
@@ -122,7 +120,6 @@ class GoalRequest:
     clearance_constraints: ClearanceConstraints | None = None
     seed: int = 0
     time_limit: float | None = None
-    progress: Callable[[str], None] | None = None
     settings: GoalSettings = field(default_factory=GoalSettings)
 
     def limited(self, seconds: float) -> AbstractContextManager[None]:
@@ -176,10 +173,6 @@ class GoalTask:
     def length(self) -> bool:
         """Whether the cost is the length of the path in joint space."""
         return bool(self.request.cost.length)
-
-    def report(self, text: str) -> None:
-        if self.request.progress is not None:
-            self.request.progress(text)
 
 
 def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
@@ -254,7 +247,7 @@ def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate
             with task.request.limited(task.request.settings.search_share * time_left()):
                 motion = optimal_motion_near(limits, path.joints, cost, horizon, settings=settings)
             candidate = _PathProblem(task, path, motion, horizon).candidate("is a locally optimal spline")
-            task.report(f"path of length {path.length:.4g}: {candidate}")
+            report(f"path of length {path.length:.4g}: {candidate}")
             if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:
                 break
             settings = replace(settings, margin=2 * settings.margin)
@@ -285,7 +278,7 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
         enough = attains_bound(task, candidate) or (candidate.passed and (problem.path.length == 0 or task.is_fastest))
         best = candidate if enough else min(candidate, problem.without_stops(), key=lambda c: (not c.passed, c.cost))
         candidates.append(best)
-        task.report(f"path of length {problem.path.length:.4g}: {best}")
+        report(f"path of length {problem.path.length:.4g}: {best}")
     return candidates
 
 
@@ -299,19 +292,12 @@ def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _PathProblem:
-    """Optimal control problem of a motion near one path, within actuator limits.
-
-    Attributes:
-        task: Checked request.
-        path: The path.
-        motion: Feasible motion, such as one that stops at corners of the path.
-        fixed: Fixed horizon, s; None if it is free.
-    """
+    """Optimal control problem of a motion near one path, within actuator limits."""
 
     task: GoalTask
     path: JointPath
-    motion: ConstantJerkMotion
-    fixed: float | None
+    motion: ConstantJerkMotion  # a feasible motion, such as one that stops at the corners of the path
+    fixed: float | None  # horizon, s; None if it is free
 
     @property
     def horizon_guess(self) -> float:
@@ -385,7 +371,7 @@ class _PathProblem:
 def _audit_candidate(task: GoalTask, solution: Solution, path: JointPath) -> Candidate:
     """Audit a solution; return it as a candidate, rejected if it is infeasible or could not be audited in time."""
     candidate = Candidate(path.joints[0], solution.cost, None, Stage.FINE, solution)
-    task.report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
+    report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
     try:
         audit = solution.audit(only_feasible=True)
     except TimeLimitReached:

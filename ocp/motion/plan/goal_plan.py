@@ -15,7 +15,7 @@ import numpy as np
 
 from models import FixedBase
 from models.checks import Array
-from ocp.console import TimeLimitReached, interruptible
+from ocp.console import TimeLimitReached, interruptible, report
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.constant_jerk import TorqueLimits
 from ocp.motion.local.inverse_kinematics import spread_points
@@ -69,7 +69,7 @@ def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
         try:
             with task.request.limited(settings.search_share * seconds):
                 paths = _paths(task, seconds)
-            task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
+            report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
             candidates += motions_along(task, paths)
         except (SolveError, TimeLimitReached):
             if not any(candidate.passed for candidate in candidates):
@@ -78,11 +78,7 @@ def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
 
 
 def _check_request(request: GoalRequest) -> GoalTask:
-    """Check a request; return it with goals shifted towards the start by full turns of the unlimited joints.
-
-    Raises:
-        ProblemError: As `plan_to_goal`.
-    """
+    """Check a request; return it with goals shifted towards the start by full turns of the unlimited joints."""
     machine = require.instance("machine", request.machine, FixedBase)
     limits = Limits() if request.limits is None else require.instance("limits", request.limits, Limits)
     bounds = limits.bounds(machine)  # the problem that is declared warns of unknown limits
@@ -172,11 +168,7 @@ def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal
 
 
 def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
-    """Search for collision-free paths of several homotopy classes, and sort them by length.
-
-    Raises:
-        SolveError: No path was found.
-    """
+    """Return collision-free paths of several homotopy classes, the shortest first, or raise SolveError for none."""
     request, bounds, joints = task.request, task.bounds, np.vstack([task.start, task.goals])
     lower = np.where(np.isfinite(bounds.lower) & ~task.space.periodic, bounds.lower, joints.min(axis=0) - np.pi)
     upper = np.where(np.isfinite(bounds.upper) & ~task.space.periodic, bounds.upper, joints.max(axis=0) + np.pi)
@@ -205,11 +197,7 @@ def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
 
 
 def _best(task: GoalTask, candidates: list[Candidate]) -> SolvedPlan:
-    """Return the lowest-cost candidate as the plan, with a lower bound of the cost of all motions.
-
-    Raises:
-        SolveError: No candidate passed its audit.
-    """
+    """Return the plan of the lowest-cost candidate, with a cost bound, or raise SolveError if no candidate passed."""
     passed = sorted((c for c in candidates if c.passed), key=lambda candidate: candidate.cost)
     if not passed:
         reasons = "\n".join(f"  {candidate.reason}" for candidate in candidates)

@@ -117,11 +117,8 @@ def plan_from_configurations(
 def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
     """Return the plan of the candidate that costs least by the cost function of the request.
 
-    If the request has another cost than the squared rates, all motions that passed are solved again for this cost,
-    in the order of the value that it has for them before.
-
-    Raises:
-        SolveError: No motion passed.
+    If this is not the integral of the squared rates, all motions that passed are solved again for it, in the order of
+    their costs before. If no motion passed, raise SolveError.
     """
     if solver.request.cost is None or not queue.passed:
         return queue.plan()
@@ -186,11 +183,7 @@ def _repair(
 
 
 def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configurations: Array, thorough: bool) -> None:
-    """Try start configurations one after the other, in order of their conditioning, until one leads to a plan.
-
-    Args:
-        thorough: Whether failures are diagnosed, since nothing else is tried.
-    """
+    """Try start configurations one after the other until one leads to a plan; if `thorough`, diagnose failures."""
     request = solver.request
     for joints in configurations[: request.settings.max_failures]:
         motions = local_motions_from(request, joints[None])
@@ -206,9 +199,6 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
 
     A free start and a coarse mesh may lead away from a nearly optimal motion. Motions of the search that promise a
     lower cost than the plan are therefore also solved with their start fixed, until the plan is close to its bound.
-
-    Raises:
-        DeadEnd: No motion of the search reaches the end.
     """
     settings = solver.settings
     _check_dead_end(search)
@@ -238,8 +228,7 @@ def _search_cells(
 ) -> None:
     """Solve candidates of a floating-base machine from motions of a `CellSearch` and from local motions.
 
-    Raises:
-        Unreachable, DeadEnd: As in `CellSearch`, if no local motion leads to a plan either.
+    If there are none, raise the error of the `CellSearch`.
     """
     request, include_costlier = solver.request, solver.request.search == "global"
     tracked = np.flatnonzero(tracks_tasks(request, motions))
@@ -325,11 +314,7 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
 
 
 def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
-    """Plan a request with some joints held at rest; `whole` is the request before these were held.
-
-    Raises:
-        ProblemError, SolveError: As in `plan`.
-    """
+    """Plan a request with some joints held at rest; `whole` is the request before these were held."""
     report("inverse kinematics of the start")
     request, configurations = place_held_joints(whole, request)
     start = request.start
@@ -434,15 +419,7 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
-    """Check the cost weights of a motion along tip tasks, and return the cost.
-
-    Args:
-        free: Whether the horizon is free.
-
-    Raises:
-        ProblemError: The time is weighted but fixed, or free without a weight; the machine has no base to turn, or its
-            torques are not known.
-    """
+    """Return the cost of a motion along tip tasks after checking that its weights fit the machine and the horizon."""
     if cost is None:
         return Cost(time=float(free))
     own = require.instance("cost", cost, Cost)

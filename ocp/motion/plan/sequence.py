@@ -41,37 +41,10 @@ from ocp.motion.tasks.goals import Cost, Goal, Scene, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask, retime_task
 
-__all__ = ["SequenceRequest", "plan_consecutive", "plan_in_segments"]
+__all__ = ["plan_consecutive", "plan_in_segments"]
 
 AT_START = 1e-6
 """Largest pose error, m and rad, with which a configuration counts as being at the start of a task or at a goal."""
-
-
-@dataclass(frozen=True, eq=False)
-class SequenceRequest:
-    """Options that all motions of a sequence share.
-
-    Attributes:
-        machine: Machine on a fixed or floating base.
-        start: Start of the first motion, as in `plan`; may be None if this motion is along a task.
-        free: Whether the planner chooses the durations.
-        cost, limits, scene, search, seed: As in `plan`.
-    """
-
-    machine: Machine
-    start: Any
-    free: bool
-    cost: Cost | None
-    limits: Limits | None
-    scene: Scene | Literal[False] | None
-    search: str
-    seed: int
-
-    @property
-    def smooth(self) -> bool:
-        """Whether joint rates must be continuous, because actuators are limited or weighted."""
-        limits = self.limits or Limits()
-        return limits_actuators(limits) or (self.cost is not None and weights_actuators(self.cost))
 
 
 class _State(NamedTuple):
@@ -93,64 +66,84 @@ def _velocity(rates: Array, smooth: bool) -> Any:
     return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
 
 
-def plan_consecutive(request: SequenceRequest, parts: Sequence[Goal | TipTask | Sequence[TipTask]]) -> SequencePlan:
+def plan_consecutive(
+    machine: Machine,
+    parts: Sequence[Goal | TipTask | Sequence[TipTask]],
+    options: PlanOptions,
+    *,
+    scene: Scene | Literal[False] | None,
+    free: bool,
+) -> SequencePlan:
     """Plan motions to goals and motions along tasks, one after the other.
 
     Args:
-        request: The options.
+        machine: Machine on a fixed or floating base.
         parts: Goals and tasks in their order. Tasks that are done at once form a sequence of their own.
+        options: Options that all motions share; the start may be None if the first motion is along a task.
+        scene: As in `plan`.
+        free: Whether the planner chooses the durations.
 
     Raises:
         ProblemError: The parts cannot be planned in sequence; names the part. Or as `plan` for each part.
         SolveError: A part has no motion; names the part.
     """
-    return _Sequence(request, tuple(parts)).plan()
+    return _Sequence(checked_motors("plan", machine), tuple(parts), options, scene, free).plan()
 
 
 @dataclass(eq=False)
 class _Sequence:
     """Planner of a sequence of motions, with the plans so far and the configuration and rates at their end."""
 
-    request: SequenceRequest
+    machine: Machine
     parts: tuple[Any, ...]
-    machine: Machine = field(init=False)
+    options: PlanOptions
+    scene: Scene | Literal[False] | None
+    free: bool
     state: _State = field(init=False)
     plans: list[SolvedPlan] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.machine = checked_motors("plan", self.request.machine)
-        start, joints, base = Start.of(self.request.start, self.machine)
+        start_of = Start.of_known if isinstance(self.parts[0], Goal) else Start.of
+        start, joints, base = start_of(self.options.start, self.machine)
         self.state = _State(joints, base, start.velocity)
-        if joints is None and isinstance(self.parts[0], Goal):
-            words = "start is missing: a goal is reached from somewhere; give plan(..., start=)"
-            raise ProblemError(words, name="start")
+
+    @property
+    def horizon(self) -> Literal["free"] | None:
+        """Horizon of each motion, as in `plan`."""
+        return "free" if self.free else None
+
+    @property
+    def smooth(self) -> bool:
+        """Whether joint rates must be continuous, because actuators are limited or weighted."""
+        limits, cost = self.options.limits or Limits(), self.options.cost
+        return limits_actuators(limits) or (cost is not None and weights_actuators(cost))
 
     def plan(self) -> SequencePlan:
         """Plan the motions to all goals and along all tasks of the sequence, one after the other."""
-        led: SolvedPlan | None = None  # plan of the next tasks, if the goal before them leads to their start
+        next_plan: SolvedPlan | None = None  # of the next tasks, if the goal before them leads to their start
         for number, (part, following) in enumerate(zip_longest(self.parts, self.parts[1:]), 1):
             if isinstance(part, Goal):
                 name = part.name or f"goal {number}"
                 if following is not None and not isinstance(following, Goal) and not self.machine.base_size:
                     with _naming_part(f"task {number + 1}"):
-                        led = self._plan_tasks(following, self._joints_near(part))
-                    part = _led_to(self.machine, part, led, self.request.smooth)
+                        next_plan = self._plan_tasks(following, self._joints_near(part))
+                    part = _with_next_start(self.machine, part, next_plan, self.smooth)
                 with _naming_part(name):
                     self._append(self._plan_goal(part), name)
                 continue
             with _naming_part(f"task {number}"):
-                plan = led or self._plan_tasks(part, self.state.joints)
+                plan = next_plan or self._plan_tasks(part, self.state.joints)
             with _naming_part(f"approach to task {number}"):
                 plan = self._approach(plan, part, f"approach to task {number}")
             self._append(plan, f"task {number}")
-            led = None
-        return SequencePlan(self.plans[0].machine, tuple(self.plans), tuple(self.names), self.request.smooth)
+            next_plan = None
+        return SequencePlan(self.plans[0].machine, tuple(self.plans), tuple(self.names), self.smooth)
 
     def _append(self, plan: SolvedPlan, name: str) -> None:
         self.plans.append(plan)
         self.names.append(name)
-        self.state = _State.end_of(plan, self.request.smooth)
+        self.state = _State.end_of(plan, self.smooth)
 
     def _joints_near(self, goal: Goal) -> Array | None:
         """Return the joint positions of a goal, with current positions for the joints that the goal leaves open."""
@@ -163,7 +156,6 @@ class _Sequence:
 
     def _plan_goal(self, goal: Goal) -> SolvedPlan:
         """Plan the motion from the end of the previous motion to a goal."""
-        request = self.request
         own = self.machine if goal.machine is None else checked_motors("goal: machine", goal.machine)
         if own.robot.joint_names != self.machine.robot.joint_names:
             words = "all machines of a sequence need the joints of the first one"
@@ -172,25 +164,21 @@ class _Sequence:
             raise ProblemError("a load is picked up or put down at rest", name="machine", value=goal.machine)
         self.machine = own
         start = Start(self.state.joints, self.state.base if own.base_size else None, self.state.rates)
-        options = PlanOptions(start, cost=request.cost, limits=request.limits, seed=request.seed)
-        horizon = "free" if request.free else None
-        return plan_goal(own, replace(goal, machine=None), horizon, options, constraints=self._constraints())
+        options = replace(self.options, start=start)
+        return plan_goal(own, replace(goal, machine=None), self.horizon, options, constraints=self._constraints())
 
     def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
         """Return the motion along tasks from the configuration `near` or, if they do not start there, from any.
 
         Among start configurations, those count as better to which the motion from `near` costs less.
         """
-        request, machine = self.request, self.machine
-        options: dict[str, Any] = {"cost": request.cost, "limits": request.limits, "seed": request.seed}
-        options |= {"search": request.search, "start": None}
-        horizon = "free" if request.free else None
+        machine, start = self.machine, None
         if machine.base_size or (near is not None and _is_at_start(machine, tasks, near)):
-            options["start"] = Start(near, self.state.base if machine.base_size else None)
-        checked = checked_request(machine, tasks, horizon, PlanOptions(**options))
+            start = Start(near, self.state.base if machine.base_size else None)
+        checked = checked_request(machine, tasks, self.horizon, replace(self.options, start=start))
         checked = replace(checked, clearance_constraints=self._constraints())
-        if options["start"] is None and near is not None:
-            if request.search != "global":  # its bound is that of the task alone
+        if start is None and near is not None:
+            if checked.search != "global":  # its bound is that of the task alone
                 checked = replace(checked, near=near)
             idle = bind(machine, checked.tasks).idle
             names = np.array(machine.robot.joint_names)[idle].tolist()
@@ -202,10 +190,10 @@ class _Sequence:
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
-        rates = _velocity(first["rates"], self.request.smooth)
+        rates = _velocity(first["rates"], self.smooth)
         if np.abs(first["joints"] - state.joints).max() <= JUMP_TOLERANCE:
             jump = np.abs(_numbers(rates, first) - _numbers(state.rates, first)).max()
-            if not self.request.smooth or jump <= JUMP_TOLERANCE:
+            if not self.smooth or jump <= JUMP_TOLERANCE:
                 return plan
             fastest = int(np.abs(first["rates"]).argmax())
             words = f"its joints move where it begins, {self.machine.robot.joint_names[fastest]!r} at "
@@ -219,12 +207,8 @@ class _Sequence:
         return self._plan_tasks(tasks, joints) if turned else plan
 
     def _constraints(self) -> ClearanceConstraints | None:
-        """Return the clearance constraints of the current machine.
-
-        Raises:
-            ProblemError: An obstacle moves.
-        """
-        constraints = clearance_for(self.machine, self.request.limits, self.request.scene)
+        """Return the clearance constraints of the current machine; raise ProblemError if an obstacle moves."""
+        constraints = clearance_for(self.machine, self.options.limits, self.scene)
         if constraints is not None and constraints.scene.has_moving_obstacles:
             words = "obstacles of a sequence may not move, since it is not known when each part begins"
             raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
@@ -244,7 +228,7 @@ def _misses(equations: TaskEquations, joints: Array) -> float:
     return max(float(np.abs(each).max(initial=0.0)) for each in errors)
 
 
-def _led_to(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
+def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
     """Return the goal with the start configuration of the next task, or unchanged if that does not satisfy the goal."""
     first = plan.at(0.0)
     if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
@@ -275,13 +259,10 @@ def _naming_part(part: str) -> Iterator[None]:
 def plan_in_segments(
     machine: FixedBase,
     tasks: TipTask | Sequence[TipTask],
-    horizon: Any = None,
+    horizon: Any,
+    options: PlanOptions,
     *,
-    start: Any = None,
-    cost: Any = None,
-    limits: Limits | None = None,
-    scene: Scene | Literal[False] | None = None,
-    seed: int = 0,
+    scene: Scene | Literal[False] | None,
 ) -> SegmentedPlan:
     """Plan tasks in the fewest segments, at the least cost; the arm reconfigures between segments.
 
@@ -291,9 +272,8 @@ def plan_in_segments(
 
     Args:
         machine: An arm on a fixed base.
-        tasks, horizon, start, cost, limits, seed: As in `plan`; the tasks are poses that leave at most two
-            degrees of freedom undetermined. Actuator limits do not influence the division, but the segments are planned
-            within them.
+        tasks, horizon, options: As in `plan`; the tasks are poses that leave at most two degrees of freedom
+            undetermined. Actuator limits do not influence the division, but the segments are planned within them.
         scene: As in `plan`, with static obstacles, since a reconfiguration takes time.
 
     Returns:
@@ -305,9 +285,8 @@ def plan_in_segments(
         SolveError: No segment could be planned, however the tasks were divided.
     """
     require.instance("machine", machine, FixedBase)
-    options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "seed": seed}
-    request = checked_request(machine, tasks, horizon, PlanOptions(search="global", **options))
-    constraints = clearance_for(machine, limits, scene)
+    request = checked_request(machine, tasks, horizon, replace(options, search="global"))
+    constraints = clearance_for(machine, options.limits, scene)
     if constraints is not None and constraints.scene.has_moving_obstacles:
         words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"
         raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
@@ -347,11 +326,7 @@ def plan_in_segments(
 
 
 def _plan_segment(request: PlanRequest, begin: float, end: float) -> SolvedPlan:
-    """Plan the part of the tasks between two times as one segment.
-
-    Raises:
-        ProblemError, SolveError: As in `plan`.
-    """
+    """Plan the part of the tasks between two times as one segment."""
     tasks = tuple(part for task in request.tasks if (part := _task_between(task, begin, end)) is not None)
     stretches = stretches_of(request.machine, tasks, end - begin)
     start = request.start if begin == 0 else None

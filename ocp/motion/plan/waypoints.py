@@ -11,14 +11,14 @@ segments may be requested (see `ocp.motion.search.reconfigurations`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from models import FixedBase
-from models.checks import NOT_NUMBERS, Array, floats
+from models.checks import Array
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
@@ -39,9 +39,7 @@ from ocp.motion.tasks.goals import Cost, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["Reconfigurations", "plan_path"]
-
-Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
+__all__ = ["plan_path"]
 
 WAYPOINT = "waypoint {:g}"
 TOO_MANY_CHARTS = "configurations"
@@ -76,21 +74,13 @@ class WaypointSettings:
 
 
 class _Path(NamedTuple):
-    """Joint path through all waypoints, in one or several segments.
-
-    Attributes:
-        cost: Cost of the path.
-        failure: Why the path is not valid; "" if it is.
-        invalid: Waypoints where it is not valid.
-        joints: Configurations at the waypoints. Shape (N, n).
-        breaks: Waypoints after which the arm reconfigures.
-    """
+    """Joint path through all waypoints, in one or several segments."""
 
     cost: float
-    failure: str
-    invalid: NDArray[np.intp]
-    joints: Array
-    breaks: tuple[int, ...] = ()
+    failure: str  # why the path is not valid; "" if it is
+    invalid: NDArray[np.intp]  # waypoints where it is not valid
+    joints: Array  # at the waypoints, shape (N, n)
+    breaks: tuple[int, ...] = ()  # waypoints after which the arm reconfigures
 
 
 def plan_path(
@@ -123,7 +113,7 @@ def plan_path(
     """
     require.instance("machine", machine, FixedBase)
     require.count("seed", seed, 0, LARGEST_SEED)
-    positions, rotations = _poses(waypoints.positions, waypoints.quaternions)
+    positions, rotations = _poses(waypoints)
     n = machine.joint_size
     checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     own_cost = Cost(velocity=0, length=1) if cost is None else require.instance("cost", cost, Cost)
@@ -136,7 +126,7 @@ def plan_path(
         if getattr(checked_limits, quantity) is not None and not (quantity == "velocity" and is_timed):
             words = f"limits: a path through waypoints has no time, hence no {quantity}; leave it out, or give a step"
             raise ProblemError(words, name=quantity, value=getattr(checked_limits, quantity))
-    require.choice("reconfigurations", waypoints.reconfigurations, get_args(Reconfigurations))
+    require.choice("reconfigurations", waypoints.reconfigurations, ("forbidden", "counted"))
     if is_timed:
         if own_cost.weights is not None:
             words = "cost: the time of a path takes no weights; leave them out"
@@ -146,7 +136,7 @@ def plan_path(
             raise ProblemError("cost: the time needs a joint with a velocity limit", name="velocity")
     else:
         joint_weights = own_cost.length * _path_weights(own_cost.weights, n)
-    max_step = _step(waypoints.step, n)
+    step = require.broadcast("step", waypoints.step, n, "joints", entries="numbers", sign="positive")
     constraints = clearance_for(machine, checked_limits, scene)
     if constraints is not None and constraints.scene.has_moving_obstacles:
         words = "a path through waypoints has no time at which obstacles would be somewhere; give static obstacles"
@@ -155,7 +145,7 @@ def plan_path(
         machine,
         positions,
         rotations,
-        max_step,
+        step,
         (LargestMotion if is_timed else PathLength)(joint_weights),
         checked_limits,
         constraints,
@@ -250,17 +240,16 @@ class _WaypointPlanner:
         return [[Segment(0, len(path) - 1, path, search.path_cost(path), bound)] for path in paths], bound
 
     def _best_plan(self, paths: list[_Path], bound: float) -> PathPlan:
-        """Return the plan of the valid path of lowest cost.
-
-        Raises:
-            SolveError: No path is valid.
-        """
+        """Return the plan of the valid path of lowest cost, or raise SolveError with the failures of all paths."""
         paths = sorted(paths, key=lambda path: (bool(path.failure), path.cost))
         if not paths or paths[0].failure:
             reasons = "; ".join(dict.fromkeys(path.failure for path in paths))
             raise SolveError(f"{NO_PATH}{reasons and ': '}{reasons}", name="waypoints")
-        candidates = [self._candidate(path, path is paths[0]) for path in paths]
         best, lower_bound = paths[0], checked_bound(bound, paths[0].cost)
+        candidates = [Candidate(best.joints[0], best.cost, None, Stage.FINE)]
+        for path in paths[1:]:
+            reason = Reason(Rejection.INFEASIBLE, path.failure) if path.failure else Reason(Rejection.COSTLIER)
+            candidates.append(Candidate(path.joints[0], path.cost, reason, Stage.FINE))
         return PathPlan(
             self.machine,
             best.joints,
@@ -272,11 +261,6 @@ class _WaypointPlanner:
             lower_bound or None,
             best.breaks,
         )
-
-    def _candidate(self, path: _Path, is_best: bool) -> Candidate:
-        """Return the path as a candidate of the plan, accepted or rejected with a reason."""
-        reason = Reason(Rejection.INFEASIBLE, path.failure) if path.failure else Reason(Rejection.COSTLIER)
-        return Candidate(path.joints[0], path.cost, None if is_best else reason, Stage.FINE)
 
     # ---- searched waypoints ------------------------------------------------------------------------------------------
 
@@ -352,8 +336,7 @@ class _WaypointPlanner:
     def _negligibly_relaxed_paths(self, search: AtlasSearch) -> list[_Path]:
         """Return paths that become possible if the poses are relaxed by no more than the pose tolerance.
 
-        Raises:
-            SolveError: There is no such path.
+        If there is none, raise the SolveError that says why.
         """
         uncovered = [float(time) for time, charts in zip(search.times, search.atlas, strict=True) if not len(charts)]
         if uncovered and self._section_joint is not None:
@@ -461,35 +444,15 @@ def _path_weights(weights: Any, size: int) -> Array:
     return array
 
 
-def _step(step: Any, size: int) -> Array:
-    """Check the largest step between waypoints, and return the largest displacement of each joint. Shape (n,)."""
-    try:
-        steps = floats(step)
-        if steps.shape in ((), (1,), (size,)) and (steps > 0).all():
-            return np.array(np.broadcast_to(steps, (size,)))
-    except NOT_NUMBERS:
-        pass
-    words = f"step must be positive, one number or one for each of {size} joints, not {step!r}"
-    raise ProblemError(words, name="step", value=step, limit=0.0)
-
-
-def _poses(positions: ArrayLike, quaternions: ArrayLike) -> tuple[Array, Array]:
+def _poses(waypoints: Waypoints) -> tuple[Array, Array]:
     """Check the poses of waypoints, and return positions (N, 3) and rotation matrices (N, 3, 3)."""
-    arrays = []
-    for name, values, size in (("positions", positions, 3), ("quaternions", quaternions, 4)):
-        words = f"{name} must be finite numbers of shape (N, {size}) with N > 1"
-        try:
-            array = floats(values)
-        except NOT_NUMBERS as error:
-            raise ProblemError(words, name=name, value=values, limit=size) from error
-        if array.ndim != 2 or array.shape[1] != size or len(array) < 2 or not np.isfinite(array).all():
-            raise ProblemError(f"{words}, not {array.shape}", name=name, value=array.shape, limit=size)
-        arrays.append(array)
-    positions, rotations = arrays
-    if len(positions) != len(rotations):
-        words = f"there are {len(positions)} positions and {len(rotations)} quaternions"
-        raise ProblemError(words, name="quaternions", value=len(rotations), limit=len(positions))
-    norms = np.linalg.norm(rotations, axis=1)
+    positions = require.array("positions", waypoints.positions, ("waypoints", 3), least=2)
+    quaternions = require.array("quaternions", waypoints.quaternions, ("waypoints", 4), least=2)
+    if len(positions) != len(quaternions):
+        words = f"there are {len(positions)} positions and {len(quaternions)} quaternions"
+        raise ProblemError(words, name="quaternions", value=len(quaternions), limit=len(positions))
+    norms = np.linalg.norm(quaternions, axis=1)
     if not (norms > 0).all():
         raise ProblemError(f"quaternion {int(norms.argmin())} is zero", name="quaternions", value=0.0)
-    return positions, np.asarray(scipy.spatial.transform.Rotation.from_quat(rotations[:, [1, 2, 3, 0]]).as_matrix())
+    rotations = scipy.spatial.transform.Rotation.from_quat(quaternions[:, [1, 2, 3, 0]])
+    return positions, np.asarray(rotations.as_matrix())

@@ -15,9 +15,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models import Machine, ModelError
 from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats
@@ -36,14 +37,15 @@ from ocp.storage import table_head, write_arrays, write_text
 from ocp.tolerances import LIMIT_SHARE
 
 __all__ = [
-    "CHECKED_TIMES", "ENDS", "Plan", "PlanSample", "audit_key", "describe_ends", "evaluate_parts", "read_record",
-    "reading_plan", "record_arrays",
+    "CHECKED_TIMES", "ENDS", "Plan", "PlanSample", "Rows", "audit_key", "describe_ends", "evaluate_parts",
+    "read_record", "reading_plan", "record_arrays",
 ]  # fmt: skip
 
 ENDS = "speed at both ends"
 """Name of the audit finding that tells whether a motion starts and ends at rest."""
 CHECKED_TIMES = 2001
 """Number of samples at which joint limits are checked, besides the times of the plan."""
+Rows: TypeAlias = NDArray[np.intp]
 TIME_TOLERANCE = 1e-9
 """Largest amount by which a time may lie outside a plan, as a fraction of the horizon."""
 
@@ -379,7 +381,7 @@ class Plan(ABC):
         return tip_poses(self.machine, bases, joints)
 
 
-def evaluate_parts(begins: Sequence[float], times: Array, width: int, evaluate: Callable[[int, Array], Array]) -> Array:
+def evaluate_parts(begins: Sequence[float], times: Array, width: int, evaluate: Callable[[int, Rows], Array]) -> Array:
     """Evaluate a quantity at times (M,), each in the consecutive part of a motion that contains it. Shape (M, width).
 
     Args:

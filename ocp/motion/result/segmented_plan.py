@@ -18,7 +18,7 @@ from ocp.audit.audit import COST_LOST, Audit, Finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError
 from ocp.motion.result.candidate import Candidate
-from ocp.motion.result.plan import Plan, evaluate_parts, read_record, reading_plan, record_arrays
+from ocp.motion.result.plan import Plan, Rows, evaluate_parts, read_record, reading_plan, record_arrays
 from ocp.motion.result.solved_plan import PHASED, PhasedPlan, SolvedPlan
 from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target
@@ -144,7 +144,7 @@ class ConsecutivePlans(Plan):
     def _values_at(self, name: str, times: Array) -> Array:
         pieces = self.pieces
 
-        def values(number: int, rows: Array) -> Array:
+        def values(number: int, rows: Rows) -> Array:
             local = np.clip(times[rows] - pieces[number].begin, 0.0, pieces[number].plan.horizon)
             return pieces[number].plan._values_at(name, local)
 
@@ -229,7 +229,7 @@ class SequencePlan(ConsecutivePlans):
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
         pieces = self.pieces
 
-        def tips(number: int, rows: Array) -> Array:
+        def tips(number: int, rows: Rows) -> Array:
             return pieces[number].plan._tips_at(times[rows] - pieces[number].begin, bases[rows], joints[rows])
 
         return evaluate_parts([piece.begin for piece in pieces], times, 7, tips)

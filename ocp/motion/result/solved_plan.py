@@ -18,7 +18,7 @@ from ocp.audit.audit import Audit
 from ocp.errors import ProblemError, StorageWarning
 from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
 from ocp.motion.result.candidate import Candidate
-from ocp.motion.result.plan import Plan, evaluate_parts, read_record, reading_plan, record_arrays
+from ocp.motion.result.plan import Plan, Rows, evaluate_parts, read_record, reading_plan, record_arrays
 from ocp.motion.result.request import MotionRequest, machines_of_phases, request_of, restored_request, stored_request
 from ocp.motion.search.held_joints import all_joints
 from ocp.motion.tasks.speed_profile import segment_index
@@ -340,7 +340,7 @@ class PhasedPlan(SolvedPlan):
         return values if name == "base" else values[:, self._joint_indices[part.suffix]]
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
-        def tips(number: int, rows: Array) -> Array:
+        def tips(number: int, rows: Rows) -> Array:
             order = np.argsort(self._joint_indices[self.phases[number]])
             return tip_poses(self.machines[number], bases[rows], joints[rows][:, order])
 

@@ -149,11 +149,8 @@ class StraightMotions:
     ) -> None:
         """Prove straight motions collision-free by bisection; unset the marks `clear` of motions that may collide.
 
-        Args:
-            lines: Starts and ends of the motions.
-            sizes: Approach and turning of each pair over each whole motion.
-            clear: Marks of the motions, which are changed.
-            intervals: Motion, middle and width of each.
+        `lines` are the starts and ends of the motions, `sizes` the approach and turning of each pair of bodies over
+        each whole motion, `intervals` the number of the motion, the middle and the width of each interval.
         """
         (approach, turning), (motion, middle, width) = sizes, intervals
         interval = pair = np.zeros(0, dtype=np.intp)  # undecided pairs of the intervals, after the first level
@@ -417,7 +414,7 @@ def _resample(motions: StraightMotions, path: Array, scale: Array, count: int) -
     blocked = np.flatnonzero(~motions.are_clear(chain[:-1], chain[1:]))
     if not len(blocked):
         return chain
-    places = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1)))
+    places = _places(path, scale)
     places /= places[-1]
     inside = ((places > shares[blocked, None]) & (places < shares[blocked + 1, None])).any(axis=0)
     order = np.argsort(np.concatenate([shares, places[inside]]), kind="stable")

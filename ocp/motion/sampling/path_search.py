@@ -142,8 +142,7 @@ def _step_towards(starts: Array, targets: Array, step: float, scale: Array) -> A
 def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step: float) -> tuple[int, int] | None:
     """Extend a random tree step by step from new nodes towards target nodes (K, n) of another tree.
 
-    Returns:
-        Which of the targets is reached, and the tree's node there; None if none is.
+    Return the index of the first target that is reached and the tree's node there; None if no target is reached.
     """
     places = np.arange(len(new))
     while len(places):

@@ -181,10 +181,7 @@ def optimal_motion_near(
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
     """Solve linear or quadratic programs in sequence; return the best feasible motion and the trust region size.
 
-    If none is, return the last motion. The sequence ends when the cost decreases by less than `least_gain`.
-
-    Raises:
-        TimeLimitReached: The time limit has passed before one was feasible.
+    If no motion is feasible, return the last one. The sequence ends when the cost decreases by less than `least_gain`.
     """
     settings = search.settings
     penalty = settings.penalty if search.horizon is None else settings.violation

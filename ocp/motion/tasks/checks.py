@@ -79,7 +79,7 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
         ModelWarning: Angles that look like degrees.
     """
     if joints is None:
-        words = "start is missing; inverse_kinematics(machine, task) finds some for a pose"
+        words = "start is missing; give joint positions: inverse_kinematics(machine, task) finds some for a pose"
         raise ProblemError(words, name="start")
     positions = require.array("start", joints, (machine.joint_size,), meaning="one entry for each joint")
     for joint, angle in zip(machine.robot.moving_joints, positions, strict=True):

@@ -278,10 +278,8 @@ class Limits:
 
     def __post_init__(self) -> None:
         for kind in LIMITED:
-            value = getattr(self, kind)
-            if value is not None and not (_numbers(value) > 0).all():
-                words = f"limits: {kind} must be positive, one number or one for each joint, not {value!r}"
-                raise ProblemError(words, name=kind, value=value, limit=0.0)
+            if getattr(self, kind) is not None:
+                require.array(f"limits: {kind}", getattr(self, kind), ("joints",), entries="numbers", sign="positive")
         if self.vertical_force is not None:
             require.positive("limits: vertical_force", self.vertical_force)
         require.flag("limits: joints", self.joints)
@@ -298,13 +296,8 @@ class Limits:
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Limits:
         """Return the limits of a subset of a machine's joints, given as a mask (n,)."""
-        values = {kind: getattr(self, kind) for kind in LIMITED}
-        own: dict[str, Any] = {
-            kind: _numbers(value)[chosen]
-            for kind, value in values.items()
-            if value is not None and _numbers(value).size > 1
-        }
-        return replace(self, **own)
+        own: dict[str, Any] = {kind: floats(getattr(self, kind)) for kind in LIMITED if np.ndim(getattr(self, kind))}
+        return replace(self, **{kind: values[chosen] for kind, values in own.items()})
 
     def bounds(self, machine: Machine, used: Collection[str] = ()) -> JointBounds:
         """Return the joint limits of a machine; limits that the robot description lacks are infinite.
@@ -325,11 +318,7 @@ class Limits:
         for kind in values:
             value = getattr(self, kind)
             if value is not None:
-                array = _numbers(value)
-                if array.size not in (1, n):
-                    words = f"limits: {kind} must be positive, one number or {n}, not {value!r}"
-                    raise ProblemError(words, name=kind, value=value, limit=n)
-                values[kind] = np.array(np.broadcast_to(array, n))
+                values[kind] = require.broadcast(f"limits: {kind}", value, n, "joints", entries="numbers")
             elif kind in used and (names := unknown_limits(robot, kind)):
                 words = f"the robot gives {', '.join(names)} a {kind} limit of 0, which is read as unknown: they are "
                 words += f"unlimited; set Limits({kind}=...), inf for no limit"
@@ -342,12 +331,3 @@ def unknown_limits(robot: Robot, kind: str) -> list[str]:
     """Return the joints whose "velocity" or "torque" limit in the robot description is 0, which means unknown."""
     attribute = {"velocity": "velocity", "torque": "effort"}.get(kind)
     return [joint.name for joint in robot.moving_joints if attribute and getattr(joint, attribute) == 0]
-
-
-def _numbers(value: Any) -> Array:
-    """Return a limit as a flat array of numbers, or as a single 0, which is no valid limit, if it is not numeric."""
-    try:
-        numbers = floats(value).ravel()
-        return numbers if numbers.size else np.zeros(1)
-    except NOT_NUMBERS:
-        return np.zeros(1)

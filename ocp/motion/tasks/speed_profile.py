@@ -102,18 +102,9 @@ class SpeedProfile:
 
     def __post_init__(self) -> None:
         for name in ("t", "distance", "speed", "acceleration", "jerk"):
-            try:
-                row = floats(getattr(self, name))
-            except NOT_NUMBERS as error:
-                message = f"profile: {name} is not numeric: {getattr(self, name)!r}"
-                raise ProblemError(message, name=name, value=getattr(self, name)) from error
+            count = "times" if name == "t" else len(self.t) - (name == "jerk")
+            row = require.array(f"profile: {name}", getattr(self, name), (count,), least=2)
             object.__setattr__(self, name, row)
-            shape = (len(self.t) - (name == "jerk"),) if self.t.ndim == 1 and len(self.t) > 1 else None
-            if row.shape != shape or not np.isfinite(row).all():
-                message = (
-                    f"profile: {name} of shape {row.shape} must be finite, {shape or 'two times at least'} expected"
-                )
-                raise ProblemError(message, name=name, value=row, limit=shape)
             if name in ("t", "distance") and (np.diff(row) < 0).any():
                 raise ProblemError(f"profile: {name} must not decrease", name=name, value=row)
 
