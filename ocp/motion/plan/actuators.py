@@ -58,7 +58,7 @@ def weights_actuators(cost: Cost) -> bool:
 
 
 def without_actuators(limits: Limits) -> Limits:
-    """Return the limits after removing those of acceleration, jerk, torque and power."""
+    """Return a copy of the limits of a motion without those of acceleration, jerk, torque and power."""
     return replace(limits, acceleration=None, jerk=None, torque=None, power=None)
 
 
@@ -162,7 +162,7 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
 
 
 def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan) -> Array:
-    """Return orthogonal rows (k, n) of the joint velocities that the tasks leave undetermined at the end."""
+    """Return orthonormal rows (k, n) that span the joint velocities which tasks leave undetermined at the end."""
     last = request.stretches[-1]
     if last.equations is None:
         return np.eye(request.machine.joint_size)

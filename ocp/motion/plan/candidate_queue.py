@@ -244,7 +244,7 @@ class CandidateQueue:
         return any(c.solution is not None and self.solver.same_path(candidate.solution, c.solution) for c in same)
 
     def _take(self, previous: Candidate, advanced: Candidate) -> None:
-        """Store an advanced candidate if it is finished or rejected; otherwise push it to the queue again."""
+        """Store a candidate that was advanced if it is finished or rejected; else push it to the queue again."""
         if not advanced.passed:
             self.candidates.append(advanced)
             self._failures += previous.stage is not Stage.SEED

@@ -122,7 +122,7 @@ class CandidateSolver(Solver):
         return cost_of_motion(self.plan([candidate]), self.request.cost)
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
-        """Return whether to relax the tasks, because the task Jacobian is nearly singular along a local motion."""
+        """Return whether the tasks must be relaxed, as their Jacobian is nearly singular along a local motion."""
         samples = map(MotionSample.of_local, self.motion.stretches, local)
         return self._can_relax and any(sample.is_nearly_singular for sample in samples)
 
@@ -138,7 +138,7 @@ class CandidateSolver(Solver):
         return self._can_relax and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
-        """Return the rejection reason: what the initial guess or, if tasks are relaxed, the last iterate violates."""
+        """Return why a candidate failed: what its guess or, if tasks are relaxed, the last iterate violates."""
         samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
         if not samples:
             return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
@@ -253,7 +253,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return a new candidate with a free start, derived from a candidate that passed with a fixed start."""
+        """Return a list with a copy of a candidate whose start is free, if the candidate passed with a fixed start."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints

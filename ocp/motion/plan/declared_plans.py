@@ -212,7 +212,7 @@ def with_joints(goal: Goal, joints: Array) -> Goal:
 
 
 def _plan_of_phases(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
-    """Return the plan whose motion is the solution of a problem with phases."""
+    """Convert the solution of a problem with phases to a plan, whose only candidate starts at `start`."""
     candidate = Candidate(start, solution.cost, None, Stage.AUDITED, solution)
     return PhasedPlan(machine, solution, parts_of_phases(solution), (candidate,))
 

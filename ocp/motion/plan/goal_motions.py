@@ -123,7 +123,7 @@ class GoalRequest:
     settings: GoalSettings = field(default_factory=GoalSettings)
 
     def limited(self, seconds: float) -> AbstractContextManager[None]:
-        """Return the context that limits the time of the request or of a part of it."""
+        """Return the context that limits the time, s: wall time if the request limits it, else processor time."""
         return time_limited(seconds, processor=self.time_limit is None)
 
 
@@ -176,7 +176,7 @@ class GoalTask:
 
 
 def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return the audited candidate motions that follow paths at constant speed."""
+    """Return audited candidates that follow collision-free joint paths at constant speed."""
     request = task.request
     fastest = np.where(np.isfinite(task.bounds.velocity), task.bounds.velocity, request.settings.unlimited_rate)
     candidates = []
@@ -197,7 +197,7 @@ def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate
 
 
 def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return audited candidate motions along paths, with the timing that the request needs.
+    """Return audited candidates along joint paths, with the timing that the request needs.
 
     That is the least time, any timing within the limits of the actuators, or constant speed.
     """
@@ -305,7 +305,7 @@ class _PathProblem:
         return self.motion.duration if self.fixed is None else self.fixed
 
     def declare(self, clearance: ClearanceConstraints | None) -> Problem:
-        """Declare the optimal control problem, with or without clearance constraints."""
+        """Declare the optimal control problem of a motion between the ends of the path, with or without clearance."""
         task, ends = self.task, {"start": self.path.joints[0], "end": self.path.joints[-1]}
         guess = self.horizon_guess
         least = 0.0 if task.moves else least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()
@@ -348,7 +348,7 @@ class _PathProblem:
         return self.smooth()
 
     def smooth(self) -> Candidate:
-        """Solve the optimal control problem, guessed from the path, and return the motion with its audit."""
+        """Solve the optimal control problem from a smooth guess along the path; return the audited candidate."""
         task, joints = self.task, self.path.joints
         settings, duration = task.request.settings, self.horizon_guess
         times = np.linspace(0.0, duration, settings.guess_times)

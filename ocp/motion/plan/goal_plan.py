@@ -78,7 +78,7 @@ def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
 
 
 def _check_request(request: GoalRequest) -> GoalTask:
-    """Check a request; return it with goals shifted towards the start by full turns of the unlimited joints."""
+    """Return a checked request, with goals shifted towards the start by full turns of the unlimited joints."""
     machine = require.instance("machine", request.machine, FixedBase)
     limits = Limits() if request.limits is None else require.instance("limits", request.limits, Limits)
     bounds = limits.bounds(machine)  # the problem that is declared warns of unknown limits

@@ -170,7 +170,7 @@ def _repair(
     configurations: Array,
     seeds: list[Candidate],
 ) -> None:
-    """Retry after all candidates failed: with separated bodies if some collided, otherwise from other guesses."""
+    """Search again after all candidates failed: with separated bodies if some collided, else from other guesses."""
     if queue.collided and not solver.no_clear_configuration:
         _try_alternatives(queue, solver, seeds)
     if queue.passed or queue.collided or queue.exhausted:

@@ -48,7 +48,7 @@ AT_START = 1e-6
 
 
 class _State(NamedTuple):
-    """Configuration and joint velocities at the junction of two motions; unknown joint positions are None."""
+    """Configuration and joint velocities where two motions of a sequence meet; unknown joint positions are None."""
 
     joints: Array | None
     base: Array
@@ -56,13 +56,13 @@ class _State(NamedTuple):
 
     @classmethod
     def end_of(cls, plan: SolvedPlan, smooth: bool) -> _State:
-        """Return the configuration and rates at the end of a motion; the rates count as zero if they may jump."""
+        """Return the state at the end of a motion; unless `smooth`, velocities may jump there and count as zero."""
         at = plan.at(plan.horizon)
         return cls(at["joints"], at.get("base", np.zeros(0)), _velocity(at["rates"], smooth))
 
 
 def _velocity(rates: Array, smooth: bool) -> Any:
-    """Return the joint velocity at a junction of two motions; "rest" if it is zero or velocities may jump there."""
+    """Return the joint velocity where two motions meet; "rest" if it is zero or, unless `smooth`, may jump there."""
     return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
 
 
@@ -110,7 +110,7 @@ class _Sequence:
 
     @property
     def horizon(self) -> Literal["free"] | None:
-        """Horizon of each motion, as in `plan`."""
+        """Horizon of each motion of the sequence: "free", or None for the duration that its tasks or goal state."""
         return "free" if self.free else None
 
     @property
@@ -155,7 +155,7 @@ class _Sequence:
         return np.where(np.isnan(joints), self.state.joints, joints)
 
     def _plan_goal(self, goal: Goal) -> SolvedPlan:
-        """Plan the motion from the end of the previous motion to a goal."""
+        """Plan the motion to a goal from the configuration at which the previous motion of the sequence ends."""
         own = self.machine if goal.machine is None else checked_motors("goal: machine", goal.machine)
         if own.robot.joint_names != self.machine.robot.joint_names:
             words = "all machines of a sequence need the joints of the first one"
@@ -186,7 +186,7 @@ class _Sequence:
         return plan_request(checked)
 
     def _approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
-        """Append an approach motion to the start of a task, if one is needed, and return the plan along the task."""
+        """Append the motion to the start of a task to the sequence, if needed; return the plan along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
@@ -207,7 +207,7 @@ class _Sequence:
         return self._plan_tasks(tasks, joints) if turned else plan
 
     def _constraints(self) -> ClearanceConstraints | None:
-        """Return the clearance constraints of the current machine; raise ProblemError if an obstacle moves."""
+        """Return the clearance constraints of the machine in its scene; raise ProblemError if an obstacle moves."""
         constraints = clearance_for(self.machine, self.options.limits, self.scene)
         if constraints is not None and constraints.scene.has_moving_obstacles:
             words = "obstacles of a sequence may not move, since it is not known when each part begins"
@@ -222,14 +222,14 @@ def _is_at_start(machine: Machine, tasks: Any, joints: Array) -> bool:
 
 
 def _misses(equations: TaskEquations, joints: Array) -> float:
-    """Return the largest pose error of a configuration at time 0, m or rad; a tool axis inside its cone has none."""
+    """Return the largest error of the poses that tasks require at time 0, m or rad; 0 for an axis inside its cone."""
     at: tuple[Any, ...] = np.zeros(1), None, joints[None]
     errors = equations.errors(*at), equations.cone_violations(*at)
     return max(float(np.abs(each).max(initial=0.0)) for each in errors)
 
 
 def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return the goal with the start configuration of the next task, or unchanged if that does not satisfy the goal."""
+    """Return the goal at the start configuration of the next task's plan, or unchanged if that misses the goal."""
     first = plan.at(0.0)
     if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
         return goal
@@ -242,13 +242,13 @@ def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: boo
 
 
 def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:
-    """Return a joint velocity as an array, which is zero for "rest"."""
+    """Return a joint velocity, given as numbers or as "rest", as an array; "rest" is zero."""
     return np.zeros_like(like["rates"]) if isinstance(velocity, str) else floats(velocity)
 
 
 @contextmanager
 def _naming_part(part: str) -> Iterator[None]:
-    """Add the name of a motion of a sequence to errors that are raised while this motion is planned."""
+    """Add the name of a motion of a sequence to the text of errors that are raised inside a `with` block."""
     try:
         yield
     except (ProblemError, SolveError) as error:

@@ -232,7 +232,7 @@ class _WaypointPlanner:
         return self._best_plan(paths, bound)
 
     def _segmented_paths(self, search: AtlasSearch, segmented: bool) -> tuple[list[list[Segment]], float]:
-        """Return paths through the waypoints of a search, each as a list of segments, and a lower cost bound."""
+        """Return paths through the waypoints of a search, each a list of segments, and a lower bound of their cost."""
         if segmented:
             result = fewest_segments(search)
             return ([], np.inf) if result is None else ([result[0]], result[1])

@@ -215,7 +215,7 @@ class Candidate:
         return self.reason is None
 
     def with_rejection(self, reason: Reason) -> Candidate:
-        """Return the candidate as rejected for `reason` or, if bodies had been separated, for their collision."""
+        """Return the rejected candidate: for `reason` or, if colliding bodies were separated, for their collision."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
@@ -228,7 +228,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class SingularSettings:
-    """Settings of the treatment of singular configurations.
+    """Thresholds below which a motion counts as nearly singular, and a joint as being at a limit.
 
     Attributes:
         conditioning: Ratio of the least to the largest singular value of the tasks' Jacobian below which tasks are
@@ -263,7 +263,7 @@ class MotionSample:
 
     @classmethod
     def of_local(cls, stretch: Stretch, motion: LocalMotion) -> MotionSample:
-        """Return the samples of the first of several local (resolved-rate) motions."""
+        """Convert the first of several local (resolved-rate) motions to samples in one time interval."""
         return cls(stretch, motion.t, motion.base[0], motion.joints[0], motion.rates[0])
 
     @property

@@ -103,7 +103,7 @@ class PathPlan(Plan):
 
     @property
     def t(self) -> Array:
-        """Times of the waypoints, s. Shape (N,)."""
+        """Times at which the plan passes the waypoints, s. Shape (N,)."""
         limits = self.limits.bounds(self.machine).velocity
         rates = np.where(np.isfinite(limits), limits, UNLIMITED_RATE)
         durations = (np.abs(np.diff(self.joints, axis=0)) / rates).max(axis=1, initial=0.0)

@@ -203,7 +203,7 @@ class Plan(ABC):
         """Audit the motion without using the cache of earlier audits."""
 
     def _with_rest_finding(self, audit: Audit) -> Audit:
-        """Add to an audit how fast the joints move at both ends; a controller expects a motion that starts at rest."""
+        """Return an audit with a further finding: how fast the joints move at the start and end of the motion."""
         ends = np.array([0.0, self.horizon])
         speeds = np.abs(self.at(ends)["rates"])
         speeds[speeds <= LIMIT_SHARE * np.abs(self._values("rates")).max(initial=0.0)] = 0.0
@@ -313,7 +313,7 @@ class Plan(ABC):
 
     @abstractmethod
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan, by name; raise the same errors as `save`."""
+        """Return the data of the plan as arrays by name, as `save` writes them to a file."""
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -411,7 +411,7 @@ def read_record(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], 
 
 @contextmanager
 def reading_plan(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Convert an error that the data of a plan file cause into a ProblemError, which names the file."""
+    """Convert errors that damaged data of a plan file cause in a `with` block to a ProblemError that names the file."""
     try:
         yield
     except (*RECORD_ERRORS, ModelError) as error:

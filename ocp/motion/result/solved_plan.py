@@ -91,7 +91,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, np.concatenate([self.solution[own + part.suffix] for part in self.parts]))
 
     def _of_all_joints(self, name: str, values: Array) -> Array:
-        """Extend joint values (M, m) of the solution by the values of the joints that stay at rest."""
+        """Insert the values of the joints that stay at rest into joint values (M, m) of the solution."""
         return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
 
     def _values_at(self, name: str, times: Array) -> Array:
@@ -126,10 +126,9 @@ class SolvedPlan(Plan):
         return self._fractions(self.parts[0], np.atleast_1d(self._checked_times(times)))
 
     def _audit(self, **settings: Any) -> Audit:
-        """Return the audit of the solution.
+        """Return the audit of the solution, with findings about all joint limits if the user declared the problem.
 
-        For a plan without a `request`, the limits of its machine are checked as well, since the meaning of the limits
-        in its problem is unknown.
+        The meaning of the limits in such a problem is unknown.
         """
         audit: Audit = self.solution.audit(**settings)
         if self.request is None:
@@ -227,7 +226,7 @@ class SolvedPlan(Plan):
 
     @property
     def rate_name(self) -> str:
-        """Name of the joint rates in the solution. SLOPES, with respect to task time, are divided by the pace."""
+        """Name of the state or control in the solution that holds the joint rates."""
         names = {**self.solution.states, **self.solution.controls}
         return next(name for name in RATES if name + self.parts[0].suffix in names)
 
@@ -268,7 +267,7 @@ class SolvedPlan(Plan):
         return [part.begin for part in self.parts]
 
     def _evaluate(self, times: Array, size: int, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate a quantity at times (M,) by a function of a part of the plan and fractions of the horizon."""
+        """Evaluate a quantity at times (M,), a function of a part of the plan and fractions of the horizon."""
         return evaluate_parts(
             self._begins,
             times,
@@ -278,7 +277,7 @@ class SolvedPlan(Plan):
 
 
 def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
-    """Return a part of the plan (time interval and suffix of names) for each time interval with the same tasks."""
+    """Return the parts of a plan, with times and a suffix of names: one for each time interval with the same tasks."""
     return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)
 
 
@@ -351,7 +350,7 @@ class PhasedPlan(SolvedPlan):
         return {**super().arrays(path), PHASED: np.ones(1)}
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the separately solved parts of the plan: none, because its phases are solved as one problem."""
+        """Return an empty list, since the phases of the plan are solved together as one problem."""
         return []
 
     def _check_parts(self) -> None:

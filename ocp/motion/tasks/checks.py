@@ -125,7 +125,7 @@ def checked_weights(weights: Any, size: int) -> Array:
 def checked_tasks(
     equations: TaskEquations, base: Array, joints: Array, horizon: float, *, check_start: bool = True
 ) -> None:
-    """Raise ProblemError if tasks require motions that the machine cannot perform, or a jump of a tip at the start.
+    """Raise ProblemError if the machine cannot perform the tasks, or if its tip is not at a task's target at the start.
 
     Args:
         equations: Equations of the tasks.
@@ -177,7 +177,7 @@ def checked_tasks(
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
-    """Return a description of the tasks if their equations are linearly dependent in a configuration, else None."""
+    """Return a text that names the task equations if they are linearly dependent in a configuration, else None."""
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
@@ -185,7 +185,7 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joint positions affect neither the joint rates that tasks require nor the base motion. Shape (n,).
+    """Return which joints' positions affect neither the joint rates that tasks require nor the base motion. Shape (n,).
 
     Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
     and the cones of tool axes do not depend on such a joint position.
@@ -212,7 +212,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the numbers of task equations in error messages: twist components of a single task, else positions."""
+    """Return the numbers of task equations for messages: twist components 0..5 of a single task, else 0, 1, ..."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -252,7 +252,7 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if the target of a task in a cyclic motion does not return to where it starts.
+    """Raise ProblemError if the target of a task does not return to its start, as a cyclic motion requires.
 
     Poses are checked by their targets, velocities by their integrals.
     """
@@ -279,7 +279,7 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
-    """Raise ProblemError if a task prescribes motion at a time of rest of the joints; times of None are skipped."""
+    """Raise ProblemError if a task prescribes motion at a given time at which the joints must rest; None is no time."""
     for time in (time for time in times if time is not None):
         for part, velocity in _moving_tasks(equations, time):
             words = (
@@ -400,7 +400,7 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
 
 
 def _rate_rows(task: TipTask) -> list[int]:
-    """Return the indices of the velocities among the target values of a pose task."""
+    """Return the indices of the velocities and angular velocities among the target values of a pose task."""
     return [row for _, rates in target_rows(task).values() for row in range(rates.start, rates.stop)]
 
 
@@ -416,7 +416,7 @@ def _rotation_angle(velocity: Array, step: float) -> float:
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities (n,) to prescribe where a motion begins or ends at rest, nan where left free.
+    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan for as many joints as tasks fix there.
 
     A tip whose velocity or acceleration is prescribed comes to rest by itself. As many joints as the tasks have such
     rows then follow from the others, and prescribing their rest too would be redundant. The joints that move the tip

@@ -257,13 +257,13 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Return pose minus target for pose tasks, and the velocity residuals for velocity tasks. Shape (size, 1)."""
+        """Return pose minus target for pose tasks, and velocity residual for velocity tasks. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         return ca.vertcat(*((-error if is_pose else residual)[i] for i, is_pose in enumerate(self.pose_rows)))
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return a column of pose errors that, unlike `error`, does not vanish at a rotation error of half a turn.
+        """Return a column of pose errors (m, near zero rad) that does not vanish at a rotation error of half a turn.
 
         In m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad). If all rotation is
         prescribed, these are the differences of the frame axes over sqrt 2, otherwise the rows of the half-angle
@@ -298,7 +298,7 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def misses(self, base: Any, joints: Any, targets: Any) -> tuple[float, float]:
-        """Return the largest position error, m, and orientation error, rad, of the tips at numeric arguments."""
+        """Return the largest position error, m, and orientation error, rad, of all tips in a numeric configuration."""
         distance = angle = 0.0
         for part, target in self.by_task(ca.DM(targets)):
             task = part.task
@@ -337,7 +337,7 @@ class TaskEquations:
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the differences between tip poses of velocity tasks and the poses in a reference configuration.
+        """Return the differences of the tip poses of velocity tasks between a configuration and a reference one.
 
         For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
         """
@@ -387,7 +387,7 @@ class TaskEquations:
 
     @cached_property
     def function(self) -> Any:
-        """CasADi Function of the matrix, right-hand side and pose errors of the task equations.
+        """CasADi Function of configuration and targets: task matrix J, right-hand side b and pose errors.
 
         (base, joints, targets) -> (J, b, pose error, pose residual).
         """
@@ -426,7 +426,7 @@ class TaskEquations:
         return on_symbols(build)
 
     def cyclic_rows(self, base: Array, joints: Array) -> Array:
-        """Return the combinations of task equations whose integral over a cyclic motion vanishes. Shape (size, k).
+        """Return the combinations of task equations whose integral vanishes if the joints return. Shape (size, k).
 
         If the joints return to their start, part of the closure conditions follows from the task: all of its rows on a
         fixed base; on a floating base the combinations of rows that are independent of the base pose while the centre
@@ -457,7 +457,7 @@ def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
 
 
 def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
-    """Return the equations of one or several tip tasks of a machine.
+    """Return the stacked equations of one or several tip tasks in the joint rates of a machine.
 
     If the robot has no tip, the machine of the equations has the frame of the first task as its tip.
 

@@ -46,7 +46,7 @@ class InFoot:
             raise ProblemError(words, name="margin", value=self.margin, limit=0.0)
 
     def check(self, machine: Standing) -> None:
-        """Raise ProblemError if the support polygon is too small for the margin."""
+        """Raise ProblemError if the support polygon of a machine is too small for the margin of the rule."""
         directions, support = machine.moving_directions, machine.support
         half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
         largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
@@ -70,7 +70,7 @@ class IndexAtLeast:
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return the corners of the rectangle in which the zero moment point satisfies the rule. Shape (2,) each, m."""
+        """Return two opposite corners of the rectangle of sufficient stability index. Shape (2,) each, m."""
         radius = machine.half_widths * np.sqrt(1 - self.value)
         return machine.most_stable_point - radius, machine.most_stable_point + radius
 
@@ -131,7 +131,7 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges, moved inwards by a margin, that a zero moment point rule needs as constraints.
+    """Return the support edges that must become constraints for a zero moment point rule; a margin moves them inwards.
 
     Returns:
         Inward normals n and offsets o: n . point >= o. Shapes (k, 2) and (k,).
@@ -151,7 +151,7 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the distances of the zero moment point from support edges, if the motion affects them. Shape (k, 1), m.
+    """Return the distances of the zero moment point from the support edges, if motions change them. Shape (k, 1), m.
 
     Args:
         machine, zmp: The machine and the rule for its zero moment point.
@@ -178,7 +178,7 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 
 
 def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the axes (0: x, 1: y) along which a motion can move the zero moment point out of the region of a rule.
+    """Return along which axes (0: x, 1: y) motions move the zero moment point out of a rule's rectangle.
 
     Args:
         machine, zmp, point, external: As for foot_rows.
@@ -200,7 +200,7 @@ def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool)
 
 
 def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
-    """Raise ProblemError if a rule for the zero moment point has the wrong type or is infeasible inside the support."""
+    """Raise ProblemError if a zero moment point rule has the wrong type or demands a point outside the support."""
     if not isinstance(zmp, ZmpRule):
         words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
         raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))

@@ -270,14 +270,14 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
 
 
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
-    """Return the distance (m) covered while the speed changes in the shortest time; raise the errors of `ramp_time`."""
+    """Return the distance (m) covered while the speed changes from `first` to `last` (m/s) in the shortest time."""
     for name, value in (("first", first), ("last", last)):
         require.nonnegative(f"ramp: {name}", value)
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
 
 
 def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Return the greatest speed (m/s) that can be reached within a distance (m), with zero acceleration at both ends.
+    """Return the greatest speed (m/s) reached from a given speed over a distance (m), acceleration zero at both ends.
 
     This is the inverse of ramp_distance; the same holds for slowing down from that speed.
     """

@@ -144,7 +144,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def resolving_times(equations: TaskEquations, times: Array) -> Array:
-    """Return given times and further ones, between which the target poses are nearly linear: `NODES.chord_error`.
+    """Return the given times and additional ones, so that target poses are nearly linear in time between neighbours.
 
     Args:
         equations: Equations of the tasks.

@@ -232,7 +232,7 @@ class TipTask:
 
     @property
     def along_reference(self) -> bool:
-        """Whether the components that the task prescribes are along the axes of the reference frame of the pose."""
+        """Whether the task prescribes components along the axes of the frame in which its target pose is given."""
         return self.axes == "reference" or (self.axes == "world" and self.relative_to is None)
 
     @property
@@ -286,7 +286,7 @@ def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
 
 
 class BoundTask(NamedTuple):
-    """A task, the machine whose tip is the task's frame, and the machine whose tip is the reference (None: world)."""
+    """A task, the machine whose tip is the task's frame, and that whose tip is the reference frame (None: world)."""
 
     task: TipTask
     tip: Machine
@@ -313,7 +313,7 @@ def target_size(task: TipTask) -> int:
 
 
 def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
-    """Split targets of a pose task into (position, velocity) and (rotation or direction, angular velocity).
+    """Split the target column of a pose task: (position, velocity), (rotation or direction, angular velocity).
 
     Either part is None if the task does not prescribe it.
     """
@@ -349,7 +349,7 @@ def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates
 
 
 def task_rows(part: BoundTask, base: Any, joints: Any, twist: Any) -> Any:
-    """Return the components that a task prescribes, selected from a world-axes twist or a matrix of twist columns."""
+    """Return the components that a task prescribes of a twist in world axes, or of each column of a twist matrix."""
     task = part.task
     angular, linear = twist[0:3, :], twist[3:6, :]
     rotation = None
@@ -377,7 +377,7 @@ def _tool_normals(task: TipTask) -> Any:
 
 
 def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the rotation and position error of a pose, in world axes; the rotation as axis times sine of the angle."""
+    """Return the rotation error (axis times sine of angle) and position error of a tip in world axes. Shape (6, 1)."""
     position_target, goal = split_targets(part.task, targets)
     pose, reference = part.tip.tip_pose(base, joints), reference_pose(part, base, joints)
     angular, linear = ca.DM(3, 1), ca.DM(3, 1)
@@ -419,7 +419,7 @@ def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> An
 
 
 def is_holonomic(part: BoundTask) -> Array:
-    """Return which velocity components of a task have a path-independent integral, a pose coordinate. Shape (size,)."""
+    """Return which velocity components of a task are rates of pose coordinates and so integrable. Shape (size,)."""
     task = part.task
     if task.is_pose:
         return np.ones(task.size, dtype=bool)
@@ -462,7 +462,7 @@ def angular_velocity(rotation: Any, rate: Any) -> Any:
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return the combinations of task equations that base motion with a fixed centre of mass does not affect.
+    """Return the combinations of task equations that no base motion with a fixed centre of mass affects.
 
     Raises:
         ProblemError: The momentum moves the centre of mass, and the joints cannot return.
@@ -490,7 +490,7 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return orthonormal combinations (count, k) of a matrix's first `count` rows that the other rows span."""
+    """Return orthonormal combinations (count, k) of a matrix's first `count` rows in the span of its other rows."""
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)

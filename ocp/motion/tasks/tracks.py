@@ -123,7 +123,7 @@ class PathTracks(NamedTuple):
     breaks: Array
 
     def axis(self, tool_axis: Array) -> Callable[[Any], Any]:
-        """Return the function of time for the direction of an axis of the tool frame, shape (3,)."""
+        """Return the direction (3,) of an axis of the tool frame as a function of time with a rate."""
         rotation, angular_velocity = self.orientation, self.orientation.rate  # type: ignore[attr-defined]
 
         def direction(time: Any) -> Any:
@@ -214,7 +214,7 @@ def reparametrize(track: Track, clock: Callable[[Any], Any]) -> Track:
 
 
 def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]:
-    """Check a numeric pose, and return its rotation (3, 3) and position (3,)."""
+    """Check a numeric pose (orientation, position), and return its rotation matrix (3, 3) and position (3,)."""
     try:
         orientation, position = (np.array(ca.DM(expression(part))) for part in pose)
     except NOT_NUMBERS as error:
@@ -227,7 +227,7 @@ def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]
 
 
 def on_symbols(build: Callable[[Any], _Result]) -> _Result:
-    """Call `build` with SX symbols or, if interpolants or external functions reject SX, with MX symbols."""
+    """Return `build(SX)` with CasADi's SX symbols or, if interpolants or external functions reject SX, `build(MX)`."""
     try:
         return build(ca.SX)
     except (RuntimeError, NotImplementedError):
