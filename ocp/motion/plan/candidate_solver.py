@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any
@@ -27,7 +26,7 @@ from ocp.motion.builders.tool_motion import CLOCK, SLOPES, ToolMotion
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.plan.actuators import cost_of_motion, solve_with_accelerations
+from ocp.motion.plan.actuators import solve_with_accelerations
 from ocp.motion.plan.candidate_queue import Solver
 from ocp.motion.result.candidate import (
     Candidate,
@@ -41,7 +40,7 @@ from ocp.motion.result.candidate import (
 )  # fmt: skip
 from ocp.motion.result.plan import audit_key
 from ocp.motion.result.request import declared_motion
-from ocp.motion.result.solved_plan import SolvedPlan, parts_of
+from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
@@ -109,17 +108,6 @@ class CandidateSolver(Solver):
             seed = replace(candidate.seed, fixed=True)
             return [advanced, Candidate(candidate.start, seed.cost, seed=seed)]
         return [advanced, *self._free_start(advanced)]
-
-    def with_own_cost(self) -> CandidateSolver:
-        """Return the solver with an additional last stage, which minimises the cost function of the request."""
-        solver = copy(self)
-        solver.last = Stage.ACTUATED
-        return solver
-
-    def own_cost(self, candidate: Candidate) -> float:
-        """Return the value of the request's own cost function for the motion of an audited candidate."""
-        assert self.request.cost is not None
-        return cost_of_motion(self.plan([candidate]), self.request.cost)
 
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
         """Return whether the tasks must be relaxed, as their Jacobian is nearly singular along a local motion."""
@@ -489,7 +477,8 @@ class CandidateSolver(Solver):
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, in which the other candidates are listed as well."""
-        best, parts = candidates[0], parts_of(self.motion.stretches)
+        best = candidates[0]
+        parts = tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in self.motion.stretches)
         assert best.solution is not None
         if self.request.time_cost is not None:
             parts = (parts[0]._replace(end=float(best.solution[CLOCK][-1, 0])),)

@@ -27,7 +27,6 @@ from ocp.motion.builders.space.capture import Capture, solve_capture
 from ocp.motion.builders.standing.plan import solve_standing, solve_steps
 from ocp.motion.builders.standing.problem import StandingSetup, Weights
 from ocp.motion.builders.standing.stances import Steps
-from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
@@ -35,7 +34,7 @@ from ocp.motion.plan.goal_motions import GoalRequest
 from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.plan.planner import PlanOptions
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
-from ocp.motion.result.solved_plan import Part, PhasedPlan, SolvedPlan, parts_of_phases
+from ocp.motion.result.solved_plan import Part, PhasedPlan, SolvedPlan
 from ocp.motion.search.configurations import PlannerSettings
 from ocp.motion.tasks.checks import are_at_rest, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
@@ -162,14 +161,13 @@ def _goal_request(
     )
 
 
-def plan_steps(
-    machine: Machine, steps: Steps, *, start: Any, cost: StepWeights | None, limits: Limits | None
-) -> PhasedPlan:
+def plan_steps(machine: Machine, steps: Steps, options: PlanOptions) -> PhasedPlan:
     """Plan the motion of a standing machine that makes given footsteps; see `steps_problem`.
 
     Args:
         machine: Machine of the first stance, `steps.stances[0]`.
-        start: Joint positions at the start, in the order of this machine.
+        steps: The steps.
+        options: Start, the joint positions in the order of this machine; cost; and limits.
 
     Raises:
         ProblemError: As `steps_problem`; or the machine is not that of the first stance.
@@ -179,19 +177,13 @@ def plan_steps(
     if not isinstance(machine, Stance) or machine.robot.joint_names != stance.robot.joint_names:
         words = "steps begin in their first stance: give plan(steps.stances[0], steps, start=...)"
         raise ProblemError(words, name="machine", value=machine)
-    joints = Start.of_known(start, stance)[1]
+    joints = Start.of_known(options.start, stance)[1]
     begin = steps.in_order(stance, joints[None])[0]
-    return _plan_of_phases(stance, solve_steps(steps, start=begin, cost=cost, limits=limits), joints)
+    return _plan_of_phases(stance, solve_steps(steps, start=begin, cost=options.cost, limits=options.limits), joints)
 
 
 def plan_capture(
-    machine: Machine,
-    capture: Capture,
-    *,
-    start: Any,
-    cost: Cost | None,
-    limits: Limits | None,
-    constraints: ClearanceConstraints | None,
+    machine: Machine, capture: Capture, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> PhasedPlan:
     """Plan the capture of a tumbling body by a free-floating chaser; see `capture_problem`.
 
@@ -200,9 +192,9 @@ def plan_capture(
         SolveError: No motion satisfies its limits.
     """
     chaser = require.instance("machine", machine, FreeFloating)
-    options: dict[str, Any] = {"cost": cost, "limits": limits, "clearance_constraints": constraints}
-    solution = solve_capture(chaser, capture, start=start, **options)
-    return _plan_of_phases(chaser, solution, np.asarray(Start.of(start, chaser)[1]))
+    setup: dict[str, Any] = {"cost": options.cost, "limits": options.limits, "clearance_constraints": constraints}
+    solution = solve_capture(chaser, capture, start=options.start, **setup)
+    return _plan_of_phases(chaser, solution, Start.of_known(options.start, chaser)[1])
 
 
 def with_joints(goal: Goal, joints: Array) -> Goal:
@@ -214,7 +206,8 @@ def with_joints(goal: Goal, joints: Array) -> Goal:
 def _plan_of_phases(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
     """Convert the solution of a problem with phases to a plan, whose only candidate starts at `start`."""
     candidate = Candidate(start, solution.cost, None, Stage.AUDITED, solution)
-    return PhasedPlan(machine, solution, parts_of_phases(solution), (candidate,))
+    parts = tuple(Part(begin, end, name) for name, (begin, end) in solution.phases.items())
+    return PhasedPlan(machine, solution, parts, (candidate,))
 
 
 def goal_configurations(

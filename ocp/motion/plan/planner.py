@@ -12,6 +12,7 @@ kind of seeds is used only if the kinds before it led to no plan, or to none tha
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -26,10 +27,10 @@ from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.plan.actuators import limits_actuators, weights_actuators, without_actuators
+from ocp.motion.plan.actuators import cost_of_motion, limits_actuators, weights_actuators, without_actuators
 from ocp.motion.plan.candidate_queue import CandidateQueue
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.cells import CellSearch, tracks_tasks
 from ocp.motion.search.configurations import (
@@ -120,10 +121,12 @@ def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
     If this is not the integral of the squared rates, all motions that passed are solved again for it, in the order of
     their costs before. If no motion passed, raise SolveError.
     """
-    if solver.request.cost is None or not queue.passed:
+    if (cost := solver.request.cost) is None or not queue.passed:
         return queue.plan()
-    passed = [replace(c, cost=solver.own_cost(c)) for c in queue.candidates if c.passed]
-    weighted = CandidateQueue(solver.with_own_cost(), queue.settings, include_costlier=True)
+    passed = [replace(c, cost=cost_of_motion(solver.plan([c]), cost)) for c in queue.candidates if c.passed]
+    last_solver = copy(solver)
+    last_solver.last = Stage.ACTUATED  # the stage that minimises this cost
+    weighted = CandidateQueue(last_solver, queue.settings, include_costlier=True)
     weighted.run(passed)
     weighted.candidates += [replace(c, cost=np.nan) for c in queue.candidates if not c.passed]
     return weighted.plan()

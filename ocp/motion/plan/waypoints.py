@@ -23,8 +23,8 @@ from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.ik_solver import idle_positions
-from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
-from ocp.motion.plan.planner import clearance_for
+from ocp.motion.local.inverse_kinematics import Unreachable
+from ocp.motion.plan.planner import PlanOptions, clearance_for
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.path_plan import PathPlan, PathPoses
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
@@ -84,13 +84,7 @@ class _Path(NamedTuple):
 
 
 def plan_path(
-    machine: FixedBase,
-    waypoints: Waypoints,
-    *,
-    cost: Any = None,
-    limits: Limits | None = None,
-    scene: Scene | Literal[False] | None = None,
-    seed: int = 0,
+    machine: FixedBase, waypoints: Waypoints, options: PlanOptions, *, scene: Scene | Literal[False] | None
 ) -> PathPlan:
     """Plan the lowest-cost joint path through tool poses, within limits and collision-free at every waypoint.
 
@@ -99,11 +93,11 @@ def plan_path(
             paths are searched on sections in which the joint nearest to the base has one of several values (see
             `ocp.motion.search.reconfigurations`), and no bound is known.
         waypoints: Poses of the tip.
-        cost: `length`, the sum of all joint displacements with the `weights` of the joints, or `time`, s, by the
-            velocity limits of the joints, from waypoint to waypoint; None for the length.
-        limits: Limits of the joint positions, and of the velocities for a time; the robot's own if None.
+        options: Cost, limits, and seed of inverse kinematics. The cost is the `length`, the sum of all joint
+            displacements with the `weights` of the joints, which is the default, or the `time`, s, by the velocity
+            limits of the joints, from waypoint to waypoint. The limits are those of the joint positions and, for a
+            time, of the velocities; the robot's own if None.
         scene: As in `plan`, with static obstacles, since a path has no times.
-        seed: Seed of inverse kinematics.
 
     Raises:
         ProblemError: The request does not fit the machine. Its subclass Unreachable names the waypoint as time.
@@ -111,8 +105,7 @@ def plan_path(
             end, what obstructs them, and by how much the poses or the clearance would have to be relaxed.
         SolveError: No path was found, though some pass a part of the waypoints.
     """
-    require.instance("machine", machine, FixedBase)
-    require.count("seed", seed, 0, LARGEST_SEED)
+    cost, limits = options.cost, options.limits
     positions, rotations = _poses(waypoints)
     n = machine.joint_size
     checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
@@ -149,7 +142,7 @@ def plan_path(
         (LargestMotion if is_timed else PathLength)(joint_weights),
         checked_limits,
         constraints,
-        int(seed),
+        int(options.seed),
     )
     return planner.plan(waypoints.reconfigurations == "counted")
 

@@ -16,7 +16,7 @@ from models import Machine
 from models.checks import Array
 from ocp.audit.audit import Audit
 from ocp.errors import ProblemError, StorageWarning
-from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
+from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.result.plan import Plan, Rows, evaluate_parts, read_record, reading_plan, record_arrays
 from ocp.motion.result.request import MotionRequest, machines_of_phases, request_of, restored_request, stored_request
@@ -26,7 +26,7 @@ from ocp.motion.tasks.targets import Target, targets_along, tip_poses
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.solution import Solution
 
-__all__ = ["PHASED", "Part", "PhasedPlan", "SolvedPlan", "parts_of", "parts_of_phases"]
+__all__ = ["PHASED", "Part", "PhasedPlan", "SolvedPlan"]
 
 RATES = ("rates", SLOPES, "velocities")
 PHASED = "plan.phased"
@@ -276,11 +276,6 @@ class SolvedPlan(Plan):
         )
 
 
-def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
-    """Return the parts of a plan, with times and a suffix of names: one for each time interval with the same tasks."""
-    return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class PhasedPlan(SolvedPlan):
     """Plan of several consecutive phases, such as motions to several goals with different loads.
@@ -366,8 +361,3 @@ class PhasedPlan(SolvedPlan):
             ]
             if set(machine.robot.joint_names) != set(self.names) or sizes != [machine.joint_size] * 2:
                 raise ValueError(f"the solution has no joints and velocities of its machine in phase {name!r}")
-
-
-def parts_of_phases(solution: Solution) -> tuple[Part, ...]:
-    """Return the parts of a plan with phases: the time interval and the name of each phase."""
-    return tuple(Part(begin, end, name) for name, (begin, end) in solution.phases.items())
