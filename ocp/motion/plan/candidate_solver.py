@@ -127,15 +127,14 @@ class CandidateSolver(Solver):
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
         """Return why a candidate failed: what its guess or, if tasks are relaxed, the last iterate violates."""
-        samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
-        if not samples:
+        if not candidate.seed.local:
             return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
-        solution = candidate.solution
-        if solution is not None and candidate.seed.relaxed:
-            samples = self._motion_samples(solution)
-        return shortfall_reason(self.request, samples)
+        if candidate.solution is not None and candidate.seed.relaxed:
+            return shortfall_reason(self.request, self._motion_samples(candidate.solution))
+        samples = map(MotionSample.of_local, self.motion.stretches, candidate.seed.local)
+        return shortfall_reason(self.request, list(samples))
 
-    def _turned_over(self, solution: Solution) -> Reason | None:
+    def _turned_tool_reason(self, solution: Solution) -> Reason | None:
         """Return a rejection reason if the tool at a free start is turned by more than 90 degrees from its target."""
         if self.request.start is not None:
             return None
@@ -183,7 +182,7 @@ class CandidateSolver(Solver):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
         assert candidate.solution is not None
-        if (reason := self._turned_over(candidate.solution)) is not None:
+        if (reason := self._turned_tool_reason(candidate.solution)) is not None:
             return candidate.with_rejection(reason)
         solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if (deviation := self._deviations(motion, solution).max()) > self.settings.max_deviation:

@@ -295,7 +295,6 @@ def plan_to_stand(
         SolveError: No start leads to a plan that passes its audit.
     """
     start, limits, cost = options.start, options.limits, options.cost
-    require.flag("cyclic", options.cyclic)
     if options.cyclic:
         words = "a standing motion cannot be cyclic; declare standing_problem with StandingSetup(end=...)"
         raise ProblemError(words, name="cyclic", value=options.cyclic)

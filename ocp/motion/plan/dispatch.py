@@ -136,8 +136,7 @@ def _plan(machine: Machine, tasks: Any, horizon: Any, scene: Any, options: PlanO
         raise ProblemError(words, name="wrenches", value=wrenches)
     if isinstance(tasks, Waypoints):
         _check_unused("a path through waypoints", horizon=horizon, start=options.start, cyclic=cyclic)
-        arm = require.instance("machine", machine, FixedBase)
-        return plan_path(arm, tasks, options, scene=scene)
+        return plan_path(require.instance("machine", machine, FixedBase), tasks, options, scene=scene)
     if options.search == "segments":
         _check_unused("search='segments'", cyclic=cyclic)
         arm = require.instance("machine", machine, FixedBase)

@@ -175,7 +175,7 @@ class GoalTask:
         return bool(self.request.cost.length)
 
 
-def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
+def _constant_speed_candidates(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
     """Return audited candidates that follow collision-free joint paths at constant speed."""
     request = task.request
     fastest = np.where(np.isfinite(task.bounds.velocity), task.bounds.velocity, request.settings.unlimited_rate)
@@ -202,8 +202,8 @@ def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
     That is the least time, any timing within the limits of the actuators, or constant speed.
     """
     if task.is_fastest:
-        return [_fastest(task, path) for path in paths]
-    return _within_actuator_limits(task, paths) if task.is_dynamic else _at_constant_speed(task, paths)
+        return [_fastest_candidate(task, path) for path in paths]
+    return _candidates_within_limits(task, paths) if task.is_dynamic else _constant_speed_candidates(task, paths)
 
 
 def synchronised_candidates(task: GoalTask) -> list[Candidate]:
@@ -227,16 +227,16 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
     return []
 
 
-def _fastest(task: GoalTask, path: JointPath) -> Candidate:
+def _fastest_candidate(task: GoalTask, path: JointPath) -> Candidate:
     """Return an audited, locally fastest motion near a path or, if none is found, one that stops at path corners."""
-    candidate = _spline(task, path, None)
+    candidate = _spline_candidate(task, path, None)
     if not candidate.passed:
         with suppress(TimeLimitReached):
-            return next((other for other in _within_actuator_limits(task, [path]) if other.passed), candidate)
+            return next((other for other in _candidates_within_limits(task, [path]) if other.passed), candidate)
     return candidate
 
 
-def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate:
+def _spline_candidate(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate:
     """Return an audited, locally optimal spline near a path; the horizon is free if it is None."""
     settings = task.request.settings.spline
     ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
@@ -256,7 +256,7 @@ def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate
     return candidate
 
 
-def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
+def _candidates_within_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
     """Return audited motions along paths within actuator limits: with stops at corners or, if better, without."""
     request, settings, bounds = task.request, task.request.settings, task.bounds
     candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
@@ -342,12 +342,12 @@ class _PathProblem:
     def without_stops(self) -> Candidate:
         """Return a locally optimal motion without stops near the path, with its audit."""
         if self.task.spline_cost is not None and not self.task.is_fastest:
-            spline = _spline(self.task, self.path, self.fixed)
+            spline = _spline_candidate(self.task, self.path, self.fixed)
             if spline.passed:
                 return spline
-        return self.smooth()
+        return self.solve()
 
-    def smooth(self) -> Candidate:
+    def solve(self) -> Candidate:
         """Solve the optimal control problem from a smooth guess along the path; return the audited candidate."""
         task, joints = self.task, self.path.joints
         settings, duration = task.request.settings, self.horizon_guess

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.builders.torques import checked_motors
-from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
+from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.plan.actuators import cost_of_motion, limits_actuators, weights_actuators, without_actuators
 from ocp.motion.plan.candidate_queue import CandidateQueue
@@ -36,7 +36,6 @@ from ocp.motion.search.cells import CellSearch, tracks_tasks
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
-    SearchKind,
     largest_pose_errors,
     local_motions_from,
     start_collisions,
@@ -106,7 +105,7 @@ def plan_from_configurations(
     seeds = candidates_from(solver, motions)
     queue.run(seeds)
     if not queue.passed:
-        _repair(queue, solver, motions, configurations, seeds)
+        _search_again(queue, solver, motions, configurations, seeds)
     try:
         return _final_plan(queue, solver), None if search is None else search.bound
     except SolveError as error:
@@ -166,7 +165,7 @@ def _approach_costs(request: PlanRequest, starts: Array) -> Array:
     return np.asarray(squares / 2 + (0.0 if request.cost is None else request.cost.time) * durations)
 
 
-def _repair(
+def _search_again(
     queue: CandidateQueue,
     solver: CandidateSolver,
     motions: Sequence[LocalMotion],
@@ -372,15 +371,12 @@ class PlanOptions:
 
 
 def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOptions) -> PlanRequest:
-    """Check the arguments of `plan`, except the scene, and return them as a request.
+    """Check the arguments of `plan` for tip tasks, except the scene, search, seed and `cyclic`; return the request.
 
     Raises:
         ProblemError: As in `plan`.
     """
     limits, search = options.limits, options.search
-    require.choice("search", search, get_args(SearchKind))
-    require.flag("cyclic", options.cyclic)
-    require.count("seed", options.seed, 0, LARGEST_SEED)
     all_tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, all_tasks)  # checks the tasks against the machine
     checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)

@@ -47,7 +47,7 @@ AT_START = 1e-6
 """Largest pose error, m and rad, with which a configuration counts as being at the start of a task or at a goal."""
 
 
-class _State(NamedTuple):
+class _Junction(NamedTuple):
     """Configuration and joint velocities where two motions of a sequence meet; unknown joint positions are None."""
 
     joints: Array | None
@@ -55,13 +55,13 @@ class _State(NamedTuple):
     rates: Any
 
     @classmethod
-    def end_of(cls, plan: SolvedPlan, smooth: bool) -> _State:
+    def end_of(cls, plan: SolvedPlan, smooth: bool) -> _Junction:
         """Return the state at the end of a motion; unless `smooth`, velocities may jump there and count as zero."""
         at = plan.at(plan.horizon)
-        return cls(at["joints"], at.get("base", np.zeros(0)), _velocity(at["rates"], smooth))
+        return cls(at["joints"], at.get("base", np.zeros(0)), _junction_velocity(at["rates"], smooth))
 
 
-def _velocity(rates: Array, smooth: bool) -> Any:
+def _junction_velocity(rates: Array, smooth: bool) -> Any:
     """Return the joint velocity where two motions meet; "rest" if it is zero or, unless `smooth`, may jump there."""
     return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
 
@@ -99,14 +99,14 @@ class _Sequence:
     options: PlanOptions
     scene: Scene | Literal[False] | None
     free: bool
-    state: _State = field(init=False)
+    state: _Junction = field(init=False)
     plans: list[SolvedPlan] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         start_of = Start.of_known if isinstance(self.parts[0], Goal) else Start.of
         start, joints, base = start_of(self.options.start, self.machine)
-        self.state = _State(joints, base, start.velocity)
+        self.state = _Junction(joints, base, start.velocity)
 
     @property
     def horizon(self) -> Literal["free"] | None:
@@ -126,16 +126,16 @@ class _Sequence:
             if isinstance(part, Goal):
                 name = part.name or f"goal {number}"
                 if following is not None and not isinstance(following, Goal) and not self.machine.base_size:
-                    with _naming_part(f"task {number + 1}"):
+                    with _errors_named_after(f"task {number + 1}"):
                         next_plan = self._plan_tasks(following, self._joints_near(part))
                     part = _with_next_start(self.machine, part, next_plan, self.smooth)
-                with _naming_part(name):
+                with _errors_named_after(name):
                     self._append(self._plan_goal(part), name)
                 continue
-            with _naming_part(f"task {number}"):
+            with _errors_named_after(f"task {number}"):
                 plan = next_plan or self._plan_tasks(part, self.state.joints)
-            with _naming_part(f"approach to task {number}"):
-                plan = self._approach(plan, part, f"approach to task {number}")
+            with _errors_named_after(f"approach to task {number}"):
+                plan = self._with_approach(plan, part, f"approach to task {number}")
             self._append(plan, f"task {number}")
             next_plan = None
         return SequencePlan(self.plans[0].machine, tuple(self.plans), tuple(self.names), self.smooth)
@@ -143,7 +143,7 @@ class _Sequence:
     def _append(self, plan: SolvedPlan, name: str) -> None:
         self.plans.append(plan)
         self.names.append(name)
-        self.state = _State.end_of(plan, self.smooth)
+        self.state = _Junction.end_of(plan, self.smooth)
 
     def _joints_near(self, goal: Goal) -> Array | None:
         """Return the joint positions of a goal, with current positions for the joints that the goal leaves open."""
@@ -185,14 +185,14 @@ class _Sequence:
             checked = checked.with_held(dict(zip(names, near[idle].tolist(), strict=True)))
         return plan_request(checked)
 
-    def _approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
+    def _with_approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
         """Append the motion to the start of a task to the sequence, if needed; return the plan along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
-        rates = _velocity(first["rates"], self.smooth)
+        rates = _junction_velocity(first["rates"], self.smooth)
         if np.abs(first["joints"] - state.joints).max() <= JUMP_TOLERANCE:
-            jump = np.abs(_numbers(rates, first) - _numbers(state.rates, first)).max()
+            jump = np.abs(_velocity_array(rates, first) - _velocity_array(state.rates, first)).max()
             if not self.smooth or jump <= JUMP_TOLERANCE:
                 return plan
             fastest = int(np.abs(first["rates"]).argmax())
@@ -218,10 +218,10 @@ class _Sequence:
 def _is_at_start(machine: Machine, tasks: Any, joints: Array) -> bool:
     """Return whether a configuration satisfies the tasks at their start; velocity tasks may start anywhere."""
     first = [task for task in ((tasks,) if isinstance(tasks, TipTask) else tasks) if not task.begin]
-    return _misses(bind(machine, first), joints) <= AT_START if first else True
+    return _largest_pose_error(bind(machine, first), joints) <= AT_START if first else True
 
 
-def _misses(equations: TaskEquations, joints: Array) -> float:
+def _largest_pose_error(equations: TaskEquations, joints: Array) -> float:
     """Return the largest error of the poses that tasks require at time 0, m or rad; 0 for an axis inside its cone."""
     at: tuple[Any, ...] = np.zeros(1), None, joints[None]
     errors = equations.errors(*at), equations.cone_violations(*at)
@@ -231,23 +231,25 @@ def _misses(equations: TaskEquations, joints: Array) -> float:
 def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
     """Return the goal at the start configuration of the next task's plan, or unchanged if that misses the goal."""
     first = plan.at(0.0)
-    if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
+    if goal.region is not None or (
+        goal.has_pose and _largest_pose_error(bind(machine, goal.task), first["joints"]) > AT_START
+    ):
         return goal
     apart = 0.0 if goal.has_pose else float(np.nanmax(np.abs(floats(goal.joints).ravel() - first["joints"])))
     if not apart <= JUMP_TOLERANCE:
         return goal
     passes = isinstance(goal.velocity, str) and goal.velocity == "free"
-    velocity = _velocity(first["rates"], smooth) if passes else goal.velocity
+    velocity = _junction_velocity(first["rates"], smooth) if passes else goal.velocity
     return replace(with_joints(goal, first["joints"]), velocity=velocity)
 
 
-def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:
+def _velocity_array(velocity: Any, like: Mapping[str, Array]) -> Array:
     """Return a joint velocity, given as numbers or as "rest", as an array; "rest" is zero."""
     return np.zeros_like(like["rates"]) if isinstance(velocity, str) else floats(velocity)
 
 
 @contextmanager
-def _naming_part(part: str) -> Iterator[None]:
+def _errors_named_after(part: str) -> Iterator[None]:
     """Add the name of a motion of a sequence to the text of errors that are raised inside a `with` block."""
     try:
         yield
@@ -284,7 +286,6 @@ def plan_in_segments(
         DeadEnd: At some time no motion does the tasks even for the shortest while, in any configuration.
         SolveError: No segment could be planned, however the tasks were divided.
     """
-    require.instance("machine", machine, FixedBase)
     request = checked_request(machine, tasks, horizon, replace(options, search="global"))
     constraints = clearance_for(machine, options.limits, scene)
     if constraints is not None and constraints.scene.has_moving_obstacles:

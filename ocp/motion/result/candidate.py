@@ -310,7 +310,7 @@ def _limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reas
         shares = _rate_shares(request, sample.rates)
         k, joint = (int(i) for i in np.unravel_index(int(shares.argmax()), shares.shape))
         if shares[k, joint] > 1 + SINGULAR.at_limit:
-            name, unit = _joint(request, joint)
+            name, unit = _joint_name_and_unit(request, joint)
             rate, limit = float(abs(sample.rates[k, joint])), float(request.bounds.velocity[joint])
             words = (
                 f"at {sample.t[k]:.4g} s {name!r} would have to move at {rate:.4g} {unit}/s, its limit is {limit:.4g} "
@@ -339,14 +339,14 @@ def shortfall_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> R
         slack = np.nan_to_num(SINGULAR.at_limit * (bounds.upper - bounds.lower), nan=0.0, posinf=0.0)
     for limits in (bounds.lower, bounds.upper):
         for joint in np.flatnonzero(np.abs(joints - limits) <= slack).tolist():
-            name, unit = _joint(request, joint)
+            name, unit = _joint_name_and_unit(request, joint)
             words = (
                 f"{words}, with {name!r} at its limit {limits[joint]:.5g} {unit}; start elsewhere or leave a row free"
             )
             return Reason(Rejection.INFEASIBLE, words, name, float(joints[joint]), float(limits[joint]), time)
     shares = _rate_shares(request, sample.rates[k])
     fastest = int(shares.argmax())
-    name, unit = _joint(request, fastest)
+    name, unit = _joint_name_and_unit(request, fastest)
     value, limit = float(abs(sample.rates[k, fastest])), float(bounds.velocity[fastest])
     at_limit = shares[fastest] >= 1 - SINGULAR.at_limit
     words += (
@@ -361,7 +361,7 @@ def _rate_shares(request: PlanRequest, rates: Array) -> Array:
         return np.nan_to_num(np.abs(rates) / request.bounds.velocity, nan=0.0)
 
 
-def _joint(request: PlanRequest, joint: int) -> tuple[str, str]:
+def _joint_name_and_unit(request: PlanRequest, joint: int) -> tuple[str, str]:
     """Return the name of a joint, and the unit of its position."""
     moving = request.machine.robot.moving_joints[joint]
     return moving.name, "m" if moving.kind == "prismatic" else "rad"

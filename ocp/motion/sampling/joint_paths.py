@@ -384,7 +384,7 @@ def optimise_length(motions: StraightMotions, path: Array, scale: Array, *, limi
     best, best_length, inertia, idle = path, length, OPTIMISATION.inertia, 0
     for _ in range(OPTIMISATION.most_steps):
         check_time()
-        step = _step(motions, chain, scale, limits, inertia)
+        step = _length_step(motions, chain, scale, limits, inertia)
         moved, shares = _clear_step(motions, chain, chain + step, OPTIMISATION.smallest_share)
         length = path_length(moved, scale)
         gain = 1 - length / best_length
@@ -417,7 +417,9 @@ def _resample(motions: StraightMotions, path: Array, scale: Array, count: int) -
     return chain if motions.are_clear(chain[:-1], chain[1:]).all() else path
 
 
-def _step(motions: StraightMotions, chain: Array, scale: Array, limits: tuple[Array, Array], inertia: float) -> Array:
+def _length_step(
+    motions: StraightMotions, chain: Array, scale: Array, limits: tuple[Array, Array], inertia: float
+) -> Array:
     """Return displacements of a path's corners that minimise an upper bound of its length under linear constraints.
 
     The clearance constraints are linearised. Shape (m + 1, n).

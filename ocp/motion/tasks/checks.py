@@ -370,11 +370,8 @@ def _task_speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
         angular = targets[-3:] if task.tilts else targets[-3:][angular_rows]
         linear = targets[3:6][task.linear] if task.position is not None else targets[:0]
     else:
-        by_row = {row: targets[i] for i, row in enumerate(task.chosen)}
-        linear, angular = (
-            np.array([by_row[row] for row in by_row if (row in ANGULAR) == is_angular]).reshape(-1, targets.shape[1])
-            for is_angular in (False, True)
-        )
+        turning = np.isin(task.chosen, ANGULAR)
+        linear, angular = targets[~turning], targets[turning]
     return np.linalg.norm(linear, axis=0), np.linalg.norm(angular, axis=0)
 
 

@@ -35,7 +35,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Convert a Start, joint positions or None to (Start, joint positions (n,) or None if free, base).
+        """Return a value as (Start, joint positions of shape (n,) or None if free, base configuration), all checked.
 
         Args:
             value: A start, joint positions, or None.
@@ -50,7 +50,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Convert a Start or joint positions to (Start, joint positions (n,), base); the positions must be known.
+        """Return a value as (Start, joint positions of shape (n,), base configuration); no position may be free.
 
         Args:
             value: A start with joint positions, or joint positions.
