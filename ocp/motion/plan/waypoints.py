@@ -106,8 +106,7 @@ def plan_path(
         SolveError: No path was found, though some pass a part of the waypoints.
     """
     cost, limits = options.cost, options.limits
-    positions, rotations = _poses(waypoints)
-    n = machine.joint_size
+    poses = _poses(waypoints, machine.joint_size)
     checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     own_cost = Cost(velocity=0, length=1) if cost is None else require.instance("cost", cost, Cost)
     if own_cost.terms not in (("length",), ("time",)):
@@ -125,57 +124,48 @@ def plan_path(
             words = "cost: the time of a path takes no weights; leave them out"
             raise ProblemError(words, name="weights", value=own_cost.weights)
         joint_weights = own_cost.time / checked_limits.bounds(machine, ("velocity",)).velocity
-        if not joint_weights.any():
-            raise ProblemError("cost: the time needs a joint with a velocity limit", name="velocity")
     else:
-        joint_weights = own_cost.length * _path_weights(own_cost.weights, n)
-    step = require.broadcast("step", waypoints.step, n, "joints", entries="numbers", sign="positive")
+        joint_weights = np.full(machine.joint_size, own_cost.length)
+        if own_cost.weights is not None:
+            shape, meaning = joint_weights.shape, "one for each joint"
+            joint_weights *= require.array("weights", own_cost.weights, shape, sign="nonnegative", meaning=meaning)
+    if not joint_weights.any():
+        words = "cost: no joint adds to it; give a joint a velocity limit for the time, or a weight for the length"
+        raise ProblemError(words, name="velocity" if is_timed else "weights", value=joint_weights)
     constraints = clearance_for(machine, checked_limits, scene)
     if constraints is not None and constraints.scene.has_moving_obstacles:
         words = "a path through waypoints has no time at which obstacles would be somewhere; give static obstacles"
         raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
-    planner = _WaypointPlanner(
-        machine,
-        positions,
-        rotations,
-        step,
-        (LargestMotion if is_timed else PathLength)(joint_weights),
-        checked_limits,
-        constraints,
-        int(options.seed),
-    )
+    cost_of_steps = (LargestMotion if is_timed else PathLength)(joint_weights)
+    planner = _WaypointPlanner(machine, poses, cost_of_steps, checked_limits, constraints, int(options.seed))
     return planner.plan(waypoints.reconfigurations == "counted")
 
 
+@dataclass(eq=False)
 class _WaypointPlanner:
     """Planner of a path through waypoints, with the checked arguments of `plan_path`."""
 
-    def __init__(
-        self,
-        machine: FixedBase,
-        positions: Array,
-        rotations: Array,
-        step: Array,
-        cost: Homogeneous,
-        limits: Limits,
-        constraints: ClearanceConstraints | None,
-        seed: int,
-        settings: WaypointSettings = WaypointSettings(),
-    ) -> None:
-        self.settings = settings
-        self.machine, self.positions, self.rotations, self.step = machine, positions, rotations, step
-        self.constraints, self.scene = constraints, None if constraints is None else constraints.scene
-        self.seed, self.limits, self.joint_limits, self.cost = seed, limits, limits.joints, cost
-        bounds = limits.bounds(machine)
+    machine: FixedBase
+    poses: PathPoses
+    cost: Homogeneous
+    limits: Limits
+    constraints: ClearanceConstraints | None
+    seed: int
+    settings: WaypointSettings = field(default_factory=WaypointSettings)
+
+    def __post_init__(self) -> None:
+        machine, bounds = self.machine, self.limits.bounds(self.machine)
+        self.positions, self.rotations, self.step = self.poses
+        self.scene = None if self.constraints is None else self.constraints.scene
         self.lower, self.upper = bounds.lower, bounds.upper
         self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
         pose = bind(machine, self._task(0))
         equations = TasksWithFixedJoints(machine, pose.bound, tuple(np.flatnonzero(pose.idle).tolist()))
         stationary = idle_positions(self.lower, self.upper)
-        targets = np.zeros((len(positions), 18))
-        targets[:, :3] = positions
-        targets[:, 6:15] = rotations.transpose(0, 2, 1).reshape(-1, 9)
-        targets = np.column_stack([targets, np.tile(stationary[pose.idle], (len(positions), 1))])
+        targets = np.zeros((len(self.positions), 18))
+        targets[:, :3] = self.positions
+        targets[:, 6:15] = self.rotations.transpose(0, 2, 1).reshape(-1, 9)
+        targets = np.column_stack([targets, np.tile(stationary[pose.idle], (len(targets), 1))])
         self.manifolds = SelfMotionManifolds(self.space, equations, targets)
         self._seed_cache = dict[int, Array]()
         if not 0 <= self.manifolds.size <= MAX_FREE_DIRECTIONS:
@@ -249,7 +239,7 @@ class _WaypointPlanner:
             self.limits,
             best.cost,
             self.constraints,
-            PathPoses(self.positions, self.rotations, self.step),
+            self.poses,
             tuple(candidates),
             lower_bound or None,
             best.breaks,
@@ -377,7 +367,7 @@ class _WaypointPlanner:
         """Return inverse kinematics solutions at a waypoint, from the cache if possible."""
         if number not in self._seed_cache:
             try:
-                seeds = self.manifolds.seeds(number, self.joint_limits, self.seed + number)
+                seeds = self.manifolds.seeds(number, self.limits.joints, self.seed + number)
             except Unreachable as error:
                 words = f"waypoint {number} at {self.positions[number].round(6).tolist()} m: {error}"
                 raise Unreachable(words, **{**vars(error), "time": float(number)}) from error
@@ -427,18 +417,9 @@ class _WaypointPlanner:
         return words, np.flatnonzero(invalid | colliding)
 
 
-def _path_weights(weights: Any, size: int) -> Array:
-    """Check the weights of the joints in the path length, and return the weight of each joint. Shape (size,)."""
-    if weights is None:
-        return np.ones(size)
-    array = require.array("weights", weights, (size,), sign="nonnegative", meaning="one for each joint")
-    if not array.any():
-        raise ProblemError("weights are all 0; one at least must be positive", name="weights", value=array, limit=0.0)
-    return array
-
-
-def _poses(waypoints: Waypoints) -> tuple[Array, Array]:
-    """Check the poses of waypoints, and return positions (N, 3) and rotation matrices (N, 3, 3)."""
+def _poses(waypoints: Waypoints, size: int) -> PathPoses:
+    """Return the poses of waypoints and the largest step of each of `size` joints, after checking all of them."""
+    step = require.broadcast("step", waypoints.step, size, "joints", entries="numbers", sign="positive")
     positions = require.array("positions", waypoints.positions, ("waypoints", 3), least=2)
     quaternions = require.array("quaternions", waypoints.quaternions, ("waypoints", 4), least=2)
     if len(positions) != len(quaternions):
@@ -448,4 +429,4 @@ def _poses(waypoints: Waypoints) -> tuple[Array, Array]:
     if not (norms > 0).all():
         raise ProblemError(f"quaternion {int(norms.argmin())} is zero", name="quaternions", value=0.0)
     rotations = scipy.spatial.transform.Rotation.from_quat(quaternions[:, [1, 2, 3, 0]])
-    return positions, np.asarray(rotations.as_matrix())
+    return PathPoses(positions, np.asarray(rotations.as_matrix()), step)
