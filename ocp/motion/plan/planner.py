@@ -356,7 +356,7 @@ def clearance_for(
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """Unchecked options of `plan` for tip tasks.
+    """Options of `plan` besides machine, tasks, horizon and scene; they are not yet checked against the machine.
 
     Attributes:
         start, cyclic, cost, limits, search, seed: As in `plan`.

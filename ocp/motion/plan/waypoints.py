@@ -125,7 +125,7 @@ def plan_path(
             raise ProblemError(words, name="weights", value=own_cost.weights)
         joint_weights = own_cost.time / checked_limits.bounds(machine, ("velocity",)).velocity
     else:
-        joint_weights = np.full(machine.joint_size, own_cost.length)
+        joint_weights = np.full(machine.joint_size, float(own_cost.length))
         if own_cost.weights is not None:
             shape, meaning = joint_weights.shape, "one for each joint"
             joint_weights *= require.array("weights", own_cost.weights, shape, sign="nonnegative", meaning=meaning)

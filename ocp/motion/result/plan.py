@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import Machine, ModelError
-from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats
+from models.checks import MAX_LISTED, Array
 from ocp.audit.audit import Audit, Finding
 from ocp.console import interruptible
-from ocp.errors import ProblemError, require, sample_times
+from ocp.errors import ProblemError, require, sample_times, values_within
 from ocp.motion.result.candidate import Candidate, Stage
 from ocp.motion.schedule.trajectory import JointTrajectory
 from ocp.motion.tasks.speed_profile import segment_index
@@ -46,8 +46,6 @@ ENDS = "speed at both ends"
 CHECKED_TIMES = 2001
 """Number of samples at which joint limits are checked, besides the times of the plan."""
 Rows: TypeAlias = NDArray[np.intp]
-TIME_TOLERANCE = 1e-9
-"""Largest amount by which a time may lie outside a plan, as a fraction of the horizon."""
 
 
 class PlanSample(NamedTuple):
@@ -365,16 +363,7 @@ class Plan(ABC):
         return ("joints", "rates", *(("base",) if self.machine.base_size else ()))
 
     def _checked_times(self, time: Any) -> Array:
-        try:
-            times = floats(time)
-        except NOT_NUMBERS as error:
-            words = f"a time or an array of times is expected, not {time!r}"
-            raise ProblemError(words, name="time", value=time) from error
-        slack = TIME_TOLERANCE * self.horizon
-        if not ((times >= -slack) & (times <= self.horizon + slack)).all():
-            words = f"time {time!r} is outside the plan, 0 to {self.horizon:g} s"
-            raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon))
-        return np.asarray(np.clip(times, 0.0, self.horizon))
+        return values_within(time, self.horizon, "time", f"s is outside the plan, 0 to {self.horizon:g} s")
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
         """Return the poses of the machine's tip at checked times (M,). Shape (M, 7)."""

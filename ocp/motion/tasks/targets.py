@@ -166,7 +166,7 @@ def resolving_times(equations: TaskEquations, times: Array) -> Array:
 
 
 def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
-    """Return the indices of all pose values among the target values of tasks, and the rows of each velocity of a pose.
+    """Return the indices of the pose values among the stacked targets of tasks, and the rows of each pose's velocities.
 
     The velocity of an orientation or of a direction is an angular velocity.
     """

@@ -294,7 +294,7 @@ class BoundTask(NamedTuple):
 
 
 def target_rows(task: TipTask) -> dict[str, tuple[slice, slice]]:
-    """Return the rows of a pose task's target column that hold each target, and the rows of the target's velocity.
+    """Return, by name, which rows of a pose task's target column hold each target and which hold its velocity.
 
     By name, as far as given: "position" (3 rows), "orientation" (9 rows, a rotation matrix by columns) and "direction"
     (3 rows). A velocity or an angular velocity has 3 rows.
