@@ -30,6 +30,7 @@ __all__ = ["RefinementSettings", "refine", "refine_from", "split"]
 
 
 LIMITS = [name for name, entry in signature(judge).parameters.items() if entry.kind is Parameter.KEYWORD_ONLY]
+INTEGRATION = "integration error, relative"
 KINDS = ("integration", "equalities", "limits", "cost", "other")
 
 
@@ -227,7 +228,7 @@ def _tightened(
     if not (settings.tighten and failures and {finding.name for finding in failures} <= limited):
         return None
     excess = min(finding.limit for finding in failures if finding.limit is not None) / 2
-    largest = solution.cost + settings.limits.get("lost", LIMIT_SHARE) * abs(solution.cost)
+    largest = solution.cost + LIMIT_SHARE * abs(solution.cost)
     options = {**WARM_START_OPTIONS, **(arguments["options"] or {})}
     try:
         result = tighten(
@@ -309,7 +310,7 @@ class _Row(NamedTuple):
     """An error that the audit reports: its value and each interval's contribution, relative to the error's limit.
 
     ``errors`` (N,) are the contributions, None if it cannot be attributed to intervals; ``order`` is the power of the
-    interval width with which it falls.
+    interval width with which it falls. ``grows`` tells that unstable dynamics amplify the errors of the intervals.
     """
 
     name: str
@@ -317,6 +318,7 @@ class _Row(NamedTuple):
     value: float
     errors: np.ndarray | None = None
     order: int = 1
+    grows: bool = False
 
 
 class _Parts(NamedTuple):
@@ -349,10 +351,11 @@ def _rows(
     order = method.control_order
     parts = {
         name: _Parts("integration", audit.local_errors, method.order)
-        for name in (requested.name, "integration error, relative", "integration error of one interval")
+        for name in (requested.name, INTEGRATION, "integration error of one interval")
     }
-    if audit.integration_error > float(audit.local_errors.sum()):  # the growth of errors, which no mesh reduces
-        parts["integration error, relative"] = _Parts("integration", audit.local_errors, method.order, summed=True)
+    grows = audit.integration_error > CORRECTION.growth * float(audit.local_errors.sum())
+    if grows:
+        parts[INTEGRATION] = _Parts("integration", audit.local_errors, method.order, summed=True)
     parts["cost lost, relative"] = _Parts("cost", audit.lost, 2 * order, summed=True)
     costates = audit.optimality.adjoint
     parts["costate equation, relative"] = _Parts("other", costates.error, order, summed=True)
@@ -364,15 +367,15 @@ def _rows(
         if finding.limit is None or finding.name in form.separations:  # refinement does not separate bodies
             continue
         value = 0.0 if finding.value == 0 else finding.value / finding.limit if finding.limit > 0 else np.inf
-        if finding.name == "integration error, relative" and finding.limit > 0:
-            # of unstable dynamics only the defects matter: the audit requires that their sum is below a share
-            value = min(value, CORRECTION.growth * float(audit.local_errors.sum()) / finding.limit)
+        if finding.name == INTEGRATION and finding.limit > 0 and grows:
+            # no mesh reduces the growth: the audit requires that the sum of the defects is below a share of the limit
+            value = CORRECTION.growth * float(audit.local_errors.sum()) / finding.limit
         value = np.inf if np.isnan(value) else float(value)
         part = parts.get(finding.name)
         if part is None or not part.values.any():
             rows.append(_Row(finding.name, "other", value))
         else:
-            rows.append(_Row(finding.name, part.kind, value, part.shares(value), part.order))
+            rows.append(_Row(finding.name, part.kind, value, part.shares(value), part.order, grows))
     return rows
 
 
@@ -438,6 +441,8 @@ def _parts_per_interval(
     """
     n = len(mesh) - 1
     parts, error = np.ones(n, int), np.zeros(n)
+    if growing := [row for row in beyond if row.name == INTEGRATION and row.grows]:
+        beyond = [row for row in beyond if row.kind == "integration"] or growing  # other rows judge diverged states
     for row in beyond:
         if row.errors is not None:
             with np.errstate(over="ignore"):

@@ -327,7 +327,7 @@ def test_a_plan_with_a_singular_arc_is_feasible_and_no_cost_is_lost(method: Meth
     assert solution.audit().feasible
     assert solution.audit().optimal is not False
     assert solution.cost == pytest.approx(1.34408, abs=1e-5)
-    assert np.abs(solution.control_interpolant.breaks * 12.0 - 2.4348).min() < 1e-3  # the first switch, from 0 to 1
+    assert np.abs(solution.control_interpolant.breaks * 12.0 - 2.4348).min() < 2e-3  # the first switch, from 0 to 1
 
 
 @pytest.mark.parametrize("ceiling", [0.08, 0.125])
