@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from models.checks import Checks, argument_of
-from models.errors import DetailedError
+from models.errors import DetailedError, ModelError
 from models.files import INPUT_LIMITS
 
 __all__ = [
     "AuditError", "BoundWarning", "DetailedError", "Interrupted", "ProblemError", "RefinementWarning", "SolveError",
-    "SolverStatus", "StorageWarning", "checked_time_limit", "error_names", "format_distinct", "require", "sample_times",
+    "SolverStatus", "StorageWarning", "checked_time_limit", "error_names", "format_distinct", "problem_errors",
+    "require", "sample_times",
 ]  # fmt: skip
 
 
@@ -143,6 +144,15 @@ def error_names(name: str) -> Iterator[None]:
     except DetailedError as error:
         error.name = name if error.name is None else error.name
         raise
+
+
+@contextmanager
+def problem_errors(prefix: str = "") -> Iterator[None]:
+    """Raise each ModelError of a ``with`` block as a ProblemError with the same fields and a message after a prefix."""
+    try:
+        yield
+    except ModelError as error:
+        raise ProblemError(f"{prefix}{error}", **vars(error)) from error
 
 
 require = Checks(ProblemError)

@@ -362,7 +362,7 @@ def _read_path(entries: TomlTable, folder: Path) -> SmoothPath:
     except NOT_NUMBERS:
         corners = np.zeros(0)
     if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 2 or not np.isfinite(corners).all():
-        raise entries.error("points", "points must be two or more triples of numbers, m: [[x, y, z], [x, y, z]]")
+        raise entries.error("points", "points must be two or more lists of three numbers, m: [[x, y, z], [x, y, z]]")
     warn_of_millimetres(f"{entries.file}: an extent of the points of", np.ptp(corners, axis=0), "points")
     with _located_errors(entries, "points"):
         return smooth(ToolPath.through(corners), deviation=deviation)

@@ -11,7 +11,7 @@ from models import Path, Scara, SmoothPath, scara_along, smooth
 from models.machines.scara import ScaraPath
 from ocp import Collocation, ProblemError, minimum_time_problem, solve
 from ocp.motion.builders import timing_tables
-from ocp.motion.builders.timing import Fastest, solve_minimum_time
+from ocp.motion.builders.timing import FastestMotion, solve_minimum_time
 from ocp.motion.builders.timing_tables import largest_demand, table
 from ocp.motion.schedule import JointLimits, LineLimits, Schedule, joint_motion, peak_acceleration, schedule
 from tests.models.paths.test_paths import example
@@ -31,7 +31,7 @@ class Case(NamedTuple):
     limits: LineLimits
     joints: ScaraPath | None
     plan: Schedule
-    best: Fastest
+    best: FastestMotion
 
 
 def random_path(seed: int) -> tuple[SmoothPath, LineLimits]:
