@@ -129,11 +129,11 @@ class Checks:
         words = f"{kind} {name!r} does not exist; {hint}"
         return self.error(words, name=str(name) or kind, value=name, limit=tuple(names))
 
-    def number(self, label: str, value: Any, *, finite: bool = True) -> float:
+    def number(self, label: str, value: Any, *, finite: bool = True, unit: str = "") -> float:
         """Return a value as a float after checking that it is a number and, if `finite`, that it is finite."""
         number = real(value)
         if isnan(number) or (finite and isinf(number)):
-            raise self.invalid(label, "a finite number" if finite else "a number", value)
+            raise self.invalid(label, ("a finite number" if finite else "a number") + _unit_text(unit), value)
         return number
 
     def positive(self, label: str, value: Any, *, below: float = inf, unit: str = "") -> float:

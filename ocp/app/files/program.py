@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from models import ModelError, Path, SmoothPath, smooth
-from models.checks import NOT_NUMBERS, Array, ArrayInput, floats
+from models.checks import Array, ArrayInput
 from models.paths.path import NO_ROTATION, Reversal, fit_splines
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, require, values_within
 from ocp.motion.schedule import LineLimits, Schedule, schedule
 
 __all__ = [
@@ -341,15 +341,8 @@ class TimedProgram:
         Raises:
             ProblemError: A time is not a number, or is outside by more than rounding.
         """
-        try:
-            t = np.atleast_1d(floats(time))
-        except NOT_NUMBERS as error:
-            raise ProblemError(f"time {time!r} is not numeric", name="time", value=time) from error
-        slack = 1e-9 * self.duration
-        if t.ndim != 1 or not ((t >= -slack) & (t <= self.duration + slack)).all():
-            message = f"times must be a number or a vector within the program, 0 to {self.duration:g} s"
-            raise ProblemError(message, name="time", value=time, limit=(0.0, self.duration))
-        t = np.clip(t, 0.0, self.duration)
+        words = f"s is outside the program, 0 to {self.duration:g} s"
+        t = np.atleast_1d(values_within(time, self.duration, "time", words))
         index = np.clip(np.searchsorted(self.bounds, t, side="right") - 1, 0, len(self.schedules) - 1)
         rows = {name: np.zeros(len(t)) for name in ("distance", "speed", "acceleration", "jerk")}
         position, tangent = np.empty((len(t), 3)), np.zeros((len(t), 3))

@@ -198,11 +198,16 @@ def minimum_time_problem(
         path, limits, joints, guess, intervals: As for `solve_minimum_time`.
 
     Raises:
-        ProblemError: Joint limits are given without joints; the joint jerk is limited on a path whose curvature jumps;
-            curvature or joints are not finite; the guess is for another path; there are fewer than 10 intervals.
+        ProblemError: Joint limits are given without joints; limits of tool or torque are given; the joint jerk is
+            limited on a path whose curvature jumps; curvature or joints are not finite; the guess is for another path;
+            there are fewer than 10 intervals.
     """
     require.count("intervals", intervals, 10)
     limited = check_line(path, limits, joints)
+    unsupported = {"tool": limits.tool is not None}
+    unsupported["torque"] = limits.joints is not None and bool(np.isfinite(limits.joints.torque).any())
+    for name in (name for name, is_limited in unsupported.items() if is_limited):
+        raise ProblemError(f"this problem has no constraints on the {name}; call schedule instead", name=name)
     if guess is not None:
         require.instance("guess", guess, Schedule)
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
