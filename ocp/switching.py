@@ -113,8 +113,8 @@ def locate_switches(problem: Problem, solution: Solution) -> Switches:
             if crossing is not None:
                 fractions.append(crossing)
                 smeared[i + 1 : j] = True
-    found = np.unique([at for at in fractions if SWITCHING.same < at < 1 - SWITCHING.same])
-    return Switches(found[np.diff(found, prepend=-1.0) > SWITCHING.same], smeared)
+    inner = np.unique([at for at in fractions if SWITCHING.same < at < 1 - SWITCHING.same])
+    return Switches(inner[np.diff(inner, prepend=-1.0) > SWITCHING.same], smeared)
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class _Arcs:
         first, last = (lagrange(self.nodes, np.array([end]))[0] for end in (0.0, 1.0))
         matrix, width = differentiation_matrix(self.nodes), np.diff(self.breaks)
         a, b = self.breaks[i + 1], self.breaks[j]
-        best, found = 0.0, None
+        best, crossing = 0.0, None
         for column in columns:
             own, span = self.values[:, :, column], spans[column]
             before, after = last @ own[i], first @ own[j]
@@ -155,12 +155,12 @@ class _Arcs:
             jump = abs(gap + bend * place) / span if span > 0 else 0.0
             meeting = a - gap / bend if bend else np.nan
             if jump > max(SWITCHING.jump, best):
-                best, found = jump, a + place
+                best, crossing = jump, a + place
             elif best == 0.0 and self.breaks[i] <= meeting <= self.breaks[j + 1] and jump <= SWITCHING.jump:
                 # a kink that a polynomial over the interval resolves needs no node
                 bow = abs(bend) * max(b - a, width[i], width[j]) / 8
-                found = meeting if bow > SWITCHING.at_limit * span else found
-        return None if found is None else float(found)
+                crossing = meeting if bow > SWITCHING.at_limit * span else crossing
+        return None if crossing is None else float(crossing)
 
 
 def _limited_values(form: Formulation, solution: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

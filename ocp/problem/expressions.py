@@ -114,7 +114,7 @@ class ExpressionReader:
         if bounds[0] is None and bounds[1] is None:
             raise ProblemError(f"{what} has neither lower nor upper bound")
         tolerances = read_tolerance(what, tolerance, vector.numel())
-        if any(is_symbolic(bound) and ca.depends_on(stack_column(what, bound), self.time) for bound in bounds):
+        if any(self._changes_in_time(what, bound) for bound in bounds):
             sides = [
                 self.expression(f"{what}: bound", bound, (self.time, *self.parameters))
                 for bound in bounds
@@ -133,6 +133,11 @@ class ExpressionReader:
         if during is not None:
             vector = self._inside_window(what, vector, (low, high), during)
         return Constraint(name, vector, low, high, unit, tolerances)
+
+    def _changes_in_time(self, what: str, bound: Value) -> bool:
+        """Return whether a bound contains the time."""
+        column = stack_column(what, bound) if is_symbolic(bound) else None
+        return isinstance(column, self.symbols) and bool(ca.depends_on(column, self.time))
 
     def _inside_window(self, what: str, vector: Any, bounds: tuple[Any, Any], during: Value) -> Any:
         """Return an expression that outside a window of time is replaced by a number inside its bounds."""

@@ -104,15 +104,15 @@ def test_a_rate_limit_is_a_control_of_the_rate() -> None:
 
 def test_samples_are_a_guess() -> None:
     samples = np.column_stack([np.linspace(0.0, 1.0, 11), np.linspace(0.0, 1.0, 11) ** 2])
-    given = Problem("given")
-    pair = given.state("pair", guess=samples)
+    rest = Problem("rest")
+    pair = rest.state("pair", guess=samples)
     assert pair.shape == (2, 1)
-    given.dynamics(pair, np.zeros(2))
-    given.horizon(2.0)
-    given.minimize()
-    point = Collocation(10).prepare(given).solve(check=False)
+    rest.dynamics(pair, np.zeros(2))
+    rest.horizon(2.0)
+    rest.minimize()
+    point = Collocation(10).prepare(rest).solve(check=False)
     assert point.success
-    whole = Phases("whole", {"only": given})
+    whole = Phases("whole", {"only": rest})
     assert solve(whole, Collocation(5)).success
 
 
