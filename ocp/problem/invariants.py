@@ -36,12 +36,15 @@ class InvariantSettings:
         contradiction: Residual, relative to its terms, by which a condition may contradict a first integral:
             quaternions are given with few digits.
         leeway: Violation allowed of a dropped condition, relative to its terms: it excludes -q, which is as long as q.
+        control_weight: Weight of conditions on controls where one of several is dropped. The multiplier of a condition
+            on a control at one time is an impulse of those of the path equalities, so conditions on states stay.
     """
 
     monomials: int = 300
     steps: int = 20
     contradiction: float = 1e-3
     leeway: float = 0.5
+    control_weight: float = 1e-3
 
 
 SETTINGS = InvariantSettings()
@@ -190,7 +193,9 @@ def implied_conditions(
     if not own.any():
         return []
     independent = (ends @ null_projector(np.vstack([others, invariance]))).T
-    triangle, order = scipy.linalg.qr(independent, mode="r", pivoting=True)
+    of_controls = np.concatenate([np.arange(nx, n), np.arange(n + nx, 2 * n)])
+    weight = np.where((ends[:, of_controls] != 0).any(axis=1), SETTINGS.control_weight, 1.0)
+    triangle, order = scipy.linalg.qr(independent * weight, mode="r", pivoting=True)
     threshold = SOLVER_SHARE * np.abs(ends).max()
     rank = int((np.abs(np.diag(triangle)) > threshold).sum())
     if rank == np.linalg.matrix_rank(ends @ null_projector(others), tol=threshold):
