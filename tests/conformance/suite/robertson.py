@@ -1,0 +1,29 @@
+"""Robertson's stiff chemical kinetics over 40 s: a simulation stated as a problem without a cost.
+
+x' = -0.04 x + 1e4 y z, y' = 0.04 x - 1e4 y z - 3e7 y^2, z' = 3e7 y^2 from (1, 0, 0). Robertson, 1966; OptimalControl-
+Problems.jl, robertson. The values at 40 s are x = 0.71582707, y = 9.1855e-6, z = 0.28416375.
+"""
+
+from __future__ import annotations
+
+from ocp import Collocation, Problem
+
+from .entry import TOOLBOX, Entry
+
+K1, K2, K3 = 0.04, 1e4, 3e7
+
+
+def build() -> Problem:
+    problem = Problem("Robertson")
+    x = problem.state("x", initial=1.0, guess=1.0)
+    y = problem.state("y", initial=0.0, guess=1e-5, scale=1e-5)
+    z = problem.state("z", initial=0.0, guess=0.0)
+    problem.horizon(40.0)
+    problem.dynamics(x, -K1 * x + K2 * y * z)
+    problem.dynamics(y, K1 * x - K2 * y * z - K3 * y**2)
+    problem.dynamics(z, K3 * y**2)
+    problem.minimize()
+    return problem
+
+
+ENTRY = Entry("robertson", (TOOLBOX,), build, exact=0.0, method=Collocation(60, 3), second=Collocation(90, 5))
