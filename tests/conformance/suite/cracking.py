@@ -33,7 +33,7 @@ def rates(problem: Problem, y: Any) -> Any:
 
 
 def build(initial: list[float] | None) -> Phases:
-    return estimation("gas oil", TIMES, DATA, rates, states=2, initial=initial)
+    return estimation("gas oil", TIMES, DATA, rates, states=2, initial=initial, lower=0.0)
 
 
 MESHES = {"method": Collocation(2, 4), "second": Collocation(3, 3, "legendre")}

@@ -31,6 +31,7 @@ def estimation(
     *,
     states: int,
     initial: Any = None,
+    lower: float | None = None,
     guess: Array | None = None,
 ) -> Phases:
     """Least squares of the first states against ``data`` (M, k) at ``times`` (M,), s.
@@ -38,6 +39,7 @@ def estimation(
     Args:
         states: Number of states; those beyond the k measured ones are not.
         initial: Known states at the first time; None where they are sought and measured.
+        lower: Bound of all states.
         guess: States at the times, (M, states); by default the data.
     """
     measured = data.shape[1]
@@ -46,7 +48,7 @@ def estimation(
     for k, (begin, end) in enumerate(pairwise(times)):
         leg = legs[f"p{k}"] = Problem(f"p{k}")
         here = initial if k == 0 else None
-        y = leg.state("y", states, initial=here, guess=line(at[k], at[k + 1], end - begin))
+        y = leg.state("y", states, initial=here, lower=lower, guess=line(at[k], at[k + 1], end - begin))
         leg.horizon(end - begin)
         leg.dynamics(y, declare(leg, y))
         cost = ca.sumsqr(y[:measured] - data[k + 1])

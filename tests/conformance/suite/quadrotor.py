@@ -38,4 +38,4 @@ def build() -> Problem:
     return problem
 
 
-ENTRY = Entry("quadrotor", (TOOLBOX,), build, method=Collocation(50, 3), second=Collocation(71, 3, "legendre"))
+ENTRY = Entry("quadrotor", (TOOLBOX,), build, {"CTDirect": 1.492}, method=Collocation(50, 3), second=Collocation(71, 3, "legendre"))

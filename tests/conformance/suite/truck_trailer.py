@@ -11,7 +11,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from ocp import Collocation, Problem
+from ocp import MultipleShooting, Problem
 
 from .entry import TOOLBOX, Entry
 
@@ -48,5 +48,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "truck_trailer", (TOOLBOX,), build, method=Collocation(100, 3), second=Collocation(141, 3, "legendre")
-)
+    "truck_trailer", (TOOLBOX,), build, {"CTDirect": 59.28}, method=MultipleShooting(100, control="held"),
+    second=MultipleShooting(140, control="held"),
+)  # fmt: skip

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from ocp import Collocation, Indirect, Problem
+from ocp import Collocation, Problem
 
 from .entry import PSOPT, Entry
 
@@ -30,5 +30,5 @@ def build() -> Problem:
 
 ENTRY = Entry(
     "twolinkarm", (PSOPT,), build, {PSOPT: 2.988662, "Luus": 2.98226}, method=Collocation(60, 3, control="held"),
-    second=Indirect(),
+    second=Collocation(85, 3, "legendre", control="held"),
 )  # fmt: skip

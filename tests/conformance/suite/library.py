@@ -1,0 +1,31 @@
+"""All problems of the public suites that can be stated, and why the others cannot."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+from .entry import Entry
+
+OTHERS = {"__init__", "__main__", "entry", "estimation", "library", "peer", "run", "table", "test_suite"}
+"""Modules beside those of problems."""
+MODULES = sorted(file.stem for file in Path(__file__).parent.glob("*.py") if file.stem not in OTHERS)
+
+
+def entries() -> dict[str, Entry]:
+    """Every problem by its name."""
+    found: list[Entry] = []
+    for name in MODULES:
+        module = import_module(f"{__package__}.{name}")
+        found += getattr(module, "ENTRIES", None) or (module.ENTRY,)
+    return {entry.name: entry for entry in sorted(found, key=lambda entry: entry.name)}
+
+
+SAME = {"dqc": "mineng_di", "lqr_radau": "lqr_gauss", "space_shuttle": "shuttle_reentry", "steering": "lts"}
+"""Problems of the suites that are stated under the name of another."""
+EXCLUDED = {
+    "delay_history": "a comparison of two transcriptions of delayed states, without a cost to compare",
+    "int_static_linear": "a parameter with integer values: four problems, to be solved one by one",
+    "notorious": "its data are drawn by the generator of the source, so that its cost cannot be reproduced",
+}
+"""Problems of the suites that are not stated, and the reason."""
