@@ -127,10 +127,11 @@ def solve(
 ) -> Solution:
     """Solve an optimal control problem by the given method.
 
-    If the solver fails from the guess, it starts again from zeros (moved inside the bounds, a free horizon longer),
-    from a roll-out of the dynamics with the controls of the guess, and from the plan of least constraint violation;
-    each with at most 200 iterations and ``max_iter`` together. If it stops at a stationary plan that is not a minimum,
-    it starts again on both sides of it, along the variation that lowers the cost, and the plan of lower cost counts.
+    If the solver fails from the guess, it starts again from the guess displaced by seeded random amounts, from zeros
+    (moved inside the bounds, a free horizon longer), from a roll-out of the dynamics with the controls of the guess,
+    and from the plan of least constraint violation; each with at most 200 iterations and ``max_iter`` together. If it
+    stops at a stationary plan that is not a minimum, it starts again on both sides of it, along the variation that
+    lowers the cost, and the plan of lower cost counts.
     ``Solution.start`` names the successful start.
 
     Args:

@@ -247,12 +247,13 @@ class Prepared:
         attempts, remaining, x0 = list[Attempt](), self._max_iterations, first.arguments["x0"]
         if first.is_final:
             return attempts
-        limits = arguments["lbx"], arguments["ubx"]
-        for start, point in alternative_starts(self.formulation, self.transcription, x0, arguments["p"], bounds=limits):
+        limits, p = (arguments["lbx"], arguments["ubx"]), arguments["p"]
+        sizes = sizes_along(self._pattern, x0, first.names, bounds=bounds, p=p).of_variables(self.transcription)
+        for start, point in alternative_starts(self.formulation, self.transcription, x0, p, bounds=limits, sizes=sizes):
             if remaining <= 0 or np.array_equal(point, x0):
                 continue
             attempts.append(self._attempt(start, point, first.names, arguments, bounds, self._short_solver))
-            if attempts[-1].is_final or all(attempt.is_broken for attempt in (first, *attempts)):
+            if attempts[-1].is_final:
                 break
             remaining -= attempts[-1].outcome.iterations
         return attempts
