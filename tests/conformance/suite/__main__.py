@@ -81,13 +81,11 @@ def done(entry: Entry) -> Row:
         "exact": "" if entry.exact is None else entry.exact,
         "psopt_seconds": PSOPT_SECONDS.get(entry.name, ""),
     }
-    return {key: f"{value:.10g}" if isinstance(value, float) and "cost" in key else _short(value)
-            for key, value in row.items()}  # fmt: skip
-
-
-def _short(value: Any) -> Any:
-    """A number in four digits at most where it is a time or a count of digits."""
-    return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1e3 and value != round(value, 4) else value
+    short = {key for key in row if key.endswith("seconds") or key == "digits"}
+    return {
+        key: f"{value:{'.3g' if key in short else '.10g'}}" if isinstance(value, float) else value
+        for key, value in row.items()
+    }
 
 
 def main() -> None:

@@ -41,6 +41,4 @@ def build() -> Problem:
     return problem
 
 
-ENTRY = Entry(
-    "balanced_field", (TOOLBOX,), build, method=Collocation(40, 4), second=Collocation(57, 3, "legendre")
-)
+ENTRY = Entry("balanced_field", (TOOLBOX,), build, method=Collocation(40, 4), second=Collocation(57, 3, "legendre"))

@@ -38,6 +38,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "bioreactor_1day", (TOOLBOX,), build, {"CTDirect": -0.614134}, method=Collocation(60, 3, control="held"),
-    second=Collocation(84, 3, "legendre", control="held"),
+    "bioreactor_1day", (TOOLBOX,), build, {"CTDirect": -0.614134}, method=Collocation(60, 3),
+    second=Collocation(84, 3, "legendre"),
 )  # fmt: skip

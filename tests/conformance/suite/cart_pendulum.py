@@ -40,6 +40,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "cart_pendulum", (TOOLBOX,), build, method=Collocation(60, 3, control="held"),
-    second=Collocation(85, 3, "legendre", control="held"),
+    "cart_pendulum", (TOOLBOX,), build, method=Collocation(60, 3),
+    second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

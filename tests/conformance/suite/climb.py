@@ -60,7 +60,9 @@ def spline(grid: Sequence[float], values: Sequence[float], at: Any) -> Any:
 def build() -> Problem:
     deg = np.pi / 180
     problem = Problem("climb", ca.MX)
-    h = problem.state("h", initial=0.0, terminal=65600.0, lower=0.0, upper=69000.0, unit="ft", guess=line(0, 65600, 500))
+    h = problem.state(
+        "h", initial=0.0, terminal=65600.0, lower=0.0, upper=69000.0, unit="ft", guess=line(0, 65600, 500)
+    )
     v = problem.state("v", initial=424.26, terminal=968.148, lower=1.0, upper=2000.0, unit="ft/s")
     gamma = problem.state("gamma", initial=0.0, terminal=0.0, lower=-89 * deg, upper=89 * deg, unit="rad")
     w = problem.state("w", initial=42000.0, lower=1.0, upper=45000.0, guess=line(42000, 33600, 500), unit="lb")
@@ -81,8 +83,7 @@ def build() -> Problem:
     problem.dynamics(h, v * ca.sin(gamma))
     problem.dynamics(v, (thrust * ca.cos(alpha) - drag) / mass - MU / radius**2 * ca.sin(gamma))
     problem.dynamics(
-        gamma,
-        (thrust * ca.sin(alpha) + lift) / (mass * v) + ca.cos(gamma) * (v / radius - MU / (v * radius**2)),
+        gamma, (thrust * ca.sin(alpha) + lift) / (mass * v) + ca.cos(gamma) * (v / radius - MU / (v * radius**2))
     )
     problem.dynamics(w, -thrust / IMPULSE)
     problem.minimize(terminal=horizon)

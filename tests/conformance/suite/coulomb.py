@@ -27,8 +27,7 @@ def build() -> Problem:
     problem.dynamics(
         v,
         ca.vertcat(
-            (-(K1 + K2) * q[0] + K2 * q[1] - friction[0] + u[0]) / M1,
-            (K2 * q[0] - K2 * q[1] - friction[1] + u[1]) / M2,
+            (-(K1 + K2) * q[0] + K2 * q[1] - friction[0] + u[0]) / M1, (K2 * q[0] - K2 * q[1] - friction[1] + u[1]) / M2
         ),
     )
     problem.minimize(terminal=horizon)

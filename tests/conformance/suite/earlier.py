@@ -8,7 +8,6 @@ from tests.ocp.problem import flights
 
 from .entry import COPS, PSOPT, TOOLBOX, Entry
 
-HELD = Collocation(60, 3, control="held"), Collocation(85, 3, "legendre", control="held")
 ENTRIES = (
     Entry(
         "bryson_denham", (PSOPT, TOOLBOX), bryson_denham.build, {PSOPT: 3.999539}, bryson_denham.CASE.cost,
@@ -16,9 +15,9 @@ ENTRIES = (
     ),
     Entry(
         "catmix", (PSOPT, COPS), catalyst_mixing.build, {PSOPT: -0.0480532, COPS: -4.8056e-2},
-        catalyst_mixing.CASE.cost, *HELD,
+        catalyst_mixing.CASE.cost,
     ),
-    Entry("rocket", (COPS, TOOLBOX), goddard.build, {COPS: -1.01283}, goddard.CASE.cost, *HELD),
+    Entry("rocket", (COPS, TOOLBOX), goddard.build, {COPS: -1.01283}, goddard.CASE.cost),
     Entry(
         "vanderpol", (TOOLBOX,), van_der_pol.build, {"CTDirect": 1.047921}, van_der_pol.CASE.cost, Collocation(20, 4),
         Indirect(),

@@ -59,6 +59,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "f8", (PSOPT,), build, {PSOPT: 3.780858, "Kaya & Noakes": 3.78086}, method=Collocation(60, 3, control="held"),
-    second=Collocation(85, 3, "legendre", control="held"),
+    "f8", (PSOPT,), build, {PSOPT: 3.780858, "Kaya & Noakes": 3.78086}, method=Collocation(60, 3),
+    second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

@@ -22,9 +22,7 @@ ENDS = np.deg2rad([[90 - 40.6413, 360 - 73.7781], [90 - 51.4700, 360 - 0.4543]])
 def place(angles: np.ndarray) -> np.ndarray:
     """Point of the spheroid at a parametric polar angle and an azimuth."""
     polar, azimuth = angles
-    return np.array(
-        [A * np.sin(polar) * np.cos(azimuth), A * np.sin(polar) * np.sin(azimuth), B * np.cos(polar)]
-    )
+    return np.array([A * np.sin(polar) * np.cos(azimuth), A * np.sin(polar) * np.sin(azimuth), B * np.cos(polar)])
 
 
 def build() -> Problem:
@@ -44,9 +42,7 @@ def build() -> Problem:
     theta = problem.control("theta", lower=0.0, upper=np.pi, guess=along(polar))
     phi = problem.control("phi", lower=0.0, upper=2 * np.pi, guess=along(azimuth))
     horizon = problem.horizon(lower=3.0, upper=10.0, guess=duration)
-    problem.dynamics(
-        r, SPEED * ca.vertcat(ca.sin(theta) * ca.cos(phi), ca.sin(theta) * ca.sin(phi), ca.cos(theta))
-    )
+    problem.dynamics(r, SPEED * ca.vertcat(ca.sin(theta) * ca.cos(phi), ca.sin(theta) * ca.sin(phi), ca.cos(theta)))
     problem.path("spheroid", (r[0] ** 2 + r[1] ** 2) / A**2 + r[2] ** 2 / B**2 - 1, 0.0, 0.0)
     problem.minimize(terminal=SPEED * horizon)
     return problem

@@ -31,6 +31,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "goddard", (PSOPT,), build, {PSOPT: -1.025336}, method=Collocation(50, 3, control="held"),
-    second=Collocation(71, 3, "legendre", control="held"),
+    "goddard", (PSOPT,), build, {PSOPT: -1.025336}, method=Collocation(50, 3),
+    second=Collocation(71, 3, "legendre"),
 )  # fmt: skip

@@ -45,6 +45,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "insurance", (TOOLBOX,), build, {"CTDirect": -2.059511}, method=Collocation(60, 3, control="held"),
-    second=Collocation(85, 3, "legendre", control="held"),
+    "insurance", (TOOLBOX,), build, {"CTDirect": -2.059511}, method=Collocation(60, 3),
+    second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

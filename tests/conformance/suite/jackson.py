@@ -29,6 +29,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "jackson", (TOOLBOX,), build, {"CTDirect": -0.192011}, method=Collocation(60, 3, control="held"),
-    second=Collocation(85, 3, "legendre", control="held"),
+    "jackson", (TOOLBOX,), build, {"CTDirect": -0.192011}, method=Collocation(60, 3),
+    second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

@@ -18,9 +18,7 @@ START = [1.0, 0.1, 40.0, 0.0, 0.0, 1.0, 0.0]
 
 def build() -> Problem:
     problem = Problem("Lee-Ramirez bioreactor")
-    x = problem.state(
-        "x", initial=START, lower=-10.0, upper=[10.0, 10.0, 50.0, 10.0, 10.0, 10.0, 10.0], guess=START
-    )
+    x = problem.state("x", initial=START, lower=-10.0, upper=[10.0, 10.0, 50.0, 10.0, 10.0, 10.0, 10.0], guess=START)
     u = problem.control("u", 2, lower=0.0, upper=1.0, guess=lambda t: [t / 30, 0.0])
     problem.horizon(10.0)
     volume, cells, nutrient, protein, inducer, shock, recovery = ca.vertsplit(x)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -12,13 +13,24 @@ OTHERS = {"__init__", "__main__", "entry", "estimation", "library", "peer", "run
 MODULES = sorted(file.stem for file in Path(__file__).parent.glob("*.py") if file.stem not in OTHERS)
 
 
-def entries() -> dict[str, Entry]:
-    """Every problem by its name."""
-    found: list[Entry] = []
+@cache
+def stated() -> dict[str, tuple[str, Entry]]:
+    """Every problem by its name, with the module that states it."""
+    found = []
     for name in MODULES:
         module = import_module(f"{__package__}.{name}")
-        found += getattr(module, "ENTRIES", None) or (module.ENTRY,)
-    return {entry.name: entry for entry in sorted(found, key=lambda entry: entry.name)}
+        found += [(name, entry) for entry in getattr(module, "ENTRIES", None) or (module.ENTRY,)]
+    return {entry.name: (name, entry) for name, entry in sorted(found, key=lambda pair: pair[1].name)}
+
+
+def entries() -> dict[str, Entry]:
+    """Every problem by its name."""
+    return {name: entry for name, (_, entry) in stated().items()}
+
+
+def module_of(name: str) -> str:
+    """The module that states a problem."""
+    return stated()[name][0]
 
 
 SAME = {"dqc": "mineng_di", "lqr_radau": "lqr_gauss", "space_shuttle": "shuttle_reentry", "steering": "lts"}

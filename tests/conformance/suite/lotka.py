@@ -29,8 +29,8 @@ def build(fleets: int) -> Problem:
 
 
 MESHES = {
-    "method": Collocation(80, 3, control="held"),
-    "second": Collocation(113, 3, "legendre", control="held"),
+    "method": Collocation(80, 3),
+    "second": Collocation(113, 3, "legendre"),
     "note": "relaxed: the infimum over fleets that are in or out",
 }
 ENTRIES = (

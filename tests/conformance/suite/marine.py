@@ -43,6 +43,4 @@ def build() -> Phases:
     return estimation("marine population", TIMES, COUNTS / 1000, rates, states=8)
 
 
-ENTRY = Entry(
-    "marine", (COPS,), build, {COPS: 19.7465}, method=Collocation(2, 3), second=Collocation(3, 3, "legendre")
-)
+ENTRY = Entry("marine", (COPS,), build, {COPS: 19.7465}, method=Collocation(2, 3), second=Collocation(3, 3, "legendre"))

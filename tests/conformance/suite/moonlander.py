@@ -33,6 +33,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "moonlander", (TOOLBOX,), build, {"CTDirect": 0.962}, method=Collocation(60, 3, control="held"),
-    second=Collocation(85, 3, "legendre", control="held"),
+    "moonlander", (TOOLBOX,), build, {"CTDirect": 0.962}, method=Collocation(60, 3),
+    second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

@@ -30,6 +30,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "mountain_car", (TOOLBOX,), build, {"Dymos": 102.479}, method=Collocation(60, 3, control="held"),
-    second=Collocation(85, 3, "legendre", control="held"),
+    "mountain_car", (TOOLBOX,), build, {"Dymos": 102.479}, method=Collocation(60, 3),
+    second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

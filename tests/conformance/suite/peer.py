@@ -61,11 +61,15 @@ def rockit_cost(problem: Problem, method: Collocation) -> float:
             k = rows.bounds[i]
             _limit(ocp, lower[k], values[i], upper[k], grid)
     nodes = np.linspace(0.0, 1.0, 20 * method.intervals + 1)
-    curves = ((x, start.state_interpolant), (u, start.control_interpolant)) if form.nu else ((x, start.state_interpolant),)
+    curves = (
+        ((x, start.state_interpolant), (u, start.control_interpolant)) if form.nu else ((x, start.state_interpolant),)
+    )
     for value, curve in curves:
         table = ca.interpolant("guess", "linear", [nodes * start.horizon], np.asarray(curve(nodes)).ravel())
         ocp.set_initial(value, table(ocp.t))
-    ocp.solver("ipopt", {"print_time": False, "expand": True, "ipopt": {"print_level": 0, "sb": "yes", "tol": TOLERANCE}})
+    ocp.solver(
+        "ipopt", {"print_time": False, "expand": True, "ipopt": {"print_level": 0, "sb": "yes", "tol": TOLERANCE}}
+    )
     ocp.method(peer.DirectCollocation(N=method.intervals, degree=method.degree))
     solution = ocp.solve()
     return float(solution.value(ocp.objective))

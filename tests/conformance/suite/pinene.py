@@ -27,15 +27,11 @@ DATA = np.array([
 
 def rates(problem: Problem, y: Any) -> Any:
     a, b, c, d, e = (problem.free_parameter(name, lower=0.0, guess=0.5) for name in "abcde")
-    return ca.vertcat(
-        -(a + b) * y[0], a * y[0], b * y[0] - (c + d) * y[2] + e * y[4], c * y[2], d * y[2] - e * y[4]
-    )
+    return ca.vertcat(-(a + b) * y[0], a * y[0], b * y[0] - (c + d) * y[2] + e * y[4], c * y[2], d * y[2] - e * y[4])
 
 
 def build() -> Phases:
     return estimation("alpha-pinene", TIMES, DATA, rates, states=5, initial=START)
 
 
-ENTRY = Entry(
-    "pinene", (COPS,), build, {COPS: 19.872}, method=Collocation(4, 4), second=Collocation(6, 3, "legendre")
-)
+ENTRY = Entry("pinene", (COPS,), build, {COPS: 19.872}, method=Collocation(4, 4), second=Collocation(6, 3, "legendre"))

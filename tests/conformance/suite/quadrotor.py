@@ -31,11 +31,20 @@ def build() -> Problem:
     sr, cr, sp, cp = ca.sin(tilt[0]), ca.cos(tilt[0]), ca.sin(tilt[1]), ca.cos(tilt[1])
     sy, cy = ca.sin(yaw), ca.cos(yaw)
     problem.dynamics(p, v)
-    problem.dynamics(v, a * ca.vertcat(cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr) - ca.DM([0, 0, GRAVITY]))
+    problem.dynamics(
+        v, a * ca.vertcat(cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr) - ca.DM([0, 0, GRAVITY])
+    )
     problem.dynamics(tilt, rate)
     problem.path("tilt", cp * cr, lower=np.cos(TILT))
     problem.minimize(running=1e-8 * (a**2 + ca.sumsqr(tilt) + yaw**2) + 100 * yaw**2, terminal=horizon)
     return problem
 
 
-ENTRY = Entry("quadrotor", (TOOLBOX,), build, {"CTDirect": 1.492}, method=Collocation(50, 3), second=Collocation(71, 3, "legendre"))
+ENTRY = Entry(
+    "quadrotor",
+    (TOOLBOX,),
+    build,
+    {"CTDirect": 1.492},
+    method=Collocation(50, 3),
+    second=Collocation(71, 3, "legendre"),
+)

@@ -25,4 +25,6 @@ def build() -> Problem:
     return problem
 
 
-ENTRY = Entry("robbins", (TOOLBOX,), build, {"CTDirect": 19.4}, method=Collocation(60, 4), second=Collocation(85, 3, "legendre"))
+ENTRY = Entry(
+    "robbins", (TOOLBOX,), build, {"CTDirect": 19.4}, method=Collocation(60, 4), second=Collocation(85, 3, "legendre")
+)

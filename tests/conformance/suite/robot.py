@@ -20,13 +20,9 @@ LENGTH, REACH, LIFT, TURN = 5.0, 4.5, np.pi / 4, 2 * np.pi / 3
 def build() -> Problem:
     problem = Problem("robot arm")
     rho = problem.state("rho", initial=REACH, terminal=REACH, lower=0.0, upper=LENGTH, guess=REACH)
-    theta = problem.state(
-        "theta", initial=0.0, terminal=TURN, lower=-np.pi, upper=np.pi, guess=lambda t: TURN * t**2
-    )
+    theta = problem.state("theta", initial=0.0, terminal=TURN, lower=-np.pi, upper=np.pi, guess=lambda t: TURN * t**2)
     phi = problem.state("phi", initial=LIFT, terminal=LIFT, lower=0.0, upper=np.pi, guess=LIFT)
-    rates = problem.state(
-        "rates", initial=np.zeros(3), terminal=np.zeros(3), guess=lambda t: [0.0, 2 * TURN * t, 0.0]
-    )
+    rates = problem.state("rates", initial=np.zeros(3), terminal=np.zeros(3), guess=lambda t: [0.0, 2 * TURN * t, 0.0])
     u = problem.control("u", 3, lower=-1.0, upper=1.0, guess=0.0)
     horizon = problem.horizon(lower=0.1, upper=100.0, guess=1.0)
     inertia = ((LENGTH - rho) ** 3 + rho**3) / 3
@@ -39,6 +35,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "robot", (COPS, TOOLBOX), build, {COPS: 9.14093}, method=Collocation(60, 3, control="held"),
-    second=Collocation(85, 3, "legendre", control="held"),
+    "robot", (COPS, TOOLBOX), build, {COPS: 9.14093}, method=Collocation(60, 3),
+    second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

@@ -24,7 +24,7 @@ from ocp import Collocation, Indirect, MultipleShooting, Problem, RefinementSett
 from .entry import Entry, Method
 from .library import entries
 
-MOST_SECONDS = 150
+MOST_SECONDS = 100
 """Of the processor for all stages of a problem; what is not done by then stays out."""
 FINER = 4
 """How many times as many intervals as the given mesh a refined one may have."""

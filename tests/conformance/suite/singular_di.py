@@ -17,9 +17,7 @@ TIMES = [0.0, 1.0, 3.0, 4.0]
 def build() -> Problem:
     problem = Problem("singular double integrator")
     x = problem.state("x", initial=2.0, terminal=5.0, lower=-10.0, upper=10.0)
-    v = problem.state(
-        "v", initial=0.0, terminal=0.0, lower=-5.0, upper=5.0, guess=samples(TIMES, [0.0, 1.0, 1.0, 0.0])
-    )
+    v = problem.state("v", initial=0.0, terminal=0.0, lower=-5.0, upper=5.0, guess=samples(TIMES, [0.0, 1.0, 1.0, 0.0]))
     u = problem.control("u", lower=-1.0, upper=1.0, guess=lambda t: 1.0 * (t < 1) - 1.0 * (t > 3))
     problem.horizon(lower=2.0, upper=8.0, guess=4.0)
     problem.dynamics(x, v)
@@ -29,6 +27,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "singular_di", (PSOPT,), build, {PSOPT: 3.333328}, 10 / 3, method=Collocation(40, 3, control="held"),
-    second=Collocation(61, 3, "legendre", control="held"),
+    "singular_di", (PSOPT,), build, {PSOPT: 3.333328}, 10 / 3, method=Collocation(40, 3),
+    second=Collocation(61, 3, "legendre"),
 )  # fmt: skip

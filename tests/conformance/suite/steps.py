@@ -22,6 +22,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "steps", (PSOPT,), build, {PSOPT: 1.0}, 1.0, method=Collocation(30, 3, control="held"),
-    second=Collocation(45, 2, "legendre", control="held"),
+    "steps", (PSOPT,), build, {PSOPT: 1.0}, 1.0, method=Collocation(30, 3),
+    second=Collocation(45, 2, "legendre"),
 )  # fmt: skip

@@ -29,6 +29,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "twolinkarm", (PSOPT,), build, {PSOPT: 2.988662, "Luus": 2.98226}, method=Collocation(60, 3, control="held"),
-    second=Collocation(85, 3, "legendre", control="held"),
+    "twolinkarm", (PSOPT,), build, {PSOPT: 2.988662, "Luus": 2.98226}, method=Collocation(60, 3),
+    second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

@@ -58,9 +58,7 @@ def build() -> Problem:
     c = problem.control("qc", 4, lower=-1.0, upper=1.0, guess=line(START, END, DURATION))
     problem.horizon(DURATION)
     torque = inertia @ (PROPORTIONAL * 2 * rows(c).T @ q + DERIVATIVE * (w - orbital_rate(c)))
-    down = ca.vertcat(
-        2 * (q[1] * q[3] - q[0] * q[2]), 2 * (q[2] * q[3] + q[0] * q[1]), 1 - 2 * (q[1] ** 2 + q[2] ** 2)
-    )
+    down = ca.vertcat(2 * (q[1] * q[3] - q[0] * q[2]), 2 * (q[2] * q[3] + q[0] * q[1]), 1 - 2 * (q[1] ** 2 + q[2] ** 2))
     gradient = 3 * RATE**2 * ca.cross(down, inertia @ down)
     momentum_rate = torque - ca.cross(w, MOMENTUM * h)
     problem.dynamics(q, rows(q) @ (w - orbital_rate(q)) / 2)
