@@ -10,24 +10,20 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
-from typing import Any
 
-from tests.sweep.results import ROOT, code_of
+from tests.sweep.results import code_of
 
 from .entry import Entry
 from .library import entries
+from .run import Row, done, warm_up
 
 TABLE = "suite.csv"
 COLUMNS = (
-    "name", "suites", "verdict", "cost", "published", "exact", "digits", "second", "second_start", "feasible", "optimal",
-    "reason", "method", "intervals", "first_cost", "seconds", "refined_seconds", "rockit_seconds", "rockit_cost",
-    "psopt_seconds", "failed", "code",
+    "name", "suites", "verdict", "cost", "published", "exact", "digits", "second", "second_start", "feasible",
+    "optimal", "reason", "method", "intervals", "first_cost", "seconds", "refined_seconds", "rockit_seconds",
+    "rockit_cost", "psopt_seconds", "failed", "code",
 )  # fmt: skip
 PSOPT_SECONDS = {
     "bioreactor": 29.1, "brac1": 1.2, "breakwell": 44.1, "bryson_denham": 1.2, "bryson_max_range": 0.3, "catmix": 0.8,
@@ -41,7 +37,6 @@ PSOPT_SECONDS = {
     "twophase_robot": 0.5, "twophase_schwartz": 0.4,
 }  # fmt: skip
 """s, by IPOPT on two cores, as PSOPT publishes them (github.com/PSOPT/psopt, doc/SQP_ALL_EXAMPLES.csv)."""
-Row = dict[str, Any]
 
 
 def rows_of(folder: Path) -> dict[str, Row]:
@@ -64,12 +59,9 @@ def write(folder: Path, rows: dict[str, Row]) -> None:
     part.replace(folder / TABLE)
 
 
-def done(entry: Entry) -> Row:
-    """The row of a problem, by a process of its own."""
-    command = [sys.executable, "-W", "ignore", "-m", "tests.conformance.suite.run", entry.name]
-    ran = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    lines = [line for line in ran.stdout.splitlines() if line.startswith("{")]
-    row: Row = json.loads(lines[-1]) if lines else {"failed": (ran.stderr.strip().splitlines() or ["no row"])[-1][:200]}
+def row_of(entry: Entry) -> Row:
+    """The row of a problem, done now."""
+    row = done(entry)
     row["first_cost"] = row.get("cost", "")
     row["cost"] = row.get("refined_cost", row.get("cost", ""))
     row["rockit_cost"] = row.get("rockit_cost", row.get("rockit_failed", ""))
@@ -96,11 +88,12 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=90.0, help="after which no further problem is begun")
     parser.add_argument("--again", action="store_true", help="those whose rows are of other code once more")
     options = parser.parse_args()
+    warm_up(known)
     code, rows, end = code_of(Path(__file__)), rows_of(options.out), time.time() + 60 * options.minutes
     for name in options.only or known:
         old = name not in rows or (rows[name]["code"] != code and (options.again or options.only))
         if old and time.time() < end:
-            rows[name] = done(known[name]) | {"code": code}
+            rows[name] = row_of(known[name]) | {"code": code}
             write(options.out, rows)
             print({key: value for key, value in rows[name].items() if value != ""}, flush=True)
 

@@ -1,8 +1,8 @@
 """Take-off of an airliner after an engine failure: the shortest distance to 35 ft.
 
 r' = v cos gamma, v' = (T cos a - D) / m - g sin gamma, h' = v sin gamma, gamma' = (T sin a + L) / (m v) - g cos gamma /
-v, with a lift coefficient linear in the angle of attack a and an induced drag reduced by the ground effect; 0 <= a <= 15
-deg, v >= 1, h >= 0, from (600 m, 70 m/s, 0, 0) to h = 10.668 m, gamma = 5 deg (0.0873 rad). Dymos, example balanced
+v, with a lift coefficient linear in the angle of attack a and an induced drag reduced by the ground effect; 0 <= a <=
+15 deg, v >= 1, h >= 0, from (600 m, 70 m/s, 0, 0) to h = 10.668 m, gamma = 5 deg (0.0873 rad). Dymos, example balanced
 field; OptimalControlProblems.jl, balanced_field, the climb alone.
 """
 

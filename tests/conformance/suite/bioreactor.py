@@ -1,8 +1,8 @@
 """Coupled growth of algae and bacteria over a day, periodic: greatest production of methane.
 
-y' = mu(t) y / (1 + y) - (0.005 + u) y, s' = -m b + u (y - s), b' = (m - u) b with m = 0.1 s / (s + 0.05), mu = sin^2(pi t
-/ 5) in the first half of a day of 10 and 0 in the second, 0 <= u <= 1, y, b >= 1 at the start, equal values at both ends,
-greatest int m b / 3 dt. Bocop, example bioreactor; CTDirect.jl, bioreactor_1day_periodic.
+y' = mu(t) y / (1 + y) - (0.005 + u) y, s' = -m b + u (y - s), b' = (m - u) b with m = 0.1 s / (s + 0.05), mu = sin^2(pi
+t / 5) in the first half of a day of 10 and 0 in the second, 0 <= u <= 1, y, b >= 1 at the start, equal values at both
+ends, greatest int m b / 3 dt. Bocop, example bioreactor; CTDirect.jl, bioreactor_1day_periodic.
 """
 
 from __future__ import annotations

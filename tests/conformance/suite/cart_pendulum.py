@@ -1,8 +1,8 @@
 """A uniform rod on a cart swung up in least time.
 
-(M + m) x'' + m (L / 2) (theta'' cos theta - theta'^2 sin theta) = F, (m L^2 / 3) theta'' = -m (L / 2) (x'' cos theta + g
-sin theta); L = 1 m, m = 1 kg, M = 0.5 kg, |F| <= 5 N, |x| <= 1 m, |x'| <= 2 m/s, from rest hanging to rest upright. The
-velocity of the cart is free at both ends. OptimalControlProblems.jl, cart_pendulum, states the acceleration of the
+(M + m) x'' + m (L / 2) (theta'' cos theta - theta'^2 sin theta) = F, (m L^2 / 3) theta'' = -m (L / 2) (x'' cos theta +
+g sin theta); L = 1 m, m = 1 kg, M = 0.5 kg, |F| <= 5 N, |x| <= 1 m, |x'| <= 2 m/s, from rest hanging to rest upright.
+The velocity of the cart is free at both ends. OptimalControlProblems.jl, cart_pendulum, states the acceleration of the
 cart by a constant that it then leaves free; here it follows from the equations of motion.
 """
 

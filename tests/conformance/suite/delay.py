@@ -1,9 +1,9 @@
 """A delay in the state, by the method of steps.
 
-x1' = x2, x2' = -10 x1 - 5 x2 - 2 x1(t - d) - x2(t - d) + u with d = 0.25 s, x = (1, 1) up to time zero, 5 s, least int (10
-x1^2 + x2^2 + u^2) / 2 dt. Cut into 20 pieces of length d, the delayed state of each is the state of the piece before it
-at the same time within the piece: a problem over 0.25 s with 40 states, whose pieces join at their ends. Luus, 2002;
-PSOPT, example delay1.
+x1' = x2, x2' = -10 x1 - 5 x2 - 2 x1(t - d) - x2(t - d) + u with d = 0.25 s, x = (1, 1) up to time zero, 5 s, least int
+(10 x1^2 + x2^2 + u^2) / 2 dt. Cut into 20 pieces of length d, the delayed state of each is the state of the piece
+before it at the same time within the piece: a problem over 0.25 s with 40 states, whose pieces join at their ends.
+Luus, 2002; PSOPT, example delay1.
 """
 
 from __future__ import annotations

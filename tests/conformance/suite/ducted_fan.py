@@ -1,7 +1,7 @@
 """A planar ducted fan moved 1 m aside from hover to hover.
 
-m x'' = u1 cos a - u2 sin a, m y'' = -m g + u1 sin a + u2 cos a, J a'' = r u1, |a| <= 30 deg, |u1| <= 5 N, 0 <= u2 <= 17 N,
-least int 2 u1^2 + u2^2 dt + 1000 T, free time T. Graichen & Petit, 2009; OptimalControlProblems.jl, ducted_fan.
+m x'' = u1 cos a - u2 sin a, m y'' = -m g + u1 sin a + u2 cos a, J a'' = r u1, |a| <= 30 deg, |u1| <= 5 N, 0 <= u2 <= 17
+N, least int 2 u1^2 + u2^2 dt + 1000 T, free time T. Graichen & Petit, 2009; OptimalControlProblems.jl, ducted_fan.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ocp import Collocation, Indirect, MultipleShooting, Problem
 
 Method = Collocation | MultipleShooting | Indirect
+FIRST, SECOND = Collocation(30, 4), Collocation(43, 3, "legendre")
 PSOPT, COPS, TOOLBOX = "PSOPT", "COPS", "OptimalControlProblems.jl"
 """The suites: github.com/PSOPT/psopt, COPS 3 (github.com/MadNLP/COPSBenchmark.jl), and
 github.com/control-toolbox/OptimalControlProblems.jl."""
@@ -25,7 +26,8 @@ class Entry:
         name: As in the suite.
         suites: The suites that contain it.
         build: The statement, with the guess that its source gives.
-        published: Cost that the source of each name publishes; the first is the one compared.
+        published: Cost that the source of each name publishes, as text where it is printed in few digits or with
+            zeros at the end; the first is the one compared.
         exact: Optimal cost in closed form, or None.
         method: Mesh of the first solve, which is refined afterwards, and on which other tools are compared.
         second: An independent method: another scheme on another mesh, shooting, or the minimum principle.
@@ -35,10 +37,10 @@ class Entry:
     name: str
     suites: tuple[str, ...]
     build: Callable[[], Problem]
-    published: Mapping[str, float] = field(default_factory=dict)
+    published: Mapping[str, float | str] = field(default_factory=dict)
     exact: float | None = None
-    method: Collocation | MultipleShooting = Collocation(30, 4)
-    second: Method = Collocation(43, 3, "legendre")
+    method: Collocation | MultipleShooting = FIRST
+    second: Method = SECOND
     note: str = ""
 
 

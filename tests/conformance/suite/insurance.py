@@ -2,8 +2,8 @@
 
 I' = (1 - 0.2 t v'(m) / U_R) h, m' = h, x' = I f(t), with v = m^2 / (1 + m^2), U_R = 10 exp(-10 R), the income R = 1 - P
 + I - m, the health H = 1.5 - 0.2 t (1 - v), utility U = 1 - exp(-10 R) + H, and the density f = 0.25 exp(-0.25 t) +
-exp(-2.5) / 10; premium P = x(10). From (0, 0.001, 0), 0 <= h <= 25, R, H, U, P >= 0, greatest int U f dt over 10. Bocop,
-example insurance; OptimalControlProblems.jl, insurance, with R, H, U and U_R as controls tied by equations.
+exp(-2.5) / 10; premium P = x(10). From (0, 0.001, 0), 0 <= h <= 25, R, H, U, P >= 0, greatest int U f dt over 10.
+Bocop, example insurance; OptimalControlProblems.jl, insurance, with R, H, U and U_R as controls tied by equations.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def build() -> Problem:
     problem.dynamics(x, equinoctial_rates(x, thrust) / TIME)
     problem.dynamics(w, -force / IMPULSE)
     problem.path("direction", ca.sumsqr(u), 0.999, 1.001)
-    p, f, g, h, k, _ = ca.vertsplit(x)
+    _, f, g, h, k, _ = ca.vertsplit(x)
     problem.end("eccentricity", f**2 + g**2, 0.73550320568829**2, 0.73550320568829**2)
     problem.end("inclination", h**2 + k**2, 0.61761258786099**2, 0.61761258786099**2)
     problem.end("perigee", f * h + g * k, 0.0, 0.0)

@@ -1,7 +1,7 @@
 """A planar lander with two thrusters flies to (5, 5) m in least time.
 
-m p'' = R(theta) (0, F1 + F2) - (0, m g), I theta'' = (D / 2) (F2 - F1), 0 <= F <= 2 g N, from rest upright, to rest with a
-free attitude; m = 1 kg, I = 0.1 kg m^2, D = 1 m. OptimalControlProblems.jl, moonlander.
+m p'' = R(theta) (0, F1 + F2) - (0, m g), I theta'' = (D / 2) (F2 - F1), 0 <= F <= 2 g N, from rest upright, to rest
+with a free attitude; m = 1 kg, I = 0.1 kg m^2, D = 1 m. OptimalControlProblems.jl, moonlander.
 """
 
 from __future__ import annotations
@@ -33,6 +33,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "moonlander", (TOOLBOX,), build, {"CTDirect": 0.962}, method=Collocation(60, 3),
+    "moonlander", (TOOLBOX,), build, {"CTDirect": "0.962"}, method=Collocation(60, 3),
     second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

@@ -29,6 +29,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "mpec", (PSOPT,), build, {PSOPT: 1.656309}, method=Collocation(30, 4),
-    second=Collocation(42, 3, "legendre"),
+    "mpec", (PSOPT,), build, {PSOPT: 1.656309}, method=Collocation(30, 4, control="held"),
+    second=Collocation(42, 3, "legendre", control="held"),
 )  # fmt: skip

@@ -1,8 +1,8 @@
 """A quadrotor flies 5 m aside in least time, tilted by at most 0.55 rad.
 
-p'' = R(phi, theta, psi) (0, 0, a) - (0, 0, g), the rates of roll phi and pitch theta are controls, |.| <= 3 rad/s, 0 <= a
-<= 45.9 m/s^2, cos theta cos phi >= cos 0.55, and the yaw psi is a control; from rest at (0, 0, 2.5) to rest at (0.01, 5,
-2.5), least T + int 1e-8 (a^2 + phi^2 + theta^2 + psi^2) + 100 psi^2 dt. OptimalControlProblems.jl, quadrotor, which
+p'' = R(phi, theta, psi) (0, 0, a) - (0, 0, g), the rates of roll phi and pitch theta are controls, |.| <= 3 rad/s, 0 <=
+a <= 45.9 m/s^2, cos theta cos phi >= cos 0.55, and the yaw psi is a control; from rest at (0, 0, 2.5) to rest at (0.01,
+5, 2.5), least T + int 1e-8 (a^2 + phi^2 + theta^2 + psi^2) + 100 psi^2 dt. OptimalControlProblems.jl, quadrotor, which
 marks it as not solved.
 """
 
@@ -44,7 +44,7 @@ ENTRY = Entry(
     "quadrotor",
     (TOOLBOX,),
     build,
-    {"CTDirect": 1.492},
+    {"CTDirect": "1.492"},
     method=Collocation(50, 3),
     second=Collocation(71, 3, "legendre"),
 )

@@ -26,5 +26,5 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "robbins", (TOOLBOX,), build, {"CTDirect": 19.4}, method=Collocation(60, 4), second=Collocation(85, 3, "legendre")
+    "robbins", (TOOLBOX,), build, {"CTDirect": "19.4"}, method=Collocation(60, 4), second=Collocation(85, 3, "legendre")
 )

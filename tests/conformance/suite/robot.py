@@ -1,7 +1,7 @@
 """A robot arm of variable reach turned in least time.
 
-L rho'' = u1, I_theta theta'' = u2, I_phi phi'' = u3, |u| <= 1, I_phi = ((L - rho)^3 + rho^3) / 3, I_theta = I_phi
-sin^2 phi, L = 5, from rest at (4.5, 0, pi / 4) to rest at (4.5, 2 pi / 3, pi / 4). COPS 3, problem 9, 9.14093; Bang-bang
+L rho'' = u1, I_theta theta'' = u2, I_phi phi'' = u3, |u| <= 1, I_phi = ((L - rho)^3 + rho^3) / 3, I_theta = I_phi sin^2
+phi, L = 5, from rest at (4.5, 0, pi / 4) to rest at (4.5, 2 pi / 3, pi / 4). COPS 3, problem 9, 9.14093; Bang-bang
 controls. OptimalControlProblems.jl, robot.
 """
 

@@ -1,8 +1,7 @@
 """One problem of a suite: solved, refined, audited, confirmed by a second method, and solved by rockit.
 
-python -m tests.conformance.suite.run NAME prints a row of JSON after every stage, each with what the row before has; so
-that what a limit of processor time ends leaves the stages before it. Seconds are those of the processor, without
-imports.
+Each problem is done by a process of its own, forked from one that has solved a problem, so that seconds contain no
+imports. It sends what it has after every stage: what a limit of processor time ends leaves the stages before it.
 """
 
 from __future__ import annotations
@@ -13,16 +12,14 @@ import json
 import math
 import os
 import resource
-import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from ocp import Collocation, Indirect, MultipleShooting, Problem, RefinementSettings, Solution, refine, solve
 
 from .entry import Entry, Method
-from .library import entries
 
 MOST_SECONDS = 100
 """Of the processor for all stages of a problem; what is not done by then stays out."""
@@ -68,24 +65,25 @@ def digits(one: float, other: float) -> float:
     return min(-math.log10(max(abs(one - other) / (size if size > 1e-6 else 1.0), 1e-15)), 15.0)
 
 
-def verdict(cost: float, published: float | None, second: float) -> str:
+def verdict(cost: float, printed: float | str | None, second: float) -> str:
     """What the cost says of a printed one: "agrees", "below" or "above" if both methods say so, else "open".
 
     Without a printed cost "confirmed" or "open", by whether both methods agree within DEVIATION.
     """
-    if published is None:
+    if printed is None:
         return "confirmed" if digits(cost, second) >= -math.log10(DEVIATION) else "open"
-    if abs(cost - published) <= max(DEVIATION * abs(published), last_digit(published) / 2, 1e-9):
+    published = float(printed)
+    if abs(cost - published) <= max(DEVIATION * abs(published), last_digit(printed) / 2, 1e-9):
         return "agrees"
     if not abs(cost - second) <= SHARE * abs(cost - published):
         return "open"
     return "below" if cost < published else "above"
 
 
-def last_digit(number: float) -> float:
+def last_digit(number: float | str) -> float:
     """The unit of the last digit of a number as it is printed."""
-    mantissa, _, exponent = repr(number).partition("e")
-    return float(10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2].rstrip("0") or "")))
+    mantissa, _, exponent = str(number).partition("e")
+    return float(10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2])))
 
 
 def named(method: Method) -> str:
@@ -146,17 +144,38 @@ def stages(entry: Entry) -> list[Callable[[Row, dict[str, Any]], Row]]:
     return [solved, finer, audited, again, peer]
 
 
-def main(name: str) -> int:
-    """Print a row after each stage."""
-    resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS + 5))
+def warm_up(known: Mapping[str, Entry]) -> None:
+    """Solve a problem by every tool, so that what they import is there."""
     warnings.simplefilter("ignore")
-    known = entries()
-    solve(known["mineng_di"].build(), known["mineng_di"].method)  # what a first solve imports
+    entry = known["mineng_di"]
+    solve(entry.build(), entry.method).audit()
     with contextlib.suppress(Exception), contextlib.redirect_stdout(io.StringIO()):
         from .peer import rockit_cost
 
-        rockit_cost(known["mineng_di"].build(), Collocation(2, 2))
-    entry, row, kept = known[name], {"name": name}, dict[str, Any]()
+        rockit_cost(entry.build(), Collocation(2, 2))
+
+
+def done(entry: Entry) -> Row:
+    """All stages of a problem, in a process of its own."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS + 5))
+        with os.fdopen(writer, "w") as sink:
+            _stages(entry, lambda row: print(json.dumps(row), file=sink, flush=True))
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as source:
+        lines = source.read().splitlines()
+    os.waitpid(child, 0)
+    rows = [json.loads(line) for line in lines if line.endswith("}")]
+    return rows[-1] if rows else {"failed": f"no plan within {MOST_SECONDS} s of the processor"}
+
+
+def _stages(entry: Entry, send: Callable[[Row], None]) -> None:
+    """Do every stage and send the row so far after each."""
+    row: Row = {"name": entry.name}
+    kept: dict[str, Any] = {}
     for stage in stages(entry):
         try:
             row |= stage(row, kept)
@@ -164,11 +183,5 @@ def main(name: str) -> int:
             row["failed"] = f"{stage.__name__}: {words(error)}"
             if "plan" not in kept:
                 break
-        print(json.dumps(row), file=sys.__stdout__, flush=True)
-    print(json.dumps(row), file=sys.__stdout__, flush=True)
-    sys.stdout.flush()
-    os._exit(0)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+        send(row)
+    send(row)

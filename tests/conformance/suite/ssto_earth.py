@@ -1,8 +1,8 @@
 """A rocket of one stage to an orbit of 185 km in least time.
 
 x'' = (F cos theta - D x' / v) / m, y'' = (F sin theta - D y' / v) / m - g, m' = -F / (g Isp), D = rho v^2 Cd S / 2 with
-rho = 1.225 exp(-y / 8440) kg/m^3, flat Earth; from rest at the origin to y = 185 km, (7796.6961, 0) m/s. Longuski, Guzman
-& Prussing, 2014; Dymos, example SSTO; OptimalControlProblems.jl, ssto_earth.
+rho = 1.225 exp(-y / 8440) kg/m^3, flat Earth; from rest at the origin to y = 185 km, (7796.6961, 0) m/s. Longuski,
+Guzman & Prussing, 2014; Dymos, example SSTO; OptimalControlProblems.jl, ssto_earth.
 """
 
 from __future__ import annotations
@@ -37,6 +37,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "ssto_earth", (TOOLBOX,), build, {"Dymos": 143.0}, method=Collocation(40, 4), second=Collocation(57, 3, "legendre"),
+    "ssto_earth", (TOOLBOX,), build, {"Dymos": "143"}, method=Collocation(40, 4), second=Collocation(57, 3, "legendre"),
     note="the source tells the time to three digits",
 )  # fmt: skip

@@ -75,5 +75,5 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "zpm", (PSOPT,), build, {PSOPT: 6.680107e6}, method=Collocation(40, 4), second=Collocation(60, 3, "legendre")
+    "zpm", (PSOPT,), build, {PSOPT: "6.680107e6"}, method=Collocation(40, 4), second=Collocation(60, 3, "legendre")
 )
