@@ -2,7 +2,7 @@
 
 v' = -D / m - g sin gamma, gamma' = -g cos gamma / v, h' = v sin gamma, r' = v cos gamma; iron ball, 1 to 10 cm, drag
 coefficient 0.5, exponential atmosphere, energy at most 400 kJ, v at most 500 m/s; range in km. Dymos, example
-cannonball; its atmosphere is a table, and its range 3.183 km;
+cannonball, where the atmosphere is a table;
 OptimalControlProblems.jl, cannonball, which has a control that acts on nothing.
 """
 

@@ -1,7 +1,7 @@
 """Hanging chain: the shape of least potential energy of a chain of length 4.
 
 x' = u, least int x sqrt(1 + u^2) dt with int sqrt(1 + u^2) dt = 4, from x(0) = 1 to x(1) = 3. The shape is a catenary,
-x = c cosh((t - m) / c) - mu; its three constants follow from the two ends and the length. COPS 3, problem 2; PSOPT,
+x = c cosh((t - m) / c) - mu; its three constants follow from the two ends and the length. COPS 3, problem 3; PSOPT,
 example chain.
 """
 

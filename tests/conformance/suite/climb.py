@@ -3,9 +3,9 @@
 h' = v sin gamma, v' = (T cos a - D) / m - mu sin gamma / r^2, gamma' = (T sin a + L) / (m v) + cos gamma (v / r - mu /
 (v r^2)), w' = -T / 1600 s, m = w / g0, r = Re + h. Thrust is a table of Mach number and altitude, lift slope, zero-lift
 drag and induced drag are tables of the Mach number. From (0, 424.26 ft/s, 0, 42 000 lb) to (65 600 ft, 968.148 ft/s,
-0), |a| <= 20 deg. Bryson, Desai & Hoffman, 1969; Betts, 2010, gives 324.9750302 s for the 1962 atmosphere and splines
-of least curvature; PSOPT, example climb. Its atmosphere applies the lowest layer of 1976 at all altitudes, as is done
-here, and its tables are interpolated by cubic splines, as here, but with other ends: the time depends on both.
+0), |a| <= 20 deg. Bryson, Desai & Hoffman, 1969; Betts, 2010; PSOPT, example climb. Its atmosphere applies the lowest
+layer of 1976 at all altitudes, as is done here, and its tables are interpolated by cubic splines, as here, but with
+other ends: the time depends on both.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Catalytic cracking of gas oil: three rates from 21 measurements.
 
 y1' = -(a + c) y1^2, y2' = a y1^2 - b y2; least sum of squares. PSOPT (example cracking) seeks the states at the start
-as well, COPS 3 (problem 17, gasoil) knows them to be (1, 0). Tjoa & Biegler, 1991.
+as well, COPS 3 (problem 12, gasoil) knows them to be (1, 0). Tjoa & Biegler, 1991.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ ENTRIES = (
         "catmix", (PSOPT, COPS), catalyst_mixing.build, {PSOPT: -0.0480532, COPS: -4.8056e-2},
         catalyst_mixing.CASE.cost,
     ),
-    Entry("rocket", (COPS, TOOLBOX), goddard.build, {COPS: -1.01283}, goddard.CASE.cost),
+    Entry("rocket", (COPS, TOOLBOX), goddard.build, {COPS: -1.0128}, goddard.CASE.cost),
     Entry(
         "vanderpol", (TOOLBOX,), van_der_pol.build, {"CTDirect": 1.047921}, van_der_pol.CASE.cost, Collocation(20, 4),
         Indirect(),

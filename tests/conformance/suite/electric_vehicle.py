@@ -23,4 +23,6 @@ def build() -> Problem:
     return problem
 
 
-ENTRY = Entry("electric_vehicle", (TOOLBOX,), build, {"CTDirect": "1.23e3"}, method=Collocation(20, 4), second=Indirect())
+ENTRY = Entry(
+    "electric_vehicle", (TOOLBOX,), build, {"CTDirect": "1.23e3"}, method=Collocation(20, 4), second=Indirect()
+)

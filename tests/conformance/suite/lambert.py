@@ -1,8 +1,8 @@
 """Lambert's problem: the orbit between two places in a given time.
 
 r'' = -mu r / |r|^3 from (15945.34, 0, 0) km to (12214.83899, 10249.46731, 0) km in 76 min, without a cost. Vallado,
-Fundamentals of Astrodynamics and Applications, 2001, example 7-5, whose velocity at the start is (2.058913, 2.915965,
-0) km/s with his value of mu; PSOPT, example lambert, with mu = 6.6720e-11 5.9742e24.
+Fundamentals of Astrodynamics and Applications, 2001, example 7-5; PSOPT, example lambert, with mu = 6.6720e-11
+5.9742e24.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Linear tangent steering: the direction of a constant thrust that reaches a height and a speed in least time.
 
 x'' = a cos u, y'' = a sin u, a = 100, |u| <= pi / 2, from rest to y = 5, x' = 45, y' = 0. The tangent of u is linear in
-time. Bryson & Ho, 1975; Betts, 2010; PSOPT, example lts; COPS 3, problem 8 (steering).
+time. Bryson & Ho, 1975; Betts, 2010; PSOPT, example lts; COPS 3, problem 9 (steering).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Marine population dynamics: growth and mortality of eight stages from 21 counts.
 
 y_i' = g_(i-1) y_(i-1) - (m_i + g_i) y_i with g_0 = g_8 = 0: 15 rates, and the counts at the start, are sought. Counts
-in thousands. Rothschild, Sharov, Kearsley & Bondarenko, 1997; COPS 3, problem 14, whose cost in counts is 1e6 times
+in thousands. Rothschild, Sharov, Kearsley & Bondarenko, 1997; COPS 3, problem 6, whose cost in counts is 1e6 times
 this.
 """
 

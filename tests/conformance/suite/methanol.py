@@ -1,7 +1,7 @@
 """Methanol to hydrocarbons: five rates from 16 measurements.
 
 y1' = -(2 b - a y2 / d + c + e) y1, y2' = a y1 (b y1 - y2) / d + c y1, y3' = a y1 (y2 + f y1) / d + e y1 with d = (b +
-f) y1 + y2, from (1, 0, 0). Maria, 1989; COPS 3, problem 15.
+f) y1 + y2, from (1, 0, 0). Maria, 1989; COPS 3, problem 13.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Isomerisation of alpha-pinene: five rates from eight measurements.
 
 y1' = -(a + b) y1, y2' = a y1, y3' = b y1 - (c + d) y3 + e y5, y4' = c y3, y5' = d y3 - e y5, from (100, 0, 0, 0, 0);
-time in units of 1e4 min. Box, Hunter, MacGregor & Erjavec, 1973; COPS 3, problem 18.
+time in units of 1e4 min. Box, Hunter, MacGregor & Erjavec, 1973; COPS 3, problem 5.
 """
 
 from __future__ import annotations

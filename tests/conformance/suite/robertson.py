@@ -1,7 +1,7 @@
 """Robertson's stiff chemical kinetics over 40 s: a simulation stated as a problem without a cost.
 
 x' = -0.04 x + 1e4 y z, y' = 0.04 x - 1e4 y z - 3e7 y^2, z' = 3e7 y^2 from (1, 0, 0). Robertson, 1966; OptimalControl-
-Problems.jl, robertson. The values at 40 s are x = 0.71582707, y = 9.1855e-6, z = 0.28416375.
+Problems.jl, robertson.
 """
 
 from __future__ import annotations

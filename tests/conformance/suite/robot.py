@@ -1,8 +1,8 @@
 """A robot arm of variable reach turned in least time.
 
 L rho'' = u1, I_theta theta'' = u2, I_phi phi'' = u3, |u| <= 1, I_phi = ((L - rho)^3 + rho^3) / 3, I_theta = I_phi sin^2
-phi, L = 5, from rest at (4.5, 0, pi / 4) to rest at (4.5, 2 pi / 3, pi / 4). COPS 3, problem 9, 9.14093; Bang-bang
-controls. OptimalControlProblems.jl, robot.
+phi, L = 5, from rest at (4.5, 0, pi / 4) to rest at (4.5, 2 pi / 3, pi / 4). COPS 3, problem 8. The controls switch.
+OptimalControlProblems.jl, robot.
 """
 
 from __future__ import annotations
@@ -35,6 +35,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "robot", (COPS, TOOLBOX), build, {COPS: 9.14093}, method=Collocation(60, 3),
+    "robot", (COPS, TOOLBOX), build, {COPS: 9.1409}, method=Collocation(60, 3),
     second=Collocation(85, 3, "legendre"),
 )  # fmt: skip

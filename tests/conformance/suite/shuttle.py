@@ -3,7 +3,7 @@
 Altitude h, longitude phi, latitude theta, speed v, flight path gamma and azimuth psi over a spherical Earth with an
 exponential atmosphere; lift and drag are polynomials of the angle of attack, and the bank angle tilts the lift. From
 (260 000 ft, 25 600 ft/s, -1 deg, 90 deg) to (80 000 ft, 2500 ft/s, -5 deg), greatest latitude, degrees, free time. No
-limit of heating. Betts, 2010, section 6.1, who gives 34.1412 deg; PSOPT, example shuttle_reentry.
+limit of heating. Betts, 2010, section 6.1; PSOPT, example shuttle_reentry.
 """
 
 from __future__ import annotations
@@ -50,6 +50,6 @@ def build() -> Problem:
 
 
 ENTRY = Entry(
-    "shuttle_reentry", (PSOPT, TOOLBOX), build, {PSOPT: -34.14120, "Betts": -34.1412}, method=Collocation(40, 4),
+    "shuttle_reentry", (PSOPT, TOOLBOX), build, {PSOPT: -34.1412}, method=Collocation(40, 4),
     second=Collocation(60, 3, "legendre"),
 )  # fmt: skip
