@@ -20,42 +20,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, f
 from ocp import SolveError, solve
 from scripts import drawing
 from tests.conformance.suite.__main__ import rows_of
-from tests.conformance.suite.library import entries, module_of
+from tests.conformance.suite.library import entries
+from tests.conformance.suite.page import PAGE, write_page
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "suite.md"
-MARKS = ("<!-- made by scripts/suite.py -->", "<!-- end -->")
 TOOLS = {"seconds": ("selfmotion", "blue"), "rockit_seconds": ("rockit", "orange")}
 PANELS = 9  # a row
 SIZE = (11.0, 11.0)  # inches
-
-
-def table(rows: Mapping[str, Mapping[str, str]]) -> str:
-    """The rows as Markdown."""
-    lines = [
-        "| problem | cost | printed | verdict | digits | feasible | minimum | s | refined, s | rockit, s | PSOPT, s |",
-        "|---|---:|---:|---|---:|---|---|---:|---:|---:|---:|",
-    ]
-    for name, row in rows.items():
-        printed = f"{float(row['exact']):.8g} (exact)" if row["exact"] else row["published"] or "-"
-        rockit = row["rockit_seconds"] if row["rockit_cost"].lstrip("-")[:1].isdigit() else ""
-        cells = (
-            f"[{name}](../tests/conformance/suite/{module_of(name)}.py)", f"{float(row['cost']):.8g}", printed,
-            row["verdict"], f"{float(row['digits'] or 'nan'):.0f}".replace("nan", "-"),
-            {"True": "yes", "False": "no"}.get(row["feasible"], "-"),
-            {"True": "yes", "False": "no"}.get(row["optimal"], "undetermined"),
-            *(f"{float(text):.2g}" if text else "-" for text in
-              (row["seconds"], row["refined_seconds"], rockit, row["psopt_seconds"])),
-        )  # fmt: skip
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def write_page(page: Path, rows: Mapping[str, Mapping[str, str]]) -> None:
-    """Put the table between its marks."""
-    text = page.read_text(encoding="utf-8")
-    begin, end = (text.index(mark) for mark in MARKS)
-    page.write_text(f"{text[:begin]}{MARKS[0]}\n{table(rows)}\n{text[end:]}", encoding="utf-8")
 
 
 def profile(path: Path, rows: Mapping[str, Mapping[str, str]]) -> None:
@@ -78,9 +49,9 @@ def _seconds(row: Mapping[str, str], key: str) -> float:
     return float(row[key]) if row[key] and cost.lstrip("-")[:1].isdigit() else np.nan
 
 
-def problems(path: Path) -> None:
-    """States of every problem over its horizon, each divided by its size."""
-    known = entries()
+def problems(path: Path, rows: Mapping[str, Mapping[str, str]]) -> None:
+    """States of every problem that is in the table over its horizon, each divided by its size."""
+    known = {name: entry for name, entry in entries().items() if rows.get(name, {}).get("seconds")}
     note = "States, each divided by its size, over the horizon; phases side by side over their own durations."
     with drawing.sheet(path, (-(-len(known) // PANELS), PANELS), SIZE, note) as (_, axes):
         for ax in axes.ravel():
@@ -105,4 +76,4 @@ if __name__ == "__main__":
     profile(options.out / "suite" / "profile.png", found)
     write_page(PAGE, found)
     if options.problems:
-        problems(options.out / "suite" / "problems.png")
+        problems(options.out / "suite" / "problems.png", found)

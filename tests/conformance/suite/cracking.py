@@ -36,8 +36,8 @@ def build(initial: list[float] | None) -> Phases:
     return estimation("gas oil", TIMES, DATA, rates, states=2, initial=initial, lower=0.0)
 
 
-MESHES = {"method": Collocation(2, 4), "second": Collocation(3, 3, "legendre")}
+FIRST, SECOND = Collocation(2, 4), Collocation(3, 3, "legendre")
 ENTRIES = (
-    Entry("cracking", (PSOPT,), partial(build, None), {PSOPT: 5.228971e-3}, **MESHES),
-    Entry("gasoil", (COPS,), partial(build, [1.0, 0.0]), {COPS: 5.2366e-3}, **MESHES),
+    Entry("cracking", (PSOPT,), partial(build, None), {PSOPT: 5.228971e-3}, None, FIRST, SECOND),
+    Entry("gasoil", (COPS,), partial(build, [1.0, 0.0]), {COPS: 5.2366e-3}, None, FIRST, SECOND),
 )

@@ -42,8 +42,8 @@ def build(suite: str) -> Problem:
     return problem
 
 
-MESHES = {"method": Collocation(60, 4), "second": Collocation(90, 3, "legendre")}
+FIRST, SECOND = Collocation(60, 4), Collocation(90, 3, "legendre")
 ENTRIES = (
-    Entry("glider", (PSOPT,), partial(build, PSOPT), {PSOPT: -1250.190}, **MESHES),
-    Entry("glider_cops", (COPS, TOOLBOX), partial(build, COPS), {"CTDirect": "-1.248e3"}, **MESHES),
+    Entry("glider", (PSOPT,), partial(build, PSOPT), {PSOPT: "-1250.190"}, None, FIRST, SECOND),
+    Entry("glider_cops", (COPS, TOOLBOX), partial(build, COPS), {"CTDirect": "-1.248e3"}, None, FIRST, SECOND),
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from .entry import Entry
 
-OTHERS = {"__init__", "__main__", "entry", "estimation", "library", "peer", "run", "table", "test_suite"}
+OTHERS = {"__init__", "__main__", "entry", "estimation", "library", "page", "peer", "run", "table", "test_suite"}
 """Modules beside those of problems."""
 MODULES = sorted(file.stem for file in Path(__file__).parent.glob("*.py") if file.stem not in OTHERS)
 

@@ -28,12 +28,9 @@ def build(fleets: int) -> Problem:
     return problem
 
 
-MESHES = {
-    "method": Collocation(80, 3),
-    "second": Collocation(113, 3, "legendre"),
-    "note": "relaxed: the infimum over fleets that are in or out",
-}
+FIRST, SECOND = Collocation(80, 3), Collocation(113, 3, "legendre")
+NOTE = "relaxed: the infimum over fleets that are in or out"
 ENTRIES = (
-    Entry("lotka", (PSOPT,), partial(build, 1), {PSOPT: 1.344093, "Sager": 1.34408}, **MESHES),
-    Entry("lotka2", (PSOPT,), partial(build, 2), {PSOPT: 1.088024}, **MESHES),
+    Entry("lotka", (PSOPT,), partial(build, 1), {PSOPT: 1.344093, "Sager": 1.34408}, None, FIRST, SECOND, NOTE),
+    Entry("lotka2", (PSOPT,), partial(build, 2), {PSOPT: 1.088024}, None, FIRST, SECOND, NOTE),
 )

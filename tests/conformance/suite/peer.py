@@ -56,7 +56,9 @@ def rockit_cost(problem: Problem, method: Collocation) -> float:
             _limit(ocp, lower[k], value[i], upper[k], {})
     first = (at_start, ca.MX(form.nu, 1), 0, ocp.T, at_start, ca.MX(form.nu, 1))
     for rows, arguments, grid in ((form.path, here, everywhere), (form.start, first, {}), (form.end, at_end, {})):
-        values = function("rows", rows.expression)(*arguments) if len(rows) else None
+        if not len(rows):
+            continue
+        values = function("rows", rows.expression)(*arguments)
         for i in range(len(rows)):
             k = rows.bounds[i]
             _limit(ocp, lower[k], values[i], upper[k], grid)

@@ -6,6 +6,8 @@ Problems.jl, robertson.
 
 from __future__ import annotations
 
+import numpy as np
+
 from ocp import Collocation, Problem
 
 from .entry import TOOLBOX, Entry
@@ -26,4 +28,9 @@ def build() -> Problem:
     return problem
 
 
-ENTRY = Entry("robertson", (TOOLBOX,), build, exact=0.0, method=Collocation(60, 3), second=Collocation(90, 5))
+MESH = (0.0, *np.geomspace(1e-7, 1.0, 60).tolist())
+"""Nodes that crowd at the start, where y rises within milliseconds."""
+ENTRY = Entry(
+    "robertson", (TOOLBOX,), build, exact=0.0, method=Collocation(len(MESH) - 1, 3, "radau", "points", MESH),
+    second=Collocation(len(MESH) - 1, 5, "radau", "points", MESH),
+)  # fmt: skip
