@@ -72,8 +72,8 @@ if __name__ == "__main__":
     parser.add_argument("--problems", action="store_true")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    found = rows_of(options.out / "suite")
-    profile(options.out / "suite" / "profile.png", found)
-    write_page(PAGE, found)
+    rows = rows_of(options.out / "suite")
+    profile(options.out / "suite" / "profile.png", rows)
+    write_page(PAGE, rows)
     if options.problems:
-        problems(options.out / "suite" / "problems.png", found)
+        problems(options.out / "suite" / "problems.png", rows)

@@ -27,7 +27,7 @@ ENTRIES = (
         second=Collocation(30, 3, "legendre"),
     ),
     Entry(
-        "launch", (PSOPT,), flights.launch, {PSOPT: -7529.661 / flights.MASS}, method=Collocation(15, 4),
+        "launch", (PSOPT,), flights.launch, {PSOPT: f"{-7529.661 / flights.MASS:.7g}"}, method=Collocation(15, 4),
         second=Collocation(22, 3, "legendre"), note="mass in units of that at the start",
     ),
 )  # fmt: skip

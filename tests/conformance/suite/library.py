@@ -16,11 +16,11 @@ MODULES = sorted(file.stem for file in Path(__file__).parent.glob("*.py") if fil
 @cache
 def stated() -> dict[str, tuple[str, Entry]]:
     """Every problem by its name, with the module that states it."""
-    found = []
+    pairs = []
     for name in MODULES:
         module = import_module(f"{__package__}.{name}")
-        found += [(name, entry) for entry in getattr(module, "ENTRIES", None) or (module.ENTRY,)]
-    return {entry.name: (name, entry) for name, entry in sorted(found, key=lambda pair: pair[1].name)}
+        pairs += [(name, entry) for entry in getattr(module, "ENTRIES", None) or (module.ENTRY,)]
+    return {entry.name: (name, entry) for name, entry in sorted(pairs, key=lambda pair: pair[1].name)}
 
 
 def entries() -> dict[str, Entry]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from .library import module_of
+from .library import entries, module_of
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "suite.md"
 MARKS = ("<!-- made by scripts/suite.py -->", "<!-- end -->")
@@ -31,6 +31,8 @@ def table(rows: Mapping[str, Mapping[str, str]]) -> str:
             *(f"{float(seconds):.2g}" if seconds else "-" for seconds in times),
         )
         lines.append(f"| {' | '.join(cells)} |")
+    missing = [name for name in entries() if name not in rows]
+    lines += [f"| {name} |{' - |' * HEAD.count(' |')}".removesuffix(" - |") for name in missing]
     return "\n".join(lines)
 
 

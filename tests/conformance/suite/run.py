@@ -124,9 +124,9 @@ def stages(entry: Entry) -> list[Callable[[Row, dict[str, Any]], Row]]:
 
     def again(row: Row, kept: dict[str, Any]) -> Row:
         cost = kept["plan"].cost
-        found = confirmed(entry, kept["plan"])
+        second = confirmed(entry, kept["plan"])
         printed = next(iter(entry.published.values()), None)
-        return found | {"verdict": verdict(cost, printed, found["second_cost"])}
+        return second | {"verdict": verdict(cost, printed, second["second_cost"])}
 
     def peer(row: Row, kept: dict[str, Any]) -> Row:
         if not isinstance(entry.method, Collocation):

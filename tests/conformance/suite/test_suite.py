@@ -76,8 +76,8 @@ def test_the_cost_of_the_table_is_that_of_the_closed_form(name: str) -> None:
     assert float(ROWS[name]["cost"]) == pytest.approx(exact, rel=1e-4, abs=1e-9)
 
 
-def test_the_table_has_every_problem_and_every_column() -> None:
-    assert set(ROWS) == set(ENTRIES)
+def test_the_table_has_stated_problems_and_every_column() -> None:
+    assert set(ROWS) <= set(ENTRIES)
     assert tuple(next(iter(ROWS.values()))) == COLUMNS
 
 
@@ -113,7 +113,8 @@ def test_digits_and_verdicts() -> None:
     assert last_digit("6.680107e6") == pytest.approx(1.0)
     assert last_digit("1.23e3") == pytest.approx(10.0)
     assert verdict(1.0, 1.0, 1.0) == "agrees"
-    assert verdict(0.99, 1.0, 0.9901) == "below"
-    assert verdict(1.01, 1.0, 1.0101) == "above"
-    assert verdict(1.01, 1.0, 1.005) == "open"
+    assert verdict(0.99, "1.0000", 0.9901) == "below"
+    assert verdict(1.01, "1.0000", 1.0101) == "above"
+    assert verdict(1.01, "1.0000", 1.005) == "open"
+    assert verdict(1.01, "1.0", 1.005) == "agrees"
     assert verdict(1.0, None, 1.00001) == "confirmed"
