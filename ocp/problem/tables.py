@@ -15,7 +15,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.interpolate import make_interp_spline
+import scipy
 
 from ocp.errors import ProblemError
 from ocp.problem.values import check_finite, numeric
@@ -94,7 +94,7 @@ def _weights(points: np.ndarray, x: Any) -> Any:
     derivatives vanish.
     """
     degree = min(DEGREE, len(points) - 1)
-    spline = make_interp_spline(points, np.eye(len(points)), k=degree)
+    spline = scipy.interpolate.make_interp_spline(points, np.eye(len(points)), k=degree)
     starts = np.unique(spline.t)[:-1]  # the knots at the ends are repeated
     origins = np.concatenate([points[:1], starts, points[-1:]])
     taylor = np.array([spline(origins, order) / factorial(order) for order in range(max(degree, 2) + 1)])
