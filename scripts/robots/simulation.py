@@ -17,6 +17,7 @@ from ocp.direct.assembly import ArrayFunction
 
 __all__ = ["Simulation", "mjcf_text", "mujoco_model"]
 
+
 def mujoco_model(
     robot: Robot, ground: str = "", foot: str = "", options: str = "", *, fixed: bool = False
 ) -> mujoco.MjModel:
