@@ -3,7 +3,8 @@
 The solver is sequential quadratic programming: CasADi's ``sqpmethod`` linearises the program, and ``qrqp``, an
 active-set method with a sparse QR factorisation, solves the quadratic program from the active limits of the last one.
 The numbers of iterations of both are limited. Neither allocates memory, and both have C code, so that the whole
-controller can be exported to C.
+controller can be exported to C. If the result violates dynamics or limits, as when the active limits of the last step
+are dependent for the new data, a second attempt starts without active limits.
 
 By default the Hessian is that of Gauss and Newton: squares in the cost lose the curvature of their residuals, and
 constraints lose theirs. It is positive semidefinite if the rest of the cost is convex, far from the optimum as well
@@ -84,7 +85,7 @@ class ControlStep:
         dynamics_violation: Largest violation of the discretised dynamics, in the units of the problem.
         limit_violation: Largest violation of a bound or of a path, start or end constraint by the prediction.
         residual: Largest residual of the first-order conditions: gradient of the Lagrangian, and complementarity.
-        iterations: Number of iterations. seconds: Wall time of the step, s.
+        iterations: Number of iterations of the last attempt. seconds: Wall time of the step, s.
         held: Whether the new iterate is not finite. ``control`` and ``prediction`` are then those of the last step.
     """
 
@@ -161,25 +162,32 @@ class Controller:
         Raises:
             ProblemError: A parameter is missing, unknown, of a wrong size or not finite, or a bound is not a number or
                 exceeds its upper bound at these parameters. The controller stays as it was.
-            RuntimeError: A function of the problem cannot be evaluated.
+            RuntimeError: A function of the problem cannot be evaluated in the first step. In later steps the result of
+                the last one is held.
         """
         began = time.perf_counter()
         form, tolerance = self._prepared.formulation, self.settings.tolerance
         p = form.parameter_vector(require.mapping("parameters", parameters))
         shift = np.array([0.0 if self._is_first else 1.0])
-        values = dict(zip(OUTPUTS, self._run(p, *self._state, shift), strict=True))
+        measures = np.full(len(MEASURES), np.inf)
+        try:
+            values = dict(zip(OUTPUTS, self._run(p, *self._state, shift), strict=True))
+            measures = np.concatenate([values[name] for name in MEASURES])
+        except RuntimeError:  # a function of the problem is not finite, or cannot be evaluated
+            if not self._last:
+                raise
+            values = self._last
         if not values["range"][0] >= 0:
             form.bound_values(p)  # raises the error that names the bound
             raise ProblemError(f"problem {form.name!r}: a lower bound exceeds its upper bound at these parameters")
-        dynamics, limits, residual = (float(values[name][0]) for name in MEASURES)
-        held = not np.isfinite(dynamics + limits + residual)
+        held = not np.all(np.isfinite(measures))
         if held:
             values = self._last or values
         else:
             self._state, self._last = (values["x"], values["lam_x"], values["lam_g"]), values
         self._is_first = False
         iterations = int(self._solver.stats(1)["iter_count"])
-        converged = max(dynamics, limits, residual) <= tolerance
+        converged = bool(np.all(measures <= tolerance))
         outcome = Outcome(
             values["x"],
             float(values["cost"][0]),
@@ -195,9 +203,7 @@ class Controller:
             {name: values["control"][place] for name, place in form.controls.items()},
             outcome.cost,
             converged,
-            dynamics,
-            limits,
-            residual,
+            *(float(measure) for measure in measures),
             iterations,
             outcome.seconds,
             held,
@@ -237,7 +243,8 @@ class Controller:
         lines = [f"/* {c_string(form.name).replace('*/', '* /')} */"]
         lines += [f"#define CONTROLLER_{name} {size}" for name, size in sizes.items()]
         for name, values in zip(("x", "lam_x", "lam_g"), self._state, strict=True):
-            lines.append(f"static double {name}[] = {{{', '.join([*(f'{v:.17g}' for v in values), '0'])}}};")
+            numbers = [f"{value:.17g}" for value in (*values, 0.0)]
+            lines += [f"static double {name}[] = {{", *(f"  {number}," for number in numbers), "};"]
         for name, labels in (("parameters", form.parameter_labels), ("controls", form.control_labels)):
             lines.append(f"static const char *const {name}[] = {{{', '.join([*map(c_string, labels), '0'])}}};")
         texts = {"controller.c": code, "controller.h": header, "start.h": "\n".join([*lines, ""])}
@@ -247,36 +254,51 @@ class Controller:
         return place
 
     def _build(self, functions: ProgramFunctions) -> tuple[Any, Any]:
-        """Return the solver, and the casadi Function of a step with its bounds, shifted start and measures."""
-        transcription, form = self._prepared.transcription, self._prepared.formulation
-        values, first, hessian = functions
+        """Return the solver, and the casadi Function of a step: a first attempt, and perhaps a second one."""
+        transcription, form, settings = self._prepared.transcription, self._prepared.formulation, self.settings
         x, p = ca.MX.sym("x", transcription.size), ca.MX.sym("p", form.np)
-        lam_x, lam_g = ca.MX.sym("lam_x", transcription.size), ca.MX.sym("lam_g", transcription.n_rows)
-        is_shifted = ca.MX.sym("shift")
-        settings = self.settings
-        cost, rows = values(x, p)
-        solver = ca.nlpsol(
-            "controller",
-            "sqpmethod",
-            {"x": x, "p": p, "f": cost, "g": rows},
-            {
-                **QUIET,
-                "qpsol": "qrqp",
-                "qpsol_options": {**QUIET_QP, "max_iter": settings.qp_iterations},
-                "max_iter": settings.iterations,
-                "tol_pr": settings.tolerance,
-                "tol_du": settings.tolerance,
-                "jac_fg": first,
-                "hess_lag": hessian,
-                "no_nlp_grad": True,
-                "calc_lam_p": False,
-                "error_on_fail": False,
-            },
+        cost, rows = functions.values(x, p)
+        options = {
+            **QUIET,
+            "qpsol": "qrqp",
+            "qpsol_options": {**QUIET_QP, "max_iter": settings.qp_iterations},
+            "max_iter": settings.iterations,
+            "tol_pr": settings.tolerance,
+            "tol_du": settings.tolerance,
+            "jac_fg": functions.first,
+            "hess_lag": functions.hessian,
+            "no_nlp_grad": True,
+            "calc_lam_p": False,
+            "error_on_fail": False,
+            "inputs_check": False,  # crossed bounds are reported by the range
+            "show_eval_warnings": False,
+        }
+        solver = ca.nlpsol("controller", "sqpmethod", {"x": x, "p": p, "f": cost, "g": rows}, options)
+        attempt = self._attempt(solver, functions)
+
+        lam_x, lam_g, is_shifted = (ca.MX.sym(name, *attempt.size_in(i)) for i, name in ((2, "x"), (3, "g"), (4, "s")))
+        outputs = [ca.MX.sym(name, *attempt.size_out(i)) for i, name in enumerate(OUTPUTS)]
+        second = attempt(p, x, 0, 0, is_shifted)
+        choice = ca.Function.if_else(
+            "choice",
+            ca.Function("second", [p, x, is_shifted, *outputs], second),
+            ca.Function("first", [p, x, is_shifted, *outputs], outputs),
         )
+        first = dict(zip(OUTPUTS, attempt(p, x, lam_x, lam_g, is_shifted), strict=True))
+        is_infeasible = ca.fmax(first["dynamics_violation"], first["limit_violation"]) > settings.tolerance
+        final = choice(is_infeasible, p, x, is_shifted, *first.values())
+        names = ["p", "x0", "lam_x0", "lam_g0", "shift"]
+        return solver, ca.Function("controller_step", [p, x, lam_x, lam_g, is_shifted], final, names, list(OUTPUTS))
+
+    def _attempt(self, solver: Any, functions: ProgramFunctions) -> Any:
+        """Return the casadi Function of one solve, with its bounds, its shifted start, and measures of its result."""
+        transcription, form = self._prepared.transcription, self._prepared.formulation
+        x, p, is_shifted = ca.MX.sym("x", transcription.size), ca.MX.sym("p", form.np), ca.MX.sym("shift")
+        lam_x, lam_g = ca.MX.sym("lam_x", transcription.size), ca.MX.sym("lam_g", transcription.n_rows)
         table = form.bounds.function(p)
         places = transcription.variable_bounds, transcription.row_bounds
         (low, high), (low_g, high_g) = ([ca.densify(ca.vec(side)[at.tolist()]) for side in table] for at in places)
-        at_x, at_g = (index.tolist() for index in shifted_indices(transcription, settings.shift))
+        at_x, at_g = (index.tolist() for index in shifted_indices(transcription, self.settings.shift))
 
         def shifted(vector: Any, index: list[int]) -> Any:
             return (1 - is_shifted) * vector + is_shifted * vector[index]
@@ -285,11 +307,10 @@ class Controller:
         duals = {"lam_x0": shifted(lam_x, at_x), "lam_g0": shifted(lam_g, at_g)}
         result = solver(x0=start, p=p, lbx=low, ubx=high, lbg=low_g, ubg=high_g, **duals)
         end, of_bounds, of_rows = ca.fmin(ca.fmax(result["x"], low), high), result["lam_x"], result["lam_g"]
-        cost, slope, rows, jacobian = first(end, p)
+        cost, slope, rows, jacobian = functions.first(end, p)
 
         dynamics = np.flatnonzero(transcription.row_bounds == form.bounds.places["zero"][0]).tolist()
         limits = np.setdiff1d(np.arange(transcription.n_rows), dynamics).tolist()
-        missed = ca.vertcat(0, low_g[limits] - rows[limits], rows[limits] - high_g[limits])
         gradient = slope + ca.mtimes(jacobian.T, of_rows) + of_bounds
         # a multiplier is zero, or the limit of its sign is active (natural residual of complementarity)
         gaps = [
@@ -298,19 +319,18 @@ class Controller:
             for sign, limit in zip((-1, 1), sides, strict=True)
         ]
         invalid = 0 * (ca.sum1(result["x"]) + ca.sum1(gradient) + cost)  # nan if one of them is not finite
-        measures = [
+        measures = (
             ca.norm_inf(ca.vertcat(0, rows[dynamics])),
-            ca.mmax(missed),
+            ca.mmax(ca.vertcat(0, low_g[limits] - rows[limits], rows[limits] - high_g[limits])),
             ca.norm_inf(ca.vertcat(gradient, *gaps)),
-        ]
+        )
         curves, bounds = transcription.interpolants, form.bounds.places["control"].tolist()
         weights = lagrange(curves.control_nodes, np.zeros(1))
         control = ca.mtimes(gather(end, curves.controls[:, 0].reshape(-1, form.nu).T), ca.DM(weights.T))
         control = ca.fmin(ca.fmax(control, ca.vec(table[0])[bounds]), ca.vec(table[1])[bounds])
         outputs = [control, end, of_bounds, of_rows, cost, rows, ca.mmin(ca.vertcat(high - low, high_g - low_g))]
-        names = ["p", "x0", "lam_x0", "lam_g0", "shift"]
         outputs += [measure + invalid for measure in measures]
-        return solver, ca.Function("controller_step", [p, x, lam_x, lam_g, is_shifted], outputs, names, list(OUTPUTS))
+        return ca.Function("attempt", [p, x, lam_x, lam_g, is_shifted], [ca.densify(each) for each in outputs])
 
 
 # ---- functions of the nonlinear program ------------------------------------------------------------------------------
@@ -412,7 +432,9 @@ def split_squares(cost: Any, variables: Any) -> tuple[list[Any], list[Any], Any]
 
 MAIN = """\
 /* controller < numbers: reads the parameters of one step after the other, and writes for each step the controls, the
-   cost, the violations of dynamics and of limits, and the residual. Ends with 2 if the input is wrong. */
+   cost, the violations of dynamics and of limits, and the residual. Ends with 2 if the input is wrong, with 3 if the
+   first step fails. */
+#include <math.h>
 #include <stdio.h>
 #include <string.h>
 
@@ -427,34 +449,41 @@ static casadi_real *res[controller_step_SZ_RES + 1];
 int main(void) {
   static double p[CONTROLLER_PARAMETERS + 1], control[CONTROLLER_CONTROLS + 1], rows[CONTROLLER_ROWS + 1];
   static double next_x[CONTROLLER_VARIABLES + 1], next_lam_x[CONTROLLER_VARIABLES + 1], next_lam_g[CONTROLLER_ROWS + 1];
-  double shift = 0, cost, range, dynamics, limits, residual;
+  static double next_control[CONTROLLER_CONTROLS + 1];
+  double shift = 0, cost = 0, range, dynamics, limits, residual;
   long i;
+  int failed;
   for (i = 0; controls[i]; ++i) printf("%s,", controls[i]);
-  printf("cost,dynamics_violation,limit_violation,residual\n");
+  printf("cost,dynamics_violation,limit_violation,residual\\n");
   for (;;) {
     for (i = 0; i < CONTROLLER_PARAMETERS; ++i)
       if (scanf("%lf", p + i) != 1) {
         if (i || !feof(stdin)) {
-          fprintf(stderr, "a number is missing for parameter %s\n", parameters[i]);
+          fprintf(stderr, "a number is missing for parameter %s\\n", parameters[i]);
           return 2;
         }
         return 0;
       }
     arg[0] = p, arg[1] = x, arg[2] = lam_x, arg[3] = lam_g, arg[4] = &shift;
-    res[0] = control, res[1] = next_x, res[2] = next_lam_x, res[3] = next_lam_g, res[4] = &cost, res[5] = rows;
+    res[0] = next_control, res[1] = next_x, res[2] = next_lam_x, res[3] = next_lam_g, res[4] = &cost, res[5] = rows;
     res[6] = &range, res[7] = &dynamics, res[8] = &limits, res[9] = &residual;
-    controller_step(arg, res, iw, w, 0);
+    range = 0;
+    failed = controller_step(arg, res, iw, w, 0) || !(dynamics + limits + residual < HUGE_VAL);
     if (!(range >= 0)) {
-      fprintf(stderr, "a lower bound exceeds its upper bound at these parameters\n");
+      fprintf(stderr, "a lower bound exceeds its upper bound at these parameters\\n");
       return 2;
     }
-    if (dynamics + limits + residual < 1e300) { /* finite: else the state of the controller stays as it is */
+    if (failed) { /* the controller and its control stay as they were */
+      dynamics = limits = residual = HUGE_VAL;
+      if (!shift) return 3;
+    } else {
+      memcpy(control, next_control, sizeof control);
       memcpy(x, next_x, sizeof x);
       memcpy(lam_x, next_lam_x, sizeof lam_x);
       memcpy(lam_g, next_lam_g, sizeof lam_g);
     }
     for (i = 0; controls[i]; ++i) printf("%.17g,", control[i]);
-    printf("%.17g,%.17g,%.17g,%.17g\n", cost, dynamics, limits, residual);
+    printf("%.17g,%.17g,%.17g,%.17g\\n", cost, dynamics, limits, residual);
     shift = 1;
   }
 }

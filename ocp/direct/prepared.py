@@ -212,7 +212,8 @@ class Prepared:
 
         Args:
             plan: Solution of this prepared problem, from which the first step starts.
-            iterations: Largest number of iterations of sequential quadratic programming in a step.
+            iterations: Largest number of iterations of sequential quadratic programming in an attempt. A step has one
+                attempt, or two if the result of the first one violates dynamics or limits by more than the tolerance.
             qp_iterations: Largest number of changes of the active set in a quadratic program.
             hessian: ``gauss-newton`` (linear convergence, also far from the optimum) or ``exact`` (quadratic
                 convergence near an optimum).
