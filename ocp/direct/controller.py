@@ -17,7 +17,7 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -53,7 +53,7 @@ HESSIANS = ("gauss-newton", "exact")
 QUIET = {"print_header": False, "print_iteration": False, "print_status": False, "print_time": False}
 QUIET_QP = {"print_header": False, "print_iter": False, "print_info": False, "error_on_fail": False}
 MEASURES = ("dynamics_violation", "limit_violation", "residual")
-OUTPUTS = ("control", "x", "lam_x", "lam_g", "cost", "rows", "range", *MEASURES)
+OUTPUTS = ("control", "x", "lam_x", "lam_g", "cost", "rows", *MEASURES)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,11 @@ class ControlStep:
     iterations: int
     seconds: float
     held: bool
-    _solution: Callable[[], Solution]
+    _solution: Callable[[], Solution] = field(repr=False)
+
+    def __str__(self) -> str:
+        state = "held" if self.held else "converged" if self.converged else "not converged"
+        return f"{state}, {self.iterations} iterations: violation {self.violation:.1e}, residual {self.residual:.1e}"
 
     @property
     def violation(self) -> float:
@@ -129,7 +133,7 @@ class Controller:
         self._functions = program_functions(prepared, settings.hessian)
         functions = compile_functions(self._functions) if prepared.compiled else self._functions
         self._solver, function = self._build(functions)
-        self._run = ArrayFunction(function)
+        self._run, self._bounds = ArrayFunction(function), ArrayFunction(prepared.formulation.bounds.function)
         self.reset(plan)
 
     def reset(self, plan: Solution) -> None:
@@ -168,6 +172,9 @@ class Controller:
         began = time.perf_counter()
         form, tolerance = self._prepared.formulation, self.settings.tolerance
         p = form.parameter_vector(require.mapping("parameters", parameters))
+        lower, upper = self._bounds(p)
+        if not np.all(lower <= upper):
+            form.bound_values(p)  # raises an error that names the bound
         shift = np.array([0.0 if self._is_first else 1.0])
         measures = np.full(len(MEASURES), np.inf)
         try:
@@ -177,9 +184,6 @@ class Controller:
             if not self._last:
                 raise
             values = self._last
-        if not values["range"][0] >= 0:
-            form.bound_values(p)  # raises the error that names the bound
-            raise ProblemError(f"problem {form.name!r}: a lower bound exceeds its upper bound at these parameters")
         held = not np.all(np.isfinite(measures))
         if held:
             values = self._last or values
@@ -199,11 +203,14 @@ class Controller:
             time.perf_counter() - began,
             solver="sqpmethod",
         )
+        dynamics, limits, residual = measures.tolist()
         return ControlStep(
             {name: values["control"][place] for name, place in form.controls.items()},
             outcome.cost,
             converged,
-            *(float(measure) for measure in measures),
+            dynamics,
+            limits,
+            residual,
             iterations,
             outcome.seconds,
             held,
@@ -218,8 +225,8 @@ class Controller:
 
             controller.c, controller.h
                             controller_step (p, x0, lam_x0, lam_g0, shift) -> control, x, lam_x, lam_g, cost, rows,
-                            range, dynamics_violation, limit_violation, residual; called (arg, res, iw, w, 0) as in
-                            CasADi's manual
+                            dynamics_violation, limit_violation, residual; called (arg, res, iw, w, 0) as in CasADi's
+                            manual
             start.h         sizes, names of the parameters, and x, lam_x, lam_g of the present state of the controller
             main.c          a program that reads parameters, step after step, and writes controls and violations
             Makefile        builds it with `make`
@@ -240,8 +247,7 @@ class Controller:
             "VARIABLES": transcription.size,
             "ROWS": transcription.n_rows,
         }
-        lines = [f"/* {c_string(form.name).replace('*/', '* /')} */"]
-        lines += [f"#define CONTROLLER_{name} {size}" for name, size in sizes.items()]
+        lines = [f"#define CONTROLLER_{name} {size}" for name, size in sizes.items()]
         for name, values in zip(("x", "lam_x", "lam_g"), self._state, strict=True):
             numbers = [f"{value:.17g}" for value in (*values, 0.0)]
             lines += [f"static double {name}[] = {{", *(f"  {number}," for number in numbers), "};"]
@@ -270,7 +276,6 @@ class Controller:
             "no_nlp_grad": True,
             "calc_lam_p": False,
             "error_on_fail": False,
-            "inputs_check": False,  # crossed bounds are reported by the range
             "show_eval_warnings": False,
         }
         solver = ca.nlpsol("controller", "sqpmethod", {"x": x, "p": p, "f": cost, "g": rows}, options)
@@ -308,7 +313,6 @@ class Controller:
         result = solver(x0=start, p=p, lbx=low, ubx=high, lbg=low_g, ubg=high_g, **duals)
         end, of_bounds, of_rows = ca.fmin(ca.fmax(result["x"], low), high), result["lam_x"], result["lam_g"]
         cost, slope, rows, jacobian = functions.first(end, p)
-
         dynamics = np.flatnonzero(transcription.row_bounds == form.bounds.places["zero"][0]).tolist()
         limits = np.setdiff1d(np.arange(transcription.n_rows), dynamics).tolist()
         gradient = slope + ca.mtimes(jacobian.T, of_rows) + of_bounds
@@ -321,14 +325,14 @@ class Controller:
         invalid = 0 * (ca.sum1(result["x"]) + ca.sum1(gradient) + cost)  # nan if one of them is not finite
         measures = (
             ca.norm_inf(ca.vertcat(0, rows[dynamics])),
-            ca.mmax(ca.vertcat(0, low_g[limits] - rows[limits], rows[limits] - high_g[limits])),
+            ca.mmax(ca.vertcat(0, low - end, low_g[limits] - rows[limits], rows[limits] - high_g[limits])),
             ca.norm_inf(ca.vertcat(gradient, *gaps)),
         )
         curves, bounds = transcription.interpolants, form.bounds.places["control"].tolist()
         weights = lagrange(curves.control_nodes, np.zeros(1))
         control = ca.mtimes(gather(end, curves.controls[:, 0].reshape(-1, form.nu).T), ca.DM(weights.T))
         control = ca.fmin(ca.fmax(control, ca.vec(table[0])[bounds]), ca.vec(table[1])[bounds])
-        outputs = [control, end, of_bounds, of_rows, cost, rows, ca.mmin(ca.vertcat(high - low, high_g - low_g))]
+        outputs = [control, end, of_bounds, of_rows, cost, rows]
         outputs += [measure + invalid for measure in measures]
         return ca.Function("attempt", [p, x, lam_x, lam_g, is_shifted], [ca.densify(each) for each in outputs])
 
@@ -450,7 +454,7 @@ int main(void) {
   static double p[CONTROLLER_PARAMETERS + 1], control[CONTROLLER_CONTROLS + 1], rows[CONTROLLER_ROWS + 1];
   static double next_x[CONTROLLER_VARIABLES + 1], next_lam_x[CONTROLLER_VARIABLES + 1], next_lam_g[CONTROLLER_ROWS + 1];
   static double next_control[CONTROLLER_CONTROLS + 1];
-  double shift = 0, cost = 0, range, dynamics, limits, residual;
+  double shift = 0, cost = 0, dynamics = 0, limits = 0, residual = 0;
   long i;
   int failed;
   for (i = 0; controls[i]; ++i) printf("%s,", controls[i]);
@@ -466,13 +470,8 @@ int main(void) {
       }
     arg[0] = p, arg[1] = x, arg[2] = lam_x, arg[3] = lam_g, arg[4] = &shift;
     res[0] = next_control, res[1] = next_x, res[2] = next_lam_x, res[3] = next_lam_g, res[4] = &cost, res[5] = rows;
-    res[6] = &range, res[7] = &dynamics, res[8] = &limits, res[9] = &residual;
-    range = 0;
+    res[6] = &dynamics, res[7] = &limits, res[8] = &residual;
     failed = controller_step(arg, res, iw, w, 0) || !(dynamics + limits + residual < HUGE_VAL);
-    if (!(range >= 0)) {
-      fprintf(stderr, "a lower bound exceeds its upper bound at these parameters\\n");
-      return 2;
-    }
     if (failed) { /* the controller and its control stay as they were */
       dynamics = limits = residual = HUGE_VAL;
       if (!shift) return 3;

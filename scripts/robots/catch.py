@@ -26,11 +26,11 @@ from scripts.robots.targets import DriftingTarget
 
 PERIOD = 0.05  # s, of the controller
 INTERVALS, INTERVAL = 8, 0.25  # of the horizon; s
-LIMITS = {"lower": -3.0, "upper": 3.0, "velocity": 0.15, "effort": 100.0}  # assumed: rad, rad/s, N m
-ACCELERATION = 0.5  # of each joint, rad/s^2
+LIMITS: dict[str, Any] = {"lower": -3.0, "upper": 3.0, "velocity": 0.15, "effort": 120.0}  # assumed: rad, rad/s, N m
+ACCELERATION = 0.2  # of each joint, rad/s^2
 MARGIN = 0.01  # rad and rad/s, for what the inner loop misses
 HOME = np.array([0.3, 0.9, 0.2, -1.6, 0.3, 0.9, 0.4])  # rad
-NEAR, SLOW = 0.01, 0.01  # m and m/s: position and velocity of the tip relative to a captured target
+NEAR = 0.01  # m and m/s: largest distance and relative velocity at a capture
 
 
 def build_problem(machine: FreeFloating) -> Problem:
@@ -62,7 +62,7 @@ def run(steps: int, seed: int = 0) -> Loop:
     machine = FreeFloating(replace(robot, joints=joints))
     prepared: Any = prepare(build_problem(machine), Collocation(INTERVALS, 2, control="held"), compiled=True)
     simulation = Simulation(machine, HOME, step=0.005, bandwidth=8.0)
-    base, q, v = ca.SX.sym("base", 7), ca.SX.sym("q", 7), ca.SX.sym("v", 7)
+    base, q, v = (ca.SX.sym(name, 7) for name in "bqv")
     tip = ca.Function("tip", [base, q, v], [machine.tip_pose(base, q).position, machine.tip_twist(base, q, v)[3:6]])
 
     def measure_tip() -> tuple[Array, Array]:
@@ -83,18 +83,17 @@ def run(steps: int, seed: int = 0) -> Loop:
         target.move(PERIOD)
         place, velocity = measure_tip()
         loop.add(step, simulation, place, target.place)
-        captured = np.linalg.norm(place - target.place) < NEAR and np.linalg.norm(velocity - target.velocity) < SLOW
+        captured = max(map(np.linalg.norm, (place - target.place, velocity - target.velocity))) < NEAR
         if captured or target.age > 30.0:
-            loop.captures.append(captured)
+            loop.captures.append(bool(captured))
             target.appear(home)
     return loop
 
 
 if __name__ == "__main__":
     options = command(__doc__, ()).parse_args()
-    title = "A free-floating arm captures drifting targets one after the other"
     note = (
         "Control in a receding horizon of 2 s at 20 Hz, simulated by MuJoCo. A target counts as captured within 10 mm "
         "and 10 mm/s; then the next one appears. The limits of the joints are assumed."
     )
-    draw(options.out / "gallery" / "catch.png", run(1000), title, note)
+    draw(options.out / "gallery" / "catch.png", run(1000), "A free-floating arm captures drifting targets", note)

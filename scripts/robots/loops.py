@@ -27,7 +27,7 @@ class Loop:
         places, targets: Tip and target after each step, m. Shape (M, 3) each as arrays.
         joints, rates: After each step. bases: Poses of a floating base.
         seconds: Wall time of each step of the controller.
-        converged: Whether each step converged. violation: Largest violation that each step reported.
+        converged, held: Of each step. violation: Largest violation that each step reported.
         captures: For each target, whether it was captured.
         violations: Number of steps of the simulation at which a limit of the robot was exceeded.
     """
@@ -41,6 +41,7 @@ class Loop:
     bases: list[Array] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     converged: list[bool] = field(default_factory=list)
+    held: list[bool] = field(default_factory=list)
     violation: list[float] = field(default_factory=list)
     captures: list[bool] = field(default_factory=list)
     violations: int = 0
@@ -55,17 +56,18 @@ class Loop:
         self.violations = simulation.violations
         self.seconds.append(step.seconds)
         self.converged.append(step.converged)
+        self.held.append(step.held)
         self.violation.append(step.violation)
 
     @property
     def distances(self) -> Array:
         """Distance of tip and target after each step, m. Shape (M,)."""
-        return np.linalg.norm(np.array(self.places) - np.array(self.targets), axis=1)
+        return np.asarray(np.linalg.norm(np.array(self.places) - np.array(self.targets), axis=1))
 
 
 def draw(path: Path, loop: Loop, title: str, note: str) -> None:
     """Draw the robot, the coordinates of tip and target, their distance, and the joint velocities over their limits."""
-    t = loop.period * np.arange(1, len(loop.places) + 1)
+    t = np.asarray(loop.period * np.arange(1.0, len(loop.places) + 1))
     joints, bases = np.array(loop.joints), np.array(loop.bases)
     frames = frames_along(loop.machine, joints, bases if bases.size else None)
     scene = Scene("simulated motion", loop.machine.robot, frames, t, "blue", view=(20.0, -50.0))

@@ -73,18 +73,18 @@ class Simulation:
     def __init__(
         self, machine: FixedBase | FreeFloating, joints: Array, *, step: float = 0.001, bandwidth: float = 40.0
     ) -> None:
-        robot, floating = machine.robot, isinstance(machine, FreeFloating)
+        robot = machine.robot
         self._step, self._bandwidth = step, bandwidth
         self._limits = robot.lower, robot.upper, robot.velocity, robot.effort
-        gravity = "0 0 0" if floating else "0 0 -9.81"
+        gravity = "0 0 0" if isinstance(machine, FreeFloating) else "0 0 -9.81"
         options = f'timestep="{step}" integrator="RK4" gravity="{gravity}"'
-        self._model = mujoco_model(robot, options=options, fixed=not floating)
+        self._model = mujoco_model(robot, options=options, fixed=isinstance(machine, FixedBase))
         self._data = mujoco.MjData(self._model)
         moving = [self._model.joint(name) for name in robot.joint_names]
         self._places, self._rates = [int(j.qposadr[0]) for j in moving], [int(j.dofadr[0]) for j in moving]
         self._data.qpos[self._places] = joints
         q, v, a = (ca.SX.sym(name, robot.dof) for name in "qva")
-        if floating:
+        if isinstance(machine, FreeFloating):
             torques = machine.joint_torques(ca.SX.sym("base", machine.base_size), q, v, a)
         else:
             torques = inverse_dynamics(robot, q, v, a)

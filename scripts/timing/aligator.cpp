@@ -157,6 +157,7 @@ int main(int, char **words) {
   for (int k = 0; k < steps; ++k) {
     parameters = data[k];
     problem.setInitState(parameters.head(nx));
+    xs[0] = parameters.head(nx);
     const double began = processor_time();
     // functions keep their last point, whose values change with the parameters
     for (auto &stage : problem.stages_) static_cast<const Cost &>(*stage->cost_).stage->x.setConstant(NAN);

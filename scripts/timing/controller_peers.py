@@ -23,14 +23,14 @@ import numpy as np
 from scripts.timing.controllers import summary
 
 TOLERANCE = 1e-7
-PENALTY = 1e-2
+PENALTY = 1e-6
 """First penalty of aligator."""
 
 
 def acados(tool: str, folder: Path) -> dict[str, Any]:
     """SQP with HPIPM, partially condensed to a quarter of the intervals."""
     package = importlib.import_module("acados")
-    installed = Path(package.__file__).parent
+    installed = Path(str(package.__file__)).parent
     for name in ("blasfeo", "hpipm", "qpOASES_e", "acados"):
         ctypes.CDLL(str(installed / f"install/lib/lib{name}.so"), mode=ctypes.RTLD_GLOBAL)
     source = folder / "acados"  # the layout of its sources, which its templates expect
@@ -117,7 +117,7 @@ def aligator(tool: str, folder: Path) -> dict[str, Any]:
     generator.add(ca.Function("stage_value", [x, u, p], [cost, following]))
     generator.add(ca.Function("stage_all", [x, u, p], [ca.densify(each) for each in outputs]))
     generator.add(ca.Function("end_all", [x, p], [ca.densify(each) for each in ends]))
-    with contextlib.nullcontext("/tmp/rt/abuild") as build:
+    with tempfile.TemporaryDirectory() as build:
         generator.generate(f"{build}/")
         lines = [f"{nx} {u.numel()} {p.numel()} {int(case['intervals'])} {len(sequence)}"]
         lines += [" ".join(repr(float(np.clip(v, -1e20, 1e20))) for v in row) for row in (case["lower"], case["upper"])]

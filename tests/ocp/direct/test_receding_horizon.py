@@ -14,11 +14,11 @@ import scipy
 from models.checks import Array
 from ocp import Collocation, ControlStep, MultipleShooting, Problem, ProblemError, prepare
 from ocp.direct.controller import gauss_newton_hessian, split_squares
-from ocp.direct.transcription import MeshedMethod
+from ocp.direct.prepared import DirectMethod
 from scripts.timing.measure import has_compiler
 
 STRICT = "-O1 -ffp-contract=off -std=c99 -Wall -Wextra -Wno-unused-parameter -Werror"
-METHODS: dict[str, MeshedMethod] = {
+METHODS: dict[str, DirectMethod] = {
     "shooting": MultipleShooting(12),
     "linear": MultipleShooting(12, steps=2, control="linear"),
     "radau": Collocation(8, 2, control="held"),
@@ -41,7 +41,7 @@ def pendulum() -> Problem:
     return problem
 
 
-def controller(method: MeshedMethod = METHODS["shooting"], problem: Problem | None = None, **options: Any) -> Any:
+def controller(method: DirectMethod = METHODS["shooting"], problem: Problem | None = None, **options: Any) -> Any:
     prepared: Any = prepare(problem or pendulum(), method)
     return prepared.controller(prepared.solve({"now": START, "aim": 0.0}), **options)
 
