@@ -20,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -43,9 +43,6 @@ from ocp.errors import ProblemError, SolverStatus, require
 from ocp.problem.values import symbols_of
 from ocp.solution import ByName, Solution
 from ocp.storage import checked_path, write_text
-
-if TYPE_CHECKING:
-    from ocp.direct.prepared import Prepared
 
 __all__ = ["ControlStep", "Controller", "ControllerSettings"]
 
@@ -124,7 +121,7 @@ class Controller:
         settings: The settings.
     """
 
-    def __init__(self, prepared: Prepared, plan: Solution, settings: ControllerSettings) -> None:
+    def __init__(self, prepared: Any, plan: Solution, settings: ControllerSettings) -> None:
         self.settings, self._prepared = settings, prepared
         shift = require.count("controller: shift", settings.shift, least=0, most=prepared.method.intervals - 1)
         if shift and prepared.method.mesh is not None:
@@ -354,7 +351,7 @@ class ProgramFunctions(NamedTuple):
     hessian: Any
 
 
-def program_functions(prepared: Prepared, hessian: str) -> ProgramFunctions:
+def program_functions(prepared: Any, hessian: str) -> ProgramFunctions:
     """Return the functions of a prepared problem's nonlinear program with a kind of Hessian."""
     transcription, form = prepared.transcription, prepared.formulation
     blocks = [derivatives(block.function) for block in transcription.blocks]

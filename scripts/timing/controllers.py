@@ -170,9 +170,9 @@ def row_of(tool: str, folder: Path, name: str, intervals: int) -> dict[str, Any]
     blank = {"problem": name, "intervals": intervals, "tool": tool, "median_ms": None, "worst_ms": None}
     blank |= {"iterations": None, "solved": None, "failed": ""}
     ran = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
-    found = [json.loads(line[4:]) for line in ran.stdout.splitlines() if line.startswith("row ")]
+    rows = [json.loads(line[4:]) for line in ran.stdout.splitlines() if line.startswith("row ")]
     last = ran.stderr.strip().splitlines()[-1:] or [f"ended with {ran.returncode}"]
-    return blank | (found[-1] if found else {"failed": last[0][:200]})
+    return blank | (rows[-1] if rows else {"failed": last[0][:200]})
 
 
 def summary(seconds: ArrayInput, costs: ArrayInput, iterations: ArrayInput, folder: Path) -> dict[str, Any]:
@@ -227,6 +227,7 @@ static double processor_time(void) {
 def run_c(place: Path, sequence: Array, folder: Path) -> dict[str, Any]:
     """Build the exported controller with cc, with a clock around each step, and run it."""
     main = (place / "main.c").read_text(encoding="utf-8")
+    main = main.replace("int main", CLOCK + "\nint main", 1)
     call = "    failed = controller_step("
     main = main.replace(call, f"    double began = processor_time();\n{call}")
     main = main.replace("    if (failed)", "    began = processor_time() - began;\n    if (failed)")
