@@ -37,7 +37,7 @@ _Kind = TypeVar("_Kind")
 
 
 def check_entries(value: Any) -> None:
-    """Raise ValueError if `value` has more than `INPUT_LIMITS.array_entries` entries.
+    """Raise ValueError if an array or a nested list has more than `INPUT_LIMITS.array_entries` entries.
 
     The size is estimated before anything is copied, since a view or a range may exceed the memory. The first entry of a
     list stands for all its entries.
@@ -57,7 +57,7 @@ def check_entries(value: Any) -> None:
 
 
 def floats(value: Any) -> Array:
-    """Return a value as a new array of floats.
+    """Return numbers, an array or a nested list as a new array of floats; raise an error for anything not numeric.
 
     Values that NumPy would silently convert are refused too: text, True, None, symbols (read as nan) and complex
     numbers.
@@ -100,7 +100,7 @@ def argument_of(label: str) -> str:
 
 @dataclass(frozen=True)
 class Checks:
-    """Checks of arguments, which raise the exception class of the package that uses them.
+    """Checks of function arguments: each method returns the checked value or raises an exception of a given class.
 
     The first argument of each check, `label`, is the name of the argument, behind its owner if that helps: "count" or
     "box: size". Messages state the label, the requirement and the value; the fields of the exception are `name`, the
@@ -113,13 +113,13 @@ class Checks:
     error: type[DetailedError]
 
     def invalid(self, label: str, requirement: str, value: Any, limit: Any = None) -> DetailedError:
-        """Return the exception for an argument that violates a requirement."""
+        """Return the exception about an argument that violates a requirement, with label, requirement and value."""
         value = value.item() if isinstance(value, np.generic) else value
         words = f"{label} must be {requirement}, not {value!r}"
         return self.error(words, name=argument_of(label), value=value, limit=limit)
 
     def unknown(self, kind: str, name: object, known: Iterable[str]) -> DetailedError:
-        """Return the exception for an unknown name; its message lists similar known names, or else known names."""
+        """Return the exception about an unknown name; its message lists known names, similar ones if there are any."""
         names = [str(item) for item in known]
         by_case = {item.casefold(): item for item in reversed(names)}
         similar = [by_case[item] for item in get_close_matches(str(name).casefold(), by_case, n=3, cutoff=0.5)]
@@ -133,7 +133,7 @@ class Checks:
         """Return a value as a float after checking that it is a number and, if `finite`, that it is finite."""
         number = real(value)
         if isnan(number) or (finite and isinf(number)):
-            raise self.invalid(label, ("a finite number" if finite else "a number") + _in(unit), value)
+            raise self.invalid(label, ("a finite number" if finite else "a number") + _unit_text(unit), value)
         return number
 
     def positive(self, label: str, value: Any, *, below: float = inf, unit: str = "") -> float:
@@ -141,14 +141,14 @@ class Checks:
         number = real(value)
         if not 0 < number < below:
             kind = "positive and finite" if below == inf else f"between 0 and {below:g}"
-            raise self.invalid(label, kind + _in(unit), value, 0.0 if below == inf else (0.0, below))
+            raise self.invalid(label, kind + _unit_text(unit), value, 0.0 if below == inf else (0.0, below))
         return number
 
     def nonnegative(self, label: str, value: Any, *, unit: str = "") -> float:
         """Return a value as a float after checking that it is a finite number, zero or above."""
         number = real(value)
         if not 0 <= number < inf:
-            raise self.invalid(label, "a finite number, zero or above" + _in(unit), value, 0.0)
+            raise self.invalid(label, "a finite number, zero or above" + _unit_text(unit), value, 0.0)
         return number
 
     def count(self, label: str, value: Any, least: int = 1, most: int = INPUT_LIMITS.count) -> int:
@@ -186,13 +186,13 @@ class Checks:
         return value
 
     def instance(self, label: str, value: Any, kind: type[_Kind]) -> _Kind:
-        """Return the value after checking that it is an instance of a class."""
+        """Return the value after checking that it is an instance of a given class."""
         if not isinstance(value, kind):
             raise self.invalid(label, f"a {kind.__name__}", value, kind.__name__)
         return value
 
     def each(self, label: str, values: Any, kind: type[_Kind]) -> tuple[_Kind, ...]:
-        """Return a list as a tuple after checking that all entries are instances of the class `kind`."""
+        """Return a list as a tuple after checking that all its entries are instances of a given class."""
         try:
             check_entries(values)
             items = tuple(values)
@@ -257,7 +257,7 @@ class Checks:
         sign: Sign = "any",
         unit: str = "",
     ) -> Array:
-        """Return an array with one number for each item; a single given number applies to all items. Shape (count,).
+        """Return an array of `count` numbers, given one for each item or one number for all. Shape (count,).
 
         Args:
             items: Plural noun for messages.
@@ -281,7 +281,9 @@ class Checks:
         return indices.astype(np.intp)
 
     def rotation(self, label: str, value: ArrayInput) -> Array:
-        """Return a matrix after checking that it is a rotation; rounding errors of its entries are corrected."""
+        """Return a rotation matrix, shape (3, 3), after checking that it is one; correct rounding errors of its
+        entries.
+        """
         matrix = self.array(label, value, (3, 3))
         error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()  # np.linalg.det would double the cost
@@ -315,7 +317,7 @@ class Checks:
 require = Checks(ModelError)
 
 
-def _in(unit: str) -> str:
+def _unit_text(unit: str) -> str:
     return f" (in {unit})" if unit else ""
 
 
@@ -331,7 +333,7 @@ def _description(array: Array, wrong: Any) -> str:
 
 
 def warn_of_degrees(label: str, angles: ArrayInput, name: str | None = None) -> None:
-    """Warn if an angle (rad) exceeds two turns, since it may be in degrees. Values above 1e4 count as "no limit".
+    """Warn if an angle (rad) exceeds two turns, since it may be in degrees; values above 1e4 stand for "no limit".
 
     Python shows the same message only once.
 
@@ -347,12 +349,12 @@ def warn_of_degrees(label: str, angles: ArrayInput, name: str | None = None) -> 
 
 
 def warn_of_millimetres(label: str, lengths: ArrayInput, name: str | None = None) -> None:
-    """Warn if a length (m) exceeds 50 m, since it may be in millimetres; arguments as for `warn_of_degrees`."""
+    """Warn if a length (m) exceeds 50 m, since it may be in millimetres; arguments are those of `warn_of_degrees`."""
     _warn_of_unit(label, lengths, name, (50.0, inf), "m is long for a robot; lengths are in m, is it in millimetres?")
 
 
 def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tuple[float, float], words: str) -> None:
-    """Warn about the first value whose magnitude suggests that it is in another unit, such as degrees."""
+    """Warn about the first value whose magnitude lies in a range that suggests another unit, such as degrees."""
     low, high = range_
     for value in np.ravel(values).tolist():  # faster than array operations on few entries
         if low < abs(value) < high:
@@ -362,7 +364,7 @@ def _warn_of_unit(label: str, values: ArrayInput, name: str | None, range_: tupl
 
 
 def short_repr(instance: Any) -> str:
-    """Return a dataclass or named tuple as text that gives long values by their sizes and omits default values."""
+    """Return a dataclass or named tuple as text, with long values replaced by their sizes and defaults omitted."""
     if isinstance(instance, tuple):
         shown = dict.fromkeys(instance._fields)  # type: ignore[attr-defined]
     else:
@@ -372,11 +374,11 @@ def short_repr(instance: Any) -> str:
         value = getattr(instance, name)
         is_default = value is default or (isinstance(value, str | int | float) and value == default)
         if value is not None and not is_default:
-            parts.append(f"{name}={_short(value)}")
+            parts.append(f"{name}={_short_text(value)}")
     return f"{type(instance).__name__}({', '.join(parts)})"
 
 
-def _short(value: Any) -> str:
+def _short_text(value: Any) -> str:
     if isinstance(value, np.ndarray):
         if value.size > SHORT_ARRAY:
             return f"<array of shape {value.shape}>"

@@ -7,7 +7,7 @@ from typing import Any
 
 
 class DetailedError(Exception):
-    """An exception that stores the data of its message as attributes, which are preserved by pickling.
+    """An exception that stores name, value, violated limit and time of a fault as attributes, which pickling preserves.
 
     Attributes:
         name: Name of the faulty argument, option, joint, link, state or constraint; None if there is none.
@@ -23,7 +23,7 @@ class DetailedError(Exception):
         self.name, self.value, self.limit, self.time = name, value, limit, time
 
     def __reduce__(self) -> Any:
-        """Pickle all fields; a field that cannot be pickled, such as an expression, is replaced by its `repr`."""
+        """Return the data from which pickle recreates the exception; fields without a pickle become their `repr`."""
         return type(self), self.args, {key: _picklable(value) for key, value in self.__dict__.items()}
 
 

@@ -68,7 +68,7 @@ def reference_rig(**limits: Any) -> Rig:
 
 
 def reference_tunnel() -> Tunnel:
-    """Return the wind tunnel of the reproduced results for `reference_rig`.
+    """Return the wind tunnel, with its cost weights, in which `reference_rig` moves in the reproduced results.
 
     Assumed: centre (80, 0, 0) in, ranges (60, 48, 40) in, weights 1.
     """

@@ -35,12 +35,10 @@ from xml.parsers import expat
 
 import numpy as np
 
-__all__ = ["INPUT_LIMITS", "InputLimits", "UnfitFile", "open_regular", "parse_xml", "read_regular"]
-
 
 @dataclass(frozen=True)
 class InputLimits:
-    """Upper limits on the size of input: several times the largest known files, but small enough to fit into memory.
+    """Largest accepted sizes of input, several times those of the largest known files but small enough for the memory.
 
     Attributes:
         count: Any number that a user chooses, such as a number of nodes; larger values would run too long.
@@ -87,7 +85,7 @@ INPUT_LIMITS = InputLimits()
 
 
 class UnfitFile(OSError):
-    """Error about a file that is refused: it is no regular file, is too large, or does not belong to the user.
+    """Error about a file that is not read: it is no regular file, is too large, or other users own it or may change it.
 
     Attributes:
         value: Size of a file that is too large, bytes; else None.
@@ -99,7 +97,7 @@ class UnfitFile(OSError):
 
 
 def open_regular(path: str | os.PathLike[str], most: int, own: bool = False, links: bool = True) -> BufferedReader:
-    """Open a regular file of at most `most` bytes for reading.
+    """Open a regular file (no folder, pipe or device) of at most `most` bytes for reading.
 
     The file is checked before opening, because opening a device may have side effects, and again afterwards, because it
     may have been replaced meanwhile. Opening never blocks.
@@ -160,7 +158,7 @@ UNBOUND_PREFIX = expat.errors.codes[expat.errors.XML_ERROR_UNBOUND_PREFIX]
 
 
 def parse_xml(data: str | bytes, unbound: list[str] | None = None) -> ElementTree.Element:
-    """Return the root element of an XML document.
+    """Return the root element of an XML document, after checking that it declares no entities and is not too large.
 
     Args:
         data: The document.
@@ -189,7 +187,7 @@ def parse_xml(data: str | bytes, unbound: list[str] | None = None) -> ElementTre
 
 
 def _parse_bound(data: str | bytes, unbound: list[str], refusal: ElementTree.ParseError) -> ElementTree.Element:
-    """Return the root element of a document without the elements and attributes of undeclared prefixes.
+    """Return the root of an XML document without elements and attributes whose namespace prefix is undeclared.
 
     The parser ignores namespaces; names are resolved here as the standard library's parser does.
 
@@ -268,7 +266,7 @@ def cache_key(version: str, *contents: Any) -> str:
 
 @functools.cache
 def source_version(module: str) -> str:
-    """Return a digest of the source of a module and of all modules of its package that it imports, also indirectly.
+    """Return a digest of the source of a module and of all modules of its package that it imports, even indirectly.
 
     So any change of the code invalidates its cached values. Imports must be written `from PACKAGE... import`.
     """
@@ -285,13 +283,13 @@ def source_version(module: str) -> str:
 
 
 def cache_folder() -> Path:
-    """Return the path of the cache folder, which need not exist."""
+    """Return the path of the folder of cached results, which need not exist."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()) / "selfmotion"
 
 
 def private_folder(make: bool = False) -> Path:
-    """Return the cache folder after checking that only this user can change it.
+    """Return the path of the folder of cached results after checking that only this user can change its contents.
 
     Args:
         make: Create the folder if it does not exist.
@@ -333,7 +331,7 @@ def _log_once(message: str) -> None:
 
 
 def cache_files() -> list[Path]:
-    """Return all cache files, including incomplete files that interrupted writes have left."""
+    """Return the paths of all files of the disk cache, including incomplete files that interrupted writes have left."""
     try:
         return sorted(file for file in private_folder().iterdir() if file.is_file() and file.suffix in KINDS)
     except UNREADABLE:
@@ -341,7 +339,7 @@ def cache_files() -> list[Path]:
 
 
 def load_value(key: str) -> Any:
-    """Return the JSON value stored under a key, or None if the value is missing or damaged."""
+    """Return the JSON value that the disk cache holds under a key, or None if the value is missing or damaged."""
     try:
         digest, _, content = read_regular(private_folder() / f"{key}.json", MAX_VALUE_BYTES, own=True).partition(b"\n")
         return json.loads(content) if digest == _digest(key, content) else None
@@ -350,7 +348,7 @@ def load_value(key: str) -> Any:
 
 
 def store_value(key: str, value: Any) -> None:
-    """Store a JSON value under a key, replacing the file atomically."""
+    """Store a JSON value under a key in the disk cache, atomically; do nothing if it cannot be written."""
     with suppress(*UNREADABLE):
         content = json.dumps(value).encode()
         _write(f"{key}.json", _digest(key, content) + b"\n" + content)
@@ -361,7 +359,7 @@ def _digest(key: str, content: bytes) -> bytes:
 
 
 def load_library(key: str) -> Path | None:
-    """Return the path of the shared library stored under a key and mark it as used; return None if none is stored.
+    """Return the path of the shared library that the disk cache holds under a key, or None; mark the library as used.
 
     Damaged libraries are removed; those that another user owns or may write are ignored.
     """
@@ -381,7 +379,7 @@ def load_library(key: str) -> Path | None:
 
 
 def store_library(key: str, library: bytes) -> Path | None:
-    """Store a shared library under a key and return its path; return None if the library cannot be written."""
+    """Store a shared library under a key in the disk cache and return its path; return None if it cannot be written."""
     with suppress(*UNREADABLE):
         file = _write(_library_name(key, library), library)
         _evict(file)
@@ -433,7 +431,9 @@ def _library_name(key: str, library: bytes) -> str:
 
 
 def _evict(newest: Path) -> None:
-    """Remove locks of ended processes, and the least recently used libraries until the rest fits MAX_LIBRARY_BYTES."""
+    """Remove lock files of ended processes from the disk cache, and the least recently used shared libraries until the
+    others together have at most MAX_LIBRARY_BYTES.
+    """
     for lock in newest.parent.glob("*.lock"):
         with suppress(OSError), open(lock, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while the lock is in use
@@ -453,7 +453,7 @@ def _evict(newest: Path) -> None:
 
 
 def _write(name: str, content: bytes) -> Path:
-    """Write a file into the cache folder atomically."""
+    """Write a file with a given name and content into the folder of cached results atomically, and return its path."""
     place = private_folder(make=True)
     part = None
     try:

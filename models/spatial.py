@@ -46,12 +46,12 @@ class Frame(NamedTuple):
     position: Expression
 
     def point(self, position: Expression) -> Expression:
-        """Return the coordinates in frame A of a point given in frame B. Shape (3, 1), m."""
+        """Return the coordinates in frame A of a point that is given in frame B. Shape (3, 1), m."""
         return self.position + ca.mtimes(self.rotation, expression(position))
 
 
 def expression(value: Expression) -> Expression:
-    """Convert a value to a CasADi matrix.
+    """Convert numbers, a CasADi matrix, or a nested list of both to one CasADi matrix.
 
     A CasADi matrix is returned unchanged; numbers become a DM without its exact zeros, vectors become columns. Lists,
     tuples and arrays with CasADi entries are stacked vertically, inner lists horizontally.
@@ -85,7 +85,7 @@ def _is_sequence(value: Any) -> bool:
 
 
 def on_scalars(function: _Callable) -> _Callable:
-    """Decorate a function so that it is evaluated with SX symbols even if its arguments are MX.
+    """Decorate a function of CasADi matrices: for MX arguments, build it with SX symbols and call it as a Function.
 
     Element-wise MX graphs are slow to build and to run. If an argument is MX, the decorated function is evaluated once
     with SX symbols of the same sparsity, and the resulting Function is called. Other arguments pass through unchanged.
@@ -123,7 +123,7 @@ def skew(vector: Expression) -> Expression:
 
 
 def cross(a: Expression, b: Expression) -> Expression:
-    """Return the cross product of two vectors; unlike that of CasADi, it keeps structural zeros. Shape (3, 1)."""
+    """Return the cross product of two vectors, shape (3, 1); unlike CasADi's, it keeps structural zeros."""
     a, b = expression(a), expression(b)
     return ca.vertcat(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
@@ -142,7 +142,9 @@ def rotation(axis: Expression, angle: Expression) -> Expression:
 
 
 def rotation_matrices(vectors: Array) -> Array:
-    """Return the matrices (..., 3, 3) of rotations about vectors (..., 3) by their lengths, rad, by Rodrigues."""
+    """Return the matrices of rotations about the directions of given vectors by their lengths, rad (Rodrigues'
+    formula). Shapes (..., 3) to (..., 3, 3).
+    """
     angles = np.linalg.norm(vectors, axis=-1)[..., None, None]
     skews = np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
     versines = np.sinc(angles / (2 * np.pi)) ** 2 / 2  # (1 - cos) / angle^2; np.sinc(x) is sin(pi x) / (pi x)
@@ -150,7 +152,7 @@ def rotation_matrices(vectors: Array) -> Array:
 
 
 def least_rotation(first: Array, second: Array) -> Array:
-    """Return the rotation matrix of the least angle that takes one unit vector to another."""
+    """Return the rotation matrix of least angle that takes one unit vector to another. Shape (3, 3)."""
     cosine = first @ second
     across = second - cosine * first
     sine = np.linalg.norm(across)
@@ -169,23 +171,11 @@ def rotation_from_rpy(roll: Expression, pitch: Expression, yaw: Expression) -> E
     return ca.mtimes([rotation((0, 0, 1), yaw), rotation((0, 1, 0), pitch), rotation((1, 0, 0), roll)])
 
 
-def quaternion_about(axis: Expression, angle: Expression) -> Expression:
-    """Return the unit quaternion [w, x, y, z] of a rotation by `angle` (rad) about a unit vector. Shape (4, 1)."""
-    half = expression(angle) / 2
-    return ca.vertcat(ca.cos(half), ca.sin(half) * expression(axis))
-
-
 def quaternion_product(a: Expression, b: Expression) -> Expression:
     """Return the Hamilton product a b of quaternions [w, x, y, z]: rotate by b, then by a. Shape (4, 1)."""
     a, b = expression(a), expression(b)
     scalar = a[0] * b[0] - ca.dot(a[1:4], b[1:4])
     return ca.vertcat(scalar, a[0] * b[1:4] + b[0] * a[1:4] + cross(a[1:4], b[1:4]))
-
-
-def quaternion_conjugate(quaternion: Expression) -> Expression:
-    """Return the conjugate [w, -x, -y, -z], the inverse rotation of a unit quaternion. Shape (4, 1)."""
-    quaternion = expression(quaternion)
-    return ca.vertcat(quaternion[0], -quaternion[1:4])
 
 
 def rotation_from_quaternion(quaternion: Expression) -> Expression:
@@ -247,21 +237,21 @@ def angular_velocity_from_quaternion(quaternion: Expression, rate: Expression) -
     The inverse of quaternion_rate; the quaternion may have any non-zero norm.
     """
     quaternion = expression(quaternion)
-    product = quaternion_product(rate, quaternion_conjugate(quaternion))
+    product = quaternion_product(rate, ca.vertcat(quaternion[0], -quaternion[1:4]))
     return 2 * product[1:4] / ca.dot(quaternion, quaternion)
 
 
 def motion_transform(frame: tuple[Expression, Expression]) -> Expression:
-    """Return the Pluecker transform of motion vectors from frame B to A, given the pose of B in A. Shape (6, 6)."""
+    """Return the matrix that transforms twists from frame B to frame A, given the pose of B in A. Shape (6, 6)."""
     turn, position = expression(frame[0]), expression(frame[1])
     zero = type(turn)(3, 3)
     return ca.vertcat(ca.horzcat(turn, zero), ca.horzcat(ca.mtimes(skew(position), turn), turn))
 
 
 def force_transform(frame: tuple[Expression, Expression]) -> Expression:
-    """Return the Pluecker transform of force vectors (and momenta) from frame B to A, given the pose of B in A.
+    """Return the matrix that transforms wrenches or momenta from frame B to A, given the pose of B in A. Shape (6, 6).
 
-    Shape (6, 6). The inverse transpose of motion_transform: power does not depend on the frame.
+    The inverse transpose of motion_transform: power does not depend on the frame.
     """
     turn, position = expression(frame[0]), expression(frame[1])
     zero = type(turn)(3, 3)
@@ -269,39 +259,17 @@ def force_transform(frame: tuple[Expression, Expression]) -> Expression:
 
 
 def motion_cross(velocity: Expression) -> Expression:
-    """Return the spatial cross product operator v x on motion vectors, for the velocity v of a body.
-
-    It maps a motion vector fixed in the body to its rate. Shape (6, 6).
+    """Return the matrix of the spatial cross product with a twist, which gives the rate of a twist fixed in a moving
+    body. Shape (6, 6).
     """
     v = expression(velocity)
     zero = type(v)(3, 3)
     return ca.vertcat(ca.horzcat(skew(v[0:3]), zero), ca.horzcat(skew(v[3:6]), skew(v[0:3])))
 
 
-def force_cross(velocity: Expression) -> Expression:
-    """Return the spatial cross product operator v x* on force vectors: -motion_cross(v)'. Shape (6, 6)."""
-    return -motion_cross(velocity).T
-
-
-def spatial_inertia(mass: Expression, center_of_mass: Expression, inertia: Expression) -> Expression:
-    """Return the spatial inertia of a rigid body about its frame's origin: the matrix from its twist to its momentum.
-
-    Args:
-        mass: kg.
-        center_of_mass: In the frame. Shape (3,), m.
-        inertia: About the centre of mass, in the frame's axes. Shape (3, 3), kg m^2.
-
-    Returns:
-        Shape (6, 6).
-    """
-    arm = skew(center_of_mass)
-    about_origin = expression(inertia) + mass * ca.mtimes(arm, arm.T)
-    return ca.vertcat(ca.horzcat(about_origin, mass * arm), ca.horzcat(mass * arm.T, mass * ca.DM.eye(3)))
-
-
 @on_scalars
 def solve_spd(matrix: Expression, right: Expression) -> Expression:
-    """Solve a linear system whose matrix is small, symmetric and positive definite. Shape (n, m), that of `right`.
+    """Return the solution of a linear system with a small, symmetric, positive definite matrix. Shape of `right`.
 
     L D L' elimination without pivoting or square roots, meant for n <= 7; only the lower triangle is read. An
     indefinite matrix is not detected, and a singular one gives inf or nan.
@@ -360,7 +328,7 @@ NUMBERS = re.compile(r"static const casadi_(?:real|int) (\w+)\[\d+\] =\s*\{([^}]
 
 
 def expand_tables(values: Any) -> Any:
-    """Return an SX matrix in which look-up tables of one argument are replaced by piecewise polynomials.
+    """Return an SX matrix in which look-up tables (CasADi interpolants) of one argument become piecewise polynomials.
 
     Raises:
         ModelError: An entry calls a function that is not a table of one argument.
@@ -386,7 +354,9 @@ def expand_tables(values: Any) -> Any:
 
 
 def _table(function: Any, inputs: list[Any]) -> list[Any]:
-    """Return the outputs of a look-up table as piecewise polynomials, read from the C code that CasADi generates."""
+    """Return the outputs of a look-up table (CasADi interpolant) as piecewise polynomials, read from the C code that
+    CasADi generates for it.
+    """
     code = ca.CodeGenerator("table")
     code.add(function)
     text = code.dump()

@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from models.checks import Checks, argument_of
-from models.errors import DetailedError
+from models.checks import NOT_NUMBERS, ROUNDING, Checks, argument_of, floats
+from models.errors import DetailedError, ModelError
 from models.files import INPUT_LIMITS
 
 __all__ = [
     "AuditError", "BoundWarning", "DetailedError", "Interrupted", "ProblemError", "RefinementWarning", "SolveError",
-    "SolverStatus", "StorageWarning", "checked_time_limit", "error_names", "format_distinct", "require", "sample_times",
+    "SolverStatus", "StorageWarning", "checked_time_limit", "error_names", "format_distinct", "problem_errors",
+    "require", "sample_times", "values_within",
 ]  # fmt: skip
 
 
@@ -145,6 +146,15 @@ def error_names(name: str) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def problem_errors(prefix: str = "") -> Iterator[None]:
+    """Raise each ModelError of a ``with`` block as a ProblemError with the same fields and a message after a prefix."""
+    try:
+        yield
+    except ModelError as error:
+        raise ProblemError(f"{prefix}{error}", **vars(error)) from error
+
+
 require = Checks(ProblemError)
 
 
@@ -153,6 +163,34 @@ def format_distinct(*numbers: float) -> list[str]:
     candidates = [[f"{number:.{digits}g}" for number in numbers] for digits in range(6, 18)]
     different = len({repr(number) for number in numbers})
     return next((texts for texts in candidates if len({*texts}) == different), candidates[-1])
+
+
+def values_within(value: Any, upper: float, name: str, problem: str) -> np.ndarray:
+    """Return times or distances, one number or a row, as an array of floats clipped to the range from 0 to `upper`.
+
+    Args:
+        value: One number, or numbers.
+        upper: Largest value, such as the horizon, s.
+        name: Name of the argument, which begins the error message.
+        problem: End of the error message, which says what a number outside the range is outside of.
+
+    Raises:
+        ProblemError: A value is not a number or not in a row, or is outside the range by more than rounding.
+    """
+    try:
+        # a contiguous array occupies its memory; a broadcast view could claim any size
+        plain = isinstance(value, np.ndarray) and value.dtype == float and value.flags.c_contiguous
+        array = np.asarray(value, dtype=float) if plain else floats(value)
+    except NOT_NUMBERS as error:
+        raise ProblemError(f"{name} {value!r} is not numeric", name=name, value=value) from error
+    if array.ndim > 1:
+        raise ProblemError(f"{name} has shape {array.shape}; give one number or a row", name=name, value=array.shape)
+    slack = ROUNDING * upper
+    inside = (array >= -slack) & (array <= upper + slack)
+    if not inside.all():
+        outside = array[~inside][:3].tolist()
+        raise ProblemError(f"{name} {outside} {problem}", name=name, value=outside[0], limit=(0.0, upper))
+    return np.asarray(np.clip(array, 0.0, upper))
 
 
 def sample_times(label: str, period: Any, duration: float) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from models.checks import NOT_NUMBERS, floats
 from ocp.console import interruptible
 from ocp.curves import PiecewisePolynomial
-from ocp.errors import AuditError, ProblemError, SolverStatus, StorageWarning
+from ocp.errors import AuditError, ProblemError, SolverStatus, StorageWarning, values_within
 from ocp.problem.formulation import Formulation
 from ocp.problem.phases import parts_of_phase
 from ocp.problem.problem import Problem
@@ -224,17 +224,8 @@ class Solution:
         Raises:
             ProblemError: A time outside 0 to the horizon, or not finite.
         """
-        try:
-            times = floats(time)
-        except NOT_NUMBERS as error:
-            raise ProblemError(
-                f"a time or an array of times is expected, not {time!r}", name="time", value=time
-            ) from error
-        slack = NODE_TOLERANCE * self.horizon
-        if not np.all((times >= -slack) & (times <= self.horizon + slack)):
-            words = f"time {time!r} s is outside the plan, 0 to {self.horizon:g} s"
-            raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon), time=time)
-        return self.at_fraction(times / self.horizon)
+        words = f"s is outside the plan, 0 to {self.horizon:g} s"
+        return self.at_fraction(values_within(time, self.horizon, "time", words) / self.horizon)
 
     def at_fraction(self, fraction: Any) -> Sample:
         """Return states and controls at fractions 0..1 of the horizon, as :meth:`at` does at times."""

@@ -52,7 +52,7 @@ _Record = TypeVar("_Record")
 
 
 class Incumbent(NamedTuple):
-    """The best feasible roll angle that the search has found so far.
+    """The best feasible roll angle that the search for the rig's optimal roll has found so far.
 
     Attributes:
         cost: Value of the index at the roll; inf if there is none yet.
@@ -89,14 +89,14 @@ class RoughRoll(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Cost at a roll angle (inf if joints 4 to 6 or the reach of the pitch link exclude the angle), and cos q2."""
+    """Cost at a roll angle (inf if pitch reach or joints 4 to 6 exclude it), and the cosine of joint angle 2 there."""
 
     cost: Expression
     cos2: Expression
 
 
 class LevelBound(NamedTuple):
-    """A value of cos q2 at which a constraint becomes active, and a lower bound of the cost index near this value.
+    """A value of cos q2, of joint angle 2, at which a constraint is active, and a lower bound of the cost near it.
 
     `side` is as in RoughRoll.
     """
@@ -114,7 +114,7 @@ NO_ROLL = RoughRoll(ca.inf, 1, 0, 0, 0, 0)
 
 
 class RigSolution(NamedTuple):
-    """Solution for one target: joint positions (6, 1), cost, and codes of the active constraint and of the status."""
+    """Rig's inverse kinematics for one target: joint positions (6, 1), cost, codes of active constraint and status."""
 
     joints: Expression
     cost: Expression
@@ -143,7 +143,7 @@ def _inputs(symbols: Any) -> tuple[Any, Any]:
 def optimal_inverse(
     rig: Rig, tunnel: Tunnel, branch: Branch = HOME, *, rate_weight: float = 0.0, limits: bool = True
 ) -> Any:
-    """Return the casadi Function that computes the rig's joint positions for a target at the optimal roll angle.
+    """Return the casadi Function that computes the rig's joint positions for a target at the roll angle of least cost.
 
     Args:
         rig: Dimensions and joint limits.
@@ -188,7 +188,7 @@ def _build_inverse(rig: Rig, tunnel: Tunnel, branch: Branch, gain: float, limits
 
 @dataclass(frozen=True)
 class Search:
-    """Search for the best roll angle; its methods return the casadi Functions that perform the steps of the search.
+    """Search for the rig's best roll angle; its methods return the casadi Functions that perform its steps.
 
     The argument `best` of these Functions is an Incumbent, `evaluations` columns of Evaluation, `rough` columns of
     RoughRoll. Their result `answer` is a RigSolution.
@@ -215,7 +215,8 @@ class Search:
         c, s = least_point(f)
         check = check_constraints(self.rig, target, self._configuration(target, c, s), c=c, s=s)
         best, evaluations, _ = self._compare(target, previous, [Candidate(c, s, 0)], NO_INCUMBENT)
-        status = ca.if_else(ca.logic_and(check.slide(), check.angles()), 0, 4)
+        angles = ca.logic_and(check.pitch_angles, check.yaw_angles)
+        status = ca.if_else(ca.logic_and(check.slide(), angles), 0, 4)
         status = ca.if_else(check.pitch, ca.if_else(check.yaw, status, 3), 2)
         status = ca.if_else(_is_finite(target, previous), status, 1)
         result = self._solution(target, previous, NO_INCUMBENT._replace(cost=f.value(c, s), c=c, s=s), status)
@@ -265,8 +266,6 @@ class Search:
         answer, solved = self._finish()(target, previous, best), _record(Incumbent, best).cost < ca.inf
         result = evaluate_unless(self._infeasible(), (SOLUTION_SIZE, 1))(solved, answer, target)
         return ca.Function("thorough", [target, previous, first, columns[0]], [result])
-
-    # ---- candidates ------------------------------------------------------------------------------------------
 
     def _cheap_ends(self) -> Any:
         """Return the Function that compares the incumbent with the ends of roll intervals that have a closed form.
@@ -363,7 +362,7 @@ class Search:
         return ca.Function("slide", [x, before, best], [answer])
 
     def _slack(self) -> tuple[float, float]:
-        """Return upper bounds of the changes of sin q4 and cos q2 when the roll changes by ROOTS.root_tolerance."""
+        """Return bounds of changes of sin q4 and cos q2 (joint angles) as the roll changes by ROOTS.root_tolerance."""
         rig = self.rig
         sin4 = ROOTS.root_tolerance * rig.goose_neck / rig.pitch_link
         cos4 = float(np.sqrt(2 * sin4)) + sin4
@@ -449,8 +448,6 @@ class Search:
 
     def _configuration(self, target: Expression, c: Expression, s: Expression) -> RigConfiguration:
         return configuration_at(self.rig, target, c, s, branch=self.branch)
-
-    # ---- answers ---------------------------------------------------------------------------------------------
 
     def _finish(self) -> Any:
         """Return the Function of target, previous roll and incumbent that computes joint positions at the incumbent."""

@@ -5,15 +5,12 @@ clearance. The lowest local minima of the grid, and the best roll of the closed 
 with shrinking steps. The number of operations is fixed. A minimum between the grid points may be missed; a finer grid
 finds it.
 
-The distances between the links and the scene are casadi expressions of their own, apart from `models.shapes.distance`,
-because the tunnel is an infinite box seen from inside. They are negative for overlapping bodies unless noted; their
-derivative is that of the closest pair of points.
+The rig's links are capsules, whose distances from boxes and other capsules are those of `models.shapes.distance`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -25,12 +22,9 @@ from models.cts.rig import HOME, INCH, Branch, Rig, Tunnel, checked_branch, conf
 from models.cts.roll import ACTIVE, STATUS, check_constraints, checked_gain, index_harmonics, unwrap_roll
 from models.errors import ModelError
 from models.robot.kinematics import checked_vector
-from models.shapes.distance import soft_minimum
+from models.shapes.distance import column, pair_function, soft_minimum
 from models.shapes.shapes import Box, Capsule
-from models.spatial import FULL_TURN, Expression, expression
-
-KINK = 1e-12
-"""Length over which the kink of a distance at zero is smoothed, m."""
+from models.spatial import FULL_TURN, Expression
 
 
 class LinkCapsule(NamedTuple):
@@ -41,90 +35,17 @@ class LinkCapsule(NamedTuple):
     end: Expression
 
 
-def _finite_axes(point: Expression, box: Box) -> Expression:
-    """Return the coordinates of a world point in the frame of a box, along the axes in which the box is finite."""
-    inside = ca.mtimes(ca.DM(box.rotation).T, expression(point) - ca.DM(box.position))
-    return ca.vertcat(*[inside[k] for k in range(3) if np.isfinite(box.size[k])])
-
-
-def _half_size(box: Box) -> Expression:
-    """Return half of each finite edge length of a box, m."""
-    return ca.DM(box.size[np.isfinite(box.size)] / 2)
-
-
-def box_distance(point: Expression, box: Box) -> Expression:
-    """Return the signed distance of a point from a box, a convex function of the point. Shape (1, 1), m."""
-    over = ca.fabs(_finite_axes(point, box)) - _half_size(box)
-    outside = ca.fmax(over, 0)
-    deepest = reduce(ca.fmax, ca.vertsplit(over))
-    return _length(outside) + ca.fmin(deepest, 0)
-
-
-def capsule_to_box(capsule: LinkCapsule | Capsule, box: Box) -> Expression:
-    """Return the signed distance between a capsule and a solid box. Shape (1, 1), m.
-
-    The distance to a box is convex along the segment. A golden-section search of fixed length finds the closest point
-    to 1e-8 of the segment. Its position is constant to differentiation, by the envelope theorem.
-    """
-    a, b, radius = expression(capsule.start), expression(capsule.end), capsule.radius
-
-    def at(s: Expression) -> Expression:
-        return box_distance(a + s * (b - a), box)
-
-    golden, (low, high) = (5**0.5 - 1) / 2, (0.0, 1.0)
-    left, right = 1 - golden, golden
-    f_left, f_right = at(left), at(right)
-    for _ in range(40):  # 0.618^40 = 4e-9
-        lower = f_left < f_right
-        low, high = ca.if_else(lower, low, left), ca.if_else(lower, right, high)
-        new = ca.if_else(lower, high - golden * (high - low), low + golden * (high - low))
-        value = at(new)
-        left, right, f_left, f_right = (
-            ca.if_else(lower, new, right),
-            ca.if_else(lower, left, new),
-            ca.if_else(lower, value, f_right),
-            ca.if_else(lower, f_left, value),
-        )
-    return ca.fmin(at((low + high) / 2), ca.fmin(at(0.0), at(1.0))) - radius
-
-
-def capsule_in_box(capsule: LinkCapsule | Capsule, walls: Box) -> Expression:
+def _distance_to_walls(capsule: LinkCapsule, walls: Box) -> Expression:
     """Return the signed distance of a capsule inside a hollow box from the nearest wall of the box. Shape (1, 1), m."""
-    gaps = [_half_size(walls) - ca.fabs(_finite_axes(end, walls)) for end in (capsule.start, capsule.end)]
-    return reduce(ca.fmin, ca.vertsplit(ca.vertcat(*gaps))) - capsule.radius
-
-
-def capsule_to_capsule(first: LinkCapsule | Capsule, second: LinkCapsule | Capsule) -> Expression:
-    """Return the signed distance between two capsules. Shape (1, 1), m.
-
-    If their axes cross, the distance is minus the sum of the radii. Closest points of two segments in closed form
-    (Ericson, Real-Time Collision Detection, 2005, 5.1.9).
-    """
-    p, q = expression(first.start), expression(second.start)
-    u, v = expression(first.end) - p, expression(second.end) - q
-    gap = p - q
-    a, e, b = ca.dot(u, u) + KINK**2, ca.dot(v, v) + KINK**2, ca.dot(u, v)
-    c, f = ca.dot(u, gap), ca.dot(v, gap)
-    slack = a * e - b * b
-    s = _clip(ca.if_else(slack > 1e-12 * a * e, (b * f - c * e) / (slack + 1e-300), 0.0))
-    t = _clip((b * s + f) / e)
-    s = _clip((b * t - c) / a)
-    difference = gap + s * u - t * v
-    return _length(difference) - first.radius - second.radius
-
-
-def _length(vector: Expression) -> Expression:
-    """Return the Euclidean norm of a vector, smoothed at zero."""
-    return ca.sqrt(ca.dot(vector, vector) + KINK**2) - KINK
-
-
-def _clip(x: Expression) -> Expression:
-    return ca.fmin(ca.fmax(x, 0), 1)
+    finite = np.flatnonzero(np.isfinite(walls.size)).tolist()
+    axes, half = ca.DM(walls.rotation[:, finite].T), ca.DM(walls.size[finite] / 2)
+    ends = (ca.mtimes(axes, end - ca.DM(walls.position)) for end in (capsule.start, capsule.end))
+    return ca.mmin(ca.vertcat(*(half - ca.fabs(end) for end in ends))) - capsule.radius
 
 
 @dataclass(frozen=True)
 class ClearanceSearch:
-    """Settings of the search for a collision-free roll angle.
+    """Settings of the search for the roll angle of least cost at which the rig collides with nothing.
 
     Attributes:
         samples: Number of rolls in the grid.
@@ -168,8 +89,8 @@ class CollisionScene:
     """Obstacles around the rig: tunnel walls, boxes and capsules.
 
     Attributes:
-        walls: The hollow tunnel; its floor is a wall. None for no walls.
-        solids: Boxes, such as fittings of the floor and the parent aircraft.
+        walls: The hollow tunnel, a box whose edges may be infinite; its floor is a wall. None for no walls.
+        solids: Boxes with finite edges, such as fittings of the floor and the parent aircraft.
         capsules: Capsules in world.
     """
 
@@ -209,17 +130,18 @@ def clearances(
     """Return the signed distance of every link from every obstacle, keyed by (link, obstacle). Shape (1, 1) each, m.
 
     Raises:
-        ModelError: The scene is empty.
+        ModelError: The scene is empty, or a solid box has an infinite edge.
     """
     require.instance("clearances: scene", scene, CollisionScene)
     distances: dict[tuple[str, str], Expression] = {}
     for name, capsule in rig_capsules(rig, q, radii).items():
+        own = ca.vertcat(capsule.start, capsule.end, capsule.radius)
         if scene.walls is not None:
-            distances[name, "walls"] = capsule_in_box(capsule, scene.walls)
-        for k, box in enumerate(scene.solids):
-            distances[name, f"solid {k}"] = capsule_to_box(capsule, box)
-        for k, obstacle in enumerate(scene.capsules):
-            distances[name, f"capsule {k}"] = capsule_to_capsule(capsule, obstacle)
+            distances[name, "walls"] = _distance_to_walls(capsule, scene.walls)
+        obstacles: dict[str, Box | Capsule] = {f"solid {k}": box for k, box in enumerate(scene.solids)}
+        obstacles |= {f"capsule {k}": obstacle for k, obstacle in enumerate(scene.capsules)}
+        for label, obstacle in obstacles.items():
+            distances[name, label] = pair_function(Capsule, type(obstacle))(own, column(obstacle))
     if not distances:
         message = "clearances: the scene is empty; give walls, solids or capsules"
         raise ModelError(message, name="scene", value=scene)

@@ -131,7 +131,7 @@ HOME = BRANCHES[0]
 
 
 def checked_branch(branch: Branch) -> Branch:
-    """Return the branch; raise a ModelError unless it is one of the four in BRANCHES."""
+    """Return a branch of inverse kinematics after checking that it is one of the four in BRANCHES."""
     return Branch(*require.choice("rig: branch", branch, BRANCHES))
 
 
@@ -151,9 +151,6 @@ class RigConfiguration(NamedTuple):
     sin2: Expression
     cos2: Expression
     q1: Expression
-
-
-# ---- forward ---------------------------------------------------------------------------------------------------
 
 
 def dh_frames(rig: Rig, q: Expression) -> list[Frame]:
@@ -210,9 +207,6 @@ def task_jacobian(rig: Rig, q: Expression) -> Expression:
     joints = ca.SX.sym("q", 6)
     jacobian = ca.Function("task_jacobian", [joints], [ca.jacobian(forward(rig, joints)[:5], joints)])
     return jacobian(q)
-
-
-# ---- inverse ---------------------------------------------------------------------------------------------------
 
 
 def goose_neck_corner(rig: Rig, target: Expression, roll: Expression) -> Expression:
@@ -277,7 +271,7 @@ def inverse(rig: Rig, target: Expression, roll: Expression, branch: Branch = HOM
 
 
 def joints_of(rig: Rig, target: Expression, roll: Expression, configuration: RigConfiguration) -> Expression:
-    """Return the joint positions of a configuration, each angle in the turn nearest to mid-range. Shape (6, 1)."""
+    """Return the joint positions of a rig configuration, each angle in the turn nearest to mid-range. Shape (6, 1)."""
     q2 = ca.atan2(configuration.sin2, configuration.cos2)
     q4 = ca.atan2(configuration.sin4, configuration.cos4)
     angles = [q2, target[3] - q2 - np.pi / 2, q4, target[4] - q4 + np.pi / 2]

@@ -85,16 +85,12 @@ class ConstraintCheck(NamedTuple):
     slide_upper: Expression
 
     def all_but_slide(self) -> Expression:
-        """Return whether all constraints but the limits of joint 1 (the slide) are satisfied."""
+        """Return whether all reach constraints and joint limits but those of joint 1 (the slide) are satisfied."""
         return ca.logic_and(self.pitch_joints(), ca.logic_and(self.yaw, self.yaw_angles))
 
     def pitch_joints(self) -> Expression:
         """Return whether, at the roll angle, the pitch link reaches the target, and joints 4 to 6 are within limits."""
         return ca.logic_and(self.pitch, self.pitch_angles)
-
-    def angles(self) -> Expression:
-        """Return whether the revolute joints 2 to 6 are within their limits."""
-        return ca.logic_and(self.pitch_angles, self.yaw_angles)
 
     def slide(self) -> Expression:
         """Return whether joint 1 (the slide) is within its limits."""
@@ -102,7 +98,7 @@ class ConstraintCheck(NamedTuple):
 
 
 class ArcEndLevel(NamedTuple):
-    """A value of cos q2 at which an interval of feasible roll angles may end.
+    """A value of cos q2, the cosine of joint angle 2, at which an interval of feasible roll angles may end.
 
     Attributes:
         cosine: The value.
@@ -123,7 +119,10 @@ def limit_code(joint: int, upper: bool) -> int:
 
 
 def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
-    """Return the cost index I1 as a trigonometric polynomial of the roll angle. Equation (36) of Lee, Lee 2017."""
+    """Return the cost index I1, a squared distance from the tunnel's centre, as harmonics of the roll angle.
+
+    Equation (36) of Lee, Lee 2017.
+    """
     axle, e_c, e_s = corner_circle(rig, target)
     offset = axle - ca.DM(tunnel.center)
     weight = ca.DM(tunnel.scale)
@@ -142,7 +141,7 @@ def index_harmonics(rig: Rig, tunnel: Tunnel, target: Expression) -> Harmonics:
 def check_constraints(
     rig: Rig, target: Expression, configuration: RigConfiguration, *, c: Expression, s: Expression
 ) -> ConstraintCheck:
-    """Return which reach constraints and joint limits a configuration satisfies; angles are compared by cosines."""
+    """Return which reach constraints and joint limits a rig configuration satisfies, by comparing cosines of angles."""
     p = configuration
     pair3 = _difference(ca.sin(target[3]), -ca.cos(target[3]), p.sin2, p.cos2)  # yaw - pi/2 - q2
     pair5 = _difference(-ca.sin(target[4]), ca.cos(target[4]), p.sin4, p.cos4)  # pitch + pi/2 - q4
@@ -194,7 +193,8 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
     axle, e_c, _ = corner_circle(rig, target)
     ends = []
     for sine, code in _pitch_sines(rig, target, branch):
-        c = (-rig.pitch_link * sine - axle[2]) / _not_zero(rig.goose_neck * e_c[2])
+        lever = rig.goose_neck * e_c[2]
+        c = (-rig.pitch_link * sine - axle[2]) / (lever + ca.if_else(ca.fabs(lever) < 1e-150, 1e-150, 0.0))
         c = ca.fmin(ca.fmax(c, -1.0), 1.0)
         s = ca.sqrt((1 - c) * (1 + c))
         ends += [Candidate(c, s, code), Candidate(c, -s, code)]
@@ -206,7 +206,7 @@ def closed_form_ends(rig: Rig, target: Expression, branch: Branch) -> list[Candi
 
 
 def yaw_levels(rig: Rig, target: Expression, branch: Branch) -> list[ArcEndLevel]:
-    """Return the values of cos q2 at which an interval of feasible roll angles may end.
+    """Return the values of cos q2, of joint angle 2, at which an interval of feasible roll angles may end.
 
     They are due to the limits of joints 2 and 3 and to the reach of the yaw link.
     """
@@ -260,7 +260,7 @@ def level_points(rig: Rig, target: Expression, cosine: Expression) -> list[Point
 
 
 def _pitch_sines(rig: Rig, target: Expression, branch: Branch) -> list[tuple[Expression, int]]:
-    """Return the values of sin q4 at which a feasible roll interval may end, each with the code of the active limit."""
+    """Return the values of sin q4, of joint 4, at which feasible roll angles may end, with codes of the limits."""
     sines: list[tuple[Expression, int]] = []
     for sign in (-1, 1):
         if _allows(rig, 4, sign * np.pi / 2):
@@ -297,7 +297,7 @@ def _allows(rig: Rig, joint: int, angle: float) -> bool:
 
 
 def yaw_chart(rig: Rig, branch: Branch) -> Any:
-    """Return a casadi Function that evaluates cos q2, q1 and cos q4 at a roll angle, and derivatives of the first two.
+    """Return a casadi Function from target and roll to the rig's cos q2, q1 and cos q4, with slopes of the first two.
 
     (target, cosine, sine of the roll) -> (cos q2, its slope, q1, its slope, cos q4); a slope is a derivative with
     respect to the roll. Other functions take the Function as their argument `chart`.
@@ -310,12 +310,12 @@ def yaw_chart(rig: Rig, branch: Branch) -> Any:
 
 
 def polish_to_value(chart: Any, target: Expression, output: int, *, value: Expression, point: Point) -> Point:
-    """Return the roll angle at which cos q2 (`output` 0) or q1 (`output` 2) has a given value, by Newton steps."""
+    """Return the roll angle at which the rig's cos q2 (`output` 0) or q1 (2) has a given value, by Newton steps."""
     return polish(point, chart_residual(chart, target, output, value))
 
 
 def polish_to_level(rig: Rig, chart: Any, target: Expression, *, value: Expression, above: Any, point: Point) -> Point:
-    """Return the roll angle at which cos q2 reaches a limit, on the feasible side despite rounding errors.
+    """Return the roll angle at which cos q2, of joint 2, reaches a limit, on the feasible side despite rounding errors.
 
     Near a stretched pitch link the rounding error of sin q4 is amplified by 1 / cos q4. `above` is 1 if the constraint
     is satisfied above the value, -1 if below.
@@ -343,10 +343,6 @@ def chart_residual(chart: Any, target: Expression, output: int, value: Expressio
 def _difference(cos_a: Expression, sin_a: Expression, sin_b: Expression, cos_b: Expression) -> Point:
     """Return cosine and sine of the difference a - b of two angles that are given by their cosines and sines."""
     return cos_a * cos_b + sin_a * sin_b, sin_a * cos_b - cos_a * sin_b
-
-
-def _not_zero(x: Expression) -> Expression:
-    return x + ca.if_else(ca.fabs(x) < 1e-150, 1e-150, 0.0)
 
 
 def slide_ends(rig: Rig, branch: Branch, upper: bool) -> Any:
@@ -419,7 +415,7 @@ def roll_window(rig: Rig, previous: Expression) -> tuple[Expression, Expression]
 
 
 def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
-    """Return a casadi Function from target and previous roll to five roll angles, among them all minima of I2.
+    """Return a casadi Function from target and previous roll to five rolls, among them all minima of the cost index I2.
 
     I2 = I1 + gain (roll - previous)^2. Output shape (5, 1), rad. If I2 is convex there is one minimum. Otherwise the
     window of rolls is split where I1'' = -2 gain, and each convex interval has its own minimum.
@@ -431,7 +427,9 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
     first = ca.fmin(ca.fmax(previous, start), end)
     minimum = minimize_convex(f, gain, previous, (start, end), start=first, steps=12)  # from a good start
     convex = ca.Function("convex", [target, previous], [ca.repmat(minimum, 5, 1)])
-    bounds = [start, *_sort_four(_inflections(f, gain, start, end)), end]
+    inflections = roots(f.derivative().derivative()._replace(a0=2 * gain))
+    turns = [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in inflections]
+    bounds = [start, *_sort_four(turns), end]
     minima = [minimize_convex(f, gain, previous, (a, b), start=(a + b) / 2, steps=20) for a, b in pairwise(bounds)]
     by_intervals = ca.Function("pieces", [target, previous], [ca.vertcat(*minima)])
     is_convex = ca.Function("is_convex", [target], [2 * gain >= f.slope_bound()])
@@ -443,7 +441,7 @@ def convex_minima(rig: Rig, tunnel: Tunnel, gain: float) -> Any:
 def minimize_convex(
     f: Harmonics, gain: float, previous: Expression, bracket: Point, *, start: Expression, steps: int
 ) -> Expression:
-    """Return the roll angle of least I2 on an interval where I2 is convex, by Newton steps in a shrinking bracket."""
+    """Return the roll angle of least cost index I2 on an interval where I2 is convex, by Newton steps in a bracket."""
     a, b = bracket
     slope, bend = f.derivative(), f.derivative().derivative()
     x = start
@@ -455,13 +453,6 @@ def minimize_convex(
         newton = x - value / curvature
         x = ca.if_else(ca.logic_and(newton >= a, newton <= b), newton, (a + b) / 2)
     return x
-
-
-def _inflections(f: Harmonics, gain: float, start: Expression, end: Expression) -> list[Expression]:
-    """Return the roll angles from `start` to `end` at which cost index I2 has an inflection, where I1'' = -2 gain."""
-    bend = f.derivative().derivative()
-    points = roots(bend._replace(a0=2 * gain))
-    return [ca.fmin(first_turn_after(ca.atan2(s, c), start), end) for c, s in points]
 
 
 def _sort_four(values: list[Expression]) -> list[Expression]:

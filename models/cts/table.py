@@ -21,7 +21,6 @@ from models.checks import Array, ArrayInput, require, warn_of_degrees
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import Avoidance, collision_free_inverse
 from models.cts.rig import (
-    BRANCHES,
     HOME,
     Branch,
     Rig,
@@ -215,31 +214,6 @@ def roll_interval_functions(rig: Rig, branch: Branch = HOME) -> tuple[Any, Any]:
     return ends, ca.Function("feasible", [target, roll], [inside], ["target", "roll"], ["feasible"])
 
 
-def all_joint_sets(rig: Rig, target: ArrayInput, roll: float) -> list[tuple[Branch, Array]]:
-    """Return every branch of inverse kinematics that reaches a target with a given roll angle, with joint positions.
-
-    Joint limits are not checked. The joint positions have shape (6,).
-
-    Raises:
-        ModelError: The target or roll is not finite, or no branch reaches the pose (names the link).
-    """
-    require.instance("rig: rig", rig, Rig)
-    row = checked_targets([target])[0]
-    require.number("rig: roll", roll)
-    solutions, margins = [], []
-    for branch in BRANCHES:
-        joints, reach = inverse(rig, ca.DM(row), ca.DM(roll), branch)
-        margins.append(np.array(reach).ravel())
-        if (margins[-1] >= 0).all():
-            solutions.append((branch, np.array(joints).ravel()))
-    if not solutions:
-        pitch, yaw = np.max(margins, axis=0)
-        link, shortage = ("pitch", -pitch * rig.pitch_link) if pitch < 0 else ("yaw", -yaw * rig.yaw_link_1)
-        message = f"target {row.tolist()} with roll {roll} rad: the {link} link is {shortage:.4g} m too short"
-        raise ModelError(message, name=f"{link} link", value=shortage, limit=0.0)
-    return solutions
-
-
 def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
     """Return targets (x, y, z, yaw, pitch), one per row of an array; raise a ModelError about the first invalid row."""
     rows = require.array("table: targets", targets, ("samples", 5), entries="finite" if finite else "any")
@@ -248,7 +222,7 @@ def checked_targets(targets: ArrayInput, finite: bool = True) -> Array:
 
 
 def rig_functions(rig: Rig, tunnel: Tunnel, branch: Branch = HOME, rate_weight: float = 5.0) -> dict[str, Any]:
-    """Return the casadi Functions of a rig's kinematics, by name.
+    """Return the casadi Functions of a rig's forward and inverse kinematics, by name, for tables or export to C.
 
     `.map(samples)` applies a Function to a table. forward: (joints) -> (pose). inverse: (target, roll) -> (joints,
     reach), see `rig.inverse`. corner: (target, roll) -> (P_G). arc_ends, feasible: see `roll_interval_functions`.

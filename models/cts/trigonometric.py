@@ -75,7 +75,7 @@ class Harmonics(NamedTuple):
         return Harmonics(0.0, self.b1, -self.a1, 2 * self.b2, -2 * self.a2)
 
     def slope_bound(self) -> Expression:
-        """Return an upper bound of the magnitude of the second derivative, hypot(a1, b1) + 4 hypot(a2, b2)."""
+        """Return an upper bound of the polynomial's second derivative in magnitude, hypot(a1, b1) + 4 hypot(a2, b2)."""
         return ca.sqrt(self.a1**2 + self.b1**2) + 4 * ca.sqrt(self.a2**2 + self.b2**2)
 
 
@@ -95,7 +95,7 @@ def scale_harmonics(f: Harmonics, factor: Expression) -> Harmonics:
     return Harmonics(*(factor * a for a in f))
 
 
-def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS.polish_steps) -> list[Point]:
+def roots(f: Harmonics, steps: int = ROOTS.polish_steps) -> list[Point]:
     """Return four points of the unit circle that include all roots of a trigonometric polynomial of two harmonics.
 
     If it has fewer roots, the other points have no meaning. The roots are the intersections of the unit circle with the
@@ -106,7 +106,6 @@ def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS
 
     Args:
         f: The trigonometric polynomial.
-        polish_function: Function to polish with instead of f, with the same relevant roots, but simple ones.
         steps: Newton steps of the polish; without any, simple roots are accurate to about 1e-6.
     """
     size = ca.fabs(f.a1) + ca.fabs(f.b1) + ca.fabs(f.a2) + ca.fabs(f.b2) + SMALLEST_DIVISOR
@@ -138,14 +137,13 @@ def roots(f: Harmonics, polish_function: Slope | None = None, steps: int = ROOTS
             x, y = d * nx - end * h * ny, d * ny + end * h * nx
             points.append((x * turn_c - y * turn_s, x * turn_s + y * turn_c))
     slope = f.derivative()
-    sharp = polish_function or (lambda c, s: (f.value(c, s), slope.value(c, s)))
     # f has size 1: a slope below the square root of the machine precision is a rounding error, as at a double root
-    floor = SMALLEST_DIVISOR if polish_function else np.finfo(float).eps
-    return [polish(point, sharp, steps=steps, floor=floor) for point in points]
+    options: dict[str, Any] = {"steps": steps, "floor": np.finfo(float).eps}
+    return [polish(point, lambda c, s: (f.value(c, s), slope.value(c, s)), **options) for point in points]
 
 
 def _axes(f: Harmonics, shift: Expression) -> tuple[Expression, Expression, Expression, Expression, Expression]:
-    """Return the rotation of axes that removes the mixed term x y of a polynomial, and the coefficients in these axes.
+    """Return the rotation that removes the mixed term x y of a polynomial on the unit circle, and its new coefficients.
 
     The rotation is (cosine, sine). With (x, y) on the unit circle f = a0 + p x + q y + r (x^2 - y^2), r > 0, in the
     rotated axes. `shift` is added to a2, so that the second harmonic has a direction.

@@ -74,7 +74,7 @@ class CollisionScene:
         covers: For pairs of hulls, by index, all pairs of bodies that cover the two meshes, shape (m, 2), or none if
             some of them always collide. Hulls are at least as far apart as the nearest of these.
         cover_pairs: The pairs of bodies, by the index of their pair, whose distances stand for it in `distances`.
-        left: Reason why each pair of names is not checked.
+        excluded: Reason why each pair of names is not checked.
 
     Raises:
         ModelError: A negative clearance, an invalid obstacle, an unknown name, a missing mesh.
@@ -94,7 +94,7 @@ class CollisionScene:
     pairs: Array = field(init=False, repr=False)
     covers: dict[int, Array] = field(init=False, repr=False)
     cover_pairs: dict[int, tuple[tuple[int, int], ...]] = field(init=False, repr=False)
-    left: dict[tuple[str, str], Reason] = field(init=False, repr=False)
+    excluded: dict[tuple[str, str], Reason] = field(init=False, repr=False)
     _parts: RigidParts = field(init=False, repr=False)
     _carriers: tuple[str, ...] = field(init=False, repr=False)
 
@@ -122,7 +122,7 @@ class CollisionScene:
             raise ModelError(message, name="machine", value=self.machine)
         folders = _checked_list(self.folders, "folders")
         own = collision_bodies(robot, folders=folders, missing=self.missing, covered=self.covered)
-        object.__setattr__(self, "covered", _by_mesh(robot, own))
+        object.__setattr__(self, "covered", _bodies_by_mesh(robot, own))
         link_pairs, obstacle_pairs = self._ignored_pairs()
         limits = None if require.flag("scene: limits", self.limits) else (-np.inf, np.inf)
         known = self.classified
@@ -134,18 +134,21 @@ class CollisionScene:
         parts = [self._parts.of_link[body.link] for body in own]
         checked = [(i, j) for i, j in known.checked if parts[i] != parts[j]]
         rigid = {(own[i].link, own[j].link): RIGID for i, j in known.checked if parts[i] == parts[j]}
-        object.__setattr__(self, "left", {**known.left, **rigid, **excluded})
+        object.__setattr__(self, "excluded", {**known.excluded, **rigid, **excluded})
         self._place(own, checked, with_obstacles)
 
     def with_locked(self, machine: Machine) -> CollisionScene:
-        """Return the scene with some joints locked, without the pairs of bodies that then cannot move relatively.
+        """Return the scene of the machine with some joints locked, without pairs of bodies that then cannot move
+        relatively.
 
         A scene of its own would take links as adjacent that only the locked joints connect.
         """
         return replace(self, machine=machine)
 
     def _ignored_pairs(self) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
-        """Return the pairs that the user excludes: pairs of two links, and pairs of a link and an obstacle."""
+        """Return the pairs that the user excludes from collision checks: those of two links, and those with an
+        obstacle.
+        """
         names = {f"obstacle {number}" for number in range(len(self.obstacles))}
         ignored = [_pair(each, number) for number, each in enumerate(_checked_list(self.ignored, "ignored"))]
         with_obstacle = {pair for pair in ignored if names & set(pair)}
@@ -173,7 +176,7 @@ class CollisionScene:
     def _place(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]], with_obstacles: Sequence[tuple[int, int]]
     ) -> None:
-        """Place the shapes of links, obstacles and mesh hulls in their frames, and select the pairs to check."""
+        """Place the shapes of links, obstacles and mesh hulls in the scene's frames, and select the pairs to check."""
         close = self._close_meshes(own, checked)
         covered = {pair for pairs in close.values() for pair in pairs}
         links = [body.link for body in own]
@@ -205,7 +208,7 @@ class CollisionScene:
                 covering.append([n for n, body in enumerate(own) if geometry in (body, body.mesh)])
             first, second = (own[k] for k in replaced_pairs[0])
             cover_pairs[len(pairs)] = tuple(replaced_pairs)
-            if self.left.get((first.link, second.link)) not in ASSUMED:
+            if self.excluded.get((first.link, second.link)) not in ASSUMED:
                 covers[len(pairs)] = np.array([(i, j) for i in covering[0] for j in covering[1]])
             pairs.append((sides[0], sides[1], indices[self._reference_link(first, second)]))
         pairs += [(i, len(own) + number, WORLD) for i, number in with_obstacles]
@@ -221,11 +224,11 @@ class CollisionScene:
 
     @property
     def labels(self) -> tuple[tuple[str, str], ...]:
-        """Names of the two bodies of each checked pair."""
+        """Names of the two bodies of each pair that is checked for collision."""
         return tuple((self.bodies[i].name, self.bodies[j].name) for i, j, _ in self.pairs)
 
     def pair_names(self, pair: int) -> tuple[str, str]:
-        """Return the names of two bodies as the field `ignored` states them: two links, or a link and an obstacle."""
+        """Return the names of the two bodies of a checked pair: of two links, or of a link and an obstacle."""
         bodies = [self.bodies[body] for body in self.pairs[pair, :2]]
         own = range(len(self._carriers))
         first, second = (self._carriers[body.frame] if body.frame in own else body.name for body in bodies)
@@ -234,7 +237,7 @@ class CollisionScene:
     @property
     def disabled(self) -> list[tuple[str, str]]:
         """Pairs of links whose collision check the SRDF file disables."""
-        return [pair for pair, reason in self.left.items() if reason == SRDF]
+        return [pair for pair, reason in self.excluded.items() if reason == SRDF]
 
     @property
     def assumed(self) -> dict[str, str]:
@@ -242,7 +245,7 @@ class CollisionScene:
         checked_by_hull = {frozenset(self.pair_names(pair)) for pair in self.cover_pairs}
         return {
             " and ".join(pair): reason.value
-            for pair, reason in self.left.items()
+            for pair, reason in self.excluded.items()
             if reason in ASSUMED and frozenset(pair) not in checked_by_hull
         }
 
@@ -269,7 +272,7 @@ class CollisionScene:
         pairs: Sequence[int] | None = None,
         rounding: float = 0.0,
     ) -> Expression:
-        """Return the signed distances of n pairs of bodies. Shape (n, 1), m.
+        """Return the signed distances of pairs of bodies for a configuration of the machine. Shape (n, 1), m.
 
         They are exact or lower bounds, see `distance`. For two hulls of meshes the distance is that of their covers, a
         lower bound.
@@ -371,7 +374,7 @@ class CollisionScene:
     def _close_meshes(
         self, own: Sequence[Body], checked: Sequence[tuple[int, int]]
     ) -> dict[tuple[LinkMesh | Body, LinkMesh | Body], list[tuple[int, int]]]:
-        """Return the pairs of bodies that are checked by the convex hulls of their meshes instead of the meshes'
+        """Return the pairs of bodies that are checked by convex hulls of meshes, grouped by mesh, instead of by the
         covers.
 
         They have at most three joints between them and may be only millimetres apart by design, closer than the covers
@@ -381,7 +384,7 @@ class CollisionScene:
         for i, j in checked:
             first, second = own[i], own[j]
             up, down = self._parts.path(*(self._parts.of_link[body.link] for body in (first, second)))
-            is_close = len(up) + len(down) <= 3 or self.left.get((first.link, second.link)) == COVERED
+            is_close = len(up) + len(down) <= 3 or self.excluded.get((first.link, second.link)) == COVERED
             if is_close and (first.mesh is not None or second.mesh is not None):
                 pairs.setdefault((first.mesh or first, second.mesh or second), []).append((i, j))
         return pairs
@@ -420,7 +423,7 @@ class CollisionScene:
         return levers
 
 
-def _by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tuple[Body, ...]]:
+def _bodies_by_mesh(robot: Robot, bodies: Sequence[Body]) -> dict[tuple[str, int], tuple[Body, ...]]:
     """Return the bodies that cover each mesh, keyed by link and index of the mesh among the link's collision shapes."""
     covers: dict[tuple[str, int], tuple[Body, ...]] = {
         (link.name, number): ()

@@ -96,7 +96,7 @@ class FreeFloating:
 
     @property
     def base_size(self) -> int:
-        """Length of the base configuration: 3 for a planar base, 7 for a spatial one."""
+        """Length of the base configuration: 3 for a planar base (x, y, angle), 7 for a spatial one."""
         return 3 if self.base == "planar" else 7
 
     @property
@@ -140,7 +140,7 @@ class FreeFloating:
     def tip_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
         """Return the tip's twist: generalized Jacobian times joint rates, plus drift due to momentum. Shape (6, 1)."""
         rates = joint_vector(self.robot, joint_rates, "joint_rates")
-        return self._tip_motion(base, self._reaction(q, rates, base, tip=True))
+        return self._tip_motion(base, self._reaction(q, rates, self._momentum_in_base(base), tip=True))
 
     @on_scalars
     def base_twist(self, base: Expression, q: Expression, joint_rates: Expression) -> Expression:
@@ -148,7 +148,8 @@ class FreeFloating:
 
         E1^-1 (momentum - E2 joint_rates), equation (24). Shape (6, 1) or (3, 1).
         """
-        reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), base)
+        rates = joint_vector(self.robot, joint_rates, "joint_rates")
+        reaction = self._reaction(q, rates, self._momentum_in_base(base))
         turn = self.world_from_base(base).rotation
         twist = ca.vertcat(ca.mtimes(turn, reaction.base_angular), ca.mtimes(turn, reaction.base_linear))
         return ca.densify(twist)[self.twist_rows, :]
@@ -160,7 +161,8 @@ class FreeFloating:
             twist = self.base_twist(base, q, joint_rates)
             return ca.vertcat(twist[1:3], twist[0])
         pose = self._checked_base(base)
-        reaction = self._reaction(q, joint_vector(self.robot, joint_rates, "joint_rates"), base)
+        rates = joint_vector(self.robot, joint_rates, "joint_rates")
+        reaction = self._reaction(q, rates, self._momentum_in_base(base))
         turn = self.world_from_base(base).rotation
         quaternion, spin = pose[3:7], reaction.base_angular
         turning = quaternion_product(quaternion, ca.vertcat(type(spin)(1, 1), spin)) / 2  # spin is in base axes
@@ -222,7 +224,7 @@ class FreeFloating:
         carried, plane = self._spatial_momentum(), ca.DM.eye(TWIST_SIZE)[:, self.twist_rows]
         momentum = ca.SX.sym("momentum", 0 if carried is None else TWIST_SIZE)
         in_base = None if carried is None else (momentum[:3], momentum[3:])
-        reaction = _reaction(self.robot, q, joint_rates, in_base, planar=self.base == "planar", tip=False)
+        reaction = self._reaction(q, joint_rates, in_base)
         twist = ca.mtimes(plane, ca.vertcat(reaction.base_angular, reaction.base_linear)[self.twist_rows])
         spin = twist[0:3]
         turning = ca.vertcat(ca.DM(0, 1), *(-cross(spin, part) for part in in_base or ()))
@@ -234,8 +236,8 @@ class FreeFloating:
         )  # fmt: skip
         if carried is None:
             return torques
-        turn = self.world_from_base(base).rotation.T
-        return ca.substitute(torques, momentum, ca.densify(ca.SX(ca.vertcat(*(ca.mtimes(turn, h) for h in carried)))))
+        values = ca.SX(ca.vertcat(*(self._momentum_in_base(base) or ())))
+        return ca.substitute(torques, momentum, ca.densify(values))
 
     @on_scalars
     def momentum_residual(
@@ -297,18 +299,56 @@ class FreeFloating:
         spatial[self.twist_rows] = momentum
         return ca.DM(spatial[:3]), ca.DM(spatial[3:])
 
-    def _reaction(
-        self, q: Expression, joint_rates: Expression | None, base: Expression = None, tip: bool = False
-    ) -> _Reaction:
-        """Return the base motion that given joint rates and the conserved momentum cause.
+    def _momentum_in_base(self, base: Expression) -> tuple[Expression, Expression] | None:
+        """Return the conserved momentum as angular and linear part in the axes of the base, or None if it is zero."""
+        momentum = self._spatial_momentum()
+        if momentum is None:
+            return None
+        turn = self.world_from_base(base).rotation
+        return ca.mtimes(turn.T, momentum[0]), ca.mtimes(turn.T, momentum[1])
 
-        Without joint rates, it is the base motion at zero momentum for a unit rate of each joint.
+    def _reaction(
+        self,
+        q: Expression,
+        joint_rates: Expression | None,
+        carried: tuple[Expression, Expression] | None = None,
+        tip: bool = False,
+    ) -> _Reaction:
+        """Return the velocities of base and, if `tip`, of the tip that follow from joint rates and conserved momentum.
+
+        Args:
+            q: Joint positions. Shape (dof, 1).
+            joint_rates: Shape (dof, 1); None for a unit rate of each joint at zero momentum.
+            carried: Conserved momentum, only with given joint rates: (angular about the centre of mass, linear), base
+                axes. Shape (3, 1) each; zero if None.
         """
-        carried = None
-        if joint_rates is not None and (momentum := self._spatial_momentum()) is not None:
-            turn = self.world_from_base(base).rotation
-            carried = ca.mtimes(turn.T, momentum[0]), ca.mtimes(turn.T, momentum[1])
-        return _reaction(self.robot, q, joint_rates, carried, planar=self.base == "planar", tip=tip)
+        frames, axes = frames_and_axes(self.robot, q)
+        moments = subtree_moments(self.robot, frames)
+        total = moments[self.robot.root]
+        center = total.first / total.mass
+        momentum = joint_momenta(self.robot, axes, moments)
+        if joint_rates is not None:
+            momentum = ca.mtimes(momentum, joint_rates)
+        if carried is not None:
+            momentum = momentum - ca.vertcat(carried[0] + cross(center, carried[1]), carried[1])
+
+        arm = ca.dot(center, center) * ca.DM.eye(3) - ca.tril(ca.mtimes(center, center.T))
+        inertia = total.second - total.mass * arm  # about the centre of mass
+        about_center = momentum[0:3, :] - ca.mtimes(skew(center), momentum[3:6, :])
+        if self.base == "planar":
+            turning = ca.vertcat(ca.DM(2, about_center.shape[1]), -about_center[2, :] / inertia[2, 2])
+        else:
+            turning = -solve_spd(inertia, about_center)
+        # The conserved momentum alone gives the velocity of the centre of mass, which fixes that of the base's origin.
+        linear = ca.mtimes(skew(center), turning) - momentum[3:6, :] / total.mass
+        if not tip:
+            return _Reaction(turning, linear)
+        place = tip_frame(self.robot, frames).position
+        joints = point_jacobian(self.robot, axes, self.robot.tip_link, place)
+        if joint_rates is not None:
+            joints = ca.mtimes(joints, joint_rates)
+        tip_linear = ca.mtimes(skew(center - place), turning) - momentum[3:6, :] / total.mass + joints[3:6, :]
+        return _Reaction(turning, linear, turning + joints[0:3, :], tip_linear)
 
 
 class _Reaction(NamedTuple):
@@ -322,58 +362,6 @@ class _Reaction(NamedTuple):
     base_linear: Expression
     tip_angular: Expression = None
     tip_linear: Expression = None
-
-
-def _reaction(
-    robot: Robot,
-    q: Expression,
-    joint_rates: Expression | None,
-    carried: tuple[Expression, Expression] | None,
-    *,
-    planar: bool,
-    tip: bool,
-) -> _Reaction:
-    """Return the velocity of a floating base for unit rates of each joint (n columns) or for given rates (one column).
-
-    Args:
-        robot: Kinematic tree with a free root link.
-        q: Joint positions. Shape (dof, 1).
-        joint_rates: Shape (dof, 1); None for unit rates.
-        carried: Conserved momentum, only with given joint rates: (angular about the centre of mass, linear), base axes.
-            Shape (3, 1) each; zero if None.
-        planar: Restrict the base to the plane z = constant.
-        tip: Also compute the motion of the tip.
-
-    Raises:
-        ModelError: The tip is requested but the robot has none; wrong sizes.
-    """
-    frames, axes = frames_and_axes(robot, q)
-    moments = subtree_moments(robot, frames)
-    total = moments[robot.root]
-    center = total.first / total.mass
-    momentum = joint_momenta(robot, axes, moments)
-    if joint_rates is not None:
-        momentum = ca.mtimes(momentum, joint_rates)
-    if carried is not None:
-        momentum = momentum - ca.vertcat(carried[0] + cross(center, carried[1]), carried[1])
-
-    arm = ca.dot(center, center) * ca.DM.eye(3) - ca.tril(ca.mtimes(center, center.T))
-    inertia = total.second - total.mass * arm  # about the centre of mass
-    about_center = momentum[0:3, :] - ca.mtimes(skew(center), momentum[3:6, :])
-    if planar:
-        turning = ca.vertcat(ca.DM(2, about_center.shape[1]), -about_center[2, :] / inertia[2, 2])
-    else:
-        turning = -solve_spd(inertia, about_center)
-    # The velocity of the centre of mass follows from the conserved momentum alone and fixes that of the base's origin.
-    linear = ca.mtimes(skew(center), turning) - momentum[3:6, :] / total.mass
-    if not tip:
-        return _Reaction(turning, linear)
-    place = tip_frame(robot, frames).position
-    joints = point_jacobian(robot, axes, robot.tip_link, place)
-    if joint_rates is not None:
-        joints = ca.mtimes(joints, joint_rates)
-    tip_linear = ca.mtimes(skew(center - place), turning) - momentum[3:6, :] / total.mass + joints[3:6, :]
-    return _Reaction(turning, linear, turning + joints[0:3, :], tip_linear)
 
 
 def _require_planar(robot: Robot) -> None:

@@ -107,7 +107,9 @@ class FixedBase:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        require_joints(self.robot)
+        if require.instance("machine: robot", self.robot, Robot).dof == 0:
+            names = [link.name for link in self.robot.links]
+            raise ModelError(f"the robot of the links {names} has no moving joint", name="robot", value=names)
         owner = "fixed base"
         object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
         object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
@@ -143,13 +145,13 @@ class FixedBase:
 
     @cached_property
     def _pose_function(self) -> Any:
-        """Cached CasADi Function from joint positions to the tip's pose, because rebuilding the expression is slow."""
+        """CasADi Function from joint positions to the tip's pose, built once because that takes long."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_pose", [q], [*map(ca.densify, tip_pose(self.robot, q, self.world_from_base()))])
 
     @cached_property
     def _jacobian_function(self) -> Any:
-        """Cached CasADi Function from joint positions to the Jacobian of the tip."""
+        """CasADi Function from joint positions to the geometric Jacobian of the tip, built once."""
         q = ca.SX.sym("q", self.joint_size)
         return ca.Function("tip_jacobian", [q], [tip_jacobian(self.robot, q, self.world_from_base())])
 
@@ -174,7 +176,7 @@ class FixedBase:
 def with_tip(
     machine: Machine, link: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Machine:
-    """Return the same machine with its tip at a frame fixed in any link, including the root.
+    """Return the machine with its tip at another frame, which is fixed in any of its links.
 
     Args:
         machine: A FixedBase, a FreeFloating, or any frozen dataclass with a field `robot`.
@@ -203,14 +205,6 @@ def _with_robot(machine: Machine) -> Any:
         message = f"{type(machine).__name__} is no dataclass with a field 'robot', which cannot be replaced"
         raise ModelError(message, name="machine", value=machine)
     return machine
-
-
-def require_joints(robot: Robot) -> None:
-    """Raise ModelError unless the argument is a robot with a moving joint."""
-    require.instance("machine: robot", robot, Robot)
-    if robot.dof == 0:
-        names = [link.name for link in robot.links]
-        raise ModelError(f"the robot of the links {names} has no moving joint", name="robot", value=names)
 
 
 def with_wheels(

@@ -121,7 +121,9 @@ def _reduce_groups(
 def _motion_signs(
     machine: Machine, bodies: Sequence[PlacedShape], carriers: Sequence[str], pairs: Array, joints: Sequence[str]
 ) -> Array:
-    """Return 1 where a coordinate (base or joint) moves only the first body of a pair, -1 only the second, else 0."""
+    """Return 1 where a base or joint coordinate moves only the first body of a pair, -1 only the second, else 0. Shape
+    (n, k).
+    """
     size = machine.base_size
     carried = np.zeros((len(bodies), size + len(joints)))
     for k, body in enumerate(bodies):

@@ -27,8 +27,6 @@ from models.robot.parts import Joint, Link
 from models.robot.robot import Robot
 from models.spatial import FULL_TURN, Expression, Frame, rotation
 
-__all__ = ["Elbow", "JointsAlong", "Scara", "ScaraPath", "scara_along"]
-
 Elbow: TypeAlias = Literal["left", "right"]
 QUILL = 2
 
@@ -79,12 +77,12 @@ class Scara:
 
     @property
     def outer(self) -> float:
-        """Largest distance of the tool from the shoulder axis, m."""
+        """Largest distance of the arm's tool from its shoulder axis, m."""
         return self.upper_arm + self.forearm
 
     @property
     def inner(self) -> float:
-        """Smallest distance of the tool from the shoulder axis, m."""
+        """Smallest distance of the arm's tool from its shoulder axis, m."""
         return abs(self.upper_arm - self.forearm)
 
     @cached_property
@@ -243,7 +241,7 @@ class ScaraPath:
         return self.scara.names
 
     def at(self, distance: ArrayInput) -> JointsAlong:
-        """Return joint positions with continuous angles, and derivatives, at given arc lengths, shape (M,), m."""
+        """Return joint positions, with continuous angles, and three derivatives at arc lengths (M,), m, on the path."""
         s = self.path.checked_distance(distance)
         values = [np.array(v).T for v in self.rates.map(len(s))(*_poses(self.path, s))]
         table_s, table_q = self.table
@@ -350,7 +348,7 @@ def _check_reach(scara: Scara, path: SmoothPath, clearance: float) -> None:
 
 
 def _extreme(function: Callable[[Array], Array], s: Array, values: Array, sign: float) -> tuple[float, float]:
-    """Return arc length and value at which a sampled function has its maximum (sign 1) or minimum (-1).
+    """Return the place (arc length) and value of the maximum (sign 1) or minimum (-1) of a function, given samples.
 
     The extremum is refined between the samples.
 

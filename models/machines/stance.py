@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -25,8 +25,6 @@ from models.robot.parts import massless_error
 from models.robot.rebuild import reroot, simplify, subtree
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross
-
-__all__ = ["Foot", "Foothold", "Stance"]
 
 SAMPLES = 5
 """Number of random motions sampled to find which load components and centers of pressure the joints can change."""
@@ -169,7 +167,7 @@ class Stance(FixedBase):
 
     @cached_property
     def bodies(self) -> Robot:
-        """The robot with links merged that fixed joints connect: the dynamics are the same and faster to evaluate."""
+        """The robot with links that fixed joints connect merged, whose dynamics are the same and faster to evaluate."""
         return simplify(self.robot, {foot.link for foot in self.feet.values()})
 
     def foot(self, name: str) -> Foot:
@@ -203,15 +201,7 @@ class Stance(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> dict[str, Expression]:
         """Return the contact loads of all standing feet during a motion, given the loads of all but the first foot."""
-        reaction = base_reaction(
-            self.bodies,
-            q,
-            qd,
-            qdd,
-            wrenches=self._wrenches(others),
-            gravity=self._gravity,
-            world_from_base=self.world_from_base(),
-        )
+        reaction = base_reaction(self.bodies, q, qd, qdd, **self._forces(others))
         first = next(iter(self.footholds))
         moment, force = reaction[:3], reaction[3:]
         first_load = ca.vertcat(moment - cross(ca.DM(self.footholds[first].position), force), force)
@@ -221,21 +211,10 @@ class Stance(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, others: Mapping[str, Expression]
     ) -> Expression:
         """Return the joint torques (or forces) of a motion, given the loads of all but the first foot. Shape (n, 1)."""
-        return inverse_dynamics(
-            self.bodies,
-            q,
-            qd,
-            qdd,
-            wrenches=self._wrenches(others),
-            gravity=self._gravity,
-            world_from_base=self.world_from_base(),
-        )
+        return inverse_dynamics(self.bodies, q, qd, qdd, **self._forces(others))
 
-    @property
-    def _gravity(self) -> Array:
-        return np.array([0.0, 0.0, -self.gravity])
-
-    def _wrenches(self, others: Mapping[str, Expression]) -> list[Wrench]:
+    def _forces(self, others: Mapping[str, Expression]) -> dict[str, Any]:
+        """Return loads of feet, gravity and pose of the root as keywords of `base_reaction` and `inverse_dynamics`."""
         others = require.mapping("stance: others", others)
         if set(others) != set(self.other_feet):
             message = f"stance: loads of the feet {list(self.other_feet)} are needed, not of {list(others)}"
@@ -245,7 +224,8 @@ class Stance(FixedBase):
             load = checked_vector(f"load of {name!r}", load, 6, "moment about the sole's origin and force")
             foot = self.feet[name]
             wrenches.append(Wrench(foot.link, load[3:], load[:3], foot.translation))
-        return wrenches
+        gravity = (0.0, 0.0, -self.gravity)
+        return {"wrenches": wrenches, "gravity": gravity, "world_from_base": self.world_from_base()}
 
     @cached_property
     def load_rows(self) -> dict[str, tuple[int, ...]]:
@@ -282,7 +262,9 @@ class Stance(FixedBase):
         return rows_of_feet
 
     def full_load(self, name: str, rows: Expression) -> Expression:
-        """Return all six components of a foot's load from those in `load_rows`; the others are zero. Shape (6, 1)."""
+        """Return all six components of a foot's load from those in `load_rows`; the others are always zero. Shape (6,
+        1).
+        """
         return ca.mtimes(ca.DM.eye(6)[:, list(self.load_rows[name])], rows)
 
     def load_in_sole(self, name: str, load: Expression) -> tuple[Expression, Expression]:
@@ -291,7 +273,7 @@ class Stance(FixedBase):
         return ca.mtimes(turn, load[:3]), ca.mtimes(turn, load[3:])
 
     def pressure(self, name: str, load: Expression) -> Expression:
-        """Return the force that presses a sole on its foothold, positive in contact. Shape (1, 1), N."""
+        """Return the force that presses a foot's sole on its foothold, positive in contact. Shape (1, 1), N."""
         return self.load_in_sole(name, load)[1][2]
 
     def edge_moments(self, name: str, load: Expression, margin: float = 0.0) -> Expression:

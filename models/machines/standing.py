@@ -52,7 +52,7 @@ def wrenches_at(external: External | None, time: Expression, tip: Expression) ->
 
 
 class ZmpRows(NamedTuple):
-    """Coefficients of the joint acceleration constraint that fixes the zero moment point at a given position.
+    """Coefficients of the linear condition on joint accelerations that keeps the zero moment point at a given position.
 
     J_m q'' + q'^T H_m q' = C, equation (18) of the paper. Row 0 fixes x, row 1 y, as moments about the position, N m.
 
@@ -67,7 +67,7 @@ class ZmpRows(NamedTuple):
     right: Expression
 
     def needed(self, qd: Expression) -> Expression:
-        """Return the moments that joint accelerations must produce to fix the zero moment point. Shape (2, 1), N m.
+        """Return the moments, about the zero moment point, that joint accelerations must produce. Shape (2, 1), N m.
 
         They are J_m q'' = C - q'^T H_m q'.
         """
@@ -125,7 +125,7 @@ class Standing(FixedBase):
         return np.array([0.0, 0.0, -self.gravity])
 
     def bodies(self, wrenches: Sequence[Wrench] = ()) -> Robot:
-        """Return the robot with links merged that fixed joints connect, except links on which wrenches act."""
+        """Return the robot with links that fixed joints connect merged, except links on which given wrenches act."""
         keep = frozenset(self.robot.link(wrench.link).name for wrench in checked_wrenches(wrenches))
         if keep not in self._bodies:
             self._bodies[keep] = simplify(self.robot, keep)
@@ -139,10 +139,7 @@ class Standing(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
         """Return the ground's wrench on the foot: (moment about the world's origin, force). Shape (6, 1), N m, N."""
-        robot = self.bodies(wrenches)
-        return base_reaction(
-            robot, q, qd, qdd, wrenches=wrenches, gravity=self.gravity_in_world, world_from_base=self.world_from_base()
-        )
+        return base_reaction(self.bodies(wrenches), q, qd, qdd, **self._forces(wrenches))
 
     def zero_moment_point(
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
@@ -158,10 +155,11 @@ class Standing(FixedBase):
         self, q: Expression, qd: Expression, qdd: Expression, wrenches: Sequence[Wrench] = ()
     ) -> Expression:
         """Return the joint torques (or forces) that a motion requires, by inverse dynamics. Shape (n, 1), N m or N."""
-        robot = self.bodies(wrenches)
-        return inverse_dynamics(
-            robot, q, qd, qdd, wrenches=wrenches, gravity=self.gravity_in_world, world_from_base=self.world_from_base()
-        )
+        return inverse_dynamics(self.bodies(wrenches), q, qd, qdd, **self._forces(wrenches))
+
+    def _forces(self, wrenches: Sequence[Wrench]) -> dict[str, Any]:
+        """Return wrenches, gravity and pose of the foot as keywords of `base_reaction` and `inverse_dynamics`."""
+        return {"wrenches": wrenches, "gravity": self.gravity_in_world, "world_from_base": self.world_from_base()}
 
     def stability_index(self, point: Expression) -> Expression:
         """Return the stability indices of a zero moment point in x and y. Shape (2, 1).
@@ -307,7 +305,7 @@ class StandingMotion:
 
     @property
     def friction(self) -> Array:
-        """Coefficient of friction that the motion requires; inf without contact. Shape (M,).
+        """Coefficient of friction that the motion requires at each sample; inf without contact. Shape (M,).
 
         It is the horizontal over the vertical ground force.
         """
@@ -318,17 +316,17 @@ class StandingMotion:
 
     @property
     def stays_on_ground(self) -> bool:
-        """Whether the vertical ground force is always positive."""
+        """Whether the vertical force of the ground on the foot is positive throughout the motion."""
         return bool((self.ground_force[:, 2] > 0).all())
 
     @property
     def stays_in_foot(self) -> bool:
-        """Whether the zero moment point stays in the support polygon of the foot."""
+        """Whether the zero moment point stays in the support polygon of the foot throughout the motion."""
         return bool((self.foot_margin >= -ROUNDING).all())
 
     @property
     def stays_in_limits(self) -> bool:
-        """Whether all joints stay within their position limits."""
+        """Whether all joints stay within their position limits throughout the motion."""
         return bool((self.joint_excess <= ROUNDING).all())
 
     @property
@@ -358,26 +356,6 @@ class StandingMotion:
             "peak_joint_acceleration": float(np.abs(self.joint_accelerations).max()),
             "peak_joint_torque": float(np.abs(self.joint_torques).max()),
         }
-
-    def __str__(self) -> str:
-        lines = [f"Motion of {self.t[-1]:g} s: {'stands' if self.stands else 'DOES NOT STAND'}"]
-        for quantity, values, violated in (
-            ("vertical ground force, N", self.ground_force[:, 2], ~(self.ground_force[:, 2] > 0)),
-            ("zero moment point inside the foot by, m", self.foot_margin, ~(self.foot_margin >= -ROUNDING)),
-            ("stability index", self.index.min(axis=1), np.zeros(len(self.t), dtype=bool)),
-            ("distance to the joint limits", -self.joint_excess, ~(self.joint_excess <= ROUNDING)),
-        ):
-            k = int(np.argmin(values))
-            violation = f", violated from {self.t[violated][0]:.4g} s on" if violated.any() else ""
-            lines.append(f"  {quantity:<42} least {values[k]:>10.4g} at {self.t[k]:.4g} s{violation}")
-        for quantity, values in (
-            ("joint velocity", self.joint_velocities),
-            ("joint acceleration", self.joint_accelerations),
-            ("joint torque", self.joint_torques),
-        ):
-            k = int(np.abs(values).max(axis=1).argmax())
-            lines.append(f"  {quantity:<42} peak  {np.abs(values[k]).max():>10.4g} at {self.t[k]:.4g} s")
-        return "\n".join(lines)
 
 
 def motion_function(machine: Standing, external: External | None = None, rows: Rows = (3, 4, 5)) -> Any:
@@ -423,7 +401,7 @@ def standing_motion(
 
 
 def evaluate_motion(function: Any, t: Array, q: Array, qd: Array, *, qdd: Array) -> dict[str, Array]:
-    """Evaluate the result of `motion_function` at M times; return the outputs by name.
+    """Evaluate a function that `motion_function` returned at M times, and return its outputs by name.
 
     Shape (M, k), or (M,) for scalars.
     """

@@ -67,17 +67,17 @@ class Support:
 
     @property
     def area(self) -> float:
-        """Area of the polygon, m^2."""
+        """Area of the support polygon, m^2."""
         return _area(self.vertices)
 
     @property
     def center(self) -> Array:
-        """Centre of the polygon's bounding box. Shape (2,), m."""
+        """Centre of the support polygon's bounding box. Shape (2,), m."""
         return np.asarray(self.vertices.max(axis=0) + self.vertices.min(axis=0)) / 2
 
     @property
     def half_widths(self) -> Array:
-        """Half the side lengths of the polygon's bounding box. Shape (2,), m."""
+        """Half the side lengths of the support polygon's bounding box. Shape (2,), m."""
         return np.asarray(np.ptp(self.vertices, axis=0)) / 2
 
     @cached_property
@@ -241,7 +241,7 @@ def convex_hull(points: ArrayInput) -> Array:
 
 
 def _corners(shape: CollisionShape) -> Array:
-    """Return the world coordinates of points of a primitive shape that may touch the ground. Shape (k, 3), m."""
+    """Return the points of a collision shape, in world, that may touch the ground. Shape (k, 3), m."""
     down = -np.asarray(shape.rotation)[2]  # in the shape's axes
     if shape.kind == "box":
         corners = np.array(np.meshgrid(*([-1, 1] for _ in range(3)))).reshape(3, -1).T * shape.size / 2

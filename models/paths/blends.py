@@ -37,29 +37,6 @@ from models.checks import Array, ArrayInput, require
 from models.errors import ModelError
 from models.spatial import Expression
 
-__all__ = [
-    "GAUSS_NODES",
-    "GAUSS_WEIGHTS",
-    "PAPER_SHAPE",
-    "BlendKind",
-    "Cells",
-    "arc_length",
-    "best_shape",
-    "cells",
-    "checked_shape",
-    "corner_shape",
-    "cubic",
-    "curvature",
-    "derivatives_by_arc_length",
-    "gamma",
-    "gauss_rule",
-    "parameter",
-    "polynomial",
-    "quintic",
-    "rest_to_rest",
-    "speed",
-]  # fmt: skip
-
 BlendKind: TypeAlias = Literal["cubic", "quintic"]
 Ends: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 End: TypeAlias = tuple[Array, Array, Array]
@@ -75,7 +52,7 @@ The distance at u = 1/2 is |1 - c shape| cos(angle/2) times the remaining distan
 
 
 def checked_shape(shape: ArrayInput, kind: str, count: int = 1) -> Array:
-    """Return the checked shape factors of blends; a single given factor applies to all vertices. Shape (count,).
+    """Return shape factors of blends (end tangents over remaining distance) after checking them. Shape (count,).
 
     Raises:
         ModelError: A factor is not positive or reaches that of the cusp (cubic 6, quintic 30/7), or the kind is
@@ -154,7 +131,7 @@ def _falling_factorials(order: int) -> list[float]:
 
 
 def gamma(shape: float, angle: float, kind: str = "cubic") -> float:
-    """Return the ratio of two distances at a corner between lines: from vertex to blend, and from vertex to blend ends.
+    """Return the distance of a blend's middle from its corner between two lines, relative to that of the blend's ends.
 
     |1 - shape/4| cos(angle/2) for the cubic, |1 - 5 shape/16| cos(angle/2) for the quintic, eq. (8): the distance at u
     = 1/2, which is the closest point for shapes up to 4 (cubic) and 3.2 (quintic).
@@ -367,7 +344,7 @@ def _lengths(derivative: Array, start: Array, width: Array) -> Array:
 
 
 def cells(coefficients: Array) -> Cells:
-    """Split polynomial curves, shape (B, 6, 3), into intervals of u on which the arc length can be inverted reliably.
+    """Split polynomial curves, shape (B, 6, 3), into parameter intervals on which arc lengths can be inverted reliably.
 
     Raises:
         ModelError: A curve has a cusp, which no finite number of cells resolves.
@@ -403,14 +380,22 @@ def cells(coefficients: Array) -> Cells:
     return Cells(columns[0][order].astype(np.intp), *(column[order] for column in columns[1:]))
 
 
-def parameter(coefficients: Array, start: Array, width: Array, *, length: Array, distance: Array) -> Array:
-    """Return the parameter u at which the arc length from the start of a cell, an interval of u, equals `distance`.
+def parameter(
+    coefficients: Array, cells: Cells, index: NDArray[np.intp], distance: Array
+) -> tuple[NDArray[np.intp], Array]:
+    """Return the curve and the curve parameter u at distances (m) from the starts of cells, intervals of u. Shape (M,).
 
-    Shapes: coefficients (M, 6, 3), all others (M,). A cubic Hermite guess from the cell's ends is refined by Chebyshev
-    iterations, which converge cubically, with the 10-point rule. The result is accurate to rounding for distances from
-    0 to the cell's length.
+    A cubic Hermite guess from the cell's ends is refined by Chebyshev iterations, which converge cubically, with the
+    10-point rule. The result is accurate to rounding.
+
+    Args:
+        coefficients: Polynomials of the curves. Shape (B, 6, 3).
+        cells, index: Cells of the curves, and the index of the cell for each distance, shape (M,).
+        distance: Clipped to the cell. Shape (M,).
     """
-    slopes = _derivative(coefficients)
+    curve, start, width, length = cells.curve[index], cells.start[index], cells.width[index], cells.length[index]
+    distance = np.clip(distance, 0.0, length)
+    slopes = _derivative(coefficients[curve])
     begin, end = _speed(slopes, start), _speed(slopes, start + width)
     x = distance / length
     # du/ds at the ends, over the mean slope of the cell
@@ -425,7 +410,7 @@ def parameter(coefficients: Array, start: Array, width: Array, *, length: Array,
         u = np.clip(u - step, start, start + width)
         if not excess.size or np.abs(excess / length).max() < 1e-6:  # the last step has cubed it
             break
-    return np.asarray(u)
+    return curve, u
 
 
 def arc_length(coefficients: Array, u: Array) -> Array:

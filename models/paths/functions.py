@@ -23,8 +23,6 @@ from models.paths.smooth_path import SmoothPath
 from models.paths.splines import SERIES_TERMS
 from models.spatial import angular_velocity_from_quaternion, quaternion_product
 
-__all__ = ["gauss_newton", "march", "path_function", "predictor_corrector", "turn_function"]
-
 MAX_TERMS = 100
 """Largest allowed number of corrector steps or quadrature nodes, since a mapping's expression grows with them."""
 
@@ -60,7 +58,7 @@ def turn_function(path: SmoothPath) -> Any:
 
 
 def _column_at(knots: Array, columns: Array, distance: Any) -> Any:
-    """Return the table column for the interval between knots that contains a distance, found by binary search.
+    """Return the column of a table that belongs to the interval between knots in which a distance lies (binary search).
 
     The tables are interpolants, since CasADi copies a constant matrix whenever it evaluates a function.
     """
@@ -165,7 +163,7 @@ def _cell_table(path: SmoothPath) -> tuple[Array, Array]:
 
 
 def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
-    """Return the predictor-corrector mapping from the distance along a blend to the curve parameter u.
+    """Return the casadi Function that steps the curve parameter u along a blend by a predictor and several correctors.
 
     Lee, Ryu, Cheong 2006: predictor (15), then `corrections` correctors (13). The mapping does not control its error:
     with the trapezoid rule (12) the sample drifts from its distance.
@@ -178,23 +176,17 @@ def predictor_corrector(degree: int = 3, corrections: int = 3) -> Any:
         casadi Function (state (2), coefficients (3 (degree + 1)), steps (2, m)) -> state (2). Coefficients are in
         ascending order, three entries a power: the first rows of `Blend.coefficients`, flattened.
     """
-    number = require.count("mapping: corrections", corrections, 0, MAX_TERMS)
-    return _predictor_corrector(require.choice("blend: degree", degree, (3, 5)), number)
-
-
-@lru_cache(maxsize=16)
-def _predictor_corrector(degree: int, corrections: int) -> Any:
     state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
     start_rate = rate(u)
-    guess = _predict(state, steps, start_rate)
-    for _ in range(corrections):
+    guess = state[0] + (steps[0] + step) / start_rate  # eq. (15)
+    for _ in range(require.count("mapping: corrections", corrections, 0, MAX_TERMS)):
         guess = u + 2 * step / (start_rate + rate(guess))
     return ca.Function("predictor_corrector", [state, coefficients, steps], [ca.cse(ca.vertcat(u, guess))])
 
 
 def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
-    """Return a function that computes the parameter u of a blend at an arc length, by quadrature and Newton steps.
+    """Return the casadi Function that steps the curve parameter u along a blend by quadrature and Newton steps.
 
     The predictor is equation (15), the Newton steps solve for the arc length. Arguments and result as for
     `predictor_corrector`, except `nodes`: the number of quadrature nodes over one control step, for each Newton step.
@@ -205,15 +197,10 @@ def gauss_newton(degree: int = 3, nodes: tuple[int, ...] = (2, 3, 4, 8)) -> Any:
     )
     if not numbers:
         raise ModelError("mapping: nodes is empty; give one number for each Newton step", name="nodes", value=nodes)
-    return _gauss_newton(require.choice("blend: degree", degree, (3, 5)), numbers)
-
-
-@lru_cache(maxsize=16)
-def _gauss_newton(degree: int, nodes: tuple[int, ...]) -> Any:
     state, coefficients, steps, rate = _symbols(degree)
     u, step = state[1], steps[1]
-    guess = _predict(state, steps, rate(u))
-    for number in nodes:
+    guess = state[0] + (steps[0] + step) / rate(u)  # eq. (15)
+    for number in numbers:
         width = guess - u
         mean = sum(float(w) * rate(u + float(x) * width) for x, w in zip(*gauss_rule(number), strict=True))
         guess = guess - (width * mean - step) / rate(guess)
@@ -248,14 +235,12 @@ def march(mapping: Any, coefficients: Array, distances: ArrayInput) -> Array:
 
 
 def _symbols(degree: int) -> tuple[Any, Any, Any, Any]:
+    """Return symbols of state, coefficients and steps of a mapping, and the function from u to the speed |dr/du|."""
+    degree = require.choice("blend: degree", degree, (3, 5))
     sizes = {"state": 2, "coefficients": 3 * (degree + 1), "steps": 2}
     state, coefficients, steps = (ca.SX.sym(name, size) for name, size in sizes.items())
     derivative = _derivative(ca.reshape(coefficients, 3, degree + 1))
     return state, coefficients, steps, lambda u: ca.norm_2(_horner(derivative, u))
-
-
-def _predict(state: Any, steps: Any, rate: Any) -> Any:
-    return state[0] + (steps[0] + steps[1]) / rate  # eq. (15)
 
 
 def exponential(vector: Any) -> Any:

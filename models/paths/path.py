@@ -33,11 +33,9 @@ from models.paths.splines import (
     fit_spline,
     product,
     rotate,
-    simplified,
+    simplify_polyline,
 )  # fmt: skip
 from models.spatial import rotation_from_quaternion
-
-__all__ = ["FittedPath", "Path", "Reversal", "fit_splines", "split_at_reversals"]
 
 SMALLEST_ANGLE = 1e-6
 """Interior angle (rad) below which a corner is a reversal, because its blend would be curved too sharply.
@@ -120,7 +118,7 @@ class Path:
 
     @property
     def length(self) -> float:
-        """Sum of the lengths of the segments, before corners are rounded, m."""
+        """Sum of the lengths of the path's segments, before corners are rounded, m."""
         return float(self.lengths.sum())
 
     @property
@@ -165,7 +163,7 @@ class Path:
 
     @cached_property
     def is_spline(self) -> NDArray[np.bool_]:
-        """Whether each segment is a spline. Shape (n,)."""
+        """Whether each segment of the path is a spline. Shape (n,), bool."""
         return np.array([isinstance(segment, Spline) for segment in self.segments])
 
     @cached_property
@@ -173,7 +171,7 @@ class Path:
         return SplineTable.of(self.segments, np.cumsum(self.lengths) - self.lengths)
 
     def corner_angles(self) -> Array:
-        """Return the interior angle at each vertex, which is pi for a continuous tangent. Shape (n - 1,), rad."""
+        """Return the path's interior angle at each vertex, pi if the tangent is continuous. Shape (n - 1,), rad."""
         index = np.arange(len(self.segments) - 1)
         return _angles(self.at(index, self.lengths[:-1])[1], self.tangent[1:])
 
@@ -308,7 +306,7 @@ class FittedPath(NamedTuple):
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Settings of the search for runs of short segments.
+    """Settings of the search for runs of short segments that a spline or a line can replace.
 
     Attributes:
         simplified: Deviation of the simplified polyline that shows the corners, relative to the tolerance.
@@ -368,7 +366,7 @@ def fit_splines(
     for i, j in pairwise(ends.tolist()):
         part = slice(int(number[i]), int(number[j]) + 1)
         own = Polyline(line.points[part], None if line.quaternions is None else line.quaternions[part])
-        result = _replacement(path.segments[i:j], own, tolerance, angle) if j - i > 2 else None
+        result = _replace_run(path.segments[i:j], own, tolerance, angle) if j - i > 2 else None
         if result is None:
             segments += path.segments[i:j]
             first += range(i, j)
@@ -380,7 +378,7 @@ def fit_splines(
 
 
 def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
-    """Return the path as a polyline, from which arcs deviate by `sagitta`, and the number of the point at each vertex.
+    """Return a path as a polyline, within `sagitta` of its arcs, and the index of the polyline's point at each vertex.
 
     The quaternions are None if the path states no tool orientation.
     """
@@ -398,12 +396,13 @@ def _polyline(path: Path, sagitta: float) -> tuple[Polyline, NDArray[np.intp]]:
 
 
 def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: float) -> NDArray[np.bool_]:
-    """Return at which vertices, ends included, runs of short segments end. Shape (n + 1,).
+    """Return whether a run of short segments, which a spline may replace, ends at each vertex of a path. Shape (n +
+    1,).
 
     A simplified polyline shows the shape of the path without its noise. A curve that is within its deviation from the
     chord c bends by 8 deviation / c from chord to chord; where the path bends much more, it has a corner.
     """
-    corners = simplified(points, RUNS.simplified * tolerance)
+    corners = simplify_polyline(points, RUNS.simplified * tolerance)
     steps = np.diff(points[corners], axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     bends = np.pi - _angles(steps[:-1] / lengths[:-1, None], steps[1:] / lengths[1:, None])
@@ -427,10 +426,10 @@ def _run_ends(path: Path, points: Array, number: NDArray[np.intp], tolerance: fl
     return np.asarray(is_end)
 
 
-def _replacement(
+def _replace_run(
     segments: Sequence[Segment], line: Polyline, tolerance: float, angle: float
 ) -> tuple[Segment, float] | None:
-    """Return one segment in place of several and a bound of its deviation (m); None if it needs too many pieces."""
+    """Return one segment in place of a run of segments and a bound of its deviation (m), or None if that fails."""
     (points, quaternions), deviation = line, float(distances_from_chord(line.points).max())
     is_line = deviation <= min(RUNS.simplified * tolerance, float(np.linalg.norm(points[-1] - points[0])))
     is_line &= quaternions is None or bool((np.diff(quaternions, axis=0) == 0).all())

@@ -31,14 +31,12 @@ from models.paths.smooth_path import SmoothPath
 from models.paths.splines import Spline
 from models.spatial import FULL_TURN
 
-__all__ = ["Overlap", "smooth"]
-
 Overlap: TypeAlias = Literal["shrink", "refuse"]
 
 
 @dataclass(frozen=True)
 class RoundingSettings:
-    """Settings of the rounding of corners.
+    """Settings of the algorithms that round the corners of a path.
 
     Attributes:
         samples: Samples of a blend for its deviation, of the neighbourhood of the maximum, and of one turn of a helix
@@ -90,7 +88,7 @@ class _Corners(NamedTuple):
         return np.flatnonzero(segments[self.vertices] | segments[self.vertices + 1])
 
     def ends(self, remaining: Array) -> Ends:
-        """Return point, unit tangent and curvature vector at the start and end of each blend. Shape (V, 3) each."""
+        """Return point, unit tangent and curvature vector of the path at both ends of each blend. Shape (V, 3) each."""
         before = self.vertices
         p0, n0, k0, _ = self.path.at(before, self.path.lengths[before] - remaining)
         p1, n1, k1, _ = self.path.at(before + 1, remaining)
@@ -115,7 +113,7 @@ class _Corners(NamedTuple):
 def _remaining_distances(
     corners: _Corners, remaining: ArrayInput | None, deviation: ArrayInput | None, overlap: Overlap, free: bool
 ) -> tuple[_Corners, Array]:
-    """Return the corners, and the distance from each vertex to the ends of its blend. Shape (n - 1,), m.
+    """Return the corners of a path, and the distance from each vertex to both ends of its blend. Shape (n - 1,), m.
 
     The corners have the best shape factors if `free`. Other arguments as for `smooth`.
     """
@@ -138,7 +136,7 @@ def _remaining_distances(
 
 
 def _within_tolerance(corners: _Corners, tolerance: Array, overlap: Overlap) -> Array:
-    """Return the largest distances from vertex to blend end for which each blend is within tolerance. Shape (V,), m."""
+    """Return the largest distances from vertex to blend end, (V,), m, for which each blend is within tolerance."""
     path = corners.path
     # at most the segment length, so that every trial curve exists
     longest = np.minimum(path.lengths[:-1], path.lengths[1:])

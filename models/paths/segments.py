@@ -22,8 +22,6 @@ from models.errors import ModelError
 from models.paths.splines import Spline
 from models.spatial import FULL_TURN
 
-__all__ = ["Arc", "Helix", "Line", "Segment", "screw", "screw_axes"]
-
 SHORTEST_SEGMENT = 1e-9
 """Shortest length of a segment, m."""
 
@@ -68,7 +66,7 @@ class Line:
 
     @property
     def tangent(self) -> Array:
-        """Unit tangent at the start. Shape (3,)."""
+        """Unit tangent of the line. Shape (3,)."""
         return np.asarray((self.end - self.start) / self.length)
 
     @property
@@ -78,7 +76,7 @@ class Line:
 
 
 class _Circular:
-    """Properties that arcs and helices share."""
+    """Radius, start normal and end point, which arcs and helices compute in the same way."""
 
     start: ArrayInput
     center: ArrayInput
@@ -90,7 +88,7 @@ class _Circular:
 
     @property
     def normal(self) -> Array:
-        """Unit normal at the start, towards the axis. Shape (3,)."""
+        """Unit normal of the arc or helix at its start, towards the axis. Shape (3,)."""
         return np.asarray((self.center - self.start) / self.radius)
 
     @property
@@ -192,7 +190,7 @@ class Arc(_Circular):
 
     @property
     def tangent(self) -> Array:
-        """Unit tangent at the start. Shape (3,)."""
+        """Unit tangent of the arc at its start. Shape (3,)."""
         return np.cross(self.normal, self.axis)
 
     @property
@@ -243,7 +241,7 @@ class Helix(_Circular):
 
     @property
     def tangent(self) -> Array:
-        """Unit tangent at the start. Shape (3,)."""
+        """Unit tangent of the helix at its start. Shape (3,)."""
         tangential = self.radius * self.sweep * np.cross(self.normal, self.axis)
         return np.asarray((tangential + self.rise * self.axis) / self.length)
 

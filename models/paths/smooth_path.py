@@ -22,8 +22,6 @@ from models.paths.blends import BlendKind, Cells, curvature, derivatives_by_arc_
 from models.paths.path import Path
 from models.paths.splines import Spline, along_piece, chart
 
-__all__ = ["Blend", "PathPoint", "SmoothPath", "Turn"]
-
 BLOCK_SIZE = 50_000
 """Number of samples processed at once; it bounds the memory use."""
 
@@ -138,11 +136,6 @@ class SmoothPath:
         return np.diff(self.bounds)
 
     @cached_property
-    def blend_starts(self) -> NDArray[np.intp]:
-        """Index in `bounds` of the distance at which each blend begins. Shape (V,)."""
-        return np.flatnonzero(self.piece_blend >= 0)
-
-    @cached_property
     def cell_bounds(self) -> Array:
         """Distance along the path at which each quadrature interval (cell) of the curves begins. Shape (C,), m."""
         before = np.cumsum(self.cells.length) - self.cells.length
@@ -157,7 +150,7 @@ class SmoothPath:
         if not isinstance(vertex, int | np.integer) or isinstance(vertex, bool) or not 0 <= vertex < count:
             message = f"vertex {vertex!r} does not exist; the path has {count}"
             raise ModelError(message, name="vertex", value=vertex, limit=count)
-        piece = int(self.blend_starts[vertex])
+        piece = int(np.flatnonzero(self.piece_blend == vertex)[0])
         return Blend(
             self.path.start[vertex + 1],
             float(self.path.corner_angles()[vertex]),
@@ -252,11 +245,7 @@ class SmoothPath:
 
     def _parameter(self, s: Array) -> tuple[NDArray[np.intp], Array]:
         cell = np.maximum(np.searchsorted(self.cell_bounds, s, side="right") - 1, 0)
-        curve, length = self.cells.curve[cell], self.cells.length[cell]
-        inside = np.clip(s - self.cell_bounds[cell], 0.0, length)
-        return curve, parameter(
-            self.coefficients[curve], self.cells.start[cell], self.cells.width[cell], length=length, distance=inside
-        )
+        return parameter(self.coefficients, self.cells, cell, s - self.cell_bounds[cell])
 
     def _at(self, s: Array) -> tuple[Array, ...]:
         piece = self._piece(s)
@@ -303,7 +292,8 @@ class SmoothPath:
 
     @cached_property
     def charts(self) -> tuple[Array, Array]:
-        """Tool orientation on each segment and blend: reference quaternions and polynomials of the rotation vector.
+        """Tool orientation on each segment and blend: reference quaternions, and polynomials of the rotation vector
+        from them.
 
         Shapes (P, 4) and (P, 6, 3). The variable of the polynomials is distance / length.
         """

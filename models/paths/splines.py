@@ -21,9 +21,8 @@ from math import factorial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_lsq_spline
-from scipy.special import comb
 
 from models.checks import ROUNDING, Array, ArrayInput, require
 from models.errors import ModelError
@@ -39,22 +38,6 @@ from models.paths.blends import (
     quintic,
     speed,
 )
-
-__all__ = [
-    "SERIES_TERMS",
-    "Polyline",
-    "Spline",
-    "SplineTable",
-    "along_piece",
-    "chart",
-    "distances_from_chord",
-    "exponential",
-    "fit_spline",
-    "product",
-    "rotate",
-    "simplified",
-]
-
 
 SERIES_TERMS = 18
 
@@ -94,7 +77,7 @@ class Spline:
 
     @cached_property
     def cells(self) -> Cells:
-        """Quadrature cells of the pieces."""
+        """Intervals of the curve parameter (cells) of the spline's pieces, for computing arc lengths."""
         return cells(np.asarray(self.coefficients))
 
     @property
@@ -114,34 +97,32 @@ class Spline:
 
     @property
     def tangent(self) -> Array:
-        """Unit tangent at the start. Shape (3,)."""
+        """Unit tangent of the spline at its start. Shape (3,)."""
         return np.asarray(derivatives_by_arc_length(np.asarray(self.coefficients)[:1], np.zeros(1))[1][0])
 
     @property
     def normal(self) -> Array:
-        """Zero vector; the curvature of a spline varies. Shape (3,)."""
+        """Zero vector in place of a normal, because the curvature of a spline varies. Shape (3,)."""
         return np.zeros(3)
 
     @cached_property
     def curvature(self) -> float:
-        """Largest curvature at the ends of the pieces, 1/m."""
+        """Largest curvature of the spline at the ends of its pieces, 1/m."""
         curves = np.asarray(self.coefficients)
         return float(max(curvature(curves, np.full(len(curves), u)).max() for u in (0.0, 1.0)))
 
     @cached_property
     def bounds(self) -> Array:
-        """Distances from the start at which the pieces begin, and finally the length. Shape (P + 1,), m."""
+        """Distances from the spline's start at which its pieces begin, and finally its length. Shape (P + 1,), m."""
         return np.concatenate([[0.0], np.cumsum(np.bincount(self.cells.curve, self.cells.length))])
 
     def parameters(self, distance: Array) -> tuple[NDArray[np.intp], Array]:
-        """Return the piece at each distance (m) from the start, and the parameter u in it. Shape (M,) each."""
-        each = self.cells
-        begins = np.cumsum(each.length) - each.length
+        """Return the piece of the spline at each distance (m) from its start, and the parameter u in it. Shape (M,)
+        each.
+        """
+        begins = np.cumsum(self.cells.length) - self.cells.length
         at = np.clip(np.searchsorted(begins, distance, side="right") - 1, 0, len(begins) - 1)
-        inside = np.clip(distance - begins[at], 0.0, each.length[at])
-        piece = np.asarray(each.curve[at], dtype=np.intp)
-        curves = np.asarray(self.coefficients)[piece]
-        return piece, parameter(curves, each.start[at], each.width[at], length=each.length[at], distance=inside)
+        return parameter(np.asarray(self.coefficients), self.cells, at, distance - begins[at])
 
     def part(self, first: float, last: float) -> Spline:
         """Return the part of the spline between two distances (m) from its start."""
@@ -171,12 +152,12 @@ class Spline:
 
     @property
     def start_orientation(self) -> Array | None:
-        """Tool orientation at the start, unit quaternion; None as for a Line. Shape (4,)."""
+        """Tool orientation at the spline's start, unit quaternion; None if it states none. Shape (4,)."""
         return self._orientation(0, np.array([1.0, 0, 0, 0, 0, 0]))
 
     @property
     def end_orientation(self) -> Array | None:
-        """Tool orientation at the end, unit quaternion; None as for a Line. Shape (4,)."""
+        """Tool orientation at the spline's end, unit quaternion; None if it states none. Shape (4,)."""
         return self._orientation(-1, np.ones(6))
 
     def _orientation(self, piece: int, powers: Array) -> Array | None:
@@ -186,48 +167,49 @@ class Spline:
 
 
 class SplineTable(NamedTuple):
-    """Quadrature cells of all splines of a path, to evaluate points of many splines at once.
+    """Quadrature cells of all splines of a path in one table, to evaluate points of many splines at once.
 
     Attributes:
         curves: Polynomial that each cell is a part of. Shape (C, 6, 3), m.
-        cells: Start and width in u, length and distance along the path at which it begins. Shape (C, 4), 1 and m.
+        cells: The cells, each with a curve of its own.
+        cell_begins: Distance along the path at which each cell begins. Shape (C,), m.
         first: First cell of each segment of the path, and finally C. Shape (n + 1,).
         begins: Distance along the path at which each segment begins. Shape (n,), m.
     """
 
     curves: Array
-    cells: Array
+    cells: Cells
+    cell_begins: Array
     first: NDArray[np.intp]
     begins: Array
 
     @classmethod
     def of(cls, segments: Sequence[Any], begins: Array) -> SplineTable:
-        """Return the table of the splines among the segments of a path."""
+        """Return the table of the splines among the segments of a path, which begin at given distances, m."""
         splines = [(each, begin) for each, begin in zip(segments, begins, strict=True) if isinstance(each, Spline)]
         counts = [len(each.cells.curve) if isinstance(each, Spline) else 0 for each in segments]
         curves = np.concatenate([np.asarray(each.coefficients)[each.cells.curve] for each, _ in splines])
-        rows = [
-            np.column_stack([*each.cells[1:], begin + np.cumsum(each.cells.length) - each.cells.length])
-            for each, begin in splines
-        ]
-        return cls(curves, np.concatenate(rows), np.concatenate([[0], np.cumsum(counts)]), begins)
+        columns = (np.concatenate(parts) for parts in zip(*(each.cells[1:] for each, _ in splines), strict=True))
+        cell_begins = [begin + np.cumsum(each.cells.length) - each.cells.length for each, begin in splines]
+        first = np.concatenate([[0], np.cumsum(counts)])
+        return cls(curves, Cells(np.arange(len(curves)), *columns), np.concatenate(cell_begins), first, begins)
 
     def at(self, index: NDArray[np.intp], distance: Array) -> tuple[Array, Array, Array, Array]:
         """Return points at distances (m) along splines, and three derivatives. Shapes (M,) to (M, 3)."""
         place = self.begins[index] + distance
-        cell = np.searchsorted(self.cells[:, 3], place, side="right") - 1
+        cell = np.searchsorted(self.cell_begins, place, side="right") - 1
         cell = np.clip(cell, self.first[index], self.first[index + 1] - 1)
-        start, width, length, begin = self.cells[cell].T
-        inside = np.clip(place - begin, 0.0, length)
-        u = parameter(self.curves[cell], start, width, length=length, distance=inside)
-        return derivatives_by_arc_length(self.curves[cell], u)
+        curve, u = parameter(self.curves, self.cells, cell, place - self.cell_begins[cell])
+        return derivatives_by_arc_length(self.curves[curve], u)
 
 
 def _between(coefficients: Array, first: Array, last: Array) -> Array:
-    """Return the polynomials, shape (P, 6, 3), on the parts of [0, 1] from `first` to `last`, shape (P,)."""
+    """Return polynomial curves with a new parameter, whose range 0 to 1 is the part from `first` to `last`. Shape (P,
+    6, 3).
+    """
     power, own = np.arange(6), np.arange(6)[:, None]
     shift = np.where(power >= own, first[:, None, None] ** np.maximum(power - own, 0), 0.0)
-    matrix = comb(power, own) * shift * (last - first)[:, None, None] ** own
+    matrix = scipy.special.comb(power, own) * shift * (last - first)[:, None, None] ** own
     return np.asarray(matrix @ coefficients)
 
 
@@ -301,17 +283,17 @@ def _interpolated(x: Array, places: Array, values: Array) -> Array:
     return np.stack([np.interp(x, places, column) for column in values.T], axis=-1)
 
 
-def _least_squares(x: Array, values: Array, knots: Array) -> BSpline:
+def _least_squares(x: Array, values: Array, knots: Array) -> scipy.interpolate.BSpline:
     """Return the B-spline with given knots that is closest to values (M, k) at x (M,) and equal to them at the ends."""
     degree, weights = FIT.degree, np.ones(len(x))
     weights[[0, -1]] = FIT.end_weight
     whole = np.concatenate([np.repeat(knots[0], degree), knots, np.repeat(knots[-1], degree)])
-    curve = make_lsq_spline(x, values, whole, k=degree, w=weights, method="norm-eq")
+    curve = scipy.interpolate.make_lsq_spline(x, values, whole, k=degree, w=weights, method="norm-eq")
     curve.c[[0, -1]] = values[[0, -1]]
     return curve
 
 
-def _pieces(curve: BSpline, knots: Array) -> Array:
+def _pieces(curve: scipy.interpolate.BSpline, knots: Array) -> Array:
     """Return the pieces of a B-spline as polynomials of u from 0 to 1. Shape (P, 6, 3)."""
     width = np.diff(knots)[:, None]
     orders = range(FIT.degree + 1)
@@ -324,11 +306,13 @@ def _pieces(curve: BSpline, knots: Array) -> Array:
 def _bernstein() -> Array:
     """Return the matrix from values at six equidistant points to Bernstein coefficients of degree 5. Shape (6, 6)."""
     u, k = np.linspace(0, 1, FIT.degree + 1)[:, None], np.arange(FIT.degree + 1)
-    return np.linalg.inv(comb(FIT.degree, k) * u**k * (1 - u) ** (FIT.degree - k))
+    return np.linalg.inv(scipy.special.comb(FIT.degree, k) * u**k * (1 - u) ** (FIT.degree - k))
 
 
-def _with_orientation(spline: Spline, poses: BSpline, curve: BSpline, knots: Array) -> Spline:
-    """Return a spline with tool orientations that have the values and two derivatives of `poses` at the knots."""
+def _with_orientation(
+    spline: Spline, poses: scipy.interpolate.BSpline, curve: scipy.interpolate.BSpline, knots: Array
+) -> Spline:
+    """Return a spline with tool orientations that have the values and two derivatives of a B-spline at the knots."""
     q, first, second = (poses(knots, order) for order in range(3))
     square = (q * q).sum(axis=1, keepdims=True)
     back = q * [1, -1, -1, -1]
@@ -376,7 +360,7 @@ def logarithm(first: Array, second: Array) -> Array:
 
 
 def chart(reference: Array, quaternion: Array, rate: Array, acceleration: Array) -> tuple[Array, Array, Array]:
-    """Return the rotation vectors from references to orientations, and their first two derivatives.
+    """Return the rotation vectors from reference orientations to tool orientations, and their first two derivatives.
 
     The inverse of `along_piece`: rate and acceleration of the orientation are in world. Shapes (M, 4), (M, 3).
     """
@@ -444,7 +428,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _series(start: int, square: Array) -> tuple[Array, Array, Array]:
-    """Return the value and first two derivatives of a power series that occurs in derivatives of orientations.
+    """Return value and first two derivatives of a power series, sum over k of (-x)^k / (2 k + start)!, at x = `square`.
 
     The sum of (-x)^k / (2 k + start)! over k at x = `square`; derivatives are with respect to x.
     """
@@ -470,8 +454,8 @@ def product(first: ArrayInput, second: ArrayInput) -> Array:
     return np.concatenate([scalar, vector], axis=-1)
 
 
-def simplified(points: Array, deviation: float) -> NDArray[np.intp]:
-    """Return the indices of the points that remain if all others are within a deviation of the chords (Ramer 1972)."""
+def simplify_polyline(points: Array, deviation: float) -> NDArray[np.intp]:
+    """Return the indices of points to keep so that all others are within a deviation of the chords (Ramer 1972)."""
     kept, pending = {0, len(points) - 1}, [(0, len(points) - 1)]
     while pending:
         first, last = pending.pop()

@@ -21,17 +21,17 @@ import numpy as np
 from models.checks import require
 from models.robot.kinematics import (
     Placement,
-    by_joint_vector,
     checked_placement,
     checked_vector,
     constant,
-    each_joint,
+    expand_joint_vector,
     frames_and_axes,
     joint_frames,
+    joint_vector,
     link_frames,
-    propagate_motions,
+    reduce_to_joint_vector,
 )
-from models.robot.parts import Link, massless_error
+from models.robot.parts import massless_error
 from models.robot.rebuild import simplify
 from models.robot.robot import Robot
 from models.spatial import Expression, Frame, cross, on_scalars, skew
@@ -42,7 +42,7 @@ GRAVITY = (0.0, 0.0, -9.81)
 
 @dataclass(frozen=True, eq=False)
 class Wrench:
-    """An external force and moment on a link.
+    """An external force and moment that act on a link of a robot.
 
     Each part is a CasADi vector, numbers, or a list of either; it is stored as a CasADi column.
 
@@ -135,8 +135,8 @@ def mass_matrix(robot: Robot, q: Expression) -> Expression:
                     entry = ca.dot(ca.vertcat(*axes[carrier.name]), momentum)
                     matrix[carrier.name, joint.name] = matrix[joint.name, carrier.name] = entry
     rows = {i: {j: matrix.get((i, j), ca.DM(1, 1)) for j in axes} for i in axes}
-    columns = {i: ca.vertcat(ca.DM(0, 1), *by_joint_vector(robot, row)) for i, row in rows.items()}
-    return ca.densify(ca.horzcat(ca.DM(robot.dof, 0), *by_joint_vector(robot, columns)))
+    columns = {i: ca.vertcat(ca.DM(0, 1), *reduce_to_joint_vector(robot, row)) for i, row in rows.items()}
+    return ca.densify(ca.horzcat(ca.DM(robot.dof, 0), *reduce_to_joint_vector(robot, columns)))
 
 
 def external_wrench(
@@ -157,7 +157,7 @@ def checked_wrenches(wrenches: Sequence[Wrench]) -> tuple[Wrench, ...]:
 
 
 def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
-    """Return a matrix with one column per wrench: moment, force and point of application. Shape (9, k)."""
+    """Return external wrenches as the columns (moment, force, point of application) of a matrix. Shape (9, k)."""
     require.instance("dynamics: robot", robot, Robot)
     columns = []
     for wrench in checked_wrenches(wrenches):
@@ -167,13 +167,15 @@ def stacked_wrenches(robot: Robot, wrenches: Sequence[Wrench]) -> Expression:
 
 
 def _parts(stacked: Expression, column: int) -> tuple[Expression, Expression, Expression]:
-    """Return moment, force and point of application of one wrench from the matrix of `stacked_wrenches`."""
+    """Return moment, force and point of application of one external wrench, given the matrix of `stacked_wrenches`."""
     moment, force, point = (stacked[3 * i : 3 * i + 3, column] for i in range(3))
     return moment, force, point
 
 
 def _twist_and_rate(base_motion: tuple[Expression, Expression] | None) -> tuple[Expression | None, Expression | None]:
-    """Return the twist of the base and its time derivative; raise ModelError unless `base_motion` is this pair."""
+    """Return the twist of a moving base and its time derivative, or (None, None) for a base at rest; raise ModelError
+    for a base motion that is neither None nor such a pair.
+    """
     if base_motion is None:
         return None, None
     if not isinstance(base_motion, tuple | list) or len(base_motion) != 2:
@@ -209,7 +211,9 @@ def _efforts(
     motions = _motions_in_links(robot, joints, qd, qdd, gravity, ground, base_twist, base_acceleration)
     for link in robot.links:
         acceleration, field = motions[link.name]
-        first_moment, second_moment = _mass_sums(link)
+        center, about_center = link.center_of_mass, np.trace(link.inertia) / 2 * np.eye(3) - link.inertia
+        first_moment = constant(link.mass * center)
+        second_moment = constant(about_center + link.mass * np.outer(center, center))
         turned = ca.mtimes(field, second_moment)
         moment = ca.vertcat(turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1])
         force = link.mass * acceleration + ca.mtimes(field, first_moment)
@@ -230,7 +234,7 @@ def _efforts(
         loads[joint.parent] = load[0] + moment + cross(position, force), load[1] + force
     moment, force = (ca.mtimes(ground.rotation, part) for part in loads[robot.root])
     reaction = ca.vertcat(moment + cross(ground.position, force), force)
-    return ca.densify(ca.vertcat(ca.DM(0, 1), *by_joint_vector(robot, torques))), reaction
+    return ca.densify(ca.vertcat(ca.DM(0, 1), *reduce_to_joint_vector(robot, torques))), reaction
 
 
 def _motions_in_links(
@@ -243,11 +247,12 @@ def _motions_in_links(
     base_twist: Expression | None,
     base_acceleration: Expression | None,
 ) -> dict[str, tuple[Expression, Expression]]:
-    """Return the acceleration of each link's origin less gravity, and the link's acceleration field, by link name.
+    """Return, by link name, the acceleration of the link's origin less gravity, and the matrix from the position of a
+    point in the link to its acceleration relative to that of the origin.
 
     Shapes (3, 1) and (3, 3), in the axes of the link; `_field` explains the field.
     """
-    rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
+    rates, accelerations = expand_joint_vector(robot, qd, "qd"), expand_joint_vector(robot, qdd, "qdd")
     g = checked_vector("gravity", gravity, 3, "x, y and z")
     meaning = "angular, then of the origin of the root link's frame"
     twist, push = (
@@ -277,15 +282,8 @@ def _motions_in_links(
     return fields
 
 
-def _mass_sums(link: Link) -> tuple[Expression, Expression]:
-    """Return first and second mass moments of a link in the link's frame. Shapes (3, 1), kg m, and (3, 3), kg m^2."""
-    center, inertia = link.center_of_mass, link.inertia
-    about_center = np.trace(inertia) / 2 * np.eye(3) - inertia
-    return constant(link.mass * center), constant(about_center + link.mass * np.outer(center, center))
-
-
 def _field(spin: Expression, turning: Expression) -> Expression:
-    """Return the acceleration field of a rotating body: the matrix from the position of a point to its acceleration.
+    """Return the matrix from a point of a rotating body to its acceleration relative to the body's origin.
 
     [alpha x] + [omega x]^2 with the angular velocity omega, `spin`, and acceleration alpha, `turning`. Shape (3, 3).
     """
@@ -307,11 +305,11 @@ class MassMoments(NamedTuple):
     second: Expression
 
     def plus(self, other: MassMoments) -> MassMoments:
-        """Return the mass moments of the union of two sets of bodies."""
+        """Return the mass moments of the union of two disjoint sets of bodies."""
         return MassMoments(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
     def momentum(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """Return (angular momentum about the world's origin, linear momentum) of the bodies for a common twist."""
+        """Return angular (about the world's origin) and linear momentum of the bodies if all have a given twist."""
         angular_momentum = ca.mtimes(ca.tril2symm(self.second), angular)
         return angular_momentum + cross(self.first, linear), self.mass * linear - cross(self.first, angular)
 
@@ -322,7 +320,7 @@ class MassMoments(NamedTuple):
 
 
 def center_of_mass_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the Jacobian of the whole robot's centre of mass in world axes. Shape (3, dof)."""
+    """Return the matrix from joint rates to the velocity of the robot's centre of mass, world axes. Shape (3, dof)."""
     matrix = momentum_matrix(robot, q, world_from_base)
     if robot.total_mass == 0:
         raise massless_error("hence no centre of mass")
@@ -346,7 +344,7 @@ def robot_inertia(robot: Robot, q: Expression, world_from_base: Placement | None
 
 
 def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMoments]:
-    """Return the mass moments of each link together with the links it carries, about the world's origin, by name."""
+    """Return, by link name, the mass moments of each link and all links that it carries, about the world's origin."""
     moments: dict[str, MassMoments] = {}
     for link in robot.links:
         turn, center = frames[link.name].rotation, frames[link.name].point(link.center_of_mass)
@@ -363,10 +361,12 @@ def subtree_moments(robot: Robot, frames: dict[str, Frame]) -> dict[str, MassMom
 def joint_momenta(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], moments: dict[str, MassMoments]
 ) -> Expression:
-    """Return the momentum matrix, given joint axes (from frames_and_axes) and mass moments (from subtree_moments)."""
+    """Return the matrix from joint rates to momentum, given joint axes (of frames_and_axes) and mass moments (of
+    subtree_moments). Shape (6, dof).
+    """
     children = {joint.name: moments[joint.child] for joint in robot.joints if joint.moves}
     momenta = {name: ca.vertcat(*children[name].momentum(*axis)) for name, axis in axes.items()}
-    return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, momenta))
+    return ca.horzcat(ca.DM(6, 0), *reduce_to_joint_vector(robot, momenta))
 
 
 @on_scalars
@@ -379,16 +379,8 @@ def momentum(
     world_from_base: Placement | None = None,
 ) -> Expression:
     """Return the robot's angular momentum about a fixed point, and its linear momentum. Shape (6, 1), N m s and N s."""
-    frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = propagate_motions(robot, frames, axes, qd=qd, qdd=ca.DM(robot.dof, 1))
-    place = checked_vector("about", about, 3, "a point of the world")
-    total: Expression = ca.DM(6, 1)
-    for link in robot.links:
-        motion, inertia = motions[link.name], inertia_in_world(link, frames)
-        push = link.mass * motion.velocity
-        spin = ca.mtimes(inertia, motion.angular_velocity)
-        total = total + ca.vertcat(spin + cross(motion.center - place, push), push)
-    return ca.densify(total)
+    rates = joint_vector(robot, qd, "qd")
+    return _about_point(about, ca.mtimes(momentum_matrix(robot, q, world_from_base), rates))
 
 
 @on_scalars
@@ -401,24 +393,16 @@ def momentum_rate(
     about: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return the time derivative of :func:`momentum` about a fixed point. Shape (6, 1), N m and N.
+    """Return the rate of the robot's angular momentum about a fixed point and of its linear momentum. Shape (6, 1).
 
     It is the same about a point that moves with the centre of mass, whose velocity is parallel to the momentum.
     """
-    frames, axes = frames_and_axes(robot, q, world_from_base)
-    motions = propagate_motions(robot, frames, axes, qd=qd, qdd=qdd)
-    place = checked_vector("about", about, 3, "a point of the world")
-    total: Expression = ca.DM(6, 1)
-    for link in robot.links:
-        motion, inertia = motions[link.name], inertia_in_world(link, frames)
-        spin = motion.angular_velocity
-        force = link.mass * motion.acceleration
-        moment = ca.mtimes(inertia, motion.angular_acceleration) + cross(spin, ca.mtimes(inertia, spin))
-        total = total + ca.vertcat(moment + cross(motion.center, force), force)
-    return ca.densify(ca.vertcat(total[0:3] - cross(place, total[3:6]), total[3:6]))
+    return _about_point(
+        about, base_reaction(robot, q, qd, qdd, gravity=(0.0, 0.0, 0.0), world_from_base=world_from_base)
+    )
 
 
-def inertia_in_world(link: Link, frames: dict[str, Frame]) -> Expression:
-    """Return the rotational inertia of a link about its centre of mass, in world axes. Shape (3, 3)."""
-    turn = frames[link.name].rotation
-    return ca.mtimes([turn, ca.sparsify(ca.DM(link.inertia)), turn.T])
+def _about_point(point: Expression, wrench: Expression) -> Expression:
+    """Return a wrench or momentum about a given point, given the one about the world's origin. Shape (6, 1)."""
+    arm = checked_vector("about", point, 3, "a point of the world")
+    return ca.densify(ca.vertcat(wrench[0:3] - cross(arm, wrench[3:6]), wrench[3:6]))

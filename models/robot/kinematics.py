@@ -25,7 +25,7 @@ from models.spatial import Expression, Frame, cross, determinant, expression, on
 Placement = tuple[Expression, Expression]
 
 
-class _Turn(NamedTuple):
+class _ParallelRotation(NamedTuple):
     """Rotation about consecutive parallel joint axes: initial orientation, common axis and sum of the joint angles."""
 
     before: Expression
@@ -63,28 +63,27 @@ def checked_vector(label: str, value: Expression, size: int, meaning: str) -> Ex
     return value
 
 
-def checked_placement(placement: Placement | None) -> Frame:
-    """Return the pose of the root link as a frame (the identity if None); raise ModelError if the pose is invalid."""
+def checked_placement(placement: Placement | None, label: str = "world_from_base") -> Frame:
+    """Return a pose (rotation, position) as a frame, the identity if None; raise ModelError if the pose is invalid."""
     if placement is None:
         return Frame(ca.DM.eye(3), ca.DM(3, 1))
+    name = argument_of(label)
     try:
         orientation, position = map(expression, placement)
     except NOT_NUMBERS as error:
-        message = f"world_from_base must be (rotation, position), not {placement!r}"
-        raise ModelError(message, name="world_from_base", value=placement) from error
-    if orientation.shape != (3, 3) or position.shape != (3, 1):
-        message = f"world_from_base has the shapes {orientation.shape}, {position.shape}; (3, 3), (3, 1) expected"
-        raise ModelError(
-            message, name="world_from_base", value=(orientation.shape, position.shape), limit=((3, 3), (3, 1))
-        )
+        message = f"{label} must be (rotation, position), not {placement!r}"
+        raise ModelError(message, name=name, value=placement) from error
+    shapes, expected = (orientation.shape, position.shape), ((3, 3), (3, 1))
+    if shapes != expected:
+        message = f"{label} has parts of shapes {shapes}, expected {expected}"
+        raise ModelError(message, name=name, value=shapes, limit=expected)
     if not all(part.is_regular() for part in (orientation, position) if isinstance(part, ca.DM)):
-        message = f"world_from_base {placement!r} is not finite"
-        raise ModelError(message, name="world_from_base", value=placement)
+        raise ModelError(f"{label} {placement!r} is not finite", name=name, value=placement)
     return Frame(orientation, position)
 
 
-def each_joint(robot: Robot, vector: Expression, what: str = "q") -> dict[str, Expression]:
-    """Expand a joint vector to all moving joints, including those that mimic others; return the values by joint name.
+def expand_joint_vector(robot: Robot, vector: Expression, what: str = "q") -> dict[str, Expression]:
+    """Return the entry of a joint vector for each moving joint, by name; for a mimic joint, times its multiplier.
 
     Correct for rates and accelerations; for positions, the offsets of mimic joints are not added.
     """
@@ -92,8 +91,8 @@ def each_joint(robot: Robot, vector: Expression, what: str = "q") -> dict[str, E
     return {name: vector[k] if ratio == 1 else ratio * vector[k] for name, (k, ratio, _) in robot.couplings.items()}
 
 
-def by_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> list[Expression]:
-    """Reduce quantities of all moving joints, such as forces or Jacobian columns, to one for each joint vector entry.
+def reduce_to_joint_vector(robot: Robot, by_joint: Mapping[str, Expression]) -> list[Expression]:
+    """Return a quantity, such as torque, for each entry of the joint vector from those of all moving joints, by name.
 
     Each entry is that of the joint itself plus multiplier times those of the joints that mimic it.
     """
@@ -144,9 +143,8 @@ def frame_jacobian(
     point: Expression = (0.0, 0.0, 0.0),
     world_from_base: Placement | None = None,
 ) -> Expression:
-    """Return the geometric Jacobian of a point fixed in a link.
-
-    It maps joint rates to (angular velocity, velocity of the point) in world axes.
+    """Return the geometric Jacobian of a point fixed in a link: the matrix from joint rates to (angular velocity,
+    velocity of the point) in world axes.
 
     Args:
         link: Name of the link.
@@ -168,9 +166,8 @@ def link_jacobians(robot: Robot, q: Expression, world_from_base: Placement | Non
 
 
 def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None = None) -> Expression:
-    """Return the geometric Jacobian of the tip frame.
-
-    It maps joint rates to (angular, linear) velocity in world axes. Shape (6, dof).
+    """Return the geometric Jacobian of the tip frame: the matrix from joint rates to its (angular, linear) velocity in
+    world axes. Shape (6, dof).
     """
     tip = require.instance("kinematics: robot", robot, Robot).tip_link
     return frame_jacobian(robot, q, tip, point=robot.tip_translation, world_from_base=world_from_base)
@@ -179,7 +176,7 @@ def tip_jacobian(robot: Robot, q: Expression, world_from_base: Placement | None 
 def point_jacobian(
     robot: Robot, axes: dict[str, tuple[Expression, Expression]], link: str, point: Expression
 ) -> Expression:
-    """Return the geometric Jacobian of a point of a link from given joint axes. Shape (6, dof).
+    """Return the geometric Jacobian of a point of a link, given in the world, from known joint axes. Shape (6, dof).
 
     The point is in world; the axes are those of frames_and_axes.
     """
@@ -188,11 +185,11 @@ def point_jacobian(
         name: ca.vertcat(angular, linear + cross(angular, point)) if name in carriers else ca.DM(6, 1)
         for name, (angular, linear) in axes.items()
     }
-    return ca.horzcat(ca.DM(6, 0), *by_joint_vector(robot, columns))
+    return ca.horzcat(ca.DM(6, 0), *reduce_to_joint_vector(robot, columns))
 
 
 def joint_frames(robot: Robot, q: Expression) -> dict[str, Frame]:
-    """Return the frame of each joint's child link relative to its parent link, by joint name."""
+    """Return the pose of each joint's child link in its parent link at given joint positions, by joint name."""
     positions, frames = _positions(robot, q), {}
     for joint in robot.joints:
         orientation, position = constant(joint.rotation), constant(joint.translation)
@@ -206,7 +203,7 @@ def joint_frames(robot: Robot, q: Expression) -> dict[str, Frame]:
 
 def _positions(robot: Robot, q: Expression) -> dict[str, Expression]:
     """Return the positions of all moving joints, including those that mimic others, by joint name."""
-    positions = each_joint(robot, q)
+    positions = expand_joint_vector(robot, q)
     for name, coupling in robot.couplings.items():
         if coupling.offset:
             positions[name] = positions[name] + coupling.offset
@@ -216,14 +213,14 @@ def _positions(robot: Robot, q: Expression) -> dict[str, Expression]:
 def frames_and_axes(
     robot: Robot, q: Expression, world_from_base: Placement | None = None
 ) -> tuple[dict[str, Frame], dict[str, tuple[Expression, Expression]]]:
-    """Return the frames of all links and the motion vectors of all moving joints, including mimic joints, by name.
+    """Return, by name, the frames of all links in the world and the twist of each moving joint per unit of its rate.
 
-    A motion vector is (angular velocity, velocity at the world's origin) per unit rate of the joint, world axes.
+    Twists are (angular velocity, velocity at the world's origin), world axes. Mimic joints are included.
     """
     positions = _positions(robot, q)
     frames: dict[str, Frame] = {robot.root: checked_placement(world_from_base)}
     axes: dict[str, tuple[Expression, Expression]] = {}
-    turns: dict[str, _Turn] = {}
+    turns: dict[str, _ParallelRotation] = {}
     for joint in robot.joints:
         parent, turn = frames[joint.parent], turns.get(joint.parent)
         frame = Frame(ca.mtimes(parent.rotation, constant(joint.rotation)), parent.point(joint.translation))
@@ -238,7 +235,7 @@ def frames_and_axes(
             if turn is not None and np.array_equal(turn.axis, joint.axis):
                 turn = turn._replace(angle=turn.angle + positions[joint.name])
             else:
-                turn = _Turn(frame.rotation, joint.axis, positions[joint.name])
+                turn = _ParallelRotation(frame.rotation, joint.axis, positions[joint.name])
             axis = ca.mtimes(turn.before, constant(joint.axis))
             axes[joint.name] = (axis, cross(frame.position, axis))
             turned = ca.mtimes(turn.before, rotation(constant(joint.axis), turn.angle))
@@ -283,32 +280,7 @@ def link_motions(
 ) -> dict[str, LinkMotion]:
     """Return the motion of every link (`LinkMotion`), by link name, the root link first."""
     frames, axes = frames_and_axes(robot, q, world_from_base)
-    return propagate_motions(robot, frames, axes, qd=qd, qdd=qdd)
-
-
-@on_scalars
-def center_of_mass_motion(
-    robot: Robot, q: Expression, qd: Expression, qdd: Expression, *, world_from_base: Placement | None = None
-) -> CenterOfMassMotion:
-    """Return the motion of the whole robot's centre of mass; raise ModelError if the robot has no mass."""
-    if require.instance("kinematics: robot", robot, Robot).total_mass == 0:
-        raise massless_error("hence no centre of mass")
-    motions = link_motions(robot, q, qd, qdd, world_from_base=world_from_base)
-    weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]
-    sums = (sum(parts, start=ca.DM(3, 1)) for parts in zip(*weighted, strict=True))
-    return CenterOfMassMotion(*(ca.densify(part / robot.total_mass) for part in sums))
-
-
-def propagate_motions(
-    robot: Robot,
-    frames: dict[str, Frame],
-    axes: dict[str, tuple[Expression, Expression]],
-    *,
-    qd: Expression,
-    qdd: Expression,
-) -> dict[str, LinkMotion]:
-    """Return the motion of every link, by name, propagated from the root link outwards."""
-    rates, accelerations = each_joint(robot, qd, "qd"), each_joint(robot, qdd, "qdd")
+    rates, accelerations = expand_joint_vector(robot, qd, "qd"), expand_joint_vector(robot, qdd, "qdd")
     # velocity and acceleration of the frame's origin, angular velocity, angular acceleration
     origin: dict[str, tuple[Expression, Expression, Expression, Expression]] = {robot.root: (ca.DM(3, 1),) * 4}
     for joint in robot.joints:
@@ -337,6 +309,19 @@ def propagate_motions(
     return motions
 
 
+@on_scalars
+def center_of_mass_motion(
+    robot: Robot, q: Expression, qd: Expression, qdd: Expression, *, world_from_base: Placement | None = None
+) -> CenterOfMassMotion:
+    """Return position, velocity and acceleration of the robot's centre of mass; raise ModelError if it has no mass."""
+    if require.instance("kinematics: robot", robot, Robot).total_mass == 0:
+        raise massless_error("hence no centre of mass")
+    motions = link_motions(robot, q, qd, qdd, world_from_base=world_from_base)
+    weighted = [[link.mass * part for part in motions[link.name][:3]] for link in robot.links]
+    sums = (sum(parts, start=ca.DM(3, 1)) for parts in zip(*weighted, strict=True))
+    return CenterOfMassMotion(*(ca.densify(part / robot.total_mass) for part in sums))
+
+
 TWIST_SIZE = 6
 
 
@@ -354,7 +339,7 @@ def joint_limit_index(robot: Robot, q: Expression) -> Expression:
 
 
 def joint_excess(robot: Robot, q: Expression) -> Expression:
-    """Return the largest violation of a position limit; negative within limits, -inf without limits. Shape (1, 1)."""
+    """Return the largest violation of a joint position limit, negative within limits, -inf without. Shape (1, 1)."""
     q = joint_vector(robot, q)
     lower, upper = np.flatnonzero(np.isfinite(robot.lower)).tolist(), np.flatnonzero(np.isfinite(robot.upper)).tolist()
     if not lower and not upper:

@@ -47,7 +47,7 @@ FOLDERS = ("assetdir", "meshdir", "texturedir", "strippath")
 
 
 def read_mjcf(source: Source) -> Description:
-    """Read an MJCF description from a text or a file.
+    """Read the description of a robot in MJCF, the XML format of MuJoCo, from a text or a file.
 
     Links are the bodies, in their own frames, the world, and the named sites; a site or an anchor of a joint becomes a
     link without mass. Joint positions are those of MuJoCo. A free joint that is all that the world carries means that
@@ -137,7 +137,7 @@ def excluded_pairs(source: Source) -> list[tuple[str, str]]:
 
 
 class _ReducedFile(NamedTuple):
-    """An MJCF description with the elements of READ alone.
+    """An MJCF description reduced to the elements that describe bodies, joints, shapes and actuators.
 
     Attributes:
         text: MJCF.
@@ -155,7 +155,9 @@ class _ReducedFile(NamedTuple):
 
 
 def _reduce(source: Source, omitted: list[str]) -> _ReducedFile:
-    """Read an MJCF description and reduce it; append descriptions of equality constraints that are left out."""
+    """Read an MJCF description and keep only what describes bodies, joints, shapes and actuators; append descriptions
+    of equality constraints that are left out to `omitted`.
+    """
     tree, origin = parse_file(source, "MJCF")
     if tree.tag != "mujoco":
         hint = "; read URDF with Robot.from_urdf" if tree.tag == "robot" else ""
@@ -191,7 +193,7 @@ def _reduce(source: Source, omitted: list[str]) -> _ReducedFile:
 
 
 def _include(element: ElementTree.Element, folder: Path | None, known: set[Path], origin: str) -> None:
-    """Replace every <include> by the contents of its file, which must be inside the folder and included once."""
+    """Replace each <include> in an MJCF document by the contents of its file, which must be inside a given folder."""
     for parent in list(element.iter()):
         for k in reversed([k for k, child in enumerate(parent) if child.tag == "include"]):
             name = parent[k].get("file", "")
@@ -212,7 +214,7 @@ def _include(element: ElementTree.Element, folder: Path | None, known: set[Path]
 
 
 def _prune(element: ElementTree.Element, origin: str, depth: int = 0) -> None:
-    """Remove the elements that are not read, and references to textures and generated meshes, at any depth."""
+    """Remove from an MJCF element, at any depth, the elements that are not read, and references to textures."""
     if depth > INPUT_LIMITS.nesting:
         message = f"{origin} nests elements more than {INPUT_LIMITS.nesting} deep"
         raise ModelError(message, name=origin, value=depth, limit=INPUT_LIMITS.nesting)
@@ -229,7 +231,8 @@ def _is_read(part: ElementTree.Element, parent: str) -> bool:
 
 
 def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
-    """Return MuJoCo's model with spheres in place of meshes, and the mesh, or None, that each stands for, by geom.
+    """Return MuJoCo's compiled model, with spheres in place of meshes, and by index of the geom the mesh that each
+    sphere replaces (None for height fields and for primitives fitted to meshes).
 
     Meshes are opened only if the masses of bodies follow from them.
     """
@@ -270,7 +273,8 @@ def _compile(reduced: _ReducedFile) -> tuple[Any, dict[int, Any]]:
 
 
 def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any, str]]:
-    """Replace the geoms with meshes or height fields by spheres, except on some bodies; return them and their meshes.
+    """Replace geoms that are meshes or height fields by spheres, except on bodies that `is_kept` accepts; return the
+    replaced geoms with the names of their meshes.
 
     The compiler would move a mesh to its centre of mass. A primitive that is fitted to a mesh has the mesh "".
     """
@@ -287,7 +291,7 @@ def _replace_meshes(spec: Any, is_kept: Callable[[Any], bool]) -> list[tuple[Any
 def _body_shapes(
     model: Any, meshes: Mapping[int, Any], reduced: _ReducedFile, omitted: list[str]
 ) -> list[dict[str, Any]]:
-    """Return the collision and display shapes of each body, as arguments of Link; append descriptions of omitted ones.
+    """Return the shapes of each body of a MuJoCo model as arguments of Link; append words on omitted ones to `omitted`.
 
     Args:
         model, meshes: As returned by _compile.
@@ -320,7 +324,9 @@ def _body_shapes(
 
 
 def _primitive(number: int, size: Array) -> tuple[ShapeKind, tuple[float, ...]]:
-    """Return kind and size of the collision shape for a type number of MuJoCo and half sizes; no size for a plane."""
+    """Return kind and size of the collision shape for MuJoCo's type number and half sizes of a geom; no size for a
+    plane.
+    """
     a, b, c = size.tolist()
     kinds: dict[int, tuple[ShapeKind, tuple[float, ...]]] = {
         2: ("sphere", (a,)),
@@ -347,7 +353,7 @@ def _kind(model: Any, j: int) -> Kind:
 
 
 def _effort(model: Any, j: int) -> float:
-    """Return the effort limit of a joint, N m or N: the smaller magnitude of each range, infinite without any."""
+    """Return the effort limit of a joint, N m or N, by force ranges of joint and actuators; infinite without any."""
     limits = []
     for k in range(model.nu):
         if model.actuator_trntype[k] > 1 or model.actuator_trnid[k, 0] != j:
@@ -365,7 +371,9 @@ def _effort(model: Any, j: int) -> float:
 
 
 def _equalities(model: Any, omitted: list[str]) -> tuple[dict[int, Mimic], dict[int, float]]:
-    """Return couplings of joints to others, and positions of locked joints, by the number of the joint."""
+    """Return, by number of the joint, couplings to other joints and positions of locked joints that equality
+    constraints state; append descriptions of other constraints to `omitted`.
+    """
     mimics: dict[int, Mimic] = {}
     locked: dict[int, float] = {}
     for k in (k for k in range(model.neq) if model.eq_active0[k]):

@@ -64,16 +64,12 @@ class CollisionShape:
             raise ModelError(f"{owner}: size {size.tolist()} scales it to nothing", name="size", value=size)
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "translation", require.array(f"{owner}: translation", self.translation, (3,)))
-        if not mesh:
-            self._check_size(size, owner)
+        if not mesh and not isinstance(self, VisualShape):
+            warn_of_millimetres(f"{owner}: size", size)
         object.__setattr__(self, "rotation", require.rotation(f"{owner}: rotation", self.rotation))
 
-    def _check_size(self, size: Array, owner: str) -> None:
-        """Warn if an entry of the size looks like millimetres."""
-        warn_of_millimetres(f"{owner}: size", size)
-
     def placed(self, rotation: Array, translation: Array) -> Self:
-        """Return the shape in another frame, given the pose of its link in that frame: shapes (3, 3) and (3,), m."""
+        """Return the shape in another frame, in which its link has a given rotation (3, 3) and translation (3,), m."""
         turn = require.rotation("placed shape: rotation", rotation)
         shift = require.array("placed shape: translation", translation, (3,)) + turn @ self.translation
         return replace(self, translation=shift, rotation=turn @ self.rotation)
@@ -102,9 +98,6 @@ class VisualShape(CollisionShape):
             message = f"visual {self.kind}: color {color.tolist()} has entries outside 0 to 1"
             raise ModelError(message, name="color", value=color, limit=(0.0, 1.0))
         object.__setattr__(self, "color", color)
-
-    def _check_size(self, size: Array, owner: str) -> None:
-        """Accept shapes of any size, because they are for display only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +166,7 @@ class Mimic:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A connection of a child link to a parent link.
+    """A connection of a child link to a parent link: fixed, or moving with one degree of freedom.
 
     The joint frame has the pose `translation`, `rotation` in the parent link frame (URDF convention). The child link
     frame is the joint frame rotated about `axis` (revolute, continuous) or translated along it (prismatic).
@@ -259,16 +252,16 @@ class Joint:
 
     @property
     def unit(self) -> str:
-        """Unit of the position: "m" of a prismatic joint, else "rad"."""
+        """Unit of the joint's position: "m" for a prismatic joint, else "rad"."""
         return "m" if self.kind == "prismatic" else "rad"
 
     @property
     def effort_unit(self) -> str:
-        """Unit of the effort: "N" of a prismatic joint, else "N m"."""
+        """Unit of the joint's effort: "N" for a prismatic joint, else "N m"."""
         return "N" if self.kind == "prismatic" else "N m"
 
     def placed(self, position: float) -> tuple[Array, Array]:
-        """Return rotation and translation of the child link in the parent link at a joint position (rad or m)."""
+        """Return rotation (3, 3) and translation (3,), m, of the child link in the parent link at a joint position."""
         turn, shift = self.rotation, self.translation
         position = require.number(f"joint {self.name!r}: position", position)
         if self.kind == "prismatic":
@@ -315,7 +308,7 @@ def _check_inertia(inertia: Array, owner: str, any_inertia: bool) -> None:
 def urdf_text(
     name: str, links: Sequence[Link], joints: Sequence[Joint], tip: str | None, *, translation: Array, rotation: Array
 ) -> str:
-    """Return a robot as URDF text, from which `read_urdf` recreates links, joints and tip with all digits.
+    """Return a robot as URDF text, from which `read_urdf` recreates links, joints and tip exactly.
 
     A tip frame that differs from its link's frame, (3,) and (3, 3) as in Robot, becomes a link "LINK_tip" on a fixed
     joint. The tip is named by <tip link="NAME"/>, a non-standard element that other readers skip. Infinite limits are
@@ -345,14 +338,14 @@ def _write_link(robot: ElementTree.Element, link: Link) -> None:
     if link.mass or link.inertia.any() or link.center_of_mass.any():
         body = ElementTree.SubElement(element, "inertial")
         _write_origin(body, link.center_of_mass, np.eye(3))
-        ElementTree.SubElement(body, "mass", value=_text(link.mass))
-        moments = map(_text, link.inertia[np.triu_indices(3)])
+        ElementTree.SubElement(body, "mass", value=_join_numbers(link.mass))
+        moments = map(_join_numbers, link.inertia[np.triu_indices(3)])
         ElementTree.SubElement(body, "inertia", dict(zip(MOMENTS, moments, strict=True)))
     for visual in link.visuals:
         shape = _write_shape(element, "visual", visual)
         if visual.color is not None:
             material = ElementTree.SubElement(shape, "material", name="")
-            ElementTree.SubElement(material, "color", rgba=_text(visual.color))
+            ElementTree.SubElement(material, "color", rgba=_join_numbers(visual.color))
     for collision in link.collisions:
         _write_shape(element, "collision", collision)
 
@@ -364,13 +357,13 @@ def _write_joint(robot: ElementTree.Element, joint: Joint) -> None:
     ElementTree.SubElement(element, "child", link=joint.child)
     if not joint.moves:
         return
-    ElementTree.SubElement(element, "axis", xyz=_text(joint.axis))
+    ElementTree.SubElement(element, "axis", xyz=_join_numbers(joint.axis))
     limits = [limit for limit in ("effort", "velocity") if np.isfinite(getattr(joint, limit))]
     limits += ["lower", "upper"] if np.isfinite([joint.lower, joint.upper]).any() else []
     if limits:
-        ElementTree.SubElement(element, "limit", {limit: _text(getattr(joint, limit)) for limit in limits})
+        ElementTree.SubElement(element, "limit", {limit: _join_numbers(getattr(joint, limit)) for limit in limits})
     if (tie := joint.mimic) is not None:
-        numbers = {"multiplier": _text(tie.multiplier), "offset": _text(tie.offset)}
+        numbers = {"multiplier": _join_numbers(tie.multiplier), "offset": _join_numbers(tie.offset)}
         ElementTree.SubElement(element, "mimic", {"joint": tie.joint} | numbers)
 
 
@@ -378,19 +371,19 @@ def _write_shape(link: ElementTree.Element, tag: str, shape: CollisionShape) -> 
     element = ElementTree.SubElement(link, tag)
     _write_origin(element, shape.translation, shape.rotation)
     if shape.kind == "mesh":
-        sizes = {"filename": shape.file, "scale": _text(shape.size)}
+        sizes = {"filename": shape.file, "scale": _join_numbers(shape.size)}
     elif shape.kind == "box":
-        sizes = {"size": _text(shape.size)}
+        sizes = {"size": _join_numbers(shape.size)}
     else:
-        sizes = dict(zip(("radius", "length"), map(_text, shape.size), strict=False))  # a sphere has no length
+        sizes = dict(zip(("radius", "length"), map(_join_numbers, shape.size), strict=False))  # a sphere has no length
     ElementTree.SubElement(ElementTree.SubElement(element, "geometry"), shape.kind, sizes)
     return element
 
 
 def _write_origin(element: ElementTree.Element, translation: Array, rotation: Array) -> None:
-    """Write an <origin> element; omit rpy if there is no rotation, so that zeros stay exact."""
-    rpy = {} if np.array_equal(rotation, np.eye(3)) else {"rpy": _text(_rpy(rotation))}
-    ElementTree.SubElement(element, "origin", {"xyz": _text(translation)} | rpy)
+    """Add an <origin> element with a given pose to a URDF element; omit a zero rotation, so that zeros stay exact."""
+    rpy = {} if np.array_equal(rotation, np.eye(3)) else {"rpy": _join_numbers(_rpy(rotation))}
+    ElementTree.SubElement(element, "origin", {"xyz": _join_numbers(translation)} | rpy)
 
 
 def _rpy(rotation: Array) -> Array:
@@ -405,5 +398,5 @@ def _rpy(rotation: Array) -> Array:
     return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])
 
 
-def _text(numbers: Any) -> str:
+def _join_numbers(numbers: Any) -> str:
     return " ".join(repr(float(number)) for number in np.ravel(numbers))

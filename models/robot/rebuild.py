@@ -36,8 +36,10 @@ def lock_joints(robot: Robot, positions: Mapping[str, float]) -> Robot:
 def move_tip(
     robot: Robot, tip: str, translation: ArrayInput = (0.0, 0.0, 0.0), rotation: ArrayInput | None = None
 ) -> Robot:
-    """Return the robot with its tip at another frame, which is fixed in the link named `tip`."""
-    return replace(robot, tip=_robot(robot).link(tip).name, tip_translation=translation, tip_rotation=_turn(rotation))
+    """Return the robot with its tip at another frame, which is fixed in a given link."""
+    return replace(
+        robot, tip=_robot(robot).link(tip).name, tip_translation=translation, tip_rotation=_or_identity(rotation)
+    )
 
 
 def with_load(
@@ -75,7 +77,7 @@ def attach_tool(
     prefix: str = "",
     keep_tip: bool = False,
 ) -> Robot:
-    """Attach a tool, or any other robot, to a link by a fixed joint.
+    """Return the robot with a tool, or any other robot, attached to one of its links by a fixed joint.
 
     The joint is called "NAME_mount", NAME being the tool's root link with the prefix. The joints of the tool come last.
 
@@ -92,7 +94,7 @@ def attach_tool(
     added, robot = add_prefix(added, prefix), _robot(robot)
     require.flag(f"{owner}: keep_tip", keep_tip)
     shift = require.array(f"{owner}: translation", translation, (3,))
-    turn = require.rotation(f"{owner}: rotation", _turn(rotation))
+    turn = require.rotation(f"{owner}: rotation", _or_identity(rotation))
     if link is None:
         link = robot.tip_link
         shift, turn = robot.tip_translation + robot.tip_rotation @ shift, robot.tip_rotation @ turn
@@ -104,7 +106,7 @@ def attach_tool(
 def mount_on_rail(
     robot: Robot, axis: ArrayInput, lower: float, upper: float, *, velocity: float = np.inf, name: str = "rail"
 ) -> Robot:
-    """Mount a robot on a linear axis, such as a rail or a lift: a prismatic joint that moves its root link.
+    """Return the robot on a linear axis, such as a rail or a lift: a prismatic joint moves the link that was its root.
 
     The joint is called "NAME_joint" and comes first. The rail itself, the new root link, has neither mass nor shape.
 
@@ -127,7 +129,7 @@ def merge_robots(
     translations: Mapping[str, ArrayInput] | None = None,
     rotations: Mapping[str, ArrayInput] | None = None,
 ) -> Robot:
-    """Join several robots, such as arms, on one base; the tip of the first robot becomes the tip of the result.
+    """Return one robot that consists of several, such as arms, on a common base; its tip is that of the first of them.
 
     Args:
         base: A link or a robot that carries the arms.
@@ -204,7 +206,7 @@ def subtree(robot: Robot, root: str, tip: str | None = None) -> Robot:
 
 
 def prune(robot: Robot, keep: Iterable[str] = ()) -> Robot:
-    """Return the robot with only the links on the paths from the root to the tip and to the links of `keep`.
+    """Return the robot with only the links on the paths from the root to the tip and to given other links.
 
     The other branches are removed with their mass. To keep the mass, lock their joints and call `simplify` instead.
     Joints that mimic a removed joint stay coupled to each other, see `models.robot.tree.prune_joints`.
@@ -261,7 +263,7 @@ def simplify(robot: Robot, keep: Iterable[str] = ()) -> Robot:
 
 
 def _merge_links(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Link:
-    """Merge masses and shapes of other links, at given poses (rotation, translation), into a link and return it."""
+    """Return a link to which masses and shapes of others, at given poses (rotation, translation) in it, are added."""
     shapes = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.collisions)
     visuals = (shape.placed(turn, shift) for part, turn, shift in others for shape in part.visuals)
     link = replace(link, collisions=(*link.collisions, *shapes), visuals=(*link.visuals, *visuals))
@@ -281,7 +283,7 @@ def _merge_links(link: Link, others: Sequence[tuple[Link, Array, Array]]) -> Lin
     return replace(link, mass=mass, center_of_mass=center, inertia=inertia, any_inertia=any_inertia)
 
 
-def _turn(rotation: ArrayInput | None) -> ArrayInput:
+def _or_identity(rotation: ArrayInput | None) -> ArrayInput:
     return np.eye(3) if rotation is None else rotation
 
 

@@ -26,7 +26,7 @@ from models.robot.tree import (
     lock_with_followers,
     require_unique,
     reroot_tree,
-    ties_to_leaders,
+    resolve_mimics,
     tree_order,
 )
 from models.robot.urdf import Description, InertiaRule, Source, numbers_of, parse_urdf, read_urdf, text_of
@@ -69,25 +69,21 @@ class Robot:
         require_unique((link.name for link in links), "link")
         require_unique((joint.name for joint in joints), "joint")
         joints = lock_with_followers(joints, {})
-        edges = [(joint.name, joint.parent, joint.child) for joint in joints]
-        root = find_root([link.name for link in links], edges)
+        names, edges = [link.name for link in links], [(joint.name, joint.parent, joint.child) for joint in joints]
+        root = find_root(names, edges)
         object.__setattr__(self, "root", root)
         object.__setattr__(self, "links", links)
         object.__setattr__(self, "joints", tuple(joints[i] for i in tree_order(root, edges)))
-        object.__setattr__(self, "tip", self._find_tip())
+        if self.tip is None:
+            object.__setattr__(self, "tip", self._leaves[0] if len(self._leaves) == 1 else None)
+        elif not isinstance(self.tip, str) or self.tip not in names:
+            raise require.unknown("tip link", self.tip, names)
         object.__setattr__(
             self, "tip_translation", require.array(f"{owner}: tip_translation", self.tip_translation, (3,))
         )
         object.__setattr__(self, "tip_rotation", require.rotation(f"{owner}: tip_rotation", self.tip_rotation))
         warn_of_millimetres(f"{owner}: tip_translation", self.tip_translation)
         _ = self._limits  # raises if mimic joints leave a joint no position
-
-    def _find_tip(self) -> str | None:
-        names = [link.name for link in self.links]
-        if self.tip is not None and (not isinstance(self.tip, str) or self.tip not in names):
-            raise require.unknown("tip link", self.tip, names)
-        leaves = self._leaves
-        return self.tip if self.tip is not None else leaves[0] if len(leaves) == 1 else None
 
     @property
     def _leaves(self) -> list[str]:
@@ -118,7 +114,7 @@ class Robot:
         mimic: MimicRule = "couple",
         inertia: InertiaRule = "warn",
     ) -> Robot:
-        """Read a robot from a URDF description; `models.robot.urdf.read_urdf` documents contents and defaults.
+        """Read a robot from a URDF text or file; `models.robot.urdf.read_urdf` documents contents and default values.
 
         Args:
             source: The text, recognised by its first character "<", or the path of a file.
@@ -156,7 +152,7 @@ class Robot:
         lock: Mapping[str, float] | None = None,
         mimic: MimicRule = "couple",
     ) -> Robot:
-        """Read a robot from an MJCF description with the package `mujoco`, the extra `mujoco`.
+        """Read a robot in MJCF, the XML format of MuJoCo, from a text or file with the package `mujoco`.
 
         `models.robot.mjcf.read_mjcf` documents contents and defaults. `excluded_pairs` reads the pairs of bodies that
         the description excludes from contact.
@@ -188,7 +184,7 @@ class Robot:
         tip_translation: ArrayInput,
         tip_rotation: ArrayInput,
     ) -> Robot:
-        """Return the robot of a description; the arguments are those of from_urdf."""
+        """Return the robot of a URDF or MJCF description with the requested root, tip, locked and mimic joints."""
         require.choice("robot: mimic", mimic, get_args(MimicRule))
         joints = description.joints
         if mimic == "free":
@@ -200,7 +196,7 @@ class Robot:
                 raise require.unknown("joint", name, names)
         joints = lock_with_followers(joints, positions)
         if mimic == "lock":
-            joints = lock_with_followers(joints, {name: tie.offset for name, tie in ties_to_leaders(joints).items()})
+            joints = lock_with_followers(joints, {name: tie.offset for name, tie in resolve_mimics(joints).items()})
         links = description.links
         if root is not None:
             original = cls(links, joints, tip=links[0].name)  # validates the tree before it is rerooted
@@ -235,7 +231,7 @@ class Robot:
 
     @cached_property
     def couplings(self) -> dict[str, JointCoupling]:
-        """Coupling of each moving joint, including mimic joints, to an entry of the joint vector, by joint name."""
+        """How each moving joint's position follows from an entry of the joint vector, by joint name."""
         return joint_couplings(self.joints)
 
     @property
@@ -259,7 +255,7 @@ class Robot:
 
     @property
     def total_mass(self) -> float:
-        """Mass of all links, kg."""
+        """Mass of all links of the robot, kg."""
         return float(sum(link.mass for link in self.links))
 
     @cached_property
@@ -318,10 +314,6 @@ class Robot:
             path.append(self._joint_above[name])
             name = path[-1].parent
         return tuple(reversed(path))
-
-    def print(self) -> None:
-        """Print `str(robot)`: the tree with masses and finite limits."""
-        print(self)
 
     def __repr__(self) -> str:
         return f"<Robot {self.name!r}: {len(self.links)} links, {self.dof} degrees of freedom, tip on {self.tip}>"

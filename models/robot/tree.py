@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 from warnings import warn
 
 import numpy as np
@@ -26,7 +26,7 @@ from models.spatial import least_rotation
 
 
 def require_unique(names: Iterable[str], kind: str) -> None:
-    """Raise ModelError if a name occurs twice."""
+    """Raise ModelError if a name of a link or joint occurs twice among given names."""
     for name, count in Counter(names).items():
         if count > 1:
             message = f"{kind} name {name!r} is used more than once; give every {kind} its own name"
@@ -34,7 +34,7 @@ def require_unique(names: Iterable[str], kind: str) -> None:
 
 
 def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> str:
-    """Return the name of the only link that is not the child of a joint.
+    """Return the name of the root of a kinematic tree: the only link that is not the child of a joint.
 
     Args:
         links: Names of the links, unique.
@@ -71,7 +71,7 @@ def find_root(links: Sequence[str], edges: Sequence[tuple[str, str, str]]) -> st
 
 
 def tree_order(root: str, edges: Sequence[tuple[str, str, str]]) -> list[int]:
-    """Return the indices of the joints in an order in which every joint precedes its descendants.
+    """Return the indices of the joints of a kinematic tree in an order in which every joint precedes its descendants.
 
     The order of declaration is kept where possible.
 
@@ -154,8 +154,8 @@ class JointCoupling(NamedTuple):
     offset: float
 
 
-def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
-    """Return each mimic joint's coupling to the independent joint that it follows, directly or through others, by name.
+def resolve_mimics(joints: Sequence[Joint]) -> dict[str, Mimic]:
+    """Return each mimic joint's coupling to the independent joint at the end of its chain of mimicked joints, by name.
 
     Raises:
         ModelError: A joint that follows an unknown joint, or itself through others.
@@ -182,32 +182,32 @@ def ties_to_leaders(joints: Sequence[Joint]) -> dict[str, Mimic]:
 
 
 def lock_with_followers(joints: Sequence[Joint], positions: Mapping[str, float]) -> tuple[Joint, ...]:
-    """Lock the joints named in `positions` and the joints that mimic them; return all joints.
+    """Return all joints of a robot, with those named in `positions`, and those that mimic them, locked.
 
     Positions are in rad or m, by joint name. Other joints that cannot move are locked too: those that mimic a fixed
     joint (which counts as being at 0), or any joint with multiplier 0. A mimic joint that is locked by its own name is
     no longer coupled.
 
     Raises:
-        ModelError: As `ties_to_leaders` and `Joint.locked`.
+        ModelError: As `resolve_mimics` and `Joint.locked`.
     """
     joints = tuple(joint.locked(positions[joint.name]) if joint.name in positions else joint for joint in joints)
     locked_positions = {joint.name: float(positions.get(joint.name, 0.0)) for joint in joints if not joint.moves}
     followers = {
         name: tie.offset + tie.multiplier * locked_positions.get(tie.joint, 0.0)
-        for name, tie in ties_to_leaders(joints).items()
+        for name, tie in resolve_mimics(joints).items()
         if tie.joint in locked_positions or tie.multiplier == 0
     }
     return tuple(joint.locked(followers[joint.name]) if joint.name in followers else joint for joint in joints)
 
 
 def prune_joints(joints: Sequence[Joint], kept: Container[str]) -> tuple[Joint, ...]:
-    """Return the joints whose child link is in `kept`, with mimic joints coupled to joints that are kept.
+    """Return the joints whose child link is in `kept`; mimics of removed joints are coupled to remaining ones.
 
     Mimics of a removed joint stay coupled: to its leader if that is kept, else to the first of them, which becomes
     their leader. So the remaining joints can reach the same positions as before; limits of removed joints are lost.
     """
-    ties, result = ties_to_leaders(joints), []
+    ties, result = resolve_mimics(joints), []
     kept_joints = {joint.name for joint in joints if joint.child in kept}
     new_leaders: dict[str, str] = {}
     for joint in joints:
@@ -228,12 +228,13 @@ def joint_couplings(joints: Sequence[Joint]) -> dict[str, JointCoupling]:
     """Return, by joint name, the coupling of each moving joint to the vector of the independent joints' positions."""
     leaders = [joint.name for joint in joints if joint.moves and joint.mimic is None]
     columns = {name: column for column, name in enumerate(leaders)}
-    couplings = {joint.name: Mimic(joint.name) for joint in joints if joint.moves} | ties_to_leaders(joints)
+    couplings = {joint.name: Mimic(joint.name) for joint in joints if joint.moves} | resolve_mimics(joints)
     return {name: JointCoupling(columns[tie.joint], tie.multiplier, tie.offset) for name, tie in couplings.items()}
 
 
 def joint_limits(joints: Sequence[Joint], couplings: Mapping[str, JointCoupling]) -> dict[str, Array]:
-    """Return the limits "lower", "upper", "velocity" and "effort" of all independent joints. Shape (dof,) each.
+    """Return the limits "lower", "upper", "velocity" and "effort", by name, of all independent joints. Shape (dof,)
+    each.
 
     Mimic joints must keep their own limits, so they narrow positions and speed of the joint that they mimic. Effort is
     that of its actuator, which also drives them. A velocity or effort of 0 means, as in many URDF files, that
@@ -268,15 +269,12 @@ def joint_limits(joints: Sequence[Joint], couplings: Mapping[str, JointCoupling]
 X, Y, Z = np.eye(3)
 
 
-class JointChain(NamedTuple):
-    """Serial joints that replace a joint with several degrees of freedom, and the massless links between them."""
-
-    links: tuple[Link, ...]
-    joints: tuple[Joint, ...]
+Parts: TypeAlias = tuple[tuple[Link, ...], tuple[Joint, ...]]
+"""Links and joints of a robot."""
 
 
-def planar_joint(place: Joint, axis: Array | None) -> JointChain:
-    """Return a planar joint as a chain of the joints "NAME_x", "NAME_y" and "NAME_angle".
+def replace_planar(place: Joint, axis: Array | None, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
+    """Return the links and joints of a robot with a planar joint replaced by the joints NAME_x, NAME_y, NAME_angle.
 
     The plane is the one through the joint frame across the axis, the xy plane without an axis. For any other axis, the
     frame is turned by the least rotation that takes its z axis to the axis or the opposite direction.
@@ -284,49 +282,21 @@ def planar_joint(place: Joint, axis: Array | None) -> JointChain:
     Args:
         place: Fixed joint with the name, links and frame of the planar one.
         axis: Normal of the plane in the joint frame, of any nonzero length, shape (3,); or None.
+        links, joints: Of the robot, with that joint.
     """
     normal = Z if axis is None or not np.any(axis) else axis / np.linalg.norm(axis)
     normal = normal if normal[2] >= 0 else -normal
     tilt = least_rotation(Z, normal)
     steps: list[tuple[str, Kind, Array]] = [("x", "prismatic", tilt @ X), ("y", "prismatic", tilt @ Y)]
-    return _chain(place, [*steps, ("angle", "continuous", normal)])
+    return _replace_by_chain(place, [*steps, ("angle", "continuous", normal)], links, joints)
 
 
-def floating_joint(place: Joint) -> JointChain:
-    """Return a floating joint as a chain of the joints "NAME_x" to "NAME_z", "NAME_yaw", "NAME_pitch", "NAME_roll".
+def replace_floating(place: Joint, links: Sequence[Link], joints: Sequence[Joint]) -> Parts:
+    """Return the links and joints of a robot without a given floating joint: it becomes the base of the whole robot, or
+    a chain of six joints.
 
-    Args:
-        place: Fixed joint with the name, links and frame of the floating one.
-    """
-    slides: list[tuple[str, Kind, Array]] = [("x", "prismatic", X), ("y", "prismatic", Y), ("z", "prismatic", Z)]
-    return _chain(place, [*slides, ("yaw", "continuous", Z), ("pitch", "continuous", Y), ("roll", "continuous", X)])
-
-
-def _chain(place: Joint, steps: Sequence[tuple[str, Kind, Array]]) -> JointChain:
-    """Return a chain of joints with one degree of freedom each, from the suffix, kind and axis of each joint."""
-    links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
-    ends = [place.parent, *(link.name for link in links), place.child]
-    joints = []
-    for k, (suffix, kind, axis) in enumerate(steps):
-        frame = {"translation": place.translation, "rotation": place.rotation} if k == 0 else {}
-        joints.append(Joint(f"{place.name}_{suffix}", kind, ends[k], ends[k + 1], axis=axis, **frame))
-    return JointChain(tuple(links), tuple(joints))
-
-
-def replace_joint(
-    place: Joint, chain: JointChain, links: Sequence[Link], joints: Sequence[Joint]
-) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
-    """Return the links and joints of a robot after replacing one joint by a chain of joints."""
-    others = [(each,) if each is not place else chain.joints for each in joints]
-    return (*links, *chain.links), tuple(each for group in others for each in group)
-
-
-def replace_floating(
-    place: Joint, links: Sequence[Link], joints: Sequence[Joint]
-) -> tuple[tuple[Link, ...], tuple[Joint, ...]]:
-    """Return the links and joints of a robot without a floating joint, see `models.robot.urdf.read_urdf`.
-
-    If it connects the whole robot to a massless root, both are omitted; otherwise a chain replaces it.
+    If the joint connects the whole robot to a massless root, both are omitted. Otherwise it is replaced by the joints
+    NAME_x, NAME_y, NAME_z, NAME_yaw, NAME_pitch and NAME_roll.
 
     Args:
         place: Fixed joint with the name, links and frame of the floating one.
@@ -338,7 +308,9 @@ def replace_floating(
     base = next((link for link in links if link.name == place.parent), None)
     alone = all(joint is place for joint in joints if place.parent in (joint.parent, joint.child))
     if base is None or not alone or base.mass or base.inertia.any():
-        return replace_joint(place, floating_joint(place), links, joints)
+        steps: list[tuple[str, Kind, Array]] = [("x", "prismatic", X), ("y", "prismatic", Y), ("z", "prismatic", Z)]
+        steps += [("yaw", "continuous", Z), ("pitch", "continuous", Y), ("roll", "continuous", X)]
+        return _replace_by_chain(place, steps, links, joints)
     if base.collisions:
         message = (
             f"link {base.name!r}, from which joint {place.name!r} lets the robot float, is left out with its "
@@ -346,3 +318,21 @@ def replace_floating(
         )
         warn(ModelWarning(message, name=base.name, value=len(base.collisions)), stacklevel=4)
     return tuple(link for link in links if link is not base), tuple(joint for joint in joints if joint is not place)
+
+
+def _replace_by_chain(
+    place: Joint, steps: Sequence[tuple[str, Kind, Array]], links: Sequence[Link], joints: Sequence[Joint]
+) -> Parts:
+    """Return the links and joints of a robot with one joint replaced by several joints of one degree of freedom each.
+
+    `steps` has the suffix of the name, the kind and the axis of each new joint; the links between them are massless.
+    """
+    new_links = [Link(f"{place.name}_{suffix}_link") for suffix, *_ in steps[:-1]]
+    ends = [place.parent, *(link.name for link in new_links), place.child]
+    chain = [
+        Joint(f"{place.name}_{suffix}", kind, ends[k], ends[k + 1], axis=axis)
+        for k, (suffix, kind, axis) in enumerate(steps)
+    ]
+    chain[0] = replace(chain[0], translation=place.translation, rotation=place.rotation)
+    at = joints.index(place)
+    return (*links, *new_links), (*joints[:at], *chain, *joints[at + 1 :])

@@ -26,7 +26,7 @@ from models.checks import MAX_LISTED, Array, require, warn_of_degrees
 from models.errors import ModelError, ModelWarning
 from models.files import INPUT_LIMITS, parse_xml, read_regular
 from models.robot.parts import MOMENTS, SHAPES, CollisionShape, Joint, Kind, Link, Mimic, VisualShape
-from models.robot.tree import planar_joint, replace_floating, replace_joint
+from models.robot.tree import replace_floating, replace_planar
 
 Source: TypeAlias = str | os.PathLike[str]
 InertiaRule: TypeAlias = Literal["warn", "as_given"]
@@ -65,7 +65,7 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """The content of a URDF or MJCF file.
+    """Content of a robot description (URDF or MJCF): name, links, joints and tip.
 
     Attributes:
         name: Name of the robot; "robot" if the file has none.
@@ -80,7 +80,7 @@ class Description:
 
 
 def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
-    """Read a URDF description from a text or a file.
+    """Read the description of a robot in URDF, the XML format of ROS, from a text or a file.
 
     Missing data have the default values of the format: a zero origin, the axis x, no inertia. A revolute or prismatic
     joint whose <limit> has only one of lower and upper has 0 for the other; with neither, or without <limit>, it has no
@@ -120,7 +120,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
         if (kind := element.get("type")) == "floating":
             links, joints = replace_floating(joint, links, joints)
         elif kind == "planar":
-            links, joints = replace_joint(joint, planar_joint(joint, _axis(element)), links, joints)
+            links, joints = replace_planar(joint, _axis(element), links, joints)
     omission_warning(omitted, f"file {os.fspath(source)!r}" if is_file else "the given text")
     tip = _only(tree, "tip", "the robot")
     tip_name = None if tip is None else text_of(tip, "link", "the robot")
@@ -128,7 +128,7 @@ def read_urdf(source: Source, *, inertia: InertiaRule = "warn") -> Description:
 
 
 def omission_warning(omitted: Sequence[str], origin: str) -> None:
-    """Warn about the parts of a description that are left out, if there are any, and name its origin."""
+    """Warn about the parts of a robot description that are left out, if any, and name the description."""
     if omitted := list(dict.fromkeys(omitted)):
         more = f"; and {len(omitted) - MAX_LISTED} more" if len(omitted) > MAX_LISTED else ""
         message = f"{origin}: these parts are left out: {'; '.join(omitted[:MAX_LISTED])}{more}"
@@ -199,7 +199,7 @@ def parse_urdf(source: Source, omitted: list[str] | None = None) -> ElementTree.
 
 
 def parse_file(source: Source, kind: str, unbound: list[str] | None = None) -> tuple[ElementTree.Element, str]:
-    """Return the root element of an XML text or file, and a description of the source for messages.
+    """Return the root element of an XML text or file, and words that name the text or file in error messages.
 
     Args:
         source: The text, recognised by its first character "<", or the path of a file.
@@ -268,7 +268,7 @@ def _links(tree: ElementTree.Element, rule: InertiaRule, folder: str, omitted: l
 def _link_arguments(
     element: ElementTree.Element, folder: str, colors: dict[str | None, Array], omitted: list[str]
 ) -> dict[str, Any]:
-    """Return the arguments of Link for a <link> element.
+    """Return the arguments of `Link` that a <link> element of URDF describes.
 
     Args:
         element, folder: The element, and the folder of its file.
@@ -317,7 +317,7 @@ def _shape(
     omitted: list[str],
     **arguments: Any,
 ) -> list[_Shape]:
-    """Return the shape that a <collision> or <visual> element describes, or an empty list if the shape has no volume.
+    """Return a list of the shape that a <collision> or <visual> element describes, empty if it has no volume.
 
     Args:
         element, owner, folder: The element, its link, for messages, and the folder of its file.
@@ -385,7 +385,7 @@ def _axis(element: ElementTree.Element) -> Array | None:
 
 
 def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
-    """Return descriptions of unknown attributes in a <link> or <joint> that may stand for known attributes.
+    """Return descriptions of unknown attributes in a <link> or <joint> element that may be misspelt known ones.
 
     An attribute that resembles a missing known one, or nearly equals any known one, is taken for a misspelling.
     Other unknown attributes of an element that has all known ones are an extension and are skipped, like unknown
@@ -408,7 +408,7 @@ def _unknown_attributes(owner: ElementTree.Element) -> list[str]:
 
 
 def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
-    """Return position (3,), m, and rotation (3, 3) of an element's <origin>; warn if the angles look like degrees."""
+    """Return position (3,), m, and rotation (3, 3) of a URDF element's <origin>; warn if angles look like degrees."""
     origin = _only(element, "origin", owner)
     shift, angles = np.zeros(3), np.zeros(3)
     if origin is not None:
@@ -425,7 +425,7 @@ def origin_of(element: ElementTree.Element, owner: str) -> tuple[Array, Array]:
 
 
 def _only(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element | None:
-    """Return the only child element with a given tag, or None; raise ModelError naming `owner` if there are several."""
+    """Return the only child of an XML element with a given tag, or None; raise ModelError if there are several."""
     children = element.findall(tag)
     if len(children) > 1:
         message = f"{owner} has {len(children)} <{tag}> elements in <{element.tag}>; it takes one at most"
@@ -434,12 +434,12 @@ def _only(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Ele
 
 
 def name_of(element: ElementTree.Element) -> str:
-    """Return the attribute "name" of an element; raise ModelError if there is none."""
+    """Return the attribute "name" of an XML element; raise ModelError if it is missing or empty."""
     return text_of(element, "name", f"a <{element.tag}> of children {[child.tag for child in element]}")
 
 
 def child_of(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.Element:
-    """Return the only child element with a given tag; raise ModelError naming `owner` unless there is exactly one."""
+    """Return the only child of an XML element with a given tag; raise ModelError unless there is exactly one."""
     child = _only(element, tag, owner)
     if child is None:
         raise ModelError(f"{owner}: <{element.tag}> has no <{tag}>", name=tag, value=0, limit=1)
@@ -447,7 +447,7 @@ def child_of(element: ElementTree.Element, tag: str, owner: str) -> ElementTree.
 
 
 def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
-    """Return an attribute of an element as text; raise ModelError naming `owner` if it is missing or empty."""
+    """Return an attribute of an XML element as text; raise ModelError if it is missing or empty."""
     value = element.get(key)
     if not value:
         similar = [word for word in element.attrib if get_close_matches(word.casefold(), [key], 1)]
@@ -457,32 +457,28 @@ def text_of(element: ElementTree.Element, key: str, owner: str) -> str:
 
 
 def number_of(element: ElementTree.Element, key: str, owner: str) -> float:
-    """Return an attribute of an element as one number, possibly inf or nan; raise ModelError if it is no number."""
-    return _numbers(element, key, owner, 1)[0]
+    """Return an attribute of an XML element as one number, possibly inf or nan; raise ModelError if it is no number."""
+    return float(numbers_of(element, key, owner, 1, finite=False)[0])
 
 
-def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int) -> Array:
-    """Return an attribute of an element as `count` finite numbers; raise ModelError for any other content."""
-    values = _numbers(element, key, owner, count)
-    if not all(map(isfinite, values)):
-        raise ModelError(f"{_where(element, key, owner)} is not finite", name=key, value=element.get(key))
-    return np.array(values)
+def numbers_of(element: ElementTree.Element, key: str, owner: str, count: int, *, finite: bool = True) -> Array:
+    """Return an attribute of an XML element as an array of `count` numbers; raise ModelError for any other content.
 
-
-def _numbers(element: ElementTree.Element, key: str, owner: str, count: int) -> list[float]:
+    Args:
+        owner: Description of the element, for messages.
+        finite: Refuse inf and nan as well.
+    """
     text = text_of(element, key, owner)
+    place = f"{owner}: {key}={text!r} of <{element.tag}>"
     try:
         if "_" in text:  # Python would read 1_0 as ten
             raise ValueError
         values = [float(word) for word in text.split()]
     except ValueError:
         hint = f": {XACRO}" if "${" in text or "$(" in text else ""
-        raise ModelError(f"{_where(element, key, owner)} is not numeric{hint}", name=key, value=text) from None
+        raise ModelError(f"{place} is not numeric{hint}", name=key, value=text) from None
     if len(values) != count:
-        message = f"{_where(element, key, owner)} has {len(values)} numbers, not {count}"
-        raise ModelError(message, name=key, value=text, limit=count)
-    return values
-
-
-def _where(element: ElementTree.Element, key: str, owner: str) -> str:
-    return f"{owner}: {key}={element.get(key)!r} of <{element.tag}>"
+        raise ModelError(f"{place} has {len(values)} numbers, not {count}", name=key, value=text, limit=count)
+    if finite and not all(map(isfinite, values)):
+        raise ModelError(f"{place} is not finite", name=key, value=text)
+    return np.array(values)

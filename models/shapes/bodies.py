@@ -162,7 +162,7 @@ def _primitive_body(link: Link, shape: CollisionShape) -> Body:
 
 
 def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, float], float]:
-    """Return the smallest capsule that encloses a cylinder.
+    """Return volume, size and protrusion of the smallest capsule that encloses a cylinder.
 
     With the capsule radius R, the rims of the cylinder of radius r lie on the caps, which begin sqrt(R^2 - r^2) before
     the cylinder's ends.
@@ -184,7 +184,7 @@ def capsule_around(radius: float, length: float) -> tuple[float, tuple[float, fl
 
 
 def _mesh_bodies(link: Link, shape: CollisionShape, number: int, folders: Folders) -> list[Body]:
-    """Return the bodies that cover a mesh of a link, in the frame of the link."""
+    """Return the collision bodies (capsules or a box) that cover a mesh of a link, in the frame of the link."""
     path = find_mesh(shape.file, shape.folder or None, folders)
     if path is None:
         message = (
@@ -252,7 +252,7 @@ class RigidParts:
 
     def path(self, first: str, second: str) -> tuple[list[JointStep], list[JointStep]]:
         """Return the joints between two rigid parts: those up to the part that carries both parts, then those down."""
-        up, down = self._above(first), self._above(second)
+        up, down = self._joints_above(first), self._joints_above(second)
         while up and down and up[-1] is down[-1]:
             up, down = up[:-1], down[:-1]
         return up, down[::-1]
@@ -262,8 +262,8 @@ class RigidParts:
         up = self.path(first, second)[0]
         return up[-1].above if up else first
 
-    def _above(self, part: str) -> list[JointStep]:
-        """Return the moving joints from a rigid part up to the root."""
+    def _joints_above(self, part: str) -> list[JointStep]:
+        """Return the moving joints from a rigid part up to the root, the nearest first."""
         steps = []
         while part in self.step:
             steps.append(self.step[part])

@@ -29,25 +29,22 @@ PARALLEL = 1e-18
 
 
 class SegmentCore(NamedTuple):
-    """Core of a sphere (its centre) or of a capsule (the two ends of its segment)."""
+    """The point or segment from which a ball or capsule arises by sweeping a sphere: one point, or the two ends."""
 
     points: tuple[Triple, ...]
 
 
 class BoxCore(NamedTuple):
-    """Core of a box: its centre, axes and half edge lengths."""
+    """A box in distance formulas, given by its centre, axes and half edge lengths."""
 
     centre: Triple
     axes: tuple[Triple, ...]
     half: Triple
 
 
-def no_stop(value: Expression) -> Expression:
-    """Return the value unchanged; used as `StopGradient` where all derivatives are kept."""
+def keep_gradient(value: Expression) -> Expression:
+    """Return an expression unchanged; it takes the place of `StoppedGradients` where all derivatives are kept."""
     return value
-
-
-# ---- vectors -------------------------------------------------------------------------------------------------------
 
 
 def triple(entries: Iterable[Expression]) -> Triple:
@@ -85,9 +82,6 @@ def _clip(x: Expression, low: Expression = 0.0, high: Expression = 1.0) -> Expre
     return ca.fmin(ca.fmax(x, low), high)
 
 
-# ---- from squares to distances, from gaps to depths -----------------------------------------------------------------
-
-
 def _root(square: Expression, excess: float = 0.0) -> Expression:
     """Return a distance from its square, or a lower bound of it if the square is too large by up to `excess` > 0."""
     root = ca.sqrt(square + (excess or KINK**2))
@@ -119,9 +113,6 @@ def largest_of(gaps: Sequence[Expression], rounding: float, stop_gradient: StopG
         return largest
     largest, width = stop_gradient(largest), rounding / log(len(gaps))
     return largest + width * ca.log(sum(ca.exp((gap - largest) * (1 / width)) for gap in gaps)) - rounding
-
-
-# ---- points and segments --------------------------------------------------------------------------------------------
 
 
 def distance_of_segments(
@@ -159,9 +150,6 @@ def _segments_square(gap: Triple, u: Triple, v: Triple, weight: float, stop_grad
     difference = along(along(gap, s, u), -t, v)
     square = dot(difference, difference)
     return square + weight * ((s - 0.5) ** 2 + (t - 0.5) ** 2) if weight else square
-
-
-# ---- beside a box ---------------------------------------------------------------------------------------------------
 
 
 def distance_to_box(
@@ -275,18 +263,14 @@ def _segment_box_square(
             pull, rise = pull + taken * (u[k] * (middle[k] - nearest[k])), rise + taken * squares[k]
         remaining = [keep * (1 - taken) for keep, taken in zip(remaining, added, strict=True)]
         s = _clip(-pull / rise, -0.5, 0.5)
-        s = _without_derivative(s) if step < 2 else stop_gradient(s)
+        # rounded to a multiple of 2^-53, so that its derivative is zero
+        s = ca.floor(s * 2.0**53) / 2.0**53 if step < 2 else stop_gradient(s)
     square = _point_box_square(along(middle, s, u), half, stop_gradient)
     return square + weight * s**2 if weight else square
 
 
-def _without_derivative(s: Expression) -> Expression:
-    """Return a position along a segment, rounded to a multiple of 2^-53 so that its derivative is zero."""
-    return ca.floor(s * 2.0**53) / 2.0**53
-
-
 def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
-    """Return 1 for the component of `over` whose magnitude is largest relative to its size, 0 for the others."""
+    """Return, for each of three components, 1 if its magnitude is the largest relative to its size, else 0."""
     a, b, c = (ca.fabs(x) for x in over)
     first = (a * sizes[1] >= b * sizes[0]) * (a * sizes[2] >= c * sizes[0])
     second = (1 - first) * (b * sizes[2] >= c * sizes[1])
@@ -296,7 +280,7 @@ def _largest_indicator(over: Triple, sizes: Triple) -> list[Expression]:
 def _edge_squares(
     middle: Triple, axes: list[Triple], halves: Sequence[Expression], half: Triple, stop_gradient: StopGradient
 ) -> list[Expression]:
-    """Return the squared distances of the edges of one box from another box.
+    """Return the squared distances of the twelve edges of a box from another box, in whose axes the first is given.
 
     Together with the corners of the other box they suffice: from a closest point inside a face one can slide along the
     face, at constant distance, to a corner or an edge.
@@ -312,7 +296,7 @@ def _edge_squares(
 
 
 def _corner_squares(first: BoxCore, second: BoxCore, stop_gradient: StopGradient) -> list[Expression]:
-    """Return the squared distances of the corners of one box from another box."""
+    """Return the squared distances of the eight corners of the first box from the second box."""
     centre, axes, halves = _in_box_axes(first, second)
     reaches = [triple(h * part for part in axis) for axis, h in zip(axes, halves, strict=True)]
     squares = []

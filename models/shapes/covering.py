@@ -80,7 +80,7 @@ CoverShape: TypeAlias = Capsule | Box
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """One of the shapes that cover a mesh.
+    """A capsule or box that, alone or together with others, covers a mesh, and how far it protrudes.
 
     Attributes:
         shape: Capsule or box in the frame of the mesh.
@@ -92,7 +92,7 @@ class Cover:
 
 
 def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
-    """Return capsules, or one box, that together contain every point of a mesh.
+    """Return capsules, or one box, that together contain every point of a triangle mesh.
 
     The result is deterministic. It is cached in a file by the content of the mesh, see `models.files`.
 
@@ -119,9 +119,10 @@ def cover(vertices: ArrayInput, faces: ArrayInput) -> tuple[Cover, ...]:
 
 def fit_cover(triangles: Array) -> tuple[Cover, ...]:
     """Compute the capsules, or the box, that cover triangles of shape (n, 3, 3), m, without using the cache."""
-    middle, size = _centre_and_size(triangles.reshape(-1, 3))
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    middle, size = (low + high) / 2, max(float((high - low).max()), 1e-12)
     unit = (triangles - middle) / size
-    points = _points(unit)
+    points = unit.reshape(-1, 3)
     hull = _hull_vertices(points)
     extreme_points = points[_extreme_indices(points, _principal_axes(points))]
     grid, box_volume = _grid(points)
@@ -130,7 +131,7 @@ def fit_cover(triangles: Array) -> tuple[Cover, ...]:
     first_volume = first_overhang = 1.0
     while True:
         shapes: list[CoverShape] = [
-            _enclosing_capsule(each, _points(part)) for each, part in zip(capsules, parts, strict=True)
+            _enclosing_capsule(each, part.reshape(-1, 3)) for each, part in zip(capsules, parts, strict=True)
         ]
         volume, overhang = _covered_share(shapes, grid), max(_overhang(each, hull) for each in shapes)
         if not choices:
@@ -144,11 +145,12 @@ def fit_cover(triangles: Array) -> tuple[Cover, ...]:
         if len(sides) < 2:
             break
         parts[k : k + 1] = sides
-        capsules[k : k + 1] = [_fit_capsule(_points(side)) for side in sides]
+        capsules[k : k + 1] = [_fit_capsule(side.reshape(-1, 3)) for side in sides]
     shapes = min(choices, key=lambda each: each[0])[1]
     box = _fit_box(points, extreme_points)
     if float(np.prod(box.size)) < SETTINGS.worth_a_box * box_volume * _covered_share(shapes, grid):
-        shapes = [_enclosing_box(box, points)]
+        beyond = max(0.0, float(exceedance(box, points).max())) + SETTINGS.growth  # certainly contains every point
+        shapes = [Box(box.size + 2 * beyond, box.position, box.rotation)]
     return tuple(Cover(_to_mesh_units(each, middle, size), size * _overhang(each, hull)) for each in shapes)
 
 
@@ -160,17 +162,13 @@ def exceedance(shape: CoverShape, points: Array) -> Array:
     return np.asarray(own.max(axis=1))
 
 
-# ------------------------------------------------------------------------------------------------- one capsule
-
-
 def _fit_capsule(points: Array) -> Capsule:
     """Return a capsule of nearly least volume around points; the optimisation uses only the extreme points."""
     frame = _principal_axes(points)
     extreme_points = points[_extreme_indices(points, frame)]
     bases = _bases(np.concatenate([frame.T, _sphere_points(SETTINGS.directions, half=True) @ frame.T]))
-    volumes, centres, excess = _approximate_capsules(extreme_points, bases)
-    k = int(volumes.argmin())
-    own, start = extreme_points @ bases[k], np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])])
+    start, basis, volume = _approximate_capsule(extreme_points, bases)
+    own = extreme_points @ basis
     result = scipy.optimize.minimize(
         lambda x: _evaluate_capsule(own, x)[0],
         start,
@@ -178,14 +176,14 @@ def _fit_capsule(points: Array) -> Capsule:
         options={
             "initial_simplex": start + np.vstack([np.zeros(5), np.diag(SETTINGS.simplex)]),
             "xatol": SETTINGS.parameter_tolerance,
-            "fatol": SETTINGS.volume_tolerance * float(volumes[k]),
+            "fatol": SETTINGS.volume_tolerance * volume,
         },
     )
-    return _enclosing_capsule(_capsule_from_parameters(extreme_points, result.x, bases[k]), points)
+    return _enclosing_capsule(_capsule_from_parameters(extreme_points, result.x, basis), points)
 
 
 def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, float, float, Array, Array]:
-    """Return the capsule around points that parameters describe: volume, radius, ends, axis, and a point of the axis.
+    """Return volume, radius, ends, axis and a point of the axis of the capsule around points for given parameters.
 
     The parameters, shape (5,), are two slopes of the axis (near z), its position across, and the root of the excess
     radius. A radius larger than the enclosing cylinder's lets the caps begin earlier.
@@ -206,8 +204,11 @@ def _evaluate_capsule(points: Array, parameters: Array) -> tuple[float, float, f
     return volume, radius, low, high, axis, side * x + other * y
 
 
-def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Array]:
-    """Return approximate capsules around points along k axes: volumes, axis positions, and radii / least radii - 1."""
+def _approximate_capsule(points: Array, bases: Array) -> tuple[Array, Array, float]:
+    """Return a small capsule around points whose axis is the last axis of one of k given bases, shape (k, 3, 3).
+
+    It is given by its parameters in that basis, as `_evaluate_capsule` takes them, the basis, and the volume.
+    """
     x, y, along = np.einsum("pi,kij->jkp", points, bases)
     centre_x, centre_y = ((part.min(axis=1) + part.max(axis=1)) / 2 for part in (x, y))
     rows = np.arange(len(bases))
@@ -223,14 +224,10 @@ def _approximate_capsules(points: Array, bases: Array) -> tuple[Array, Array, Ar
     length = np.maximum((along - caps).max(axis=2) - (along + caps).min(axis=2), 0)
     volumes = np.pi * radius**2 * (length + 4 / 3 * radius)
     best = volumes.argmin(axis=0)
-    return volumes[best, rows], np.stack([centre_x, centre_y], axis=1), np.array(SETTINGS.radii)[best] - 1
-
-
-def _approximate_capsule(points: Array, bases: Array) -> Capsule:
-    """Return the smallest approximate capsule around points whose axis is the last axis of one of k given bases."""
-    volumes, centres, excess = _approximate_capsules(points, bases)
+    volumes = volumes[best, rows]
     k = int(volumes.argmin())
-    return _capsule_from_parameters(points, np.array([0.0, 0.0, *centres[k], np.sqrt(excess[k])]), bases[k])
+    excess = np.array(SETTINGS.radii)[best[k]] - 1
+    return np.array([0.0, 0.0, centre_x[k], centre_y[k], np.sqrt(excess)]), bases[k], float(volumes[k])
 
 
 def _capsule_from_parameters(points: Array, parameters: Array, basis: Array) -> Capsule:
@@ -252,15 +249,12 @@ def _segment_distances(points: Array, start: Array, end: Array) -> Array:
     return np.asarray(np.sqrt(square[:, 0] + square[:, 1] + square[:, 2]))  # faster than a norm of three columns
 
 
-# ------------------------------------------------------------------------------------------------------- splits
-
-
 def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Array) -> list[Array]:
     """Return the two parts of a mesh, split by a plane, whose covering capsules have the least total volume.
 
     If no plane splits the part, the part itself is returned.
     """
-    points = _points(part)
+    points = part.reshape(-1, 3)
     frame = _principal_axes(points)
     axes = list(frame.T)
     along = np.asarray(capsule.end) - np.asarray(capsule.start)
@@ -275,11 +269,11 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
         return 1 - (1 - _covered_share(fits, free)) * len(free) / len(grid)
 
     def share_of_split(k: int, level: float) -> float:
-        sides = [_points(side) for side in split_triangles(triangles, axes[k], level) if len(side)]
+        sides = [side.reshape(-1, 3) for side in split_triangles(triangles, axes[k], level) if len(side)]
         if len(sides) < 2:
             return np.inf
         points = [side[_extreme_indices(side, frame, SETTINGS.trial_extremes)] for side in sides]
-        return covered([_approximate_capsule(each, bases) for each in points])
+        return covered([_capsule_from_parameters(each, *_approximate_capsule(each, bases)[:2]) for each in points])
 
     spans = [(float((points @ axis).min()), float(np.ptp(points @ axis))) for axis in axes]
     levels = [(k, low + share * span) for k, (low, span) in enumerate(spans) for share in SETTINGS.cuts]
@@ -292,7 +286,7 @@ def _best_split(part: Array, others: list[Capsule], capsule: Capsule, grid: Arra
 
 
 def _grid(points: Array) -> tuple[Array, float]:
-    """Return sample points in a box 1.5 times as large as the extent of given points, and the volume of the box.
+    """Return sample points spread evenly in a box 1.5 times as large as given points' extent, and the box's volume.
 
     They serve to estimate covered volumes: the box contains nearly all of the covers. Shape (k, 3).
     """
@@ -317,7 +311,7 @@ def _representative_triangles(triangles: Array, frame: Array) -> Array:
         return triangles
     length = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
     largest = triangles[np.argsort(-length, kind="stable")[: SETTINGS.max_triangles]]
-    points = _points(triangles)
+    points = triangles.reshape(-1, 3)
     return np.concatenate([largest, np.repeat(points[_extreme_indices(points, frame)][:, None], 3, axis=1)])
 
 
@@ -339,9 +333,6 @@ def split_triangles(triangles: Array, axis: Array, level: float) -> tuple[Array,
         one_side.append(np.stack([a, ab, ac], axis=1))
         other_side += [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
     return np.concatenate(low), np.concatenate(high)
-
-
-# ------------------------------------------------------------------------------------------------------- a box
 
 
 def _fit_box(points: Array, extreme_points: Array) -> Box:
@@ -379,16 +370,6 @@ def _fit_box(points: Array, extreme_points: Array) -> Box:
     return Box(np.maximum(high - low, SETTINGS.thinnest), frame @ ((low + high) / 2), frame)
 
 
-def _enclosing_box(box: Box, points: Array) -> Box:
-    """Return the box with its edges lengthened until it certainly contains every given point."""
-    return Box(
-        box.size + 2 * max(0.0, float(exceedance(box, points).max())) + 2 * SETTINGS.growth, box.position, box.rotation
-    )
-
-
-# --------------------------------------------------------------------------------------------------- overhang
-
-
 def _overhang(shape: CoverShape, hull: Array) -> float:
     """Return how far a shape extends beyond a convex hull, sampled at points of its surface, m."""
     around = _sphere_points(SETTINGS.samples)
@@ -403,25 +384,13 @@ def _overhang(shape: CoverShape, hull: Array) -> float:
 
 
 def _hull_vertices(points: Array) -> Array:
-    """Return the vertices of the convex hull; of a large mesh, only extreme points, which overestimates overhangs."""
+    """Return the vertices of the convex hull of a mesh's points; of a large mesh, only some extreme points."""
     if len(points) > SETTINGS.max_triangles:
         points = points[_extreme_indices(points, _principal_axes(points), 2 * SETTINGS.extremes)]
     try:
         return convex_hull(points).vertices
     except ModelError:  # flat: no hull with a volume
         return points
-
-
-# ---------------------------------------------------------------------------------------------------- helpers
-
-
-def _points(triangles: Array) -> Array:
-    return triangles.reshape(-1, 3)
-
-
-def _centre_and_size(points: Array) -> tuple[Array, float]:
-    low, high = points.min(axis=0), points.max(axis=0)
-    return (low + high) / 2, max(float((high - low).max()), 1e-12)
 
 
 def _principal_axes(points: Array) -> Array:
@@ -460,7 +429,7 @@ def _extreme_indices(points: Array, frame: Array, count: int = SETTINGS.extremes
 
 
 def _to_mesh_units(shape: CoverShape, middle: Array, size: float) -> CoverShape:
-    """Return a shape of the normalised mesh in the mesh's units, enlarged by a bound of the rounding errors."""
+    """Return a shape of a mesh scaled to size 1 in the mesh's own units, enlarged by a bound of the rounding errors."""
     margin = 16 * float(np.finfo(float).eps * (np.abs(middle).max() + size))
     if isinstance(shape, Capsule):
         return Capsule(shape.radius * size + margin, middle + size * shape.start, middle + size * shape.end)

@@ -23,6 +23,7 @@ import numpy as np
 from models.checks import Array, require
 from models.errors import ModelError
 from models.files import INPUT_LIMITS
+from models.robot.kinematics import checked_placement
 from models.shapes.cores import (
     BoxCore,
     SegmentCore,
@@ -34,8 +35,8 @@ from models.shapes.cores import (
     distance_to_box,
     dot,
     in_axes,
+    keep_gradient,
     largest_of,
-    no_stop,
     smooth_abs,
     subtract,
     triple,
@@ -46,7 +47,7 @@ from models.spatial import Expression, Frame, expression, on_scalars
 
 
 class HullCore(NamedTuple):
-    """Core of a mesh or a cylinder: a convex hull in its own axes."""
+    """A mesh or cylinder in distance formulas: a convex hull, with the centre and axes of its pose."""
 
     centre: Triple
     axes: tuple[Triple, ...]
@@ -54,7 +55,7 @@ class HullCore(NamedTuple):
 
 
 class PlaneCore(NamedTuple):
-    """Core of a half-space: its boundary plane, given by a point and the outward normal."""
+    """The boundary plane of a half-space in distance formulas, given by a point and the outward normal."""
 
     point: Triple
     normal: Triple
@@ -76,7 +77,7 @@ def distance(
     *,
     rounding: float = 0.0,
 ) -> Expression:
-    """Return the signed distance of two shapes as an expression, m. Shape (1, 1).
+    """Return the signed distance of two shapes, at poses that may be symbols, as an expression, m. Shape (1, 1).
 
     The distance is negative for overlapping shapes; its gradient points out of the overlap. Without rounding it is
     exact for spheres, capsules, boxes and half-spaces, and for a mesh or a cylinder (as its prism) beside a half-space.
@@ -113,7 +114,10 @@ def distance(
         function = pair_function(type(first), type(second), rounding)
         return function(column(first, first_frame), column(second, second_frame))
     require.nonnegative("distance: rounding", rounding, unit="m")
-    places = [*_placement(first_frame, "first_frame"), *_placement(second_frame, "second_frame")]
+    places = [
+        *checked_placement(first_frame, "distance: first_frame"),
+        *checked_placement(second_frame, "distance: second_frame"),
+    ]
     return expression(_distance_with_hull(*places, first=first, second=second, rounding=float(rounding)))
 
 
@@ -128,7 +132,7 @@ def column(shape: Shape, frame: Frame | None = None) -> Expression:
     """
     checked_shape("column: shape", shape)
     _check_kind(type(shape), "shape")
-    turn, place = _placement(frame, "frame")
+    turn, place = checked_placement(frame, "distance: frame")
     if isinstance(shape, Sphere | Capsule):
         return ca.vertcat(*(place + ca.mtimes(turn, ca.DM(point)) for point in shape.core), shape.radius)
     if isinstance(shape, HalfSpace):
@@ -158,7 +162,7 @@ def pair_function(first: type[Shape], second: type[Shape], rounding: float = 0.0
 
 
 def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, count: int) -> Any:
-    """Return the CasADi Function that computes the distances of n pairs of shapes, and their gradients as wrenches.
+    """Return the CasADi Function from n pairs of shapes to their distances and, as wrenches, the gradients of these.
 
     Pairs are rows of the inputs: columns (see `column`) have shapes (n, COLUMNS[kind]), distances (n, 1), m, and
     wrenches (n, 6). A wrench w is (moment about the world's origin, force); the distance changes at the rate w . (first
@@ -180,7 +184,7 @@ def pair_wrenches(first: type[Shape], second: type[Shape], rounding: float, coun
 @cache
 def _pair_function(kinds: tuple[Any, Any], rounding: float) -> Any:
     columns = [ca.SX.sym(kind.__name__, COLUMNS[kind]) for kind in kinds]
-    gap = _distance_of_columns(kinds, list(map(ca.vertsplit, columns)), rounding, no_stop)
+    gap = _distance_of_columns(kinds, list(map(ca.vertsplit, columns)), rounding, keep_gradient)
     return ca.Function("_".join(kind.__name__ for kind in kinds), columns, [ca.cse(gap)])
 
 
@@ -207,7 +211,7 @@ def _pair_wrenches(kinds: tuple[Any, Any], rounding: float, count: int) -> Any:
 
 
 class StoppedGradients:
-    """Expressions that differentiation treats as constants, because symbols replace them until they are restored.
+    """Store of expressions that differentiation treats as constants, since symbols stand for them until restored.
 
     A distance is a minimum over positions or a maximum over directions, whose motion does not change it to first order
     (envelope theorem).
@@ -226,7 +230,7 @@ class StoppedGradients:
         return self._symbols[-1]
 
     def restore(self, expressions: list[Expression]) -> list[Expression]:
-        """Return expressions in which the values that symbols had replaced are restored."""
+        """Return expressions in which the symbols are replaced by the expressions that they stand for."""
         return list(ca.substitute_inplace(self._symbols, self._values, expressions)[1])
 
 
@@ -250,27 +254,10 @@ def soft_minimum(values: Sequence[Expression], width: float) -> Expression:
     return least - width * ca.log(ca.sum1(ca.exp((least - stacked) / width)))
 
 
-def _placement(frame: Frame | None, what: str) -> tuple[Expression, Expression]:
-    if frame is None:
-        return ca.DM.eye(3), ca.DM(3, 1)
-    require.instance(f"distance: {what}", frame, tuple)
-    parts = tuple(map(expression, frame))
-    shapes = [part.shape for part in parts]
-    if shapes != [(3, 3), (3, 1)]:
-        message = f"distance: {what} has parts of shapes {shapes}, expected (3, 3) and (3, 1)"
-        raise ModelError(message, name=what, value=shapes, limit=[(3, 3), (3, 1)])
-    if any(isinstance(part, ca.DM) and not part.is_regular() for part in parts):
-        raise ModelError(f"distance: {what} is not finite", name=what, value=frame)
-    return parts
-
-
 def _check_kind(kind: Any, what: str) -> None:
     if not isinstance(kind, type) or kind not in COLUMNS:
         names = ", ".join(known.__name__ for known in COLUMNS)
         raise ModelError(f"distance: {what} must be one of {names}, not {kind!r}", name=what, value=kind, limit=names)
-
-
-# ---- cores --------------------------------------------------------------------------------------------------------
 
 
 def _distance_of_columns(
@@ -302,7 +289,9 @@ def _distance_with_hull(*poses: Expression, first: Shape, second: Shape, roundin
     elif isinstance(other, PlaneCore):
         gap = _least_height(one, other.normal, other.point, rounding)
     else:
-        gap = largest_of([*_face_gaps(one, other, rounding), *_face_gaps(other, one, rounding)], rounding, no_stop)
+        gap = largest_of(
+            [*_face_gaps(one, other, rounding), *_face_gaps(other, one, rounding)], rounding, keep_gradient
+        )
     return gap - (first.swept_radius + second.swept_radius)
 
 
@@ -315,7 +304,7 @@ def _core_in_frame(shape: Shape, turn: Expression, place: Expression) -> Core:
 
 
 def _core_of_column(kind: type[Shape], entries: Sequence[Expression]) -> Core:
-    """Return the core of a shape of the given kind from the column that describes it."""
+    """Return the point, segment, box or plane of distance formulas from the column of numbers of a shape."""
     parts = [triple(entries[3 * k : 3 * k + 3]) for k in range(len(entries) // 3)]
     if kind is Box:
         return BoxCore(parts[0], tuple(parts[1:4]), parts[4])
@@ -331,11 +320,8 @@ def _as_number(entry: Expression) -> Expression:
     return float(entry) if entry.is_constant() else entry
 
 
-# ---- half-spaces and hulls ------------------------------------------------------------------------------------------
-
-
 def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) -> Expression:
-    """Return the least height of a core above a plane, or a lower bound smoothed with the width `rounding`."""
+    """Return the least height of a segment, box or hull above a plane, or a lower bound smoothed over `rounding`."""
     if isinstance(core, SegmentCore):
         heights = [dot(normal, subtract(end, point)) for end in core.points]
         middle, reaches = sum(heights) / len(heights), [(heights[-1] - heights[0]) / 2][: len(heights) - 1]
@@ -343,21 +329,18 @@ def _least_height(core: Core, normal: Triple, point: Triple, rounding: float) ->
         assert not isinstance(core, PlaneCore)
         middle, shares = dot(normal, subtract(core.centre, point)), in_axes(normal, core.axes)
         if isinstance(core, HullCore):
-            return middle + _smooth_minimum([dot(shares, _scalars(vertex)) for vertex in core.hull.vertices], rounding)
+            heights = [dot(shares, _scalars(vertex)) for vertex in core.hull.vertices]
+            smooth = rounding > 0 and len(heights) > 1
+            return middle + (
+                soft_minimum(heights, rounding / log(len(heights))) if smooth else reduce(ca.fmin, heights)
+            )
         reaches = [h * share for h, share in zip(core.half, shares, strict=True)]
     slack = rounding / len(reaches) if reaches else 0.0
     return middle - sum(smooth_abs(reach, slack) for reach in reaches)
 
 
-def _smooth_minimum(values: Sequence[Expression], rounding: float) -> Expression:
-    """Return the smallest of several values, or a smooth lower bound that is at most `rounding` smaller."""
-    if rounding == 0 or len(values) == 1:
-        return reduce(ca.fmin, values)
-    return soft_minimum(values, rounding / log(len(values)))
-
-
 def _face_gaps(first: Core, second: Core, rounding: float) -> list[Expression]:
-    """Return the gaps to the second core along the face normals of the first core; an empty list for a segment."""
+    """Return the gaps between two convex bodies along the face normals of the first, of which a segment has none."""
     if isinstance(first, BoxCore):
         signed = [(axis, side, h) for axis, h in zip(first.axes, first.half, strict=True) for side in (-1.0, 1.0)]
         normals = [(triple(side * part for part in axis), h) for axis, side, h in signed]
@@ -394,7 +377,7 @@ def _edge_directions(hull: Hull) -> Array:
 
 
 def _in_frame(core: Core, centre: Triple, axes: Sequence[Triple]) -> Core:
-    """Return the core in the coordinates of a frame with the given centre and axes."""
+    """Return a segment, box or hull of distance formulas in the coordinates of a frame with given centre and axes."""
     if isinstance(core, SegmentCore):
         return SegmentCore(tuple(in_axes(subtract(point, centre), axes) for point in core.points))
     assert not isinstance(core, PlaneCore)

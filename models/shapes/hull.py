@@ -21,9 +21,6 @@ from models.checks import ROUNDING, Array, freeze
 from models.errors import ModelError
 from models.files import cache_key, load_value, source_version, store_value
 
-__all__ = ["gap_along", "is_box", "nearest_directions"]
-
-
 GAP_TOLERANCE = 1e-12
 """Relative difference between a distance and its lower bound, the gap, at which the distance search ends."""
 DEGENERATE = 1e-14
@@ -73,7 +70,7 @@ def convex_hull(points: Array) -> Hull:
 
 
 def cached_hull(points: Array) -> Hull:
-    """Return the convex hull of points as `convex_hull` does, from a file if it was computed before."""
+    """Return the convex hull of points, read from the disk cache if it was computed before."""
     key = cache_key(source_version(__name__), "hull", points)
     try:
         vertices, faces, normals, offsets = (np.asarray(part) for part in load_value(key))
@@ -119,7 +116,7 @@ def _convex_hull(points: Array) -> Hull:
 
 
 def _distinct(normals: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of distinct normals, and for each given normal which of these equals it. Shapes (f,), (k,)."""
+    """Return indices of distinct unit normals, and for each normal which of these equals it. Shapes (f,), (k,)."""
     close_pairs = scipy.spatial.cKDTree(normals).query_pairs(ROUNDING, p=np.inf, output_type="ndarray")
     links = scipy.sparse.coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(normals), len(normals)))
     _, same = scipy.sparse.csgraph.connected_components(links, directed=False)
@@ -299,7 +296,7 @@ def _between_hulls(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _weights(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each simplex, the barycentric weights of the point nearest to the origin, and this point.
+    """Return, for each of K tetrahedra, the barycentric weights of the point nearest to the origin, and this point.
 
     Shape (K, 4, 3) to (K, 4) and (K, 3). The vertices may coincide. Only faces that contain the last vertex are tried.
     """

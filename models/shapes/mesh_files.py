@@ -31,8 +31,6 @@ from models.checks import Array, require
 from models.errors import ModelError
 from models.files import INPUT_LIMITS, UnfitFile, parse_xml, read_regular
 
-__all__ = ["read_collada"]
-
 Faces: TypeAlias = NDArray[np.intp]
 
 STL_HEADER_BYTES = 84
@@ -200,9 +198,6 @@ def read_painted_mesh(path: str | os.PathLike[str]) -> Triangles:
     return Triangles(vertices[used], faces.reshape(-1, 3), colors)
 
 
-# ------------------------------------------------------------------------------------------------------------- STL
-
-
 def _read_stl(file: Path, data: bytes) -> Triangles:
     """Read a binary or text STL file, told apart by the size of the file, since both kinds may begin with "solid"."""
     count = (
@@ -264,9 +259,6 @@ def distinct_rows(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp
     which = np.empty(len(rows), dtype=np.intp)
     which[order] = np.cumsum(is_new) - 1
     return order[is_new], which
-
-
-# ------------------------------------------------------------------------------------------------------------- OBJ
 
 
 def _read_obj(file: Path, data: bytes) -> Triangles:
@@ -414,7 +406,7 @@ def _simplify(file: Path, data: bytes) -> tuple[ElementTree.Element, float]:
 
 
 def _check_numbers(file: Path, root: ElementTree.Element) -> None:
-    """Reject elements that pycollada reads only in part or misinterprets; normalise the axes of rotations."""
+    """Raise ModelError for elements of a Collada document that pycollada misreads; normalise the axes of rotations."""
     for part in root.iter():
         several = part.tag in ("triangles", "polylist") and len(part.findall("p")) > 1
         if several or part.tag in ("lookat", "skew", "ph"):
@@ -444,7 +436,7 @@ def _check_numbers(file: Path, root: ElementTree.Element) -> None:
 
 
 def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
-    """Replace instances of nodes by the nodes; limit the number of nodes, because nested instances multiply it."""
+    """Replace instances of nodes in a Collada document by the nodes; raise ModelError if these become too many."""
     nodes = {each.get("id"): each for each in root.iter("node")}
     counts: dict[ElementTree.Element, int] = {}
 
@@ -470,7 +462,7 @@ def _resolve_instances(file: Path, root: ElementTree.Element) -> None:
 
 
 def _materials_document(document: ElementTree.Element) -> ElementTree.Element:
-    """Return a Collada document with only the materials and their diffuse colours, without images.
+    """Return a Collada document with only the materials of a given one and their diffuse colours, without images.
 
     All materials are opaque, because programs disagree on what an opacity means.
     """

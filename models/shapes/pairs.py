@@ -21,6 +21,7 @@ from models.robot.urdf import parse_urdf, text_of
 from models.shapes.bodies import Body, JointStep, RigidParts, lever_arms
 from models.shapes.hull import gap_along, nearest_directions
 from models.shapes.shapes import Box, Shape
+from models.spatial import rotation_matrices
 
 
 class Reason(StrEnum):
@@ -74,13 +75,13 @@ class Pairs:
 
     Attributes:
         checked: Checked pairs as indices of the bodies, the lower first.
-        left: Reason of every unchecked pair of links, by their names in the order of the bodies. A pair of links is in
+        excluded: Reason of every unchecked pair of links, by names in the order of the bodies. A pair of links is in
             both if only some of its bodies always collide, or if the covers of its meshes always collide but their
             convex hulls do not.
     """
 
     checked: tuple[tuple[int, int], ...]
-    left: Mapping[tuple[str, str], Reason]
+    excluded: Mapping[tuple[str, str], Reason]
 
 
 def checked_pairs(
@@ -94,7 +95,7 @@ def checked_pairs(
     seed: int = 0,
     samples: int = 1000,
 ) -> Pairs:
-    """Return the pairs of a robot's bodies that may collide in some configuration but do not collide in all.
+    """Return the pairs of a robot's bodies to check for collision: those that may collide but do not always.
 
     Not checked are:
 
@@ -153,7 +154,7 @@ def checked_pairs(
     adjacent = parts.adjacent({parts.of_link[body.link] for body in bodies})
     classifier = _PairClassifier(robot, parts, low, high, _random_configurations(robot, low, high, count, rng), margin)
     checked: list[tuple[int, int]] = []
-    left: dict[tuple[str, str], Reason] = {}
+    excluded: dict[tuple[str, str], Reason] = {}
     for i, j in combinations(range(len(bodies)), 2):
         links = bodies[i].link, bodies[j].link
         sides = frozenset(parts.of_link[link] for link in links)
@@ -161,15 +162,17 @@ def checked_pairs(
         if reason is None:
             reason, by_hulls = classifier.reason(bodies[i], bodies[j])
             if by_hulls:
-                left[links] = COVERED
+                excluded[links] = COVERED
         if reason is None:
             checked.append((i, j))
-        elif left.get(links) not in ASSUMED or reason == COVERED:
-            left[links] = reason
+        elif excluded.get(links) not in ASSUMED or reason == COVERED:
+            excluded[links] = reason
     open_links = {(bodies[i].link, bodies[j].link) for i, j in checked}
-    left = {k: why for k, why in left.items() if k[0] != k[1] and (k not in open_links or why in ASSUMED)}
-    pairs = Pairs(tuple(checked), left)
-    store_value(key, {"checked": pairs.checked, "left": [[*pair, why.value] for pair, why in pairs.left.items()]})
+    excluded = {k: why for k, why in excluded.items() if k[0] != k[1] and (k not in open_links or why in ASSUMED)}
+    pairs = Pairs(tuple(checked), excluded)
+    store_value(
+        key, {"checked": pairs.checked, "excluded": [[*pair, why.value] for pair, why in pairs.excluded.items()]}
+    )
     return pairs
 
 
@@ -191,10 +194,10 @@ def _read(value: Any, bodies: Sequence[Body]) -> Pairs | None:
     """Return the checked and unchecked pairs read from a cache entry, or None if the entry is invalid."""
     try:
         checked = tuple((int(i), int(j)) for i, j in value["checked"])
-        left = {(str(first), str(second)): Reason(why) for first, second, why in value["left"]}
+        excluded = {(str(first), str(second)): Reason(why) for first, second, why in value["excluded"]}
     except (TypeError, ValueError, KeyError, AttributeError):
         return None
-    return Pairs(checked, left) if all(0 <= i < j < len(bodies) for i, j in checked) else None
+    return Pairs(checked, excluded) if all(0 <= i < j < len(bodies) for i, j in checked) else None
 
 
 def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
@@ -208,7 +211,7 @@ def _ignored_pairs(robot: Robot, pairs: Any) -> list[frozenset[str]]:
 
 
 def _disabled_pairs(robot: Robot, source: str | os.PathLike[str]) -> list[frozenset[str]]:
-    """Return the pairs of links whose collision check an SRDF file disables, except pairs with unknown links."""
+    """Return the pairs of links whose collision check an SRDF file disables, without pairs with unknown links."""
     known = {link.name for link in robot.links}
     elements = parse_urdf(source).findall("disable_collisions")
     pairs = [frozenset(text_of(each, key, "SRDF") for key in ("link1", "link2")) for each in elements]
@@ -227,15 +230,12 @@ def _random_configurations(robot: Robot, low: Array, high: Array, count: int, rn
     return np.asarray(start + (end - start) * rng.random((count, robot.dof)))  # rng.uniform refuses 0.0 to -0.0
 
 
-# ------------------------------------------------------------------------------------------------- one pair of bodies
-
-
 Poses: TypeAlias = tuple[Array, Array]
 """Rotations and positions of a rigid part at k configurations. Shapes (k, 3, 3) and (k, 3), m."""
 
 
 class _Lever(NamedTuple):
-    """A moving joint between two bodies: its entry in the joint vector and its lever arm.
+    """A moving joint between two bodies: its entry in the joint vector, and the bodies' largest distance from its axis.
 
     Attributes:
         column: Index in the joint vector.
@@ -247,8 +247,8 @@ class _Lever(NamedTuple):
     ratio: float
     arm: float
 
-    def moved(self, half: Array) -> Array:
-        """Return the largest change of the bodies' distance for a joint displacement of up to `half`, rad or m."""
+    def distance_change(self, half: Array) -> Array:
+        """Return the largest change of two bodies' distance if the joint moves by up to `half`, rad or m."""
         turned = np.minimum(abs(self.ratio) * half, np.pi)
         return np.asarray(2 * self.arm * np.sin(turned / 2) if self.arm else abs(self.ratio) * half)
 
@@ -268,7 +268,7 @@ class _PairClassifier:
     _poses: dict[str, Poses] = field(default_factory=dict)
 
     def reason(self, first: Body, second: Body) -> tuple[Reason | None, bool]:
-        """Return why a pair need not be checked for collision, None if it must be checked.
+        """Return why two bodies need no collision check, or None if they need one; and whether hulls contradict covers.
 
         The second result tells whether the covers of the pair always collide but the hulls do not. Covers of meshes
         protrude. Pairs with a mesh that are two joints apart, or whose covers always collide, are therefore classified
@@ -287,7 +287,8 @@ class _PairClassifier:
             if two_joints:
                 self._by_hulls[key] = hulls.check_on_grid(self.low, self.high)
             else:
-                self._by_hulls[key] = hulls.overlap_everywhere(self.configurations)
+                collides = (hulls.bounds(self.configurations)[0] <= 0).all()
+                self._by_hulls[key] = ALWAYS if collides else None
         if (hull_reason := self._by_hulls[key]) is not None:
             return hull_reason, False
         if reason == COVERED:
@@ -302,19 +303,19 @@ class _PairClassifier:
         return _BodyPair(self.robot, *bodies, up, down, _relative_poses(*poses))
 
     def _place(self, link: str, shape: Shape) -> _PlacedBody:
-        """Return a shape of a link in the frame of its rigid part."""
+        """Return a shape of a link in the frame of the rigid part that contains the link."""
         key = link, id(shape)
         if key not in self._placed:
             self._placed[key] = _PlacedBody(shape.placed(*self.parts.pose[link]))
         return self._placed[key]
 
     def _pose(self, part: str) -> Poses:
-        """Return a rigid part's poses relative to the root link in random configurations of a first collision test."""
+        """Return the poses of a rigid part relative to the root link in the first random configurations."""
         if part not in self._poses:
             q = self.configurations[: SETTINGS.first_configurations]
             step = self.parts.step.get(part)
             origin = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
-            self._poses[part] = origin if step is None else _poses_behind(self.robot, self._pose(step.above), step, q)
+            self._poses[part] = origin if step is None else _poses_below(self.robot, self._pose(step.above), step, q)
         return self._poses[part]
 
 
@@ -339,7 +340,7 @@ class _BodyPair:
     start: Poses = (np.eye(3)[None], np.zeros((1, 3)))
 
     def classify(self, low: Array, high: Array, configurations: Array, margin: float, overhang: float) -> Reason | None:
-        """Return why the bodies need no collision check (they collide always or never), or None if they need one."""
+        """Return why two bodies need no collision check (they collide always or never), or None if they need one."""
         colliding = self.bounds_at(self.start)[0] <= 0
         if colliding.all():
             largest = float(self.distance_bounds(*self._relative(configurations)).max())
@@ -369,19 +370,17 @@ class _BodyPair:
             step = step / 4
         return NEVER
 
-    def overlap_everywhere(self, configurations: Array) -> Reason | None:
-        """Return ALWAYS (always in collision) if the bodies collide in all given configurations, else None."""
-        return None if (self.bounds(configurations)[0] > 0).any() else ALWAYS
-
     def bounds(self, q: Array, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds of the distance at given joint vectors, and whether each needed more than bounding balls.
+        """Return lower bounds of two bodies' distance at joint vectors, m, and whether bounding balls were not enough.
 
         Joint vectors have shape (k, dof). Bounding balls suffice where they prove a distance greater than `above`, m.
         """
         return self.bounds_at(self._relative(q), above)
 
     def bounds_at(self, poses: Poses, above: float | Array = 0.0) -> tuple[Array, NDArray[np.bool_]]:
-        """Return lower bounds of the distance for given relative poses of the two rigid parts, as `bounds` does."""
+        """Return lower bounds of two bodies' distance for relative poses, m, and whether bounding balls were not
+        enough.
+        """
         (turn, shift), first, second = poses, self.first, self.second
         bounds = np.linalg.norm(shift + turn @ second.centre - first.centre, axis=1) - first.radius - second.radius
         close: NDArray[np.bool_] = np.asarray(bounds <= above + MARGIN_M)
@@ -390,7 +389,7 @@ class _BodyPair:
         return bounds, close
 
     def distance_bounds(self, turn: Array, shift: Array) -> Array:
-        """Return lower bounds of the distance for given poses of the second body, exact if the search has converged."""
+        """Return lower bounds of two bodies' distance for poses of the second, exact if the search has converged, m."""
         shapes = self.first.shape, self.second.shape
         first, second = (np.repeat(each.core, 2, axis=0) if len(each.core) == 1 else each.core for each in shapes)
         first, second = (
@@ -404,13 +403,13 @@ class _BodyPair:
         """Return the poses of the second body's part relative to the first body's part at joint vectors (k, dof)."""
         first = second = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
         for step in self.up[::-1]:
-            first = _poses_behind(self.robot, first, step, q)
+            first = _poses_below(self.robot, first, step, q)
         for step in self.down:
-            second = _poses_behind(self.robot, second, step, q)
+            second = _poses_below(self.robot, second, step, q)
         return _relative_poses(first, second)
 
     def _proves_apart(self, low: Array, high: Array, margin: float) -> bool:
-        """Return whether bisection of the joint space proves that the distance stays above `margin`, m."""
+        """Return whether bisection of the joint space proves that two bodies stay farther apart than `margin`, m."""
         columns = sorted({self.robot.couplings[step.joint.name].column for step in (*self.up, *self.down)})
         budget = SETTINGS.boxes // 4 ** max(0, len(columns) - 3)  # bisection of many joints rarely succeeds
         if not budget:
@@ -427,7 +426,7 @@ class _BodyPair:
         centre[0, columns] = (start[columns] + end[columns]) / 2
         half[0, columns] = (end[columns] - start[columns]) / 2
         for _ in range(SETTINGS.rounds):
-            slack = np.array([lever.moved(half[:, lever.column]) for lever in levers])  # (levers, boxes)
+            slack = np.array([lever.distance_change(half[:, lever.column]) for lever in levers])  # (levers, boxes)
             need = slack.sum(axis=0)
             bounds, close = self.bounds(centre, need + margin)
             if (close & (bounds <= margin)).any():
@@ -450,7 +449,7 @@ class _BodyPair:
         return False
 
     def _levers(self, low: Array, high: Array) -> list[_Lever]:
-        """Return the joints between the bodies as levers, each with the shorter of its arms to the two bodies."""
+        """Return the joints between two bodies with their lever arms, the shorter of those to both bodies."""
         chain = [*((step, False) for step in self.up), *((step, True) for step in self.down)]
         reverse = [(step, not down) for step, down in chain[::-1]]
         arms_second, _ = lever_arms(self.robot, chain, self.second.shape, low=low, high=high)
@@ -467,23 +466,15 @@ def _grid(values: Array, dimension: int) -> Array:
     return np.stack(np.meshgrid(*[values] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
 
 
-def _axis_rotations(axis: Array, angle: Array) -> Array:
-    """Return rotation matrices about a unit axis for k angles (rad). Shape (k, 3, 3)."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    sine, rest = np.sin(angle)[:, None, None], (1 - np.cos(angle))[:, None, None]
-    return np.asarray(np.eye(3) + sine * cross + rest * (cross @ cross))
-
-
-def _poses_behind(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
-    """Return the poses of the rigid part behind a joint from those of the part before it, at joint vectors q."""
+def _poses_below(robot: Robot, above: Poses, step: JointStep, q: Array) -> Poses:
+    """Return the poses of the rigid part below a joint from those of the part above it, at joint vectors q."""
     (turn, shift), (column, ratio, offset) = above, robot.couplings[step.joint.name]
     position = ratio * q[:, column] + offset
     shift = shift + turn @ step.translation
     turn = turn @ step.rotation
     if step.joint.kind == "prismatic":
         return turn, shift + position[:, None] * (turn @ step.joint.axis)
-    return turn @ _axis_rotations(np.asarray(step.joint.axis), position), shift
+    return turn @ rotation_matrices(position[:, None] * step.joint.axis), shift
 
 
 def _relative_poses(first: Poses, second: Poses) -> Poses:

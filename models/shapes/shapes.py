@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from math import cos, pi
 from pathlib import Path
-from typing import Any, Self, TypeAlias, cast
+from typing import Any, ClassVar, Self, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -30,7 +30,13 @@ CORNERS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in
 
 
 class _SweptCore:
-    """A convex solid: all points within `swept_radius` of the convex hull of its core points."""
+    """A convex solid: all points within `swept_radius` of the convex hull of its core points.
+
+    POINTS and AXES name the fields that are points, and directions or matrices of directions, in its frame.
+    """
+
+    POINTS: ClassVar[tuple[str, ...]] = ("position",)
+    AXES: ClassVar[tuple[str, ...]] = ()
 
     @property
     def core(self) -> Array:
@@ -42,22 +48,20 @@ class _SweptCore:
         """Distance that the shape extends beyond the convex hull of its core, m."""
         return 0.0
 
+    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
+        """Return the shape in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
+        turn = require.rotation("shape: rotation", rotation)
+        shift = require.array("shape: translation", translation, (3,))
+        own = copy(self)  # shares the hull, which is costly to compute
+        for name in (*self.POINTS, *self.AXES):
+            moved = turn @ getattr(self, name)
+            object.__setattr__(own, name, freeze(moved + shift if name in self.POINTS else moved))
+        return own
+
     def reach(self, point: ArrayInput) -> float:
         """Return the largest distance of the shape's points from a given point (3,), m; inf for an unbounded shape."""
         centre = require.array("shape: point", point, (3,))
         return float(np.linalg.norm(self.core - centre, axis=1).max()) + self.swept_radius
-
-
-class _Posed(_SweptCore):
-    """Base class of shapes with a position and a rotation of their own."""
-
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Self:
-        """Return the shape in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        own: Any = copy(self)  # shares the hull, which is costly to compute
-        object.__setattr__(own, "position", freeze(turn @ own.position + shift))
-        object.__setattr__(own, "rotation", freeze(turn @ own.rotation))
-        return cast(Self, own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,22 +81,17 @@ class Sphere(_SweptCore):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "radius", require.positive("sphere: radius", self.radius, unit="m"))
-        object.__setattr__(self, "position", _place(self.position, "sphere"))
+        object.__setattr__(self, "position", _checked_position(self.position, "sphere"))
 
     @property
     def core(self) -> Array:
-        """Centre of the sphere. Shape (1, 3), m."""
+        """Centre of the sphere, as an array of one point. Shape (1, 3), m."""
         return np.array([self.position])
 
     @property
     def swept_radius(self) -> float:
         """Radius of the sphere, m."""
         return self.radius
-
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Sphere:
-        """Return the sphere in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        return Sphere(self.radius, turn @ self.position + shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +109,7 @@ class Capsule(_SweptCore):
     radius: float
     start: ArrayInput
     end: ArrayInput
+    POINTS: ClassVar[tuple[str, ...]] = ("start", "end")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "radius", require.nonnegative("capsule: radius", self.radius, unit="m"))
@@ -129,14 +129,9 @@ class Capsule(_SweptCore):
         """Radius of the capsule, m."""
         return self.radius
 
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> Capsule:
-        """Return the capsule in a new frame, given the pose of its present frame in the new one: (3, 3) and (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        return Capsule(self.radius, turn @ self.start + shift, turn @ self.end + shift)
-
 
 @dataclass(frozen=True, eq=False)
-class Cylinder(_Posed):
+class Cylinder(_SweptCore):
     """A solid cylinder about its own z axis.
 
     Distances use the circumscribed regular prism of SIDES sides. The edges of the prism exceed the cylinder by
@@ -157,12 +152,13 @@ class Cylinder(_Posed):
     length: float
     position: ArrayInput = None
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+    AXES: ClassVar[tuple[str, ...]] = ("rotation",)
 
     def __post_init__(self) -> None:
         for name in ("radius", "length"):
             size = require.positive(f"cylinder: {name}", getattr(self, name), unit="m")
             object.__setattr__(self, name, size)
-        object.__setattr__(self, "position", _place(self.position, "cylinder"))
+        object.__setattr__(self, "position", _checked_position(self.position, "cylinder"))
         object.__setattr__(self, "rotation", require.rotation("cylinder: rotation", self.rotation))
 
     @property
@@ -180,12 +176,12 @@ class Cylinder(_Posed):
 
 
 @dataclass(frozen=True, eq=False)
-class Box(_Posed):
-    """A solid box.
+class Box(_SweptCore):
+    """A solid box at a pose of its own, whose edges may be infinite.
 
     Attributes:
         size: Full length of the edges. Shape (3,), m; inf along an axis without ends, as for walls of a wind tunnel.
-            A box with an infinite edge has no core; only the distances of the captive trajectory rig accept it.
+            A box with an infinite edge has no core; it serves only as the walls around the captive trajectory rig.
         position: Centre. Shape (3,), m.
         rotation: Axes of the box as columns. Shape (3, 3).
 
@@ -197,11 +193,12 @@ class Box(_Posed):
     size: ArrayInput
     position: ArrayInput = (0.0, 0.0, 0.0)
     rotation: ArrayInput = field(default_factory=lambda: np.eye(3))
+    AXES: ClassVar[tuple[str, ...]] = ("rotation",)
 
     def __post_init__(self) -> None:
         size = require.array("box: size", self.size, (3,), unit="m", entries="numbers", sign="positive")
         object.__setattr__(self, "size", size)
-        object.__setattr__(self, "position", _place(self.position, "box"))
+        object.__setattr__(self, "position", _checked_position(self.position, "box"))
         object.__setattr__(self, "rotation", require.rotation("box: rotation", self.rotation))
         if np.isinf(size).all():
             raise ModelError("box: every edge is infinite; there is no outside", name="size", value=size)
@@ -235,6 +232,8 @@ class HalfSpace(_SweptCore):
 
     normal: ArrayInput
     point: ArrayInput = None
+    POINTS: ClassVar[tuple[str, ...]] = ("point",)
+    AXES: ClassVar[tuple[str, ...]] = ("normal",)
 
     def __post_init__(self) -> None:
         normal = require.array("half-space: normal", self.normal, (3,))
@@ -242,17 +241,12 @@ class HalfSpace(_SweptCore):
         if not 0 < length < np.inf:
             raise ModelError(f"half-space: normal {normal.tolist()} has no direction", name="normal", value=normal)
         object.__setattr__(self, "normal", freeze(np.asarray(normal / length)))
-        object.__setattr__(self, "point", _place(self.point, "half-space", "point"))
+        object.__setattr__(self, "point", _checked_position(self.point, "half-space", "point"))
 
     @property
     def core(self) -> Array:
-        """A point on the boundary plane. Shape (1, 3), m."""
+        """A point on the half-space's boundary plane. Shape (1, 3), m."""
         return np.array([self.point])
-
-    def placed(self, rotation: ArrayInput, translation: ArrayInput) -> HalfSpace:
-        """Return the half-space in a new frame, given the pose of its old frame in the new one: (3, 3) and (3,), m."""
-        turn, shift = _motion(rotation, translation)
-        return HalfSpace(turn @ self.normal, turn @ self.point + shift)
 
     def reach(self, point: ArrayInput) -> float:
         """Return inf, because a half-space is unbounded."""
@@ -261,7 +255,7 @@ class HalfSpace(_SweptCore):
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh(_Posed):
+class Mesh(_SweptCore):
     """The convex hull of a triangle mesh; cavities and holes are filled.
 
     Attributes:
@@ -285,6 +279,7 @@ class Mesh(_Posed):
     file: str | Path | None = None
     scale: ArrayInput = 1.0
     hull: Hull = field(init=False, repr=False)
+    AXES: ClassVar[tuple[str, ...]] = ("rotation",)
 
     def __post_init__(self) -> None:
         if self.file is not None:
@@ -311,7 +306,7 @@ class Mesh(_Posed):
             message = f"mesh: scale {scale.tolist()} has a zero; every axis needs a nonzero factor"
             raise ModelError(message, name="scale", value=scale, limit=0.0)
         object.__setattr__(self, "scale", scale)
-        object.__setattr__(self, "position", _place(self.position, "mesh"))
+        object.__setattr__(self, "position", _checked_position(self.position, "mesh"))
         object.__setattr__(self, "rotation", require.rotation("mesh: rotation", self.rotation))
         used = vertices if self.faces is None else vertices[np.unique(self.faces)]
         object.__setattr__(self, "hull", convex_hull(used * scale))
@@ -327,7 +322,7 @@ class Mesh(_Posed):
 
     @property
     def core(self) -> Array:
-        """Vertices of the convex hull in the frame of the shape. Shape (m, 3), m."""
+        """Vertices of the mesh's convex hull in the frame of the shape. Shape (m, 3), m."""
         return np.asarray(self.position + self.hull.vertices @ self.rotation.T)
 
 
@@ -337,22 +332,17 @@ KINDS = (Sphere, Capsule, Cylinder, Box, HalfSpace, Mesh)
 
 
 def checked_shape(label: str, value: Any) -> Shape:
-    """Return the value after checking that it is a shape; raise ModelError otherwise."""
+    """Return the value after checking that it is a shape, such as a Box; raise ModelError otherwise."""
     if not isinstance(value, KINDS):
         names = ", ".join(kind.__name__ for kind in KINDS)
         raise require.invalid(label, f"a shape ({names})", value, names)
     return value
 
 
-def _place(value: ArrayInput, owner: str, what: str = "position") -> Array:
+def _checked_position(value: ArrayInput, owner: str, what: str = "position") -> Array:
     if value is None:
         raise ModelError(f"{owner}: {what} is missing; give its coordinates, shape (3,), m", name=what, value=None)
     return require.array(f"{owner}: {what}", value, (3,))
-
-
-def _motion(rotation: ArrayInput, translation: ArrayInput) -> tuple[Array, Array]:
-    turn = require.rotation("shape: rotation", rotation)
-    return turn, require.array("shape: translation", translation, (3,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,7 +398,7 @@ class MovingObstacle:
             require.rotation("moving: rotation", turn)
 
     def frame(self, time: Expression) -> Frame:
-        """Return the frame of the shape in the world at a time (s)."""
+        """Return the pose of the moving shape's frame in the world at a time (s)."""
         return Frame(*self._at(time))
 
     def check(self, begin: float, end: float) -> None:

@@ -11,16 +11,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from models import CollisionScene, ModelError
-from models.checks import Array, real
+from models import CollisionScene
+from models.checks import Array
 from ocp.audit.audit import Audit
 from ocp.audit.clearance import Clearance, Track, clearance_along
-from ocp.errors import ProblemError, SolveError, require
+from ocp.errors import ProblemError, SolveError, problem_errors, require
 from ocp.motion.local.collisions import Collision, find_collisions, scene_hulls
 from ocp.problem.declarations import Variable
 from ocp.problem.hulls import Separation, frames_of
@@ -28,27 +28,11 @@ from ocp.problem.problem import Problem
 from ocp.problem.values import Sampler, constant
 from ocp.solution import Solution
 
-__all__ = [
-    "APART",
-    "CLEARANCE",
-    "LOOKS",
-    "MARGIN",
-    "ROUNDING",
-    "ClearanceConstraints",
-    "Constraints",
-    "Separating",
-    "clearance_of",
-    "collision_error",
-    "is_clearance",
-    "solve_with_clearance",
-    "widen_margins",
-]  # fmt: skip
-
 CLEARANCE, APART = "clearance", "apart"
 """Name prefixes of the clearances that the audit proves (CLEARANCE) and of separation constraints (APART)."""
 ROUNDING = 3e-3
 """Width of the smoothing of distances in separation constraints, m; see `rounding` of `models.shapes.distance`."""
-LOOKS = 6
+MAX_SOLVES = 6
 """Largest number of solves of one motion; after each solve, the bodies that collide get separation constraints."""
 MARGIN = 5e-5
 """First margin by which separated bodies must exceed the clearance, and least increase of such a margin, m."""
@@ -72,17 +56,10 @@ class ClearanceConstraints:
 
     def __post_init__(self) -> None:
         require.instance("clearance_constraints: scene", self.scene, CollisionScene)
-        for pair, margin in require.mapping("clearance_constraints: margins", self.margins, object).items():
-            if not np.isfinite(real(margin)):
-                words = f"clearance_constraints: margins must be finite numbers in m, not {margin!r}"
-                raise ProblemError(words, name="margins", value=margin)
-            if (
-                isinstance(pair, bool)
-                or not isinstance(pair, int | np.integer)
-                or not 0 <= pair < len(self.scene.pairs)
-            ):
-                words = f"clearance_constraints: there is no pair {pair!r}; the scene has {len(self.scene.pairs)}"
-                raise ProblemError(words, name="margins", value=pair, limit=len(self.scene.pairs))
+        margins = require.mapping("clearance_constraints: margins", self.margins, object)
+        if margins:
+            require.indices("clearance_constraints: pairs of margins", list(margins), len(self.scene.pairs))
+            require.array("clearance_constraints: margins", list(margins.values()), unit="m")
 
     def with_pairs(self, pairs: Sequence[int]) -> ClearanceConstraints:
         """Return a copy of the constraints that also separates the pairs of bodies with the given indices."""
@@ -99,7 +76,13 @@ class ClearanceConstraints:
 
     def widened(self, proofs: Sequence[Clearance]) -> ClearanceConstraints:
         """Return a copy of the constraints with larger margins for the pairs of bodies that violate their clearance."""
-        return replace(self, margins=widen_margins(self.margins, self.scene.labels, proofs))
+        places = {label: pair for pair, label in enumerate(self.scene.labels)}
+        wider = dict(self.margins)
+        for closest in (each for proof in proofs for each in proof.pairs):
+            if closest.missed > 0 and closest.bodies in places:
+                pair = places[closest.bodies]
+                wider[pair] = self.margins[pair] + 1.5 * closest.missed + MARGIN if pair in self.margins else MARGIN
+        return replace(self, margins=wider)
 
     def declare(
         self,
@@ -129,10 +112,8 @@ class ClearanceConstraints:
         scene, time, states = self.scene, begin + pace * problem.time, problem.declared.states
         _check_limits(scene, states[joints])
         if horizon is not None:
-            try:
+            with problem_errors():
                 scene.check_motions(begin, begin + pace * horizon)
-            except ModelError as error:
-                raise ProblemError(str(error), **vars(error)) from error
         elif scene.has_moving_obstacles:
             words = "a moving obstacle needs a known time; give a horizon in s, or a fixed obstacle"
             raise ProblemError(words, name="obstacles")
@@ -159,35 +140,8 @@ class ClearanceConstraints:
             problem.path(f"{APART}{suffix}", distances, lower=least, unit="m")
 
     def find_collisions(self, base: Array, joints: Array, times: Array) -> list[Collision]:
-        """Return the pairs of bodies that come closer than the clearance at samples of a motion."""
+        """Return the pairs of bodies that come closer than the clearance at samples of a motion, sorted by distance."""
         return find_collisions(self.scene, base, joints, times)
-
-
-class Separating(Protocol):
-    """Interface of constraints that keep pairs of bodies apart with margins that can be increased."""
-
-    def widened(self, proofs: Sequence[Clearance]) -> Self:
-        """Return a copy of the constraints with larger margins for the pairs of bodies that violate their clearance."""
-
-
-def widen_margins(
-    margins: Mapping[int, float], labels: Sequence[tuple[str, str]], proofs: Sequence[Clearance]
-) -> dict[int, float]:
-    """Return the separation margins of pairs of bodies, m, increased for pairs that violate their clearance.
-
-    Args:
-        margins: Margins by the index of the pair among the labels.
-        labels: Names of the bodies of each pair.
-        proofs: Clearances of an audit; pairs that are not among the labels are ignored.
-    """
-    places = {label: pair for pair, label in enumerate(labels)}
-    wider = dict(margins)
-    for proof in proofs:
-        for closest in proof.pairs:
-            if closest.missed > 0 and closest.bodies in places:
-                pair = places[closest.bodies]
-                wider[pair] = margins[pair] + 1.5 * closest.missed + MARGIN if pair in margins else MARGIN
-    return wider
 
 
 def clearance_of(
@@ -230,7 +184,7 @@ def clearance_of(
 
 
 def _check_limits(scene: CollisionScene, joints: Variable) -> None:
-    """Raise ProblemError if a problem lets a joint leave the position limits that the collision scene presupposes."""
+    """Raise ProblemError if a problem lets joints leave the position limits that the collision scene presupposes."""
     robot = scene.machine.robot
     inside = (constant(joints.lower) >= robot.lower) & (constant(joints.upper) <= robot.upper)
     if scene.limits and not inside.all():
@@ -242,11 +196,9 @@ def _check_limits(scene: CollisionScene, joints: Variable) -> None:
         raise ProblemError(words, name=name)
 
 
-Constraints = TypeVar("Constraints", bound=Separating | None)
-"""Type variable for the clearance constraints of a planner, or None if the planner ignores collisions."""
-
-
-def solve_with_clearance(clearance_constraints: Constraints, run: Callable[[Constraints], Solution]) -> Solution:
+def solve_with_clearance(
+    clearance_constraints: ClearanceConstraints | None, run: Callable[[ClearanceConstraints | None], Solution]
+) -> Solution:
     """Solve a problem repeatedly; after each solve, add separation constraints for the bodies that collide.
 
     Args:
@@ -257,7 +209,7 @@ def solve_with_clearance(clearance_constraints: Constraints, run: Callable[[Cons
         SolveError: As ``run``; or the bodies cannot be separated: names them with place and time.
     """
     collision: SolveError | None = None
-    for _ in range(LOOKS):
+    for _ in range(MAX_SOLVES):
         try:
             return run(clearance_constraints)
         except SolveError as error:
@@ -279,7 +231,7 @@ def is_clearance(name: Any) -> bool:
 
 
 def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
-    """Return an error about colliding bodies if a solution fails its audit only because of collisions, else None."""
+    """Return an error that names colliding bodies if a solution fails its audit only because of them, else None."""
     failures = audit.failures
     if not failures or any(finding.name not in audit.clearances for finding in failures):
         return None
@@ -289,7 +241,7 @@ def collision_error(audit: Audit, solution: Solution) -> SolveError | None:
 
 
 def _evaluate(expression: Callable[..., Any], base: Any, joints: Any, time: Any) -> Any:
-    """Evaluate a function that accepts SX symbols only (base, joints and time) also for MX arguments."""
+    """Return the expression that a function of SX symbols of base, joints and time gives, also for MX arguments."""
     arguments = [base if isinstance(base, ca.SX | ca.MX) else ca.DM(base), joints, time]
     if not any(isinstance(value, ca.MX) for value in arguments):
         return ca.SX(expression(*arguments))

@@ -19,13 +19,13 @@ where rest(q) is the gravity torque, so that the least factor within the torque 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from models import FixedBase
 from models.checks import Array
@@ -39,33 +39,22 @@ from ocp.problem.values import Sampler
 from ocp.solution import Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "ConstantJerkMotion", "TorqueLimits", "least_durations", "segment_durations", "stopping_motion",
-    "synchronised_motion",
-]  # fmt: skip
-
 NODES = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 """Interpolation nodes of a phase, as fractions of its duration; four suffice because positions are cubic in time."""
 
 
 @dataclass(frozen=True)
 class ConstantJerkSettings:
-    """Settings of motions that consist of phases of constant jerk.
+    """Settings of motions that consist of phases of constant jerk."""
 
-    Attributes:
-        still: Duration of a motion that stays where it is, s, since the horizon of a problem must be positive.
-        ramp_share: Time in which joints with neither an acceleration nor a jerk limit reach their largest rate, as a
-            share of the time at that rate.
-        unlimited_rate: Rate of joints without any of these limits, rad/s or m/s.
-        samples: Number of samples of each phase at which torques are evaluated.
-        torque_share: Share of the limits of torque and power that is used there, since torques may be larger between
-            the samples.
-    """
-
+    # duration of a motion that stays where it is, s, since the horizon of a problem must be positive
     still: float = 1e-3
+    # time in which joints with neither an acceleration nor a jerk limit reach their largest rate, as a share of the
+    # time at that rate
     ramp_share: float = 5e-4
-    unlimited_rate: float = 1.0
-    samples: int = 16
+    unlimited_rate: float = 1.0  # rate of joints without any of these limits, rad/s or m/s
+    samples: int = 16  # number of samples of each phase at which torques are evaluated
+    # share of the limits of torque and power that is used there, since torques may be larger between the samples
     torque_share: float = 0.995
 
 
@@ -251,11 +240,11 @@ class TorqueLimits:
         self._samplers: dict[bool, Sampler] = {}
 
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> Array:
-        """Return the torques of the joints in `limited` at M samples of a motion. Shape (M, L)."""
+        """Return the torques, N m or N, of the L joints with limited torque or power at M samples. Shape (M, L)."""
         return np.asarray(self._sampler(False)(joints, rates, accelerations)[0])
 
     def linearise(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, list[Array]]:
-        """Return the limited torques and powers at M samples, in the order of `largest`, and their Jacobians.
+        """Return the limited torques, then the limited powers, at M samples of a motion, and their Jacobians.
 
         The Jacobians are those with respect to joint positions, rates and accelerations. Shapes (M, R), and (M, R, n)
         for each Jacobian.
@@ -298,15 +287,13 @@ class TorqueLimits:
             room = np.where(moving > 0, (allowed - rest) / moving, (allowed + rest) / -moving)
         speed = float(np.sqrt(min(1.0, float(np.where(moving == 0, np.inf, room).min()))))
         holding, driving = rest * rates[:, self.limited], moving * rates[:, self.limited]  # the power at a speed s is
-        too_fast, power = speed, SETTINGS.torque_share * self.power  # s holding + s^3 driving
-        if (speed * holding + speed**3 * driving > power).any():
-            speed = 0.0
-            while too_fast - speed > ROUNDING_SHARE * too_fast:
-                middle = (speed + too_fast) / 2
-                if (middle * holding + middle**3 * driving > power).any():
-                    too_fast = middle
-                else:
-                    speed = middle
+        power = SETTINGS.torque_share * self.power  # s holding + s^3 driving
+
+        def excess(s: float) -> float:
+            return float((s * holding + s**3 * driving - power).max())
+
+        if excess(speed) > 0:
+            speed = scipy.optimize.brentq(excess, 0.0, speed, rtol=ROUNDING_SHARE)
         return motion.slower(1 / speed)
 
 
@@ -320,9 +307,9 @@ def synchronised_motion(start: Array, goal: Array, bounds: JointBounds) -> Const
         bounds: Limits of the joints.
     """
     change = goal - start
-    own = _profiles(np.abs(change), bounds)
+    own = _ramps(np.abs(change), *_finite_limits(np.abs(change), bounds))
     duration = float(own.duration.max())
-    straight = _straight(start, change, bounds)
+    straight = _straight_motion(start, change, bounds)
     if duration == 0 or straight.duration <= (1 + ROUNDING_SHARE) * duration:
         return straight
     return _joint_phases(start, np.sign(change), own, duration)
@@ -338,8 +325,10 @@ def stopping_motion(path: Array, bounds: JointBounds, torques: TorqueLimits) -> 
     """
     moves = np.append(np.diff(path, axis=0).any(axis=1), True)
     corners = path[moves] if moves.sum() > 1 else path[[0, -1]]
-    parts = [torques.slow_down(_straight(first, last - first, bounds)) for first, last in pairwise(corners)]
-    return ConstantJerkMotion(*(np.concatenate(values) for values in zip(*map(_columns, parts), strict=True)))
+    parts = [torques.slow_down(_straight_motion(first, last - first, bounds)) for first, last in pairwise(corners)]
+    return ConstantJerkMotion(
+        *(np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True))
+    )
 
 
 def segment_durations(changes: Array, bounds: JointBounds) -> Array:
@@ -350,12 +339,8 @@ def segment_durations(changes: Array, bounds: JointBounds) -> Array:
     return np.asarray(_straight_profile(changes, bounds).duration)
 
 
-def _columns(motion: ConstantJerkMotion) -> Sequence[Array]:
-    return motion.durations, motion.joints, motion.rates, motion.accelerations, motion.jerks
-
-
-def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
-    """Return joint velocity, acceleration and jerk limits; limits that a profile needs are made finite."""
+def _finite_limits(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Array]:
+    """Return velocity, acceleration and jerk limits of joints; those that a velocity profile needs are finite."""
     velocity, acceleration, jerk = bounds.velocity, bounds.acceleration, bounds.jerk
     jumps = ~np.isfinite(acceleration) & ~np.isfinite(jerk)
     velocity = np.where(jumps & ~np.isfinite(velocity), SETTINGS.unlimited_rate, velocity)
@@ -364,25 +349,17 @@ def _effective(distances: Array, bounds: JointBounds) -> tuple[Array, Array, Arr
     return velocity, np.where(jumps, steep, acceleration), jerk
 
 
-def _profiles(distances: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest rest-to-rest velocity profile of each joint by itself over a given distance (..., n)."""
-    return _ramps(distances, *_effective(distances, bounds))
-
-
 def _straight_profile(changes: Array, bounds: JointBounds) -> _Ramps:
-    """Return the fastest velocity profiles of K straight joint motions with displacements (K, n).
-
-    The distance of a profile is the covered fraction of the displacement. Shape (K,).
-    """
+    """Return the fastest profiles (K,) of the fraction that straight motions cover of displacements (K, n)."""
     distances = np.abs(changes)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = [
-            np.where(distances > 0, each / distances, np.inf).min(axis=1) for each in _effective(distances, bounds)
+            np.where(distances > 0, each / distances, np.inf).min(axis=1) for each in _finite_limits(distances, bounds)
         ]
     return _ramps(distances.any(axis=1).astype(float), *least)
 
 
-def _straight(start: Array, change: Array, bounds: JointBounds) -> ConstantJerkMotion:
+def _straight_motion(start: Array, change: Array, bounds: JointBounds) -> ConstantJerkMotion:
     """Return the fastest straight joint motion over a displacement (n,), or a short rest if this displacement is 0."""
     profile = _straight_profile(change[None], bounds)
     duration = float(profile.duration[0])
@@ -395,13 +372,8 @@ def _straight(start: Array, change: Array, bounds: JointBounds) -> ConstantJerkM
 
 
 def _joint_phases(start: Array, signs: Array, profiles: _Ramps, duration: float) -> ConstantJerkMotion:
-    """Return the motion in which each joint follows its own velocity profile, slowed down to a common duration.
-
-    Args:
-        start: Start configuration. Shape (n,).
-        signs: Directions of the joints, -1, 0 or 1. Shape (n,).
-        profiles: Profiles of the joints. Shape (n,) each.
-        duration: Common duration, s, at least that of each profile.
+    """Return the motion in which each joint follows its own velocity profile (n,), in a direction -1, 0 or 1, slowed
+    down to a common duration, s, that is at least the duration of each profile.
     """
     build_up, steady, cruise, peak = profiles
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -20,8 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from models import ModelError
-from models.checks import NOT_NUMBERS, Array, floats, real
+from models.checks import Array, real
 from models.cts.best_roll import optimal_inverse
 from models.cts.clearance import CollisionScene, Radii, checked_clearance, clearances, proximity_cost
 from models.cts.rig import HOME, Branch, Rig, Tunnel, checked_branch, configuration_at, joints_of
@@ -31,10 +30,8 @@ from models.shapes.distance import soft_minimum
 from models.spatial import FULL_TURN, expression
 from ocp.console import interruptible
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, problem_errors, require
 from ocp.problem.problem import Problem
-
-__all__ = ["RollObstacles", "RollSettings", "least_cost_roll", "roll_problem", "spline_targets"]
 
 Targets = Callable[[Any], Any]
 LARGEST_SINE = 1 - 1e-9  # largest magnitude of the sine of q4 and the cosine of q2: the rig is just within reach
@@ -42,29 +39,17 @@ LARGEST_SINE = 1 - 1e-9  # largest magnitude of the sine of q4 and the cosine of
 
 @dataclass(frozen=True)
 class RollGuessSettings:
-    """Settings of the search for an initial guess of the roll on finer and finer grids of times and roll angles.
+    """Settings of the search for an initial guess of the roll on finer and finer grids of times and roll angles."""
 
-    Attributes:
-        times: Number of times of the grid.
-        price: Cost of a violation, per m, rad or unit of a sine.
-        margin: Distance beyond the clearance, in widths of the smooth minimum.
-        rolls: Number of rolls of the grid in a full turn.
-        tube_side: Number of rolls of a finer grid on each side of the last path.
-        tube_finer: Factor by which each finer grid has smaller steps.
-        tube_levels: Number of finer grids.
-        largest_roll: Largest distance from the start at which a roll with limits is searched, rad.
-        steps_by_rate: Grid steps that the rate limit should allow from one time to the next.
-    """
-
-    times: int = 65
-    price: float = 1e3
-    margin: float = 2.0
-    rolls: int = 120
-    tube_side: int = 8
-    tube_finer: int = 4
-    tube_levels: int = 3
-    largest_roll: float = 2 * FULL_TURN
-    steps_by_rate: float = 2.0
+    times: int = 65  # number of times of the grid
+    price: float = 1e3  # cost of a violation, per m, rad or unit of a sine
+    margin: float = 2.0  # distance beyond the clearance, in widths of the smooth minimum
+    rolls: int = 120  # number of rolls of the grid in a full turn
+    tube_side: int = 8  # number of rolls of a finer grid on each side of the last path
+    tube_finer: int = 4  # factor by which each finer grid has smaller steps
+    tube_levels: int = 3  # number of finer grids
+    largest_roll: float = 2 * FULL_TURN  # largest distance from the start at which a roll with limits is searched, rad
+    steps_by_rate: float = 2.0  # grid steps that the rate limit should allow from one time to the next
 
 
 SEARCH = RollGuessSettings()
@@ -82,14 +67,9 @@ def spline_targets(times: Any, targets: Any) -> Targets:
         ProblemError: There are fewer than 4 samples, the times do not increase, or the targets have another shape or
             are not finite.
     """
-    try:
-        t = floats(times)
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"times {times!r} are not numeric", name="times", value=times) from error
-    try:
+    t = require.array("times", times)
+    with problem_errors():
         rows = checked_targets(targets)
-    except ModelError as error:
-        raise ProblemError(str(error), name=error.name, value=error.value) from error
     if t.shape != (len(rows),) or len(t) < 4 or not (np.diff(t) > 0).all():
         message = f"times of shape {t.shape} must increase, one for each of the {len(rows)} targets, 4 at least"
         raise ProblemError(message, name="times", value=t, limit=(len(rows),))
@@ -120,11 +100,10 @@ class RollSettings:
 
     def __post_init__(self) -> None:
         for name in ("rate_weight", "acceleration_weight", "rate_limit", "acceleration_limit"):
-            _check_nonnegative(name, getattr(self, name), finite=name.endswith("weight"))
-        try:
+            entries: Any = "finite" if name.endswith("weight") else "numbers"
+            require.array(f"roll_problem: {name}", getattr(self, name), (), entries=entries, sign="nonnegative")
+        with problem_errors("roll_problem: "):
             object.__setattr__(self, "branch", checked_branch(self.branch))
-        except ModelError as error:
-            raise ProblemError(f"roll_problem: {error}", name=error.name, value=error.value) from error
         if self.symbols not in (ca.SX, ca.MX):
             words = f"roll_problem: symbols must be casadi.SX or casadi.MX, not {self.symbols!r}"
             raise ProblemError(words, name="symbols", value=self.symbols)
@@ -154,23 +133,13 @@ class RollObstacles:
 
     def __post_init__(self) -> None:
         require.instance("roll_problem: scene", self.scene, CollisionScene)
-        _check_nonnegative("clearance_weight", self.clearance_weight, finite=True)
+        require.nonnegative("roll_problem: clearance_weight", self.clearance_weight)
         require.positive("roll_problem: clearance_width", self.clearance_width)
         require.positive("roll_problem: softness", self.softness)
         if self.radii is not None:
             require.instance("roll_problem: radii", self.radii, Radii)
-        try:
+        with problem_errors("roll_problem: "):
             checked_clearance(self.clearance)
-        except ModelError as error:
-            raise ProblemError(f"roll_problem: {error}", name=error.name, value=error.value) from error
-
-
-def _check_nonnegative(name: str, value: Any, *, finite: bool) -> None:
-    """Raise ProblemError if a weight or limit is negative, or if a number that must be finite is infinite."""
-    number = real(value)
-    if not number >= 0 or (finite and np.isinf(number)):
-        message = f"roll_problem: {name} must be a number that is not negative, not {value!r}"
-        raise ProblemError(message, name=name, value=value, limit=0.0)
 
 
 @interruptible
@@ -235,7 +204,8 @@ def roll_problem(
         if np.isfinite(obstacles.clearance):
             violation += ca.fmax(obstacles.clearance + SEARCH.margin * obstacles.softness - gap, 0)
     t = np.linspace(0, horizon, SEARCH.times)
-    rows = np.array(_curve(targets, symbols).map(len(t))(t[None]))
+    time = symbols.sym("time")
+    rows = np.array(ca.Function("target", [time], [_target_at(targets, time)]).map(len(t))(t[None]))
     status = np.array(optimal_inverse(rig, tunnel, settings.branch).map(len(t))(rows, np.zeros((1, len(t))))[3])[0]
     if status.any():
         first = int(np.flatnonzero(status)[0])
@@ -263,10 +233,10 @@ def roll_problem(
     problem.horizon(horizon)
     problem.dynamics(roll, rate)
     problem.dynamics(rate, acceleration)
-    target = _column(targets, problem.time)
+    target = _target_at(targets, problem.time)
 
     def along(name: str, value: Any) -> Any:
-        """Return an expression with the tool target at the symbolic time and the roll of the problem substituted."""
+        """Return an expression of target and roll as a function of the problem's time and roll."""
         return ca.Function(name, [x, phi], [value])(target, roll)
 
     problem.path("reach", along("reach", reach), -LARGEST_SINE, LARGEST_SINE)
@@ -283,8 +253,8 @@ def roll_problem(
     return problem
 
 
-def _column(targets: Targets, time: Any) -> Any:
-    """Return a user's tool target (5, 1) at a symbolic time; raise ProblemError if it is invalid."""
+def _target_at(targets: Targets, time: Any) -> Any:
+    """Return the tool target (5, 1) of a user's function at a symbolic time; raise ProblemError if it is invalid."""
     try:
         target = expression(targets(time))
     except RuntimeError:  # interpolants do not take SX symbols
@@ -300,14 +270,8 @@ def _column(targets: Targets, time: Any) -> Any:
     return target
 
 
-def _curve(targets: Targets, symbols: Any) -> Any:
-    """Convert the user's function that returns tool targets to a casadi Function of time."""
-    time = symbols.sym("time")
-    return ca.Function("target", [time], [_column(targets, time)])
-
-
 def _violation(value: Any, lower: Any, upper: Any) -> Any:
-    """Return the summed violation of lower and upper bounds by values of an expression."""
+    """Return by how much the values of an expression exceed lower and upper bounds, summed over the values."""
     return ca.sum1(ca.fmax(lower - value, 0) + ca.fmax(value - upper, 0)) if value.numel() else 0.0
 
 
@@ -322,7 +286,7 @@ def least_cost_roll(
     acceleration_weight: float,
     rate_limit: float,
 ) -> Array:
-    """Return the roll of the rig that minimises the integral of a cost and of the weighted squared roll rate.
+    """Return the roll of the rig over time with the least integral of a cost and of the weighted squared roll rate.
 
     The roll is found by dynamic programming. Shape (samples,), rad.
 
@@ -376,9 +340,8 @@ def least_cost_roll(
 
 
 def _lowest_cost_path(stage: Array, away: Any, spans: Array, rate_weight: float, rate_limit: float, step: float) -> Any:
-    """Return the lowest-cost path through a grid of times and rolls, as the index of the roll at each time.
-
-    Roll rates beyond the limit are penalised.
+    """Return the index of the roll at each time of the lowest-cost path through a grid of times and rolls, in which
+    rates beyond the limit are penalised.
     """
     weights = np.convolve(np.append(spans, 0), [0.5, 0.5])[: len(stage)]
     weights[[0, -1]] = np.maximum(weights[[0, -1]], spans[[0, -1]] / 2)

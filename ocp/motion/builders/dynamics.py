@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -23,7 +23,7 @@ from models.spatial import quaternion_product
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
+from ocp.motion.builders.standing.problem import FreeTime, declare_horizon, declare_joints
 from ocp.motion.builders.torques import (
     JointFriction,
     Motors,
@@ -46,8 +46,6 @@ from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
-
-__all__ = ["DynamicsSetup", "dynamics_problem", "end_velocities"]
 
 QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 
@@ -134,7 +132,7 @@ def dynamics_problem(
         raise ProblemError(words, name="control", value=control, limit="jerk")
     free = isinstance(horizon, FreeTime)
     duration = require.positive("horizon", horizon.guess if isinstance(horizon, FreeTime) else horizon)
-    ends = _Ends.take(machine, bounds, (start, end), (setup.start_velocity, setup.end_velocity), setup.start_base)
+    ends = _Ends.checked(machine, bounds, (start, end), (setup.start_velocity, setup.end_velocity), setup.start_base)
     tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     equations = bind(machine, tasks) if tasks else None
     if equations is not None:
@@ -145,12 +143,15 @@ def dynamics_problem(
 
     problem = Problem("dynamics", setup.symbols)
     final = declare_horizon(problem, horizon)
-    motion = _declare_motion(problem, machine, ends, bounds, duration, control)
+    motion, jerks = _declare_motion(problem, machine, ends, bounds, duration, control)
     if setup.end_base is not None:
-        _declare_end_base(problem, machine, motion.base, setup.end_base)
+        _declare_end_base(problem, machine, motion[0], setup.end_base)
     loads: dict[str, Any] = {"friction": setup.friction, "wrenches": setup.wrenches, "gravity": setup.gravity}
-    torques = joint_torques(machine, motion[:4], **loads)
-    running = _declare_actuators(problem, machine, motion, torques, bounds, cost)
+    torques = joint_torques(machine, motion, **loads)
+    limit_torques(problem, machine.robot, torques, bounds.torque)
+    running = running_cost(machine, cost, motion, jerks=jerks, torques=torques)
+    if cost.energy or np.isfinite(bounds.power).any():
+        running += limit_power(problem, torques * motion[2], bounds, cost)
     if equations is not None:
         _declare_tasks(problem, equations, ends, motion, duration)
     if setup.clearance_constraints is not None:
@@ -183,7 +184,7 @@ class _Ends:
     start: Array
 
     @classmethod
-    def take(
+    def checked(
         cls, machine: Motors, bounds: JointBounds, joints: tuple[Any, Any], velocities: tuple[Any, Any], base: Any
     ) -> _Ends:
         n, hint = machine.joint_size, "keep within them, or leave that end free: nan"
@@ -208,78 +209,35 @@ class _Ends:
         return np.where(np.isnan(self.last), self.start, self.last)
 
     def quintic(self, duration: float, order: int) -> Any:
-        """Return the quintic joint motion used as guess, or for `order` > 0 its derivative, as a function of time."""
+        """Return the quintic joint motion of the initial guess, or a derivative of it, as a function of time."""
         shape = QUINTIC.deriv(order) if order else QUINTIC
         begin = self.start if order == 0 else np.zeros(len(self.start))
         return lambda t: begin + (self.end - self.start) * shape(t / duration) / duration**order
 
 
-class _Motion(NamedTuple):
-    """Symbols of the states and controls of a problem, and the time derivative of the base configuration."""
-
-    base: Any
-    joints: Any
-    rates: Any
-    second: Any
-    jerks: Any
-    base_rate: Any
-
-
 def _declare_motion(
     problem: Problem, machine: Motors, ends: _Ends, bounds: JointBounds, duration: float, control: str
-) -> _Motion:
-    """Declare the states and controls of joints and base, with their dynamics, limits and boundary conditions."""
-    robot, n = machine.robot, machine.joint_size
-    scales = _wheel_scales(robot, bounds, duration)
-    joints = problem.state(
-        "joints", n, initial=ends.first, terminal=ends.last, lower=bounds.lower, upper=bounds.upper,
-        guess=ends.quintic(duration, 0), unit=robot.unit(), scale=scales[0],
+) -> tuple[tuple[Any, Any, Any, Any], Any]:
+    """Declare states and controls of base and joints; return base, positions, rates and accelerations, and jerks."""
+    guess = {
+        name: ends.quintic(duration, order) for order, name in enumerate(("joints", "velocities", "accelerations"))
+    }
+    joints, rates, second, jerks = declare_joints(
+        problem, machine.robot, bounds, guess, jerk=control == "jerk",
+        starts=(ends.first, ends.first_rates, 0.0 * ends.first_rates),
+        ends=(ends.last, ends.last_rates, 0.0 * ends.last_rates),
+        scales=_wheel_scales(machine.robot, bounds, duration),
     )  # fmt: skip
-    rates = problem.state(
-        "velocities", n, initial=ends.first_rates, terminal=ends.last_rates, lower=-bounds.velocity,
-        upper=bounds.velocity, guess=ends.quintic(duration, 1), unit=robot.unit("/s"), scale=scales[1],
-    )  # fmt: skip
-    options: dict[str, Any] = {
-        "lower": -bounds.acceleration, "upper": bounds.acceleration, "guess": ends.quintic(duration, 2),
-        "scale": scales[2], "unit": robot.unit("/s^2"),
-    }  # fmt: skip
-    jerks: Any = ca.DM(0, 1)
-    if control == "jerk":
-        rest: dict[str, Any] = {"initial": 0.0 * ends.first_rates, "terminal": 0.0 * ends.last_rates}
-        second = problem.state("accelerations", n, **rest, **options)
-        jerks = problem.control(
-            "jerks", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"), scale=scales[3]
-        )
-        problem.dynamics(second, jerks)
-    else:
-        second = problem.control("accelerations", n, **options)
-    problem.dynamics(joints, rates)
-    problem.dynamics(rates, second)
     base: Any = ca.DM(0, 1)
     if machine.base_size:
         base = problem.state("base", machine.base_size, initial=None if ends.joined else ends.base, guess=ends.base)
-    base_rate = machine.base_rate(base, joints, rates)
-    if machine.base_size:
-        problem.dynamics(base, base_rate)
-    return _Motion(base, joints, rates, second, jerks, base_rate)
-
-
-def _declare_actuators(
-    problem: Problem, machine: Motors, motion: _Motion, torques: Any, bounds: JointBounds, cost: Cost
-) -> Any:
-    """Declare the torque and power limits of a problem, and return its running cost."""
-    limit_torques(problem, machine.robot, torques, bounds.torque)
-    running = running_cost(machine, cost, motion[:4], jerks=motion.jerks, torques=torques)
-    if cost.energy or np.isfinite(bounds.power).any():
-        running += limit_power(problem, torques * motion.rates, bounds, cost)
-    return running
+        problem.dynamics(base, machine.base_rate(base, joints, rates))
+    return (base, joints, rates, second), jerks
 
 
 def _checked_end(name: str, value: Any, n: int) -> Array:
-    """Return the user's positions or velocities at one end of a motion as numbers, nan where free. Shape (n,).
-
-    Raises:
-        ProblemError: The value has another size, or is infinite.
+    """Return positions or velocities that a user gives for one end of a motion as numbers (n,), nan where free; raise
+    ProblemError if the size is wrong or a number infinite.
     """
     if value is None:
         return np.full(n, np.nan)
@@ -291,11 +249,10 @@ def _checked_end(name: str, value: Any, n: int) -> Array:
 
 
 def _wheel_scales(robot: Robot, bounds: JointBounds, duration: float) -> Array:
-    """Return, for the solver, scales of reaction wheel angles, speeds, accelerations and jerks; nan for other joints.
-
-    Rotors are light and turn fast. Their scales are a quarter of the saturation speed and of the motor torque, or what
-    1 N m s and 1 N m cause where these are unlimited. Shape (4, n).
+    """Return scales for the solver of the angles, speeds, accelerations and jerks of reaction wheels, nan for other
+    joints. Shape (4, n).
     """
+    # rotors are light and turn fast: a quarter of saturation speed and motor torque, or what 1 N m s and 1 N m cause
     scales = np.full((4, robot.dof), np.nan)
     for name, inertia in find_wheels(robot).items():
         k = robot.joint_names.index(name)
@@ -333,9 +290,11 @@ def _declare_end_base(problem: Problem, machine: Motors, base: Any, end_base: An
         problem.end("base", gaps[rows], 0.0, 0.0, unit="m, rad")
 
 
-def _declare_tasks(problem: Problem, equations: TaskEquations, ends: _Ends, motion: _Motion, duration: float) -> None:
+def _declare_tasks(
+    problem: Problem, equations: TaskEquations, ends: _Ends, motion: tuple[Any, Any, Any, Any], duration: float
+) -> None:
     """Constrain the tip accelerations to those that tasks prescribe; declare the pose errors that the audit checks."""
-    base, joints, rates, second, *_ = motion
+    base, joints, rates, second = motion
     if not np.isnan(ends.first).any():
         checked_tasks(equations, ends.base, ends.first, duration)
     check_length(equations, ends.base, duration)

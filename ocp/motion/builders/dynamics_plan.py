@@ -28,13 +28,7 @@ from ocp.console import interruptible
 from ocp.direct.discretisation import Collocation
 from ocp.errors import ProblemError, SolveError, require
 from ocp.methods import solve
-from ocp.motion.builders.clearance import (
-    ClearanceConstraints,
-    Constraints,
-    collision_error,
-    is_clearance,
-    solve_with_clearance,
-)
+from ocp.motion.builders.clearance import ClearanceConstraints, collision_error, is_clearance, solve_with_clearance
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.builders.torques import Motors, checked_motors
@@ -46,12 +40,6 @@ from ocp.problem.problem import Problem, remembers_request
 from ocp.refinement import split
 from ocp.solution import Guess, Solution
 from ocp.tightening import WARM_START_OPTIONS, largest_excess, solve_at_switches, tighten
-
-__all__ = [
-    "POINTS", "SolveSettings", "audit_error", "breaks_of", "checked_goals", "dynamics_phases", "machines_of",
-    "phase_names",
-    "solve_dynamics", "within_limits",
-]  # fmt: skip
 
 
 @remembers_request("dynamics phases")
@@ -123,7 +111,7 @@ def dynamics_phases(
 
 
 def checked_goals(goals: Any) -> tuple[Goal, ...]:
-    """Check that one problem can lead to goals one after the other, a phase to each, and return the goals as a tuple.
+    """Return goals as a tuple after checking that one problem, with a phase for each goal, can reach them one by one.
 
     Raises:
         ProblemError: There are none; one is no Goal, is a pose, or has no duration; two have the same name.
@@ -194,28 +182,23 @@ def _join(phases: Phases, before: str, after: str, goal: Goal) -> None:
 
 POINTS = Collocation(20, degree=5, scheme="legendre")
 IPOPT = {"max_iter": 300}
-ROWS = r"(?P<phase>[^.;:,\n]*?\.)?(?P<quantity>joints|velocities|accelerations|jerks|torques|power)\[(?P<row>\d+)\]"
+LABELS = r"(?P<phase>[^.;:,\n]*?\.)?(?P<quantity>joints|velocities|accelerations|jerks|torques|power)\[(?P<row>\d+)\]"
 """Regular expression of constraint labels such as "torques[1]", with or without the name of a phase."""
 
 
 @dataclass(frozen=True)
-class HoldingSettings:
-    """Settings of the search for a plan that satisfies its limits between the nodes of the mesh.
+class MeshSettings:
+    """Settings of the search for a plan that satisfies its limits between the nodes of the mesh."""
 
-    Attributes:
-        meshes: Largest number of meshes, each finer than the one before.
-        splits: Number of parts of an interval whose tightened limit costs too much; 3 reduce this cost to a ninth.
-        excess: Largest excess of a limit between the nodes, in its own unit.
-        cost_increase: Largest relative increase of the cost by tightened limits; above it, nodes at switches help more.
-    """
-
-    meshes: int = 3
+    meshes: int = 3  # largest number of meshes, each finer than the one before
+    # number of parts of an interval whose tightened limit costs too much; 3 reduce this cost to a ninth
     splits: int = 3
-    excess: float = 1e-5
+    excess: float = 1e-5  # largest excess of a limit between the nodes, in its own unit
+    # largest relative increase of the cost by tightened limits; above it, nodes at switches help more
     cost_increase: float = 1e-3
 
 
-HOLDING = HoldingSettings()
+MESH_SETTINGS = MeshSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,8 +318,8 @@ def audit_error(audit: Audit, solution: Solution) -> SolveError:
 
 
 def within_limits(
-    declare: Callable[[Constraints], Problem],
-    clearance_constraints: Constraints,
+    declare: Callable[[ClearanceConstraints | None], Problem],
+    clearance_constraints: ClearanceConstraints | None,
     machines: Mapping[str, tuple[Machine, Limits | None]],
     *,
     breaks: Sequence[float] = (),
@@ -369,7 +352,7 @@ def within_limits(
                 raise
         return solve_problem(problem, guess)
 
-    def run(clearance_constraints: Constraints) -> Solution:
+    def run(clearance_constraints: ClearanceConstraints | None) -> Solution:
         return solve_problem(declare(clearance_constraints), in_collision or guess)
 
     try:
@@ -385,15 +368,14 @@ def _first_within_limits(
     tolerances: Mapping[str, float] | None,
     begin: Guess,
 ) -> Solution:
-    """Solve a problem on finer and finer meshes; return the first plan within its limits that passes its audit.
-
-    Raises:
-        SolveError: As `within_limits`; at once if collisions are all that is wrong with a plan.
+    """Solve a problem on finer and finer meshes; return the first plan within its limits that passes its audit, or else
+    the feasible one of least cost; raise SolveError if there is none, or if collisions are all that is wrong with a
+    plan.
     """
     reasons: list[str] = []
     failure, last, guess = SolveError(), None, begin
     feasible, costly = list[Solution](), list[tuple[Collocation, Solution]]()
-    for _ in range(HOLDING.meshes):
+    for _ in range(MESH_SETTINGS.meshes):
         for variant, plan in _attempts(problem, mesh, settings, guess):
             name = f"{mesh.intervals} intervals{variant}"
             if isinstance(plan, SolveError):
@@ -423,7 +405,7 @@ def _first_within_limits(
             own = finest.with_mesh(plan.control_interpolant.breaks)
             with suppress(SolveError):
                 plan = tighten(
-                    problem, own, tolerance=HOLDING.excess, options={**WARM_START_OPTIONS, **settings}, guess=plan
+                    problem, own, tolerance=MESH_SETTINGS.excess, options={**WARM_START_OPTIONS, **settings}, guess=plan
                 )
                 audit = plan.audit(tolerances=tolerances)
                 tightened += [plan] if audit.feasible else []
@@ -439,7 +421,7 @@ def _first_within_limits(
 def _attempts(
     problem: Problem, mesh: Collocation, settings: Mapping[str, Any], guess: Guess
 ) -> Iterator[tuple[str, Solution | SolveError]]:
-    """Yield a label and a plan, or the error, of a solve on a mesh, and of one with nodes at the plan's switches."""
+    """Solve on a mesh, then with nodes at the switches of the plan; yield a label and the plan or error of each."""
     warm = {**WARM_START_OPTIONS, **settings}
     try:
         plan = solve(problem, mesh, options=warm if isinstance(guess, Solution) else settings, guess=guess)
@@ -455,12 +437,15 @@ def _attempts(
 def _tighten_limits(
     problem: Problem, mesh: Collocation, plan: Solution, settings: Mapping[str, Any]
 ) -> Solution | SolveError:
-    """Tighten limits until a plan satisfies the original limits between mesh nodes; return this plan, or the error."""
-    if largest_excess(problem, plan) <= HOLDING.excess:
+    """Tighten limits until a plan satisfies the original ones between mesh nodes; return this plan, or the error."""
+    if largest_excess(problem, plan) <= MESH_SETTINGS.excess:
         return plan
-    own, largest = mesh.with_mesh(plan.control_interpolant.breaks), plan.cost + HOLDING.cost_increase * abs(plan.cost)
+    own, largest = (
+        mesh.with_mesh(plan.control_interpolant.breaks),
+        plan.cost + MESH_SETTINGS.cost_increase * abs(plan.cost),
+    )
     try:
-        tight = tighten(problem, own, tolerance=HOLDING.excess, options=settings, guess=plan, max_cost=largest)
+        tight = tighten(problem, own, tolerance=MESH_SETTINGS.excess, options=settings, guess=plan, max_cost=largest)
     except SolveError as error:
         return error
     if tight.cost <= largest:
@@ -474,12 +459,12 @@ def _finer(mesh: Collocation, plan: Solution, failure: SolveError) -> Collocatio
     if plan.bound_tightening is None or failure.solution is not plan or failure.name != "cost":
         return mesh.halve()
     nodes, amounts = plan.control_interpolant.breaks, plan.bound_tightening.max(axis=(0, 2))
-    parts = np.where(amounts > 0, HOLDING.splits, 1)
-    return mesh.with_mesh(split(nodes, parts, amounts, HOLDING.splits * len(amounts)))
+    parts = np.where(amounts > 0, MESH_SETTINGS.splits, 1)
+    return mesh.with_mesh(split(nodes, parts, amounts, MESH_SETTINGS.splits * len(amounts)))
 
 
 def _with_joint_names(error: SolveError, machines: Mapping[str, tuple[Machine, Limits | None]]) -> SolveError:
-    """Return an error that names joints instead of indices: "torques of 'elbow'" for "torques[1]"."""
+    """Return an error with the names of joints in place of their indices: "torques of 'elbow'" for "torques[1]"."""
 
     def joint_label(label: re.Match[str]) -> str:
         phase, quantity, row = label["phase"] or "", label["quantity"], int(label["row"])
@@ -492,7 +477,7 @@ def _with_joint_names(error: SolveError, machines: Mapping[str, tuple[Machine, L
             names = [name for name, own in zip(names, limited_machines, strict=True) if own]
         return f"{phase}{quantity} of {names[row]!r}" if row < len(names) else label[0]
 
-    rows = re.compile(ROWS)
+    rows = re.compile(LABELS)
     name = None if error.name is None else rows.sub(joint_label, str(error.name))
     details = {"name": name, "value": error.value, "limit": error.limit, "time": error.time}
     return SolveError(rows.sub(joint_label, str(error)), error.solution, error.conflicts, **details)

@@ -32,8 +32,6 @@ from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-__all__ = ["VelocitySetup", "joint_motion_problem", "minimum_velocity_problem", "motion_along"]
-
 RATE_SLACK = 1e-9
 """Relative excess allowed over a rate limit, since a motion at constant speed may be at its limit all the time."""
 

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import factorial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from models import FixedBase, Machine
 from models.checks import NOT_NUMBERS, floats
@@ -25,10 +25,7 @@ from ocp.motion.schedule import PathLike
 from ocp.motion.tasks.speed_profile import Array
 from ocp.solution import Solution
 
-__all__ = ["PlannedJoints", "joint_path"]
-
 DEGREE = 5
-DERIVATIVES = 3
 ROW_OPERATIONS = {
     ca.OP_ADD: np.add,
     ca.OP_SUB: np.subtract,
@@ -49,19 +46,13 @@ They are called with the operands and the output array.
 
 @dataclass(frozen=True)
 class SplineSettings:
-    """Settings of the spline of joint positions along a path.
+    """Settings of the spline of joint positions along a path."""
 
-    Attributes:
-        path_tolerance: Largest distance of a task from its path, as a share of the path's length.
-        path_samples: Number of points of a path to which targets are compared, to find those that belong to the path.
-        projections: Number of Newton steps by which targets are projected onto the path.
-        batch: Number of path points whose torques are computed together.
-    """
-
-    path_tolerance: float = 1e-6
+    path_tolerance: float = 1e-6  # largest distance of a task from its path, as a share of the path's length
+    # number of points of a path to which targets are compared, to find those that belong to the path
     path_samples: int = 200
-    projections: int = 8
-    batch: int = 1024
+    projections: int = 8  # number of Newton steps by which targets are projected onto the path
+    batch: int = 1024  # number of path points whose torques are computed together
 
 
 SPLINE = SplineSettings()
@@ -84,17 +75,6 @@ class _Torques(NamedTuple):
     rest: Array
 
 
-class PlanLike(Protocol):
-    """Interface of the plans, such as `ocp.Plan`, whose joint positions `joint_path` can sample."""
-
-    @property
-    def horizon(self) -> float: ...
-    @property
-    def targets(self) -> Sequence[Any]: ...
-    def task_share(self, times: Any) -> Array: ...
-    def at(self, time: Any) -> dict[str, Array]: ...
-
-
 @dataclass(frozen=True, eq=False)
 class PlannedJoints:
     """Joint positions and torques of a machine as functions of the distance along a path, built by `joint_path`.
@@ -111,7 +91,7 @@ class PlannedJoints:
     names: tuple[str, ...]
     length: float
     error: float
-    curves: _PiecewisePolynomial
+    curves: Any
     forces: _BatchedFunction | None
 
     def at(self, distance: Any) -> _Along:
@@ -120,10 +100,11 @@ class PlannedJoints:
         Raises:
             ProblemError: A distance is nan, or off the path by more than rounding.
         """
-        return _Along(*self.curves(self._check_distance(distance)))
+        places = self._check_distance(distance)
+        return _Along(*(self.curves(places, order) for order in range(4)))
 
     def torques(self, distance: Any) -> _Torques:
-        """Return the coefficients of the joint torques at distances (M,) along the path, m; see `_Torques`.
+        """Return inertia, drag and rest terms of the joint torques at path distances (M,), m. Shape (M, n) each.
 
         Raises:
             ProblemError: The base of the machine moves, or distances are invalid, see `at`.
@@ -136,10 +117,7 @@ class PlannedJoints:
 
     def _check_distance(self, distance: Any) -> Array:
         """Clip distances to the path; raise ProblemError if a distance is off the path by more than rounding errors."""
-        try:
-            s = np.atleast_1d(floats(distance))
-        except NOT_NUMBERS as error:
-            raise ProblemError(f"distance {distance!r} is not numeric", name="distance", value=distance) from error
+        s = np.atleast_1d(require.array("distance", distance, entries="any"))
         slack = 1e-9 * self.length
         wrong = s[~((s >= -slack) & (s <= self.length + slack))]
         if s.ndim != 1 or wrong.size:
@@ -149,12 +127,7 @@ class PlannedJoints:
 
 
 def joint_path(
-    machine: Machine,
-    plan: PlanLike | Solution | tuple[Any, Any],
-    path: PathLike,
-    *,
-    samples: int = 400,
-    names: Sequence[str] | None = None,
+    machine: Machine, plan: Any, path: PathLike, *, samples: int = 400, names: Sequence[str] | None = None
 ) -> PlannedJoints:
     """Return a spline of joint positions over the distance along a path, from a plan along the path or from samples.
 
@@ -185,21 +158,19 @@ def joint_path(
     if len(own) != machine.joint_size:
         message = f"{len(own)} names for {machine.joint_size} joints"
         raise ProblemError(message, name="names", value=own, limit=machine.joint_size)
-    curves = _spline(s, joints)
+    curves = scipy.interpolate.make_interp_spline(s, joints, k=DEGREE)
     half = np.arange(0, len(s), 2)
     half = half if half[-1] == len(s) - 1 else np.append(half, len(s) - 1)
-    coarse = _spline(s[half], joints[half])(s)[0]
-    error = float(np.abs(coarse - joints).max())
-    return PlannedJoints(machine, own, float(length), error, curves, _forces(machine))
+    coarse = scipy.interpolate.make_interp_spline(s[half], joints[half], k=DEGREE)
+    error = float(np.abs(coarse(s) - joints).max())
+    return PlannedJoints(machine, own, float(length), error, curves, _torque_function(machine))
 
 
 def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple[Array, Array]:
-    """Return path distances (M,) and joint positions (M, n) of a plan whose tasks run along the path.
+    """Return path distances (M,) and joint positions (M, n) of a plan whose tasks run along the path; raise
+    ProblemError if they do not.
 
     The times are chosen so that the distances are nearly evenly spaced, also where the tool speeds up from rest.
-
-    Raises:
-        ProblemError: The tasks leave the path, stand still on it, or do not cover it; or the plan has several motions.
     """
     times = np.linspace(0.0, plan.horizon, samples)
     if not (plan.targets and hasattr(path, "at")):
@@ -213,10 +184,8 @@ def _samples_of_plan(plan: Any, path: Any, length: float, samples: int) -> tuple
 
 
 def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> Array:
-    """Return how far along the path the targets of a plan are at given times, from 0 to the path's length. Shape (M,).
-
-    Raises:
-        ProblemError: As in `_samples_of_plan`.
+    """Return how far along a path the targets of a plan are at given times, from 0 to the path's length; raise
+    ProblemError unless the targets run along the whole path. Shape (M,).
     """
 
     def fail(what: str, at: int, value: float) -> ProblemError:
@@ -261,7 +230,7 @@ def _distances_of_targets(plan: Any, path: Any, length: float, times: Array) -> 
 
 
 def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple[Array, Array]:
-    """Sample a solution along a path, or check given samples; return path distances (M,) and joint positions (M, n)."""
+    """Return path distances (M,) and joint positions (M, n) of a solution or of given samples, after checking them."""
     if isinstance(plan, tuple):
         try:
             s, joints = (floats(part) for part in plan)
@@ -287,33 +256,6 @@ def _checked_samples(plan: Any, length: float, samples: int, size: int) -> tuple
     s = s.copy()
     s[0], s[-1] = 0.0, length
     return s, joints
-
-
-class _PiecewisePolynomial:
-    """Spline that is stored as one Taylor polynomial per interval, about the middle of the interval.
-
-    Args:
-        breaks: Ends of the intervals. Shape (K + 1,), m.
-        derivatives: Derivatives of order 0 to DEGREE in each middle, with respect to distance / `unit`. Shape
-            (DEGREE + 1, K, n).
-        unit: Unit of the distance, m.
-    """
-
-    def __init__(self, breaks: Array, derivatives: Array, unit: float) -> None:
-        self.breaks, self.middle, self.unit = breaks, (breaks[:-1] + breaks[1:]) / 2, unit
-        self.derivatives = np.ascontiguousarray(derivatives.transpose(1, 0, 2))
-        # the k-th derivative at x from the middle is the sum of the m-th in the middle times x^(m - k) / (m - k)!
-        orders = np.arange(DEGREE + 1) - np.arange(DERIVATIVES + 1)[:, None]
-        self.power = np.maximum(orders, 0)
-        self.weight = np.array([[1 / factorial(m) if m >= 0 else 0.0 for m in row] for row in orders.tolist()])
-        self.weight /= unit ** np.arange(DERIVATIVES + 1)[:, None]
-
-    def __call__(self, distance: Array) -> Array:
-        """Return the values and first three derivatives of the spline at distances (M,). Shape (4, M, n)."""
-        interval = np.clip(np.searchsorted(self.breaks, distance, side="right") - 1, 0, len(self.middle) - 1)
-        x = (distance - self.middle[interval]) / self.unit
-        powers = x[:, None] ** np.arange(DEGREE + 1)
-        return np.asarray((self.weight * powers[:, self.power] @ self.derivatives[interval]).transpose(1, 0, 2))
 
 
 class _BatchedFunction:
@@ -373,23 +315,9 @@ class _BatchedFunction:
         return table, [(step[0], [rows[place] for place in step[1:]]) for step in self.steps]
 
 
-def _spline(s: Array, joints: Array) -> _PiecewisePolynomial:
-    """Return the spline that interpolates joint positions (M, n) at distances (M,) along a path, m."""
-    # in units of the length, which keeps the derivatives of the fit in range
-    unit = float(s[-1])
-    fit = ca.interpolant("fit", "bspline", [(s / unit).tolist()], joints.ravel().tolist(), {"degree": [DEGREE]})
-    place = ca.MX.sym("distance")
-    values = [fit(place)]
-    for _ in range(DEGREE):
-        values.append(ca.jacobian(values[-1], place))
-    derivatives = ca.Function("joints", [place], values).map(len(s) - 1)(((s[:-1] + s[1:]) / 2 / unit)[None])
-    return _PiecewisePolynomial(s, np.array([value.full().T for value in derivatives]), unit)
-
-
-def _forces(machine: Machine) -> _BatchedFunction | None:
-    """Return a function that computes the coefficients of joint torques along a path; None if the base moves.
-
-    Its inputs are joint positions and their first two derivatives with respect to distance, its outputs `_Torques`.
+def _torque_function(machine: Machine) -> _BatchedFunction | None:
+    """Return a function of joint positions and their first two derivatives with respect to distance that computes the
+    coefficients `_Torques` of the joint torques; None if the base moves.
     """
     if not isinstance(machine, FixedBase):
         return None

@@ -41,24 +41,17 @@ from ocp.motion.tasks.speed_profile import Array, SpeedProfile, integrate_jerk
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
-__all__ = ["Fastest", "TimingProblem", "minimum_time_problem", "solve_minimum_time"]
-
 IPOPT = {"tol": 1e-9, "constr_viol_tol": 1e-9, "max_iter": 1000}
 
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Settings of the mesh refinement in `solve_minimum_time`.
+    """Settings of the mesh refinement in `solve_minimum_time`."""
 
-    Attributes:
-        demand: Largest accepted relative excess of a limit in an interval.
-        defect: Largest accepted error of integration in an interval, relative to its distance and to the top speed.
-        parts: Largest number of parts of an interval in one refinement.
-    """
-
-    demand: float = 2e-4
+    demand: float = 2e-4  # largest accepted relative excess of a limit in an interval
+    # largest accepted error of integration in an interval, relative to its distance and to the top speed
     defect: float = 1e-6
-    parts: int = 8
+    parts: int = 8  # largest number of parts of an interval in one refinement
 
 
 REFINEMENT = RefinementSettings()
@@ -86,7 +79,7 @@ class TimingProblem:
 
     @property
     def method(self) -> Collocation:
-        """Collocation with constant jerk in each interval, which prevents overshoot between the collocation points."""
+        """Collocation method with constant jerk in each interval, which does not overshoot between the points."""
         return Collocation(len(self.mesh) - 1, 3, scheme="legendre", control="held", mesh=self.mesh)
 
     def profile(self, solution: Solution) -> SpeedProfile:
@@ -108,7 +101,7 @@ class TimingProblem:
         pace = (self.reference.at(begin + horizon * inside).speed / speed).reshape(-1, len(points))
         durations = horizon * np.diff(breaks) * (pace @ weights) / 2
         s = self.reference.at(begin + horizon * breaks).distance
-        first, last = self.ends
+        first, last = _ends(self.reference, self.span)
         ramps = 3 * first / v[0], 3 * last / v[-1]
         return SpeedProfile(
             np.concatenate([[0.0], np.cumsum([ramps[0], *durations, ramps[1]])]),
@@ -118,15 +111,10 @@ class TimingProblem:
             np.concatenate([[a[0] * v[0] / (3 * first)], jerk, [-a[-1] * v[-1] / (3 * last)]]),
         )
 
-    @property
-    def ends(self) -> tuple[float, float]:
-        """Lengths of the parts of the path, m, in which the motion starts and stops with constant jerk."""
-        return _ends(self.reference, self.span)
-
 
 @dataclass(frozen=True, eq=False)
-class Fastest:
-    """Fastest motion along a path, with its minimum-time problem and solution.
+class FastestMotion:
+    """FastestMotion motion along a path, with its minimum-time problem and solution.
 
     Attributes:
         schedule: Motion as from ocp.motion.schedule, without a list of dips.
@@ -156,7 +144,7 @@ def solve_minimum_time(
     intervals: int = 200,
     rounds: int = 6,
     options: dict[str, Any] | None = None,
-) -> Fastest:
+) -> FastestMotion:
     """Plan the fastest motion along a path from rest to rest under all limits.
 
     The duration is an upper bound of the least time. Jerks held over intervals cannot follow a limit exactly, which
@@ -182,13 +170,13 @@ def solve_minimum_time(
         solution = solve(timing.problem, timing.method, guess=solution, options={**IPOPT, **options})
         profile = timing.profile(solution)
         demand = demand_of_intervals(path, limits, joints, profile)
-        parts = _refinement(profile, demand)
+        parts = _parts_of_intervals(profile, demand)
         if number == rounds or parts.max() == 1:
             break
         mesh = tuple(subdivide(np.array(timing.mesh), parts).tolist())
         timing = TimingProblem(timing.problem, mesh, timing.units, timing.reference, timing.span)
     assert solution is not None
-    return Fastest(Schedule(path, limits, profile, (), joints), solution, timing, float(demand.max()))
+    return FastestMotion(Schedule(path, limits, profile, (), joints), solution, timing, float(demand.max()))
 
 
 @interruptible
@@ -210,11 +198,16 @@ def minimum_time_problem(
         path, limits, joints, guess, intervals: As for `solve_minimum_time`.
 
     Raises:
-        ProblemError: Joint limits are given without joints; the joint jerk is limited on a path whose curvature jumps;
-            curvature or joints are not finite; the guess is for another path; there are fewer than 10 intervals.
+        ProblemError: Joint limits are given without joints; limits of tool or torque are given; the joint jerk is
+            limited on a path whose curvature jumps; curvature or joints are not finite; the guess is for another path;
+            there are fewer than 10 intervals.
     """
     require.count("intervals", intervals, 10)
     limited = check_line(path, limits, joints)
+    unsupported = {"tool": limits.tool is not None}
+    unsupported["torque"] = limits.joints is not None and bool(np.isfinite(limits.joints.torque).any())
+    for name in (name for name, is_limited in unsupported.items() if is_limited):
+        raise ProblemError(f"this problem has no constraints on the {name}; call schedule instead", name=name)
     if guess is not None:
         require.instance("guess", guess, Schedule)
     if guess is not None and abs(guess.path.length - path.length) > 1e-9 * path.length:
@@ -251,9 +244,8 @@ def _declare(
     units: tuple[float, ...],
     along: Any,
 ) -> Problem:
-    """Declare the minimum-time problem over an interval of the path parameter theta, in scaled units.
-
-    `along` is the function of theta that returns the reference speed and the values of `path_columns`.
+    """Declare the minimum-time problem over an interval of the path parameter theta, in scaled units; `along` is the
+    function of theta that returns the reference speed and the values of `path_columns`.
     """
     problem = Problem("minimum time along a path", symbols=ca.MX)
     v_unit, a_unit, j_unit = units
@@ -295,9 +287,8 @@ def _declare(
 
 
 def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, a: Any, j: Any) -> dict[str, Any]:
-    """Return the ratios of centripetal acceleration and joint velocities, accelerations and jerks to their limits.
-
-    `values` are the reference speed and the values of `path_columns`; v, a, j are path speed, acceleration and jerk.
+    """Return the ratios of centripetal acceleration and joint velocities, accelerations and jerks to their limits at
+    path speed v, acceleration a and jerk j; `values` are the reference speed and the values of `path_columns`.
     """
     demands: dict[str, Any] = {}
     if np.isfinite(limits.centripetal):
@@ -318,10 +309,9 @@ def _demands(limits: LineLimits, joints: JointPath | None, values: Any, v: Any, 
     return demands
 
 
-def _refinement(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
-    """Return the number of parts into which to split each mesh interval, from limit violation and integration error.
-
-    Both decrease with the square of the length of the interval.
+def _parts_of_intervals(profile: SpeedProfile, demand: Array) -> NDArray[np.intp]:
+    """Return the number of parts into which to split each mesh interval, from limit violation and integration error,
+    which decrease with the square of the length of the interval.
     """
     v, a, j, t = profile.speed, profile.acceleration, profile.jerk, np.diff(profile.t)
     distance, speed, _ = integrate_jerk(v[:-1], a[:-1], j, t)

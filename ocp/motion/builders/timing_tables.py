@@ -20,28 +20,15 @@ from numpy.typing import NDArray
 from ocp.errors import ProblemError
 from ocp.motion.schedule.limits import (
     JointPath,
-    JointRates,
     LineLimits,
     PathLike,
     check_smooth,
     curvature_along,
+    limit_rows,
     rates_along,
 )
 from ocp.motion.schedule.planner import schedule
 from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, segment_index
-
-__all__ = [
-    "Columns",
-    "demand_of_intervals",
-    "distinct",
-    "largest_demand",
-    "path_columns",
-    "reference_mesh",
-    "reference_motion",
-    "speed_limit",
-    "subdivide",
-    "table",
-]
 
 Columns = Callable[[Array], Array]
 """Type of a function that returns C quantities of a path, shape (M, C), at times (M,) of the reference motion."""
@@ -49,25 +36,16 @@ Columns = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class TableSettings:
-    """Settings of the tables of path quantities, and of the mesh of the minimum-time problem.
+    """Settings of the tables of path quantities, and of the mesh of the minimum-time problem."""
 
-    Attributes:
-        degree: Degree of the polynomials of a table.
-        accuracy: Largest error of a tabulated quantity, relative to its largest value.
-        smallest_cell: Width of an interval that is not halved further, relative to the whole.
-        halvings: Largest number of halvings of an interval.
-        points: Points of an interval at which ratios to limits are evaluated, ten for each collocation point and node.
-        beside_jump: Distance of nodes from a jump of the path's derivatives, relative to the whole time.
-        same_node: Distance of nodes that count as one, relative to the whole time.
-    """
-
-    degree: int = 7
-    accuracy: float = 1e-8
-    smallest_cell: float = 1e-9
-    halvings: int = 40
+    degree: int = 7  # degree of the polynomials of a table
+    accuracy: float = 1e-8  # largest error of a tabulated quantity, relative to its largest value
+    smallest_cell: float = 1e-9  # width of an interval that is not halved further, relative to the whole
+    halvings: int = 40  # largest number of halvings of an interval
+    # points of an interval at which ratios to limits are evaluated, ten for each collocation point and node
     points: int = 40
-    beside_jump: float = 1e-6
-    same_node: float = 1e-7
+    beside_jump: float = 1e-6  # distance of nodes from a jump of the path's derivatives, relative to the whole time
+    same_node: float = 1e-7  # distance of nodes that count as one, relative to the whole time
 
 
 TABLES = TableSettings()
@@ -140,48 +118,11 @@ def path_columns(path: PathLike, limits: LineLimits, joints: JointPath | None, s
 def largest_demand(path: PathLike, limits: LineLimits, joints: JointPath | None, motion: LineMotion) -> Array:
     """Return the largest ratio of a limited quantity to its limit at each sample of a motion along a path. Shape (M,).
 
-    Where the path's derivatives jump, the values after the jump count.
+    Torques are not among the quantities. Where the path's derivatives jump, the values after the jump count.
     """
-    s = motion.distance
-    rates = joints.at(s) if joints is not None and limits.joints is not None else None
-    curvature = np.asarray(path.curvature(s)) if np.isfinite(limits.centripetal) else np.zeros(len(s))
-    steady, power = line_demands(limits, curvature, rates)
-    rows = [motion.speed / speed_limit(path, limits, s), steady[0] * motion.speed**2]
-    rows += [np.abs(motion.acceleration) / limits.acceleration, np.abs(motion.jerk) / limits.jerk]
-    if rates is not None:
-        velocities = steady[1:][power[1:] == 1]
-        rows += [*(velocities * motion.speed), *joint_demands(limits, rates, motion)]
-    return np.asarray(np.max(rows, axis=0))
-
-
-def line_demands(limits: LineLimits, curvature: Array | None, rates: JointRates | None) -> tuple[Array, Array]:
-    """Return ratios of quantities to limits at path speed 1 m/s, and the powers of speed with which they grow.
-
-    The speed along the path is constant. The rows are the centripetal acceleration, then velocity, acceleration and
-    jerk of each joint. Shapes (C, M), (C,).
-    """
-    count = 0 if rates is None else len(rates.first)
-    rows = [np.zeros((1, count)) if curvature is None else curvature[None] / limits.centripetal]
-    powers = [2.0]
-    if rates is not None:
-        number = rates.first.shape[1]
-        bounds = limits.of_joints(number)
-        for order, derivative in enumerate((rates.first, rates.second, rates.third)):
-            rows.append(np.abs(derivative.T) / bounds[order][:, None])
-            powers += [order + 1.0] * number
-    return np.concatenate(rows), np.array(powers)
-
-
-def joint_demands(limits: LineLimits, rates: JointRates, motion: LineMotion) -> Array:
-    """Return the ratios of joint accelerations and jerks to their limits at M samples of a motion along a path.
-
-    They are q'' v^2 + q' a and q''' v^3 + 3 q'' v a + q' j at path speed v, acceleration a, jerk j. Shape (2 n, M).
-    """
-    v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
-    _, largest, jerks = limits.of_joints(rates.first.shape[1])
-    accelerations = (rates.second * v**2 + rates.first * a) / largest
-    jerk = (rates.third * v**3 + 3 * rates.second * v * a + rates.first * j) / jerks
-    return np.asarray(np.abs(np.concatenate([accelerations.T, jerk.T])))
+    usage = np.abs(limit_rows(path, limits, joints, motion.distance, torques=False).usage(motion))
+    usage[:, 0] **= 2  # the speed at the centripetal limit, of which the acceleration is the square
+    return np.asarray(np.maximum(motion.speed / speed_limit(path, limits, motion.distance), usage.max(axis=1)))
 
 
 def demand_of_intervals(path: PathLike, limits: LineLimits, joints: JointPath | None, profile: SpeedProfile) -> Array:
@@ -209,16 +150,11 @@ def reference_motion(path: PathLike, limits: LineLimits, joints: JointPath | Non
         check_smooth(path, limits, joints)  # raises if no motion satisfies the limits
     quick = schedule(path, LineLimits(limits.speed, limits.acceleration, limits.jerk)).profile
     # slowed down by a factor: velocities shrink with it, accelerations with its square, jerks with its cube
-    fractions = np.linspace(0, 1, 2001)
-    motion = quick.at(quick.duration * fractions)
-    rates = None if joints is None else joints.at(motion.distance)
-    steady, power = line_demands(limits, np.asarray(path.curvature(motion.distance)), rates)
-    slower = [(steady[power == 1] * motion.speed).max(initial=1.0), np.sqrt(steady[0] * motion.speed**2).max()]
-    if joints is not None and rates is not None:
-        whole = joint_demands(limits, rates, motion)
-        count = len(joints.names)
-        slower += [np.sqrt(whole[:count]).max(), np.cbrt(whole[count:]).max()]
-    c = 1.05 * float(max(slower))
+    motion = quick.at(quick.duration * np.linspace(0, 1, 2001))
+    rows = limit_rows(path, limits, joints, motion.distance, torques=False)
+    ends = np.cumsum([kind.shape[1] for kind in rows])[:-1]
+    kinds = np.split(np.abs(rows.usage(motion)), ends, axis=1)
+    c = 1.05 * max(float(kind.max(initial=1.0)) ** (1 / (order + 1)) for order, kind in enumerate(kinds))
     return SpeedProfile(quick.t * c, quick.distance, quick.speed / c, quick.acceleration / c**2, quick.jerk / c**3)
 
 

@@ -33,8 +33,6 @@ from ocp.motion.tasks.tip_task import TipTask, is_holonomic
 from ocp.problem.problem import Problem
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["CLOCK", "PACE", "SLOPES", "Stretch", "ToolMotion", "ToolMotionSetup", "stretches_of", "tool_motion_problem"]
-
 CLOCK, SLOPES, PACE = "clock", "slopes", "pace"
 """Names of variables of a problem with free time: the time, and derivatives of joint positions and of the time.
 
@@ -46,18 +44,13 @@ ERRORS, START_ERRORS = "task errors", "start errors"
 
 @dataclass(frozen=True)
 class FeedbackSettings:
-    """Settings of the feedback of pose errors, and of relaxed tasks, from which a motion may deviate at a cost.
+    """Settings of the feedback of pose errors, and of relaxed tasks, from which a motion may deviate at a cost."""
 
-    Attributes:
-        decay: Largest decay of a pose error over a mesh interval, as a power of e; faster decay needs a finer mesh.
-        intervals: Least number of intervals of the mesh in a stretch.
-        closed_gap: Pose error at the beginning of a task below which there is no gap to close, m and rad.
-        relaxation: Velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s.
-    """
-
+    # largest decay of a pose error over a mesh interval, as a power of e; faster decay needs a finer mesh
     decay: float = 4.0
-    intervals: int = 8
-    closed_gap: float = 1e-6
+    intervals: int = 8  # least number of intervals of the mesh in a stretch
+    closed_gap: float = 1e-6  # pose error at the beginning of a task below which there is no gap to close, m and rad
+    # velocity error of a relaxed task, m/s or rad/s, that costs as much as a joint rate of 1 rad/s
     relaxation: float = 1e-5
 
 
@@ -110,7 +103,7 @@ class ToolMotion:
     breaks: Array
 
     def guess(self, motions: Sequence[LocalMotion], number: int) -> dict[str, Any]:
-        """Return initial guesses of states and controls, by name, from the resolved-rate motion of this number."""
+        """Return initial guesses of states and controls, by name, from the resolved-rate motion with index `number`."""
         guess: dict[str, Any] = {}
         for stretch, part in zip(self.stretches, motions, strict=True):
             t = (part.t - stretch.begin) * (self.horizon / stretch.duration)
@@ -222,7 +215,7 @@ def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: T
     problem.horizon(horizon)
     motion = _Motion(problem, machine, tuple(stretches), setup)
     if setup.time_cost is not None:
-        return _in_free_time(motion, setup.time_cost)
+        return _declare_in_free_time(motion, setup.time_cost)
     running: Any = 0
     before, first, known = None, None, None
     for stretch in stretches:
@@ -247,7 +240,7 @@ def tool_motion_problem(machine: Machine, stretches: Sequence[Stretch], setup: T
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Optimal control problem under construction, with the data that all its time intervals share."""
+    """Optimal control problem of a tool motion while it is declared, with the machine, stretches and setup."""
 
     problem: Problem
     machine: Machine
@@ -260,11 +253,11 @@ class _Motion:
         return self.stretches[-1].end
 
     def pace(self, stretch: Stretch) -> float:
-        """Return the ratio of a time interval's duration to the horizon, by which the dynamics in it are scaled."""
+        """Return the ratio of a stretch's duration to the horizon, by which the dynamics in it are scaled."""
         return stretch.duration / self.horizon
 
-    def states(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare joint positions and, if the base moves, the base configuration in one time interval as states."""
+    def declare_states(self, stretch: Stretch) -> tuple[Any, Any]:
+        """Declare joint positions and, if the base moves, its configuration in one stretch; return base and joints."""
         machine, begins, ends = self.machine, stretch is self.stretches[0], stretch is self.stretches[-1]
         place: Any = np.zeros(0)
         if machine.base_size:
@@ -277,8 +270,8 @@ class _Motion:
         options |= {"initial": self.setup.start if begins else None, "terminal": self.setup.start if returns else None}
         return place, self.problem.state(f"joints{stretch.suffix}", machine.joint_size, **options)
 
-    def velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
-        """Declare the joint velocities in a time interval; return velocities, accelerations and running cost."""
+    def declare_velocities(self, stretch: Stretch, place: Any, joints: Any, pace: Any) -> tuple[Any, Any, Any]:
+        """Declare the joint velocities in one stretch; return velocities, accelerations and running cost."""
         assert self.setup.actuation is not None
         begins, ends = (rests and stretch is self.stretches[-k] for k, rests in enumerate(self.setup.actuation.rests))
         cost = self.setup.actuation.cost or Cost(weights=self.setup.weights)
@@ -287,8 +280,8 @@ class _Motion:
         options |= {"suffix": stretch.suffix}
         return declare_actuators(self.problem, self.machine, self.horizon, (place, joints), **options)
 
-    def task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
-        """Declare velocity errors of relaxed tasks as controls; return errors and their cost, 0 if none is relaxed."""
+    def declare_task_errors(self, stretch: Stretch) -> tuple[Any, Any]:
+        """Declare velocity errors of relaxed tasks as controls; return errors and cost, both 0 without such tasks."""
         assert stretch.equations is not None
         if not self.setup.relaxed or not stretch.equations.size:
             return 0, 0
@@ -308,25 +301,25 @@ class _Motion:
 def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> tuple[list[Any], Any, Array | None]:
     """Declare states, controls and constraints in one time interval of fixed duration with the same active tasks.
 
-    Return the states that continue in the next stretch, the running cost, and the Jacobian of the coordinates that
-    this stretch fixes at its end (see `_slopes`); `known` is that of the stretch before, or None.
+    Return the states that continue in the next stretch, the running cost, and the Jacobian of the coordinates that this
+    stretch fixes at its end (see `_pose_jacobian`); `known` is that of the stretch before, or None.
     """
     problem, machine, bounds, pace = motion.problem, motion.machine, motion.setup.bounds, motion.pace(stretch)
     begins, ends = stretch is motion.stretches[0], stretch is motion.stretches[-1]
-    place, joints = motion.states(stretch)
+    place, joints = motion.declare_states(stretch)
     second: Any = None
     if motion.setup.actuation is not None:
-        rates, second, running = motion.velocities(stretch, place, joints, pace)
+        rates, second, running = motion.declare_velocities(stretch, place, joints, pace)
     else:
         limits: dict[str, Any] = {"lower": -bounds.velocity, "upper": bounds.velocity}
         rates = problem.control(f"rates{stretch.suffix}", machine.joint_size, unit=machine.robot.unit("/s"), **limits)
         running = ca.dot(rates, ca.DM(motion.setup.weights) * rates) / 2
-    slack: Any = _closure(motion) if motion.setup.cyclic and ends else 0
+    slack: Any = _declare_closure(motion) if motion.setup.cyclic and ends else 0
     ends_at, error_cost = None, 0
     if stretch.equations is not None:
-        error, error_cost = motion.task_errors(stretch)
+        error, error_cost = motion.declare_task_errors(stretch)
         required = np.ones(stretch.equations.size, dtype=bool)
-        slopes = _slopes(stretch, motion.setup.base, motion.setup.reference)
+        slopes = _pose_jacobian(stretch, motion.setup.base, motion.setup.reference)
         if known is not None:
             rest = slopes - slopes @ np.linalg.pinv(known, rcond=ROUNDING_SHARE) @ known  # not fixed before
             required = ~(np.linalg.norm(rest, axis=1) <= ROUNDING_SHARE * np.linalg.norm(slopes, axis=1))
@@ -347,7 +340,7 @@ def _declare_stretch(motion: _Motion, stretch: Stretch, known: Array | None) -> 
     return states, pace * (running + error_cost), ends_at
 
 
-def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
+def _declare_in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
     """Declare the problem of a tool motion that may execute its tasks more slowly than their targets prescribe.
 
     The independent variable is the tasks' own time s, and the time t is a state. With q' = dq/ds, z = dt/ds, rates
@@ -364,8 +357,8 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
         raise ProblemError(words, name="conserved_momentum", value=momentum)
     (stretch,) = stretches
     clock = problem.state(CLOCK, initial=0.0, lower=0.0, unit="s", guess=lambda s: s)
-    place, joints = motion.states(stretch)
-    slack = _closure(motion) if motion.setup.cyclic else 0
+    place, joints = motion.declare_states(stretch)
+    slack = _declare_closure(motion) if motion.setup.cyclic else 0
     if motion.setup.actuation is None:
         pace = problem.control(PACE, lower=1.0, guess=1.0)
         slopes = problem.control(SLOPES, machine.joint_size, unit=machine.robot.unit("/s"))
@@ -378,7 +371,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
         pace = problem.state(PACE, lower=1.0, guess=1.0)
         change = problem.control("pace change", guess=0.0, unit="1/s")
         problem.dynamics(pace, change)
-        rates, second, running = motion.velocities(stretch, place, joints, pace)
+        rates, second, running = motion.declare_velocities(stretch, place, joints, pace)
         slopes = pace * rates
         drift = machine.base_rate(place, joints, slopes)
         derivatives = [(joints, slopes), (rates, pace * second), (pace, change), (place, drift)]
@@ -395,7 +388,7 @@ def _in_free_time(motion: _Motion, time_cost: float) -> ToolMotion:
     return ToolMotion(problem, stretches, stretch.end, stretch.nodes / stretch.end)
 
 
-def _closure(motion: _Motion) -> Any:
+def _declare_closure(motion: _Motion) -> Any:
     """Declare and return a constant velocity error of a task whose path is closed, so that the joints return exactly.
 
     If the joints return, the task returns as well. Both conditions differ by the error of the discretisation alone.
@@ -481,10 +474,9 @@ def _declare_tasks(
         problem.start(f"start pose{suffix}", condition, 0, 0, unit=equations.unit("", ""))
 
 
-def _slopes(stretch: Stretch, base: Array, reference: Array) -> Array:
-    """Return the Jacobian of task poses with respect to base and joint positions at a random configuration.
-
-    A rank found there applies everywhere but on a set of measure zero. Shape (size, base_size + joint_size).
+def _pose_jacobian(stretch: Stretch, base: Array, reference: Array) -> Array:
+    """Return the Jacobian of task poses with respect to base and joint positions at a random configuration, at which
+    its rank is that of almost all configurations. Shape (size, base_size + joint_size).
     """
     equations: Any = stretch.equations
     b, q = ca.SX.sym("base", len(base)), ca.SX.sym("joints", len(reference))

@@ -26,11 +26,6 @@ from ocp.motion.tasks.goals import Cost
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
 
-__all__ = [
-    "Actuation", "JointFriction", "Motors", "checked_motors", "declare_actuators", "joint_torques", "limit_power",
-    "limit_torques", "running_cost", "weights_torques",
-]  # fmt: skip
-
 LENGTH_RATE = 1e-2
 """Joint rate below which the integrand |q'| of the path length in a cost is smoothed, rad/s.
 
@@ -201,7 +196,7 @@ def weights_torques(cost: Cost) -> bool:
 
 
 def running_cost(machine: Machine, cost: Cost, motion: tuple[Any, Any, Any, Any], *, jerks: Any, torques: Any) -> Any:
-    """Return the cost per second of a motion, without the terms of duration and positive power.
+    """Return the cost per second of a motion, without the terms of duration and positive power, as an expression.
 
     Args:
         machine: The machine.

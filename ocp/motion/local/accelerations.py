@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, Literal, TypeAlias, get_args
 
 import casadi as ca
@@ -26,14 +27,9 @@ from ocp.motion.local.rates import least_rates
 from ocp.motion.tasks.checks import check_length, checked_tasks
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.goals import Start
-from ocp.motion.tasks.limits import checked_point, is_finite
+from ocp.motion.tasks.limits import checked_point
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
-
-__all__ = [
-    "AccelerationOptions", "AccelerationSolution", "Law", "Layer", "Stabiliser", "Stop", "accelerations",
-    "checked_law", "resolve_accelerations",
-]  # fmt: skip
 
 Law: TypeAlias = Literal["pseudo_inverse", "augmented", "null_space", "stabilised"]
 
@@ -58,9 +54,7 @@ class Layer:
     def __post_init__(self) -> None:
         require.choice("layer: index", self.index, ("joint_limits", "manipulability"))
         require.choice("layer: form", self.form, ("assigned", "gradient"))
-        if not is_finite(self.demand):
-            words = f"layer {self.index!r}: demand must be a number, not {self.demand!r}"
-            raise ProblemError(words, name="demand", value=self.demand)
+        require.number("layer: demand", self.demand)
 
 
 @dataclass(frozen=True)
@@ -81,10 +75,7 @@ class Stabiliser:
     gradient: float = 0.0
 
     def __post_init__(self) -> None:
-        poles = self.poles if isinstance(self.poles, Sequence | np.ndarray) else ()
-        if len(poles[:4]) != 3 or not all(is_finite(pole) and pole > 0 for pole in poles):
-            words = f"stabiliser: poles must be three positive numbers, not {self.poles!r}"
-            raise ProblemError(words, name="poles", value=self.poles, limit=0.0)
+        require.array("stabiliser: poles", self.poles, (3,), sign="positive")
         for gain in ("damping", "gradient"):
             require.nonnegative(f"stabiliser: {gain}", getattr(self, gain))
 
@@ -99,12 +90,8 @@ class AccelerationOptions:
         layers: Configuration indices that the remaining freedom improves, in this order after the law, (23)-(34).
         stabiliser: Gains of the stabilised law.
         null_damping: Damping of the joint velocities in the freedom that remains at the end, 1/s.
-        integrator: ``rk4`` with fixed steps or ``cvodes`` with error control.
-        tolerance: Absolute and relative tolerance of cvodes.
-        max_cvodes_steps: Largest number of steps of cvodes between two samples.
         stop_at_lift_off: Whether a vertical ground force that is not positive ends the motion.
         speed_limit: Joint speed, rad/s or m/s, above which the motion counts as diverged.
-        chunk: Steps between two checks of the motion.
 
     Raises:
         ProblemError: A value is invalid.
@@ -114,12 +101,8 @@ class AccelerationOptions:
     layers: Sequence[Layer] = ()
     stabiliser: Stabiliser = field(default_factory=Stabiliser)
     null_damping: float = 0.0
-    integrator: Literal["rk4", "cvodes"] = "rk4"
-    tolerance: float = 1e-10
-    max_cvodes_steps: int = 5000
     stop_at_lift_off: bool = True
     speed_limit: float = 20.0
-    chunk: int = 50
 
     def __post_init__(self) -> None:
         if not isinstance(self.layers, list | tuple) or not all(isinstance(layer, Layer) for layer in self.layers):
@@ -127,15 +110,11 @@ class AccelerationOptions:
             raise ProblemError(words, name="layers", value=self.layers)
         require.instance("stabiliser", self.stabiliser, Stabiliser)
         require.nonnegative("null_damping", self.null_damping)
-        require.choice("integrator", self.integrator, ("rk4", "cvodes"))
         require.flag("stop_at_lift_off", self.stop_at_lift_off)
-        for name in ("tolerance", "speed_limit"):
-            require.positive(name, getattr(self, name))
-        for name in ("max_cvodes_steps", "chunk"):
-            require.count(name, getattr(self, name), least=1)
+        require.positive("speed_limit", self.speed_limit)
 
     def zmp_target(self, machine: Standing) -> Callable[[Any], Any]:
-        """Return the desired zero moment point of a machine as a checked function of time."""
+        """Return the desired zero moment point (x, y) of a machine, m, as a function of time that checks its value."""
         zmp = machine.most_stable_point if self.zmp is None else self.zmp
         if callable(zmp):
             return lambda time: checked_point(zmp(time), "zmp")
@@ -151,25 +130,21 @@ class _TaskHierarchy:
         self.projector: Any = ca.DM.eye(size)
 
     def add_task(self, rows: Any, target: Any) -> None:
-        """Add equations `rows` q'' = `target` that the joint accelerations q'' shall satisfy with the least change."""
+        """Add the task `rows` q'' = `target`, which changes the joint accelerations q'' as little as possible in the
+        null space of all tasks added before.
+        """
         projected = ca.mtimes(rows, self.projector)
         inverse = least_rates(projected, ca.DM.eye(rows.shape[0]))
         self.accelerations = self.accelerations + ca.mtimes(inverse, target - ca.mtimes(rows, self.accelerations))
         self.projector = self.projector - ca.mtimes(inverse, projected)
 
     def add_free(self, direction: Any) -> None:
-        """Add joint accelerations that are projected onto the null space of all tasks added before."""
+        """Add joint accelerations after projecting them onto the null space of all tasks added before."""
         self.accelerations = self.accelerations + ca.mtimes(self.projector, direction)
 
 
-def checked_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
-    """Raise ProblemError if a redundancy resolution law is unknown, or needs more joints than the machine has.
-
-    Args:
-        machine: The machine.
-        size: Number of rows of all tasks.
-        law, layers: As for `resolve_accelerations`.
-    """
+def _check_law(machine: Standing, size: int, law: Law, layers: Sequence[Layer]) -> None:
+    """Raise ProblemError if a law is unknown or, with `size` rows of tasks, needs more joints than the machine has."""
     require.choice("law", law, get_args(Law))
     axes = len(machine.moving_directions)
     tasks = {"the tip": size, "the zero moment point": 0 if law == "pseudo_inverse" else axes}
@@ -237,7 +212,8 @@ def accelerations(
 
 
 def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, place: Any, right: Any) -> tuple[Any, Any]:
-    """Return matrix and right side of linear equations of joint accelerations that stabilise the centre of mass.
+    """Return the matrix and the right side of linear equations for the joint accelerations that keep a machine upright,
+    see `Stabiliser`.
 
     `right` is C of equation (18), minus the moment of weight and wrenches about `place`, y*: it vanishes for a centre
     of mass at y*, and -C / (M g) is the distance of the centre of mass beyond y*.
@@ -257,6 +233,8 @@ def _stabilising_task(machine: Standing, gains: Stabiliser, q: Any, qd: Any, pla
 
 TIP_TOLERANCE = 1e-3
 """Largest pose error up to which a motion counts as successful, m and rad."""
+STEPS_PER_CALL = 50
+"""Number of integration steps between two checks whether the motion fails."""
 
 
 @dataclass(frozen=True)
@@ -355,7 +333,7 @@ def resolve_accelerations(
     duration, n = require.positive("horizon", horizon), machine.joint_size
     own = AccelerationOptions() if options is None else require.instance("options", options, AccelerationOptions)
     begin, joints, base = Start.of_known(start, machine)
-    checked_law(machine, equations.size, law, own.layers)
+    _check_law(machine, equations.size, law, own.layers)
     require.positive("step", step)
     checked_tasks(equations, base, joints, duration)
     check_length(equations, base, duration)
@@ -378,71 +356,35 @@ def resolve_accelerations(
         )
         raise ProblemError(words, name="law", value=law, time=0.0)
     steps = max(int(np.ceil(duration / step - 1e-9)), 1)
-    simulate = _Simulation(function, n, duration / steps, own)
+    width, time, state = duration / steps, ca.MX.sym("time"), ca.MX.sym("state", 2 * n)
+
+    def rate(place: float, x: Any) -> Any:
+        return ca.vertcat(x[n:], function(time + place * width, x[:n], x[n:])[0])
+
+    one_step = ca.Function("step", [state, time], [rk4_step(rate, state, width)])
+    advance = cache(lambda count: one_step.mapaccum("steps", count))
     outputs = motion_function(machine, external, lambda q: equations.jacobian(ca.DM(0, 1), q))
     recorder = _Recorder(outputs, function, own.stop_at_lift_off, own.speed_limit)
-    state, done = np.concatenate([joints, velocities]), 0
-    stopped = recorder.add(np.zeros(1), state[None, :])
+    values, done = np.concatenate([joints, velocities]), 0
+    stopped = recorder.add(np.zeros(1), values[None, :])
     while done < steps and stopped is None:
-        count = min(own.chunk, steps - done)
-        times = np.asarray((done + np.arange(1, count + 1)) * simulate.step, dtype=float)
-        stopped = recorder.add(times, simulate.advance(done * simulate.step, state, count))
-        state, done = recorder.state, done + count
+        count = min(STEPS_PER_CALL, steps - done)
+        states = np.array(advance(count)(values, (done * width + width * np.arange(count))[None, :])).T
+        stopped = recorder.add(np.asarray((done + np.arange(1, count + 1)) * width), states)
+        values, done = states[-1], done + count
     return AccelerationSolution(law, *recorder.results(), stopped)
 
 
-class _Simulation:
-    """Integrator with fixed time steps for joint positions and velocities under a control law; one call makes many."""
-
-    def __init__(self, law: Any, n: int, step: float, options: AccelerationOptions) -> None:
-        self.step, self._law, self._n = step, law, n
-        time, state = ca.MX.sym("time"), ca.MX.sym("state", 2 * n)
-
-        def rate(at: Any, x: Any) -> Any:
-            return ca.vertcat(x[n:], law(at, x[:n], x[n:])[0])
-
-        if options.integrator == "cvodes":
-            fraction = ca.MX.sym("fraction")
-            problem = {"t": fraction, "x": state, "p": time, "ode": step * rate(time + step * fraction, state)}
-            accuracy = {"abstol": options.tolerance, "reltol": options.tolerance}
-            accuracy |= {"max_num_steps": options.max_cvodes_steps}
-            quiet = {"disable_internal_warnings": True, "show_eval_warnings": False}
-            solver = ca.integrator("motion", "cvodes", problem, 0.0, 1.0, accuracy | quiet)
-            after = solver(x0=state, p=time)["xf"]
-        else:
-            after = rk4_step(lambda place, x: rate(time + place * step, x), state, step)
-        self._once = ca.Function("step", [state, time], [after])
-        self._many: dict[int, Any] = {}
-
-    def advance(self, time: float, state: Array, count: int) -> Array:
-        """Return joint positions and velocities (count, 2 n) after each of `count` steps; nan after a failure."""
-        times = time + self.step * np.arange(count)
-        if count not in self._many:
-            self._many[count] = self._once.mapaccum("steps", count)
-        try:
-            return np.array(self._many[count](state, times[None, :])).T
-        except RuntimeError:  # the integrator fails at some step: integrate step by step
-            states = np.full((count, 2 * self._n), np.nan)
-            for i, at in enumerate(times):
-                try:
-                    state = np.array(self._once(state, at)).ravel()
-                except RuntimeError:
-                    break
-                states[i] = state
-            return states
-
-
 class _Recorder:
-    """Recorder of the samples of a motion up to its first failure."""
+    """Recorder of the samples of a simulated motion until a sample fails: lift-off, too fast, or not finite."""
 
     def __init__(self, motion: Any, law: Any, stop_at_lift_off: bool, speed_limit: float) -> None:
         self._motion, self._law = motion, law
         self._stop_at_lift_off, self._speed_limit = stop_at_lift_off, speed_limit
         self._records: list[dict[str, Array]] = []
-        self.state = np.zeros(0)
 
     def add(self, times: Array, states: Array) -> Stop | None:
-        """Evaluate and record samples of the motion; return a Stop for the first one that fails, else None."""
+        """Record samples of the motion up to the first one that fails; return why it fails, None if none fails."""
         n = states.shape[1] // 2
         q, qd = states[:, :n], states[:, n:]
         qdd, gap = (np.array(part).T for part in self._law.map(len(times))(times[None, :], q.T, qd.T))
@@ -457,7 +399,6 @@ class _Recorder:
         count = end + 1 if bad.any() and not not_finite[end] else end  # a finite failing sample is recorded too
         motion = {"t": times, "joints": q, "joint_velocities": qd, "joint_accelerations": qdd, "gap": gap[:, 0]}
         self._records.append({name: value[:count] for name, value in {**motion, **outputs}.items()})
-        self.state = states[-1]
         if end == len(times):
             return None
         at = float(times[end])
@@ -471,7 +412,7 @@ class _Recorder:
         return Stop("divergence", at, words)
 
     def results(self) -> tuple[StandingMotion, Array]:
-        """Return the recorded motion, and the norm of its pose errors at each sample. Shape (M,)."""
+        """Return the recorded motion, and the norm of the pose errors of its tips at each sample. Shape (M,)."""
         joined = {name: np.concatenate([record[name] for record in self._records]) for name in self._records[0]}
         gap = joined.pop("gap")
         return StandingMotion(**joined), gap

@@ -9,9 +9,8 @@ if there are still fewer than six, which must stay at zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,40 +20,29 @@ from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
 from ocp.motion.local.closed_forms import SCARA, SIX, PoseSolver, closed_forms
 from ocp.motion.local.elimination import elimination_of
 
-__all__ = ["ArmSolver", "arm_solver", "sample_shares"]
-
 STEPS = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0]) % 1
 """Increments of the sampled parameters, as fractions of their ranges; irrational, so that no sample repeats."""
 
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """Settings of the choice of the redundant joints that are sampled.
+    """Settings of the choice of redundant joints, whose positions are sampled in inverse kinematics."""
 
-    Attributes:
-        max_samples: Largest number of sampled parameters.
-        max_solvers: Largest number of choices of the sampled joints in closed form, and by elimination.
-        trials: Number of random configurations at which choices are compared.
-        seed: Seed of these configurations and of the axes of auxiliary joints.
-        slide_range: Prismatic joints without limits are sampled this far on either side of 0, m.
-        auxiliary: Largest position of an auxiliary joint that is refined at zero, rad.
-        excess: Largest excess over a limit that counts as rounding and is clipped, rad or m.
-    """
-
-    max_samples: int = 6
+    max_samples: int = 6  # largest number of sampled parameters
+    # largest number of choices of the sampled joints in closed form, and by elimination
     max_solvers: tuple[int, int] = (6, 2)
-    trials: int = 32
-    seed: int = 0
-    slide_range: float = 1.0
-    auxiliary: float = 1e-3
-    excess: float = 1e-9
+    trials: int = 32  # number of random configurations at which choices are compared
+    seed: int = 0  # seed of these configurations and of the axes of auxiliary joints
+    slide_range: float = 1.0  # prismatic joints without limits are sampled this far on either side of 0, m
+    auxiliary: float = 1e-3  # largest position of an auxiliary joint that is refined at zero, rad
+    excess: float = 1e-9  # largest excess over a limit that counts as rounding and is clipped, rad or m
 
 
 ARM = ArmSettings()
 
 
 def sample_shares(first: int, count: int, dimension: int) -> Array:
-    """Return samples in [0, 1) of a low-discrepancy sequence, from index `first` on. Shape (count, dimension)."""
+    """Return `count` points of a low-discrepancy sequence in [0, 1)^dimension, from index `first` on."""
     return np.asarray(((first + np.arange(count) + 0.5)[:, None] * STEPS[:dimension] + 0.5) % 1)
 
 
@@ -115,61 +103,34 @@ class ArmSolver:
 
     def _within_limits(self, solutions: Solutions, turns: bool) -> Solutions:
         """Return the IK solutions within the limits and, with `turns`, all whole-turn shifts that keep the limits."""
-        windows, order = self._windows, list(self.chain.order)
-        start, shiftable = windows.low if turns else windows.middle, windows.shiftable
+        below, above, order = np.isfinite(self.lower), np.isfinite(self.upper), list(self.chain.order)
+        both, lower, upper = below & above & self.chain.revolute, self.lower - ARM.excess, self.upper + ARM.excess
+        start = np.where(
+            below, lower, upper - TURN
+        )  # lower end of the interval of one turn into which angles are shifted
+        if not turns:
+            start[both] = (self.lower[both] + self.upper[both]) / 2 - np.pi
+        shiftable = np.flatnonzero((below | above) & self.chain.revolute)
         joints = solutions.joints.copy()
-        joints[:, shiftable] += TURN * np.ceil((start - joints[:, shiftable]) / TURN)
-        good = ((joints >= windows.lower) & (joints <= windows.upper))[:, order].all(axis=1)
-        rows, joints, several = np.flatnonzero(good), joints[good], windows.several
+        joints[:, shiftable] += TURN * np.ceil((start[shiftable] - joints[:, shiftable]) / TURN)
+        good = ((joints >= lower) & (joints <= upper))[:, order].all(axis=1)
+        rows, joints, several = np.flatnonzero(good), joints[good], np.flatnonzero(both & (upper - lower >= TURN))
         if turns and several.size:
-            counts = 1 + ((windows.upper[several] - joints[:, several]) // TURN).astype(int)
+            counts = 1 + ((upper[several] - joints[:, several]) // TURN).astype(int)
             shifts = list(map(_whole_turns, map(tuple, counts.tolist())))
             copies = np.repeat(np.arange(len(rows)), [len(each) for each in shifts])
             rows, joints = rows[copies], joints[copies]
             joints[:, several] += np.concatenate(shifts) if shifts else 0.0
-        np.clip(joints, windows.lowest, windows.highest, out=joints)
+        joints[:, order] = np.clip(joints[:, order], self.lower[order], self.upper[order])
         return Solutions(solutions.pose[rows], joints, solutions.singular[rows])
-
-    @cached_property
-    def _windows(self) -> _Windows:
-        """Intervals of one full turn within the joint ranges, into which the angles of solutions are shifted."""
-        below, above, revolute = np.isfinite(self.lower), np.isfinite(self.upper), self.chain.revolute
-        both, lower, upper = below & above & revolute, self.lower - ARM.excess, self.upper + ARM.excess
-        low = np.where(below, lower, upper - TURN)
-        middle = low.copy()
-        middle[both] = (self.lower[both] + self.upper[both]) / 2 - np.pi
-        shiftable = np.flatnonzero((below | above) & revolute)
-        moving = np.isin(np.arange(len(lower)), self.chain.order)
-        several = np.flatnonzero(both & (upper - lower >= TURN))
-        lowest, highest = np.where(moving, self.lower, -np.inf), np.where(moving, self.upper, np.inf)
-        return _Windows(lower, upper, lowest, highest, low[shiftable], middle[shiftable], shiftable, several)
 
 
 @lru_cache(maxsize=256)
 def _whole_turns(counts: tuple[int, ...]) -> Array:
-    """Return all combinations of 0 to count - 1 whole turns of several joints, rad. Shape (combinations, joints)."""
-    return np.asarray(TURN * np.indices(counts).reshape(len(counts), -1).T)
-
-
-class _Windows(NamedTuple):
-    """Intervals of one full turn of revolute joints, into which angles are shifted to be within the position limits.
-
-    Attributes:
-        lower, upper: Limits, beyond which lies only rounding. Shape (n,).
-        lowest, highest: Limits of the joints that move the tip. Shape (n,).
-        low, middle: Lower ends of the lowest windows, and of those in the middle of the limits. Shape (s,).
-        shiftable: Indices of the joints that have a limit. Shape (s,).
-        several: Indices of the joints that can make a whole turn within the limits.
+    """Return all combinations of 0 to count - 1 whole turns of several joints, rad; each joint has its own count. Shape
+    (combinations, joints).
     """
-
-    lower: Array
-    upper: Array
-    lowest: Array
-    highest: Array
-    low: Array
-    middle: Array
-    shiftable: NDArray[np.intp]
-    several: NDArray[np.intp]
+    return np.asarray(TURN * np.indices(counts).reshape(len(counts), -1).T)
 
 
 def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = None) -> ArmSolver | None:
@@ -208,15 +169,10 @@ def arm_solver(chain: Chain, lower: Array, upper: Array, axes: Array | None = No
 
 
 def _conditions(chain: Chain, choices: list[tuple[int, ...]]) -> Array:
-    """Return how well conditioned inverse kinematics is for each choice of redundant joints; larger is better.
-
-    This is the geometric mean, at random configurations, of the least singular value of the Jacobian of the others.
+    """Return, for each choice of redundant joints, the geometric mean over random configurations of the least singular
+    value of the Jacobian of the other joints.
     """
-    rng = np.random.default_rng(ARM.seed)
-    joints = rng.uniform(-np.pi, np.pi, (ARM.trials, len(chain.axes)))
-    joints[:, ~chain.revolute] *= chain.size / np.pi
-    positions, rotations = chain.poses(joints)
-    _, jacobian = chain.linearize(joints, chain.order, Motion(rotations, positions))
+    _, jacobian = chain.linearize(*chain.random_configurations(ARM.trials, ARM.seed), chain.order)
     columns = [[k for k, j in enumerate(chain.order) if j not in redundant] for redundant in choices]
     values = [np.linalg.svd(jacobian[:, :, each], compute_uv=False)[:, -1] for each in columns]
     return np.exp(np.log(np.maximum(values, 1e-300)).mean(axis=1)) if values else np.zeros(0)

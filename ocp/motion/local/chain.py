@@ -21,42 +21,28 @@ from models.checks import Array
 from models.spatial import Frame, cross, expression, rotation
 from ocp.problem.values import Sampler
 
-__all__ = ["TURN", "Chain", "Motion", "Solutions", "SymbolicAxis", "compose", "inverse"]
-
 TURN = 2 * np.pi
 """Angle of a full turn, rad."""
 
 
 @dataclass(frozen=True)
 class NewtonSettings:
-    """Settings of Newton's method for inverse kinematics; lengths are relative to the size of the arm.
+    """Settings of Newton's method for inverse kinematics; lengths are relative to the size of the arm."""
 
-    Attributes:
-        steps: Largest number of steps.
-        trial_steps: Number of steps after which each one must make progress.
-        progress: Factor by which a step then reduces the error; near a double root it is 4.
-        precision: Pose error at which the iteration ends, also in rad.
-        exact: Largest pose error of a solution, also in rad.
-        rough: Pose error above which a candidate is dropped, also in rad.
-        largest_step: Largest change of a joint in a step, rad or m.
-        damping: Added to the squared singular values of the Jacobian, so that steps stay finite at singularities.
-        singular: Least singular value of the Jacobian of a regular solution. Below it a further solution may lie so
-            near that rounding errors hide it.
-        same: Distance below which two solutions count as one, rad or m.
-        near: Distance up to which two solutions count as one if the pose is exact halfway between them.
-    """
-
-    steps: int = 30
-    trial_steps: int = 5
-    progress: float = 1.5
-    precision: float = 1e-13
-    exact: float = 1e-10
-    rough: float = 0.5
-    largest_step: float = 1.0
+    steps: int = 30  # largest number of steps
+    trial_steps: int = 5  # number of steps after which each one must make progress
+    progress: float = 1.5  # factor by which a step then reduces the error; near a double root it is 4
+    precision: float = 1e-13  # pose error at which the iteration ends, also in rad
+    exact: float = 1e-10  # largest pose error of a solution, also in rad
+    rough: float = 0.5  # pose error above which a candidate is dropped, also in rad
+    largest_step: float = 1.0  # largest change of a joint in a step, rad or m
+    # added to the squared singular values of the Jacobian, so that steps stay finite at singularities
     damping: float = 1e-14
+    # least singular value of the Jacobian of a regular solution. Below it a further solution may lie so near that
+    # rounding errors hide it
     singular: float = 1e-5
-    same: float = 1e-7
-    near: float = 1e-2
+    same: float = 1e-7  # distance below which two solutions count as one, rad or m
+    near: float = 1e-2  # distance up to which two solutions count as one if the pose is exact halfway between them
 
 
 NEWTON = NewtonSettings()
@@ -69,19 +55,19 @@ class Motion(NamedTuple):
     shift: Array
 
     def take(self, chosen: NDArray[np.intp]) -> Motion:
-        """Return the motions with the given indices."""
+        """Return the rigid motions with the given indices."""
         return Motion(self.turn[chosen], self.shift[chosen])
 
     def after(self, first: Motion) -> Motion:
-        """Return the motions that result if the motions `first` are applied before these motions."""
+        """Return the rigid motions that result if the motions `first` are applied before these motions."""
         return Motion(self.turn @ first.turn, self.at(first.shift))
 
     def rotate(self, vectors: Array) -> Array:
-        """Rotate directions (M, 3) by the motions."""
+        """Return M directions, shape (M, 3), each rotated by one of these rigid motions."""
         return np.asarray((self.turn @ vectors[:, :, None])[:, :, 0])
 
     def at(self, points: Array) -> Array:
-        """Return points (M, 3) after each of these rigid-body transformations."""
+        """Return M points, shape (M, 3), each moved by one of these rigid motions."""
         return self.rotate(points) + self.shift
 
     @property
@@ -108,7 +94,7 @@ class SymbolicAxis(NamedTuple):
         return self._replace(direction=ca.mtimes(motion.rotation, self.direction), point=motion.point(self.point))
 
     def frame(self, position: Any) -> Frame:
-        """Return the rigid motion, about a revolute axis or along a prismatic one, that a joint position causes."""
+        """Return the rigid motion that a joint position causes: a rotation about the axis or, if prismatic, a shift."""
         if not self.revolute:
             return Frame(ca.DM.eye(3), self.direction * position)
         turn = rotation(self.direction, position)
@@ -120,9 +106,8 @@ class SymbolicAxis(NamedTuple):
         return ca.atan2(ca.dot(self.direction, cross(across, end)), ca.dot(across, end))
 
     def terms(self, fixed: Any, vector: Any, sign: int = 1) -> Any:
-        """Return the coefficients of 1, cos(angle), sin(angle) in the scalar product of a fixed and a rotated vector.
-
-        The product is fixed . R(sign angle) vector, with the rotation R about the axis. Shape (1, 3).
+        """Return the coefficients of 1, cos(angle), sin(angle) in the scalar product of a fixed vector and a vector
+        rotated about the axis by sign times the angle. Shape (1, 3).
         """
         constant = ca.dot(fixed, self.direction) * ca.dot(self.direction, vector)
         sine = sign * ca.dot(fixed, cross(self.direction, vector))
@@ -197,7 +182,7 @@ class Chain:
         return cls(axes, points, revolute, position, np.array(ca.DM(pose.rotation)), order, size)
 
     def extend(self, axes: Array, points: Array) -> Chain:
-        """Return the chain with k revolute joints, given by axes and points (k, 3), added before the tip."""
+        """Return the chain with k further revolute joints before the tip, given by axes and points on them (k, 3)."""
         n, count = len(self.axes), len(axes)
         return replace(
             self,
@@ -214,10 +199,7 @@ class Chain:
 
     @cached_property
     def _tip_function(self) -> Sampler:
-        """Function of joint positions and a goal pose that returns pose error, Jacobian and pose of the tip.
-
-        The rotations are given and returned row by row.
-        """
+        """Function of joint positions and a goal pose that returns pose error, Jacobian and pose of the tip."""
         joints, turn, shift = ca.SX.sym("q", len(self.axes)), ca.SX.sym("turn", 9), ca.SX.sym("shift", 3)
         frame, moved = Frame(ca.DM.eye(3), ca.DM(3, 1)), list[SymbolicAxis]()
         for j in self.order:
@@ -232,10 +214,9 @@ class Chain:
             for axis in moved
         ]
         error = ca.mtimes(ca.reshape(turn, 3, 3).T, tip.rotation.T)
-        axial = ca.vertcat(*((error[i, j] - error[j, i]) / 2 for i, j in ((2, 1), (0, 2), (1, 0))))
-        axial = ca.if_else(ca.trace(error) < 1, 3.0, axial)
+        axial = ca.if_else(ca.trace(error) < 1, 3.0, ca.inv_skew(error))
         errors = ca.vertcat(axial, (shift - tip.position) / self.size)
-        outputs = [errors, ca.horzcat(*columns), tip.position, tip.rotation.T]
+        outputs = [errors, ca.horzcat(*columns), tip.position, tip.rotation.T]  # rotations row by row
         return Sampler([joints, turn, shift], outputs)
 
     def poses(self, joints: Array) -> tuple[Array, Array]:
@@ -243,7 +224,14 @@ class Chain:
         _, _, positions, rotations = self._tip_function(joints, np.zeros(9), np.zeros(3))
         return positions, rotations.reshape(-1, 3, 3)
 
-    def linearize(self, joints: Array, free: Sequence[int], goal: Motion) -> tuple[Array, Array]:
+    def random_configurations(self, count: int, seed: int) -> tuple[Array, Motion]:
+        """Return random joint positions (count, n), up to pi or the size of the arm, and the poses of the tip there."""
+        joints = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, len(self.axes)))
+        joints[:, ~self.revolute] *= self.size / np.pi
+        positions, rotations = self.poses(joints)
+        return joints, Motion(rotations, positions)
+
+    def linearize(self, joints: Array, goal: Motion, free: Sequence[int]) -> tuple[Array, Array]:
         """Return pose errors (K, 6) at joint positions (K, n), and Jacobians (K, 6, m) with respect to the free joints.
 
         The errors are the rotation as the axial vector 2 sin(angle) / 2, or (3, 3, 3) beyond a right angle, and the
@@ -268,7 +256,7 @@ class Chain:
         error, jacobians = np.full(len(joints), np.inf), np.zeros((len(joints), 6, len(numbers)))
         active = np.arange(len(joints))
         for step in range(NEWTON.steps + 1):
-            missed, jacobian = self.linearize(joints[active], free, goal.take(pose[active]))
+            missed, jacobian = self.linearize(joints[active], goal.take(pose[active]), free)
             worst, previous = np.abs(missed).max(axis=1), error[active]
             error[active], jacobians[active] = worst, jacobian
             # a solution at the limit of rounding no longer improves
@@ -290,7 +278,7 @@ class Chain:
         return self.distinct(Solutions(*parts), free, goal)
 
     def distinct(self, solutions: Solutions, numbers: Sequence[int], goal: Motion) -> Solutions:
-        """Return the IK solutions of several poses without duplicates, ordered by pose, in the range -pi to pi.
+        """Return the IK solutions of several poses without duplicates, ordered by pose, with angles from -pi to pi.
 
         Args:
             solutions: The solutions.
@@ -310,7 +298,7 @@ class Chain:
         same = distance < NEWTON.same
         if (close := np.flatnonzero(~same & (distance < NEWTON.near))).size:
             middle = joints[first[close]] + difference[close] / 2
-            missed, _ = self.linearize(middle, numbers, goal.take(pose[first[close]]))
+            missed, _ = self.linearize(middle, goal.take(pose[first[close]]), numbers)
             same[close] = np.abs(missed).max(axis=1) <= NEWTON.exact
         kept = np.ones(len(pose), dtype=bool)
         kept[second[same]] = False
@@ -318,7 +306,7 @@ class Chain:
 
 
 def _pairs_of_one_pose(pose: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the index pairs of solutions that belong to the same pose; solutions are sorted by pose. Shapes (P,)."""
+    """Return the index pairs of IK solutions of one pose; `pose` is the increasing pose index of each. Shapes (P,)."""
     if not len(pose) or pose[0] == pose[-1]:
         return _pairs(len(pose))
     first = np.arange(len(pose))[:, None]
@@ -346,12 +334,9 @@ def _damped_steps(jacobian: Array, missed: Array) -> Array:
 
 
 def _are_singular(jacobians: Array) -> NDArray[np.bool_]:
-    """Return which of the Jacobians (K, 6, m) are singular or nearly so, by their least singular value.
-
-    The product of the five other singular values is at most (|J|^2 / 5)^(5 / 2). Hence the determinant suffices to
-    recognise most regular Jacobians.
-    """
+    """Return which of the Jacobians (K, 6, m) have a least singular value near zero."""
     singular = np.ones(len(jacobians), dtype=bool)
+    # the other five singular values have a product of at most (|J|^2 / 5)^(5 / 2): the determinant shows most regular J
     if jacobians.shape[2] == 6:
         largest = ((jacobians**2).sum(axis=(1, 2)) / 5) ** 2.5
         singular = np.abs(np.linalg.det(jacobians)) < NEWTON.singular * largest

@@ -31,24 +31,16 @@ from models.spatial import Frame, cross, rotation_matrices
 from ocp.motion.local.chain import Chain, Motion, Solutions, SymbolicAxis, compose, inverse
 from ocp.problem.values import Sampler
 
-__all__ = ["ClosedForm", "Mask", "PoseSolver", "closed_forms", "is_scara"]
-
 Mask: TypeAlias = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class NearbySettings:
-    """Settings of the search for missing IK solutions of a pose by solving poses near this pose.
+    """Settings of the search for IK solutions that a solver may have missed at a pose, by solving for poses nearby."""
 
-    Attributes:
-        pairs: Number of pairs of nearby poses for each pose.
-        distance: Typical distance of nearby poses, rad and share of the size of the arm.
-        seed: Seed of the directions of nearby poses.
-    """
-
-    pairs: int = 2
-    distance: float = 1e-3
-    seed: int = 0
+    pairs: int = 2  # number of pairs of nearby poses for each pose
+    distance: float = 1e-3  # typical distance of nearby poses, rad and share of the size of the arm
+    seed: int = 0  # seed of the directions of nearby poses
 
 
 NEARBY = NearbySettings()
@@ -115,11 +107,6 @@ class PoseSolver(ABC):
             for sign in (1.0, -1.0):
                 yield Motion(tips.turn @ rotation_matrices(sign * turn), tips.shift + sign * self.chain.size * shift)
 
-    def solutions(self, positions: Array, rotations: Array, redundant: Array) -> tuple[NDArray[np.intp], Array]:
-        """Return the pose indices (K,) and joint positions (K, n) of all isolated IK solutions; see `solve`."""
-        solutions, _ = self.solve(positions, rotations, redundant)
-        return solutions.pose, solutions.joints
-
 
 TINY = 1e-300
 """Small number that is added to divisors to avoid divisions by zero."""
@@ -129,19 +116,13 @@ SIX, SCARA = 6, 4
 
 @dataclass(frozen=True)
 class FormSettings:
-    """Tolerances of the closed forms; lengths are relative to the size of the arm.
+    """Tolerances of closed-form inverse kinematics; lengths are relative to the size of the arm."""
 
-    Attributes:
-        straight: Up to this much, also in rad, axes count as meeting or parallel; Newton's method refines.
-        near: Residual up to which rough solutions are refined: near a double solution they are that inaccurate.
-        vanishing: Size of the coefficients of an equation below which each angle solves it.
-        nearby: Distance up to which two roots may be close to each other, rad.
-    """
-
-    straight: float = 1e-8
+    straight: float = 1e-8  # up to this much, also in rad, axes count as meeting or parallel; Newton's method refines
+    # residual up to which rough solutions are refined: near a double solution they are that inaccurate
     near: float = 1e-3
-    vanishing: float = 1e-8
-    nearby: float = 0.05
+    vanishing: float = 1e-8  # size of the coefficients of an equation below which each angle solves it
+    nearby: float = 0.05  # distance up to which two roots may be close to each other, rad
 
 
 FORMS = FormSettings()
@@ -200,7 +181,7 @@ class ClosedForm(PoseSolver):
         return _SymbolicLoop(symbols, axes, [*self.free[last:], *self.free[:last]], goal)
 
     def _positions(self, order: list[int], solutions: list[list[Any]]) -> Any:
-        """Join IK solutions, which list the joints in `order`, to one column with the joints in chain order."""
+        """Return IK solutions, whose joint positions are listed in `order`, as one column in the order of the chain."""
         return ca.vertcat(*(each[order.index(j)] for each in solutions for j in self.free))
 
     @cached_property
@@ -216,9 +197,8 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _pair_function(self) -> Sampler:
-        """Function of a tip pose that returns candidate angles of two joints, their residuals and their conditioning.
-
-        The two joints are the first and the third of `_loop`, x and z.
+        """Function of a tip pose that returns candidate angles of the first and the third joint of `_loop`, x and z,
+        with their residuals and conditioning.
         """
         symbols, (x, y, z, a, *_), _, goal = self._loop()
         size = self.chain.size
@@ -244,9 +224,8 @@ class ClosedForm(PoseSolver):
 
     @cached_property
     def _triple_function(self) -> Sampler:
-        """Function of a tip pose and the two angles of `_pair_function` that returns two IK solutions of all joints.
-
-        Further outputs are the excess over the reach and the lever arm of joint y, which is between x and z.
+        """Function of a tip pose and the two angles of `_pair_function` that returns two IK solutions of all joints,
+        the excess over the reach, and the lever arm of joint y, which is between x and z.
         """
         symbols, (x, y, z, *triple), order, goal = self._loop()
         angles, meeting = ca.SX.sym("angles", 2), self.kind == "meeting"
@@ -291,7 +270,7 @@ def closed_forms(chain: Chain, lockable: Sequence[int] | None = None) -> tuple[C
 
 
 def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
-    """Return a tuple with the closed-form solver of a four-joint chain if it is a SCARA, else an empty tuple."""
+    """Return the closed-form solver of a four-joint chain in a tuple, which is empty if the chain is no SCARA."""
     revolute = tuple(j for j in chain.order if chain.revolute[j])
     prismatic = [j for j in chain.order if not chain.revolute[j]]
     if len(prismatic) != 1 or _kind_of(chain, revolute) != "parallel":
@@ -301,7 +280,7 @@ def _scara_forms(chain: Chain) -> tuple[ClosedForm, ...]:
 
 
 def is_scara(chain: Chain) -> bool:
-    """Return whether a chain has the four joints of a SCARA."""
+    """Return whether a chain is a SCARA: three parallel revolute joints and a prismatic one along them."""
     return len(chain.order) == SCARA and bool(_scara_forms(chain))
 
 
@@ -332,7 +311,7 @@ def _kind_of(chain: Chain, triple: tuple[int, ...]) -> str:
 
 
 def _meeting_point(chain: Chain, triple: tuple[int, ...]) -> tuple[Array, float]:
-    """Return the point nearest to three joint axes, and its largest distance from one of them."""
+    """Return the point nearest to three joint axes by least squares, and its largest distance from one of them, m."""
     axes, points = chain.axes[list(triple)], chain.points[list(triple)]
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     projected = np.einsum("kij,kj->ki", projectors, points)
@@ -342,15 +321,12 @@ def _meeting_point(chain: Chain, triple: tuple[int, ...]) -> tuple[Array, float]
 
 @cache
 def _pair_solver() -> Any:
-    """Return the CasADi function that solves two trigonometric equations for two angles, with residuals.
+    """Return the CasADi function that solves a [cos, sin](first) + b [cos, sin](second) = c for two angles.
 
-    The equations are a [cos, sin](first) + b [cos, sin](second) = c. The singular value decomposition b = L diag(s) R,
-    in closed form, separates them: with a' = L' a and c' = L' c the remainders w = c' - a' [cos, sin](first) satisfy
-    (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1, a trigonometric polynomial of two harmonics.
-
-    The inputs are a, b and c, of shapes (2, 2), (2, 2) and (2, 1). The outputs are sixteen first and second angles,
-    some of which do not hold; how far each pair is from a solution; and a number that vanishes where an angle is not
-    determined.
+    The singular value decomposition b = L diag(s) R, in closed form, separates the angles: with a' = L' a and c' = L' c
+    the remainders w = c' - a' [cos, sin](first) satisfy (w_1 / s_1)^2 + (w_2 / s_2)^2 = 1, a trigonometric polynomial
+    of two harmonics. The outputs are sixteen first and second angles, some of which do not hold; how far each pair is
+    from a solution; and a number that vanishes where an angle is not determined.
     """
     a, b, c = ca.SX.sym("a", 2, 2), ca.SX.sym("b", 2, 2), ca.SX.sym("c", 2)
     mean, difference = (b[0, 0] + b[1, 1]) / 2, (b[0, 0] - b[1, 1]) / 2
@@ -387,7 +363,7 @@ def _pair_solver() -> Any:
 
 
 def _rotation(angle: Any) -> Any:
-    """Return the 2 x 2 rotation matrix of an angle."""
+    """Return the 2 x 2 matrix of a rotation by an angle, as an expression."""
     cosine, sine = ca.cos(angle), ca.sin(angle)
     return ca.vertcat(ca.horzcat(cosine, -sine), ca.horzcat(sine, cosine))
 
@@ -412,18 +388,16 @@ def _close_roots(f: Harmonics) -> Any:
 
 
 def _middle_and_half(value: Any, cosine: Any, sine: Any) -> tuple[Any, Any]:
-    """Return the mean and half the difference of the two roots of an equation linear in cosine and sine.
-
-    The equation is cosine cos(q) + sine sin(q) = value. Without a root, return the angle nearest to a solution.
+    """Return the mean and half the difference of the two roots q of cosine cos(q) + sine sin(q) = value, or of the
+    nearest equation that has a root.
     """
     share = value / ca.fmax(ca.hypot(cosine, sine), TINY)
     return ca.atan2(sine, cosine), ca.acos(ca.fmin(ca.fmax(share, -1.0), 1.0))
 
 
 def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple[list[list[Any]], Any]:
-    """Return two solutions for three joints that produce a rotation (if axes meet) or planar motion (if parallel).
-
-    The second result is the share by which the motion exceeds what the axes can do; the solutions are then the nearest.
+    """Return two solutions for three joints whose axes meet or are parallel and that must produce a given rotation or
+    planar motion, and the share by which this motion is out of their reach; the solutions are then the nearest.
     """
     a, b, c = axes
     goal_point = goal.point(c.point)
@@ -445,6 +419,6 @@ def _solve_triple(axes: list[SymbolicAxis], goal: Frame, meeting: bool) -> tuple
             start, end = motion.point(c.point) - a.point, goal_point - a.point
         first = a.angle(start, end)
         remaining = ca.mtimes(ca.mtimes(a.frame(first).rotation, motion.rotation).T, goal.rotation)
-        axial = ca.vertcat(*(remaining[i, j] - remaining[j, i] for i, j in ((2, 1), (0, 2), (1, 0))))
-        solutions.append([first, second, ca.atan2(ca.dot(c.direction, axial), ca.trace(remaining) - 1)])
+        third = ca.atan2(2 * ca.dot(c.direction, ca.inv_skew(remaining)), ca.trace(remaining) - 1)
+        solutions.append([first, second, third])
     return solutions, ca.fabs(value) / ca.fmax(ca.hypot(cosine, sine), TINY) - 1

@@ -22,19 +22,9 @@ from ocp.problem.hulls import BodyPairs, Hull, frames_of
 from ocp.problem.values import Sampler
 from ocp.tolerances import STANDSTILL
 
-__all__ = [
-    "Collision",
-    "checked_collision_scene",
-    "distances_along",
-    "find_collisions",
-    "prepared_pairs",
-    "scene_hulls",
-    "slide_apart",
-]
-
 
 class Collision(NamedTuple):
-    """A pair of bodies whose distance is below the clearance.
+    """Pair of bodies that are closer to each other than the clearance at a time of a motion.
 
     Attributes:
         pair: Index in `CollisionScene.pairs`.
@@ -126,7 +116,7 @@ def worst_collisions(
 def _collision_at(
     scene: CollisionScene, place: tuple[int, int], distance: float, base: Array, joints: Array, times: Array
 ) -> Collision:
-    """Return the collision of one pair of bodies at one sample of a motion; `place` holds the indices of both."""
+    """Return the collision of a pair of bodies at a sample of a motion; `place` has the indices of sample and pair."""
     at, pair = place
     base, time = np.broadcast_to(base, (len(joints), scene.machine.base_size))[at], float(np.ravel(times)[at])
     covers = pair in scene.cover_pairs
@@ -159,7 +149,9 @@ def prepared_pairs(scene: CollisionScene) -> tuple[Sampler, BodyPairs]:
 
 
 def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -> CollisionScene:
-    """Return a collision scene; raise ProblemError if it is of another machine or wrongly assumes joint limits."""
+    """Return a collision scene after checking that it is a scene of the machine and assumes joint limits only if these
+    apply; raise ProblemError otherwise.
+    """
     if require.instance("scene", value, CollisionScene).machine is not machine:
         words = "scene belongs to another machine; build it from this one: CollisionScene(machine, ...)"
         raise ProblemError(words, name="scene", value=value)
@@ -172,20 +164,14 @@ def checked_collision_scene(value: Any, machine: Machine, limits: bool = True) -
 
 @dataclass(frozen=True)
 class SlidingSettings:
-    """Settings of `slide_apart`, which moves configurations out of collision along self-motions.
+    """Settings of `slide_apart`, which moves configurations out of collision along self-motions."""
 
-    Attributes:
-        steps: Largest number of steps.
-        difference: Step of the finite differences, rad or m: the root of the rounding error of distances, 1e-10 m.
-        longest: Longest step of a joint, rad or m.
-        damping: Damping relative to the size of the gradients.
-        spare: Distance in excess of the clearance, so that correcting the tips does not use up the clearance, m.
-    """
-
-    steps: int = 12
+    steps: int = 12  # largest number of steps
+    # step of the finite differences, rad or m: the root of the rounding error of distances, 1e-10 m
     difference: float = 1e-5
-    longest: float = 0.25
-    damping: float = 0.1
+    longest: float = 0.25  # longest step of a joint, rad or m
+    damping: float = 0.1  # damping relative to the size of the gradients
+    # distance in excess of the clearance, so that correcting the tips does not use up the clearance, m
     spare: float = 2e-3
 
 
@@ -221,7 +207,7 @@ def slide_apart(
     target = scene.clearance + SLIDING.spare
 
     def distances(configurations: Array) -> Array:
-        """Return the distances (K, P) of all pairs of bodies; beyond the distance `target`, lower bounds suffice."""
+        """Return the distances (K, P) of all pairs of bodies; beyond the distance `target` lower bounds suffice."""
         return distances_along(scene, base, configurations, np.full(len(configurations), time), cutoff=target)
 
     best, current, clearance = joints.copy(), joints.copy(), np.full(count, -np.inf)
@@ -234,12 +220,14 @@ def slide_apart(
         if (clearance >= scene.clearance).any():
             break
         gradients = (distances(perturbed).reshape(count, n, -1) - gaps[:, None]) / SLIDING.difference
-        step = np.array([_step(*each, target) for each in zip(map(jacobian, current), gaps, gradients, strict=True)])
+        step = np.array(
+            [_separating_step(*each, target) for each in zip(map(jacobian, current), gaps, gradients, strict=True)]
+        )
         current = back(np.clip(current + step, lower, upper))
     return best
 
 
-def _step(jacobian: Array, distances: Array, gradients: Array, target: float) -> Array:
+def _separating_step(jacobian: Array, distances: Array, gradients: Array, target: float) -> Array:
     """Return a joint step (n,) that separates close bodies and, to first order, leaves the tips in place."""
     close = distances < target
     projector = np.eye(jacobian.shape[1]) - np.linalg.pinv(jacobian) @ jacobian

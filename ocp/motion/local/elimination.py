@@ -30,8 +30,6 @@ from models.checks import Array
 from ocp.motion.local.chain import TURN, Chain, Motion, Solutions
 from ocp.motion.local.closed_forms import SIX, Mask, PoseSolver
 
-__all__ = ["Elimination", "elimination_of", "solve_opening"]
-
 SAMPLES = 2 * np.pi / 3 * np.arange(3)
 """Angles h at which a function is sampled to find its coefficients of 1, cos h and sin h."""
 NEXT, AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -40,63 +38,44 @@ SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
 COEFFICIENTS = np.linalg.inv(np.stack([np.ones(3), np.cos(SAMPLES), np.sin(SAMPLES)], axis=1))
 
 
-def _half_angle_products() -> Array:
-    """Return coefficients that turn products of the sines and cosines of an angle and of its half into sums.
-
-    Products of 1, cos h, sin h with cos h/2, sin h/2 are sums of these two and cos 3h/2, sin 3h/2. Shape (3, 2, 4).
-    """
-    products = np.zeros((3, 2, 4))
-    products[0] = np.eye(2, 4)
-    products[1] = [[0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]]
-    products[2] = [[0, 0.5, 0, 0.5], [0.5, 0, -0.5, 0]]
-    return products
-
-
-PRODUCTS = _half_angle_products()
+PRODUCTS = np.array(
+    [[[1, 0, 0, 0], [0, 1, 0, 0]], [[0.5, 0, 0.5, 0], [0, -0.5, 0, 0.5]], [[0, 0.5, 0, 0.5], [0.5, 0, -0.5, 0]]]
+)
+"""Coefficients of the products of 1, cos h, sin h with cos h/2, sin h/2 in cos h/2, sin h/2, cos 3h/2, sin 3h/2."""
 
 
 @dataclass(frozen=True)
 class EliminationSettings:
-    """Settings of inverse kinematics by elimination.
+    """Settings of the inverse kinematics of six joints by elimination."""
 
-    Attributes:
-        rank: Singular values of the eliminated products below this share of the largest count as zero.
-        regular: Reciprocal condition number below which an eigenvalue problem counts as singular.
-        real: Distance of exp(i h) from the unit circle below which an angle h may be real: the accuracy of double
-            eigenvalues of an ill-conditioned problem.
-        probably_real: Distance below which a multiple eigenvalue counts as real.
-        surely_real: Distance below which a simple eigenvalue is real.
-        simple: Deviation of an eigenvector from the products of one solution below which its eigenvalue is simple.
-        poles: Angles h at which the half-angle may be infinite; for each pose the best-conditioned one is taken.
-        same: Distance of a solution from a configuration of the trial below which they are the same, rad or m.
-        trials: Number of random configurations of the trial.
-        openings: Largest number of eigenvalue problems that are solved at a doubtful pose.
-        seed: Seed of the trial.
-    """
-
-    rank: float = 1e-9
-    regular: float = 1e-11
+    rank: float = 1e-9  # singular values of the eliminated products below this share of the largest count as zero
+    regular: float = 1e-11  # reciprocal condition number below which an eigenvalue problem counts as singular
+    # distance of exp(i h) from the unit circle below which an angle h may be real: the accuracy of double eigenvalues
+    # of an ill-conditioned problem
     real: float = 3e-2
-    probably_real: float = 1e-4
-    surely_real: float = 1e-7
+    probably_real: float = 1e-4  # distance below which a multiple eigenvalue counts as real
+    surely_real: float = 1e-7  # distance below which a simple eigenvalue is real
+    # deviation of an eigenvector from the products of one solution below which its eigenvalue is simple
     simple: float = 1e-4
+    # angles h at which the half-angle may be infinite; for each pose the best-conditioned one is taken
     poles: tuple[float, ...] = (0.3, 1.9, 3.5, 5.1)
+    # distance of a solution from a configuration of the trial below which they are the same, rad or m
     same: float = 1e-5
-    trials: int = 12
-    openings: int = 3
-    seed: int = 0
+    trials: int = 12  # number of random configurations of the trial
+    openings: int = 3  # largest number of eigenvalue problems that are solved at a doubtful pose
+    seed: int = 0  # seed of the trial
 
 
 ELIMINATION = EliminationSettings()
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the scalar products of arrays of vectors."""
+    """Return the scalar products of arrays of vectors along their last axis."""
     return np.asarray(np.vecdot(a, b))
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return the vector products of arrays of vectors, faster than numpy for small arrays."""
+    """Return the vector products of arrays of vectors along their last axis, faster than numpy for small arrays."""
     return np.asarray(a[..., NEXT] * b[..., AFTER] - a[..., AFTER] * b[..., NEXT])
 
 
@@ -123,8 +102,8 @@ class Axis(NamedTuple):
         """Return the axis transformed by rigid motions, one for each pose."""
         return Axis(motion.rotate(self.direction), motion.at(self.point), self.revolute)
 
-    def by(self, position: Array) -> Motion:
-        """Return the rigid motions that the joint causes at given joint positions (M,)."""
+    def motion(self, position: Array) -> Motion:
+        """Return the rigid motions that the joint causes at joint positions (M,)."""
         if not self.revolute:
             return Motion(np.broadcast_to(np.eye(3), (len(position), 3, 3)), self.direction * position[:, None])
         skew = (self.direction @ SKEW).reshape(-1, 3, 3)
@@ -226,7 +205,7 @@ class Elimination(PoseSolver):
         for j in chain.order:
             axis = Axis(chain.axes[[j]], chain.points[[j]], bool(chain.revolute[j])).moved(fixed)
             if j in self.redundant:
-                fixed = axis.by(prescribed[:, j]).after(fixed)
+                fixed = axis.motion(prescribed[:, j]).after(fixed)
             else:
                 axes.append(axis)
         home = Motion(chain.rotation[None], chain.position[None])
@@ -239,12 +218,9 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
     At random configurations the openings are sorted by the condition of their problems. The first ones are taken that
     find the most of these configurations again, and the most solutions.
     """
-    rng, trials = np.random.default_rng(ELIMINATION.seed), ELIMINATION.trials
-    joints = rng.uniform(-np.pi, np.pi, (trials, len(chain.axes)))
-    joints[:, ~chain.revolute] *= chain.size / np.pi
+    joints, tips = chain.random_configurations(ELIMINATION.trials, ELIMINATION.seed)
     solver = Elimination(chain, redundant, ())
-    positions, rotations = chain.poses(joints)
-    prescribed, tips = solver.prescribe(joints[:, list(redundant)]), Motion(rotations, positions)
+    prescribed = solver.prescribe(joints[:, list(redundant)])
     axes, goal = solver.loop(prescribed, tips)
     conditions = list[tuple[float, LoopOpening]]()
     for first in range(SIX):
@@ -267,14 +243,14 @@ def elimination_of(chain: Chain, redundant: tuple[int, ...]) -> Elimination | No
         if score >= most:
             kept = [*(kept if score == most else []), opening]
             most = score
-        if len(kept) >= ELIMINATION.openings and most[0] == trials:
+        if len(kept) >= ELIMINATION.openings and most[0] == ELIMINATION.trials:
             break
     kept = kept[: ELIMINATION.openings]
     return Elimination(chain, redundant, tuple(kept)) if kept else None
 
 
 def _open(axes: list[Axis], goal: Motion, size: float, first: int) -> _Loop:
-    """Open the kinematic loop at a joint: transform the joints before that joint by the goal and append them."""
+    """Return a kinematic loop opened at a joint; the joints before it, transformed by the inverse goal, come last."""
     back = goal.inverse
     joints = [axes[(first + i) % SIX] for i in range(SIX)]
     return _Loop([axis.moved(back) if i >= SIX - first else axis for i, axis in enumerate(joints)], goal, size)
@@ -291,25 +267,16 @@ def _split(loop: _Loop) -> tuple[Array, NDArray[np.intp], Array]:
     local = [axis._replace(point=(axis.point - center) / size) for axis in loop.joints]
     remaining = _coefficients(local[4:1:-1], local[5].point, c.direction)
     point, direction = (goal.at(c.point) - center) / size, goal.rotate(c.direction)
-    eliminated = _coefficients([_reverse_axis(local[0]), _reverse_axis(local[1])], point, direction)
+    inverted = [axis._replace(direction=-axis.direction) for axis in local[:2]]
+    eliminated = _coefficients(inverted, point, direction)
     left, values, _ = np.linalg.svd(eliminated.reshape(len(point), 15, 9))
     return left, (values > ELIMINATION.rank * values[:, :1]).sum(axis=1), remaining
 
 
-def _reverse_axis(axis: Axis) -> Axis:
-    """Return the axis with opposite direction, for the inverse motion of its joint."""
-    return axis._replace(direction=-axis.direction)
-
-
 def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
-    """Return coefficients of the conformal coordinates of a moved line element in cosines and sines of joint angles.
-
-    Args:
-        axes: Axes of the joints, the one that moves the line element first in front.
-        point, direction: Line element. Shapes (M, 3), (M, 3).
-
-    Returns:
-        Coefficients of 1, cos h and sin h of each joint, those of the last one first. Shape (M, 15, 3, ...).
+    """Return the coefficients (M, 15, 3, ...) with which the conformal coordinates of a line element depend on 1, cos h
+    and sin h of the joints that move it, of the last one first; `axes` begins with the joint that moves the line
+    element first.
     """
     weights, count = np.ones(1), max(len(point), *(len(axis.point) for axis in axes))
     point, direction = (np.broadcast_to(part[:, None], (count, 1, 3)) for part in (point, direction))
@@ -341,9 +308,8 @@ def _coefficients(axes: list[Axis], point: Array, direction: Array) -> Array:
 
 
 def _matrices(annihilators: Array, remaining: Array, roles: tuple[int, int, int]) -> Array:
-    """Return the coefficient matrices of the eigenvalue problem of a chain cut at some joint. Shape (M, 3, 12, 12).
-
-    They belong to 1, cos h and sin h of the joint that has the eigenvalue.
+    """Return the coefficients of 1, cos h and sin h in the eigenvalue problem of an opened kinematic loop, h the angle
+    of the joint that has the eigenvalue. Shape (M, 3, 12, 12).
     """
     count, _, rows = annihilators.shape
     equations = annihilators.transpose(0, 2, 1) @ remaining.reshape(-1, 15, 27)
@@ -391,7 +357,7 @@ def _inverses(matrices: Array) -> Array:
 
 
 def solve_opening(axes: list[Axis], goal: Motion, size: float, opening: LoopOpening) -> _Candidates:
-    """Return candidate IK solutions of the loop cut at one joint, from real eigenvalues of the resulting problem."""
+    """Return candidate IK solutions of a kinematic loop opened at a joint, from real eigenvalues of its problem."""
     loop = _open(axes, goal, size, opening.first)
     singular_vectors, ranks, remaining = _split(loop)
     matrices = _matrices(singular_vectors[:, :, opening.rank :], remaining, opening.roles)
@@ -448,7 +414,7 @@ def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
     """
     x, y, z, a, b, c = (axis.take(pose) for axis in loop.joints)
     goal, size = loop.goal.take(pose), loop.size
-    motion = z.by(middle[:, 0]).after(a.by(middle[:, 1])).after(b.by(middle[:, 2]))
+    motion = z.motion(middle[:, 0]).after(a.motion(middle[:, 1])).after(b.motion(middle[:, 2]))
     ends = (goal.at(c.point), goal.rotate(c.direction)), (motion.at(c.point), motion.rotate(c.direction))
     columns, constants = list[Array](), list[Array]()
     for axis, (point, direction), sign in ((x, ends[0], -1.0), (y, ends[1], 1.0)):
@@ -471,6 +437,6 @@ def _all_positions(loop: _Loop, pose: NDArray[np.intp], middle: Array) -> Array:
         np.arctan2(part[:, 1], part[:, 0]) if axis.revolute else part[:, 0]
         for axis, part in ((x, solved[:, :2]), (y, solved[:, 2:]))
     )
-    rest = x.by(first).after(y.by(second)).after(motion).inverse.after(goal).turn
+    rest = x.motion(first).after(y.motion(second)).after(motion).inverse.after(goal).turn
     last = np.arctan2(dot(c.direction, axial(rest)) / 2, (np.trace(rest, axis1=1, axis2=2) - 1) / 2)
     return np.column_stack([first, second, middle, last])

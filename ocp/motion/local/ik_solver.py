@@ -10,28 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models import FixedBase, Machine, ModelError
-from models.checks import Array, ArrayInput, real
+from models import FixedBase, Machine
+from models.checks import Array, ArrayInput
 from models.machines.machine import with_tip
 from models.spatial import least_rotation, rotation_matrices
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, problem_errors, require
 from ocp.motion.local.arm_solver import ARM, ArmSolver, arm_solver, sample_shares
 from ocp.motion.local.chain import TURN, Chain
 from ocp.motion.local.closed_forms import SIX, PoseSolver, is_scara
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import ANGULAR, LINEAR, TipTask
-
-__all__ = [
-    "IkBranches",
-    "IkConfigurations",
-    "IkSolver",
-    "Incompleteness",
-    "PreparedArm",
-    "ToolFreedom",
-    "idle_positions",
-    "ik_branches",
-    "ik_configurations",
-]
 
 ROTATION_TOLERANCE = 1e-6
 """Largest accepted entry of R R^T - 1 for a rotation matrix R."""
@@ -100,6 +88,12 @@ def idle_positions(lower: Array, upper: Array) -> Array:
     return np.asarray(np.where(np.isfinite(middle), middle, np.clip(0.0, lower, upper)))
 
 
+def joint_range(machine: Machine, limits: bool) -> tuple[Array, Array]:
+    """Return the position limits of the joints, infinite if `limits` is False. Shape (n,) each, rad or m."""
+    unlimited = np.full(machine.joint_size, np.inf)
+    return (machine.robot.lower, machine.robot.upper) if limits else (-unlimited, unlimited)
+
+
 class IkSolver:
     """Solver of all IK configurations of an arm on a fixed base, prepared for any number of poses.
 
@@ -142,16 +136,12 @@ class IkSolver:
             require.positive("within", within, below=np.pi)
         require.flag("limits", limits)
         require.count("samples", samples, 1)
-        try:
+        with problem_errors():
             tip = machine if link is None else with_tip(machine, link, require.array("IkSolver: point", point, (3,)))
-            axis = require.array("IkSolver: tool_axis", tool_axis, (3,))
-        except ModelError as error:
-            raise ProblemError(str(error), **vars(error)) from error
+        axis = require.array("IkSolver: tool_axis", tool_axis, (3,))
         if not np.linalg.norm(axis) > 0:
             raise ProblemError(f"tool_axis {axis.tolist()} has no direction", name="tool_axis", value=axis)
-        unbounded = np.full(machine.joint_size, np.inf)
-        lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-        prepared = PreparedArm.of(tip, lower, upper, free=free, tool_axis=axis, within=float(within))
+        prepared = PreparedArm.of(tip, *joint_range(machine, limits), free=free, tool_axis=axis, within=float(within))
         if prepared is None:
             words = f"{machine.robot.name}: no six joints on a fixed base determine the tip; use inverse_kinematics"
             raise ProblemError(words, name="machine", value=machine)
@@ -188,7 +178,7 @@ class IkSolver:
 
 @dataclass(frozen=True, eq=False)
 class PreparedArm:
-    """Arm prepared for repeated inverse kinematics by an `IkSolver`.
+    """Arm with the solver of its inverse kinematics and the part of the tip's orientation that a task leaves free.
 
     Attributes:
         arm: Solver of the arm.
@@ -280,9 +270,8 @@ class PreparedArm:
         return np.isin(np.arange(len(self.arm.lower)), self.arm.chain.order, invert=True)
 
     def _rotations(self, shares: Array) -> Array:
-        """Return samples of those rotations of the tip, in the tip frame, that the task leaves free. Shape (S, 3, 3).
-
-        `shares` (S, 1) or (S, 3) are fractions of full turns of roll and azimuth, and of the area of the cone's cap.
+        """Return samples of those rotations of the tip, in the tip frame, that the task leaves free, from fractions of
+        full turns of roll and azimuth and of the area of the cone's cap. Shape (S, 3, 3).
         """
         rolled = rotation_matrices(TURN * shares[:, :1] * self.tool_axis)
         if self.free is ToolFreedom.ROLL:
@@ -295,7 +284,7 @@ class PreparedArm:
 
 
 def _checked_poses(positions: Any, rotations: Any) -> tuple[Array, Array]:
-    """Return tip positions (N, 3) and rotations (N, 3, 3) after checks; raise ProblemError if they are invalid."""
+    """Return a user's tip positions (N, 3) and rotations (N, 3, 3); raise ProblemError if they are invalid."""
     places, turns = np.asarray(positions, dtype=float), np.asarray(rotations, dtype=float)
     single = places.ndim == 1
     places, turns = (places[None], turns[None]) if single else (places, turns)
@@ -356,7 +345,7 @@ class IkBranches:
         return IkConfigurations(joints, np.zeros(len(joints), dtype=np.intp), tuple(names), (reason,))
 
     def _rotation(self, targets: Array) -> Array:
-        """Return a rotation of the tip that satisfies the task. Shape (3, 3)."""
+        """Return a rotation of the tip that satisfies the targets of the task. Shape (3, 3)."""
         if self._task.direction is not None:
             axis, direction = np.array(self._task.tool_axis), targets[6:9] / np.linalg.norm(targets[6:9])
             return least_rotation(axis, direction)
@@ -416,11 +405,9 @@ def ik_configurations(
     """
     require.count("samples", samples, 1)
     require.flag("limits", limits)
-    if not np.isfinite(real(time)):
-        raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
-    equations, unbounded = bind(machine, task), np.full(machine.joint_size, np.inf)
-    lower, upper = (machine.robot.lower, machine.robot.upper) if limits else (-unbounded, unbounded)
-    branches = ik_branches(equations, lower, upper)
+    require.number("time", time, unit="s")
+    equations = bind(machine, task)
+    branches = ik_branches(equations, *joint_range(machine, limits))
     if branches is None:
         words = "ik_configurations needs the pose of the tip of an arm on a fixed base; use inverse_kinematics"
         raise ProblemError(words, name="task", value=task)

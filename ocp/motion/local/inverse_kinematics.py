@@ -15,48 +15,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models import CollisionScene, Machine
-from models.checks import NOT_NUMBERS, Array, floats, real
+from models.checks import Array
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require
 from ocp.motion.local.collisions import Collision, checked_collision_scene, slide_apart, worst_collisions
-from ocp.motion.local.ik_solver import ik_branches
+from ocp.motion.local.ik_solver import ik_branches, joint_range
 from ocp.motion.tasks.checks import checked_configuration
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
-
-__all__ = [
-    "IK_OPTIONS",
-    "IkOptions",
-    "IkSolution",
-    "Unreachable",
-    "describe_miss",
-    "inverse_kinematics",
-    "inverse_kinematics_at",
-]
 
 LARGEST_SEED = 2**64
 
 
 @dataclass(frozen=True)
 class IkSettings:
-    """Settings of the Levenberg-Marquardt iterations, and of the choice among their solutions.
+    """Settings of the Levenberg-Marquardt iterations, and of the choice among their solutions."""
 
-    Attributes:
-        slide_spread: Range of the starts of prismatic joints without limits, m.
-        first_damping: Damping of the first step.
-        least_damping: Least damping.
-        most_damping: Damping at which a start is abandoned.
-        growth: Factor of the damping after a step that fails.
-        shrinkage: Factor of the damping after a step that succeeds.
-        slide_count: Number of solutions in collision that are moved along their self-motions if no solution is free.
-    """
-
-    slide_spread: float = 1.0
-    first_damping: float = 1e-2
-    least_damping: float = 1e-12
-    most_damping: float = 1e8
-    growth: float = 4.0
-    shrinkage: float = 0.25
+    slide_spread: float = 1.0  # range of the starts of prismatic joints without limits, m
+    first_damping: float = 1e-2  # damping of the first step
+    least_damping: float = 1e-12  # least damping
+    most_damping: float = 1e8  # damping at which a start is abandoned
+    growth: float = 4.0  # factor of the damping after a step that fails
+    shrinkage: float = 0.25  # factor of the damping after a step that succeeds
+    # number of solutions in collision that are moved along their self-motions if no solution is free
     slide_count: int = 8
 
 
@@ -65,7 +46,7 @@ IK_SETTINGS = IkSettings()
 
 @dataclass(frozen=True, eq=False)
 class IkOptions:
-    """Options of inverse kinematics.
+    """Options of `inverse_kinematics`: base configuration, joint limits, accuracy and number of iterations.
 
     Attributes:
         base: Base configuration, shape (base_size,); the machine's base_home() if None.
@@ -89,11 +70,6 @@ class IkOptions:
         require.positive("tolerance", self.tolerance)
         require.positive("apart", self.apart)
         require.count("iterations", self.iterations, least=1)
-
-    def joint_range(self, machine: Machine) -> tuple[Array, Array]:
-        """Return the lower and upper limits of the joints, infinite where none apply. Shape (n,) each."""
-        unlimited = np.full(machine.joint_size, np.inf)
-        return (machine.robot.lower, machine.robot.upper) if self.limits else (-unlimited, unlimited)
 
 
 IK_OPTIONS = IkOptions()
@@ -197,11 +173,10 @@ def inverse_kinematics(
     require.count("seed", seed, 0, LARGEST_SEED)
     if scene is not None:
         checked_collision_scene(scene, machine, options.limits)
-    if not np.isfinite(real(time)):
-        raise ProblemError(f"time must be a finite number of seconds, not {time!r}", name="time", value=time)
+    require.number("time", time, unit="s")
     size = machine.joint_size
     base_values = checked_configuration(machine, np.zeros(size), options.base)[1]
-    lower, upper = options.joint_range(machine)
+    lower, upper = joint_range(machine, options.limits)
     first = sample_starts(machine, lower, upper, int(starts), near=near, seed=seed)
     targets = np.array(equations.target_function()(float(time))).ravel()
     if not np.isfinite(targets).all():
@@ -249,7 +224,7 @@ def inverse_kinematics_at(
     Raises:
         Unreachable: No start leads to the pose.
     """
-    lower, upper = options.joint_range(equations.machine)
+    lower, upper = joint_range(equations.machine, options.limits)
     first = sample_starts(equations.machine, lower, upper, starts, near=near, seed=seed)
     return _MultiStart(equations, np.zeros(0), targets, lower, upper, options).solve(first, starts)
 
@@ -266,12 +241,10 @@ class _MultiStart:
     options: IkOptions = IK_OPTIONS
 
     def solve(self, first: Array, random: int) -> list[IkSolution]:
-        """Return the distinct IK solutions to which initial guesses (K, n) lead, sorted by decreasing quality.
+        """Return the distinct IK solutions to which initial guesses (K, n) lead, sorted by decreasing quality; raise
+        Unreachable if there is none.
 
         Unlimited angles that result from the last `random` guesses are wrapped to -pi .. pi.
-
-        Raises:
-            Unreachable: There is no solution.
         """
         lower, upper = self.lower, self.upper
         q, error = self.iterate(first)
@@ -286,9 +259,8 @@ class _MultiStart:
         return self.rank(q, error)
 
     def list_branches(self, count: int, seed: int) -> tuple[Array, int]:
-        """Return IK solutions (K, n) on all branches, and how many random initial guesses shall be tried in addition.
-
-        The list is empty if no solver of all branches exists.
+        """Return IK solutions (K, n) on all branches, none if there is no solver of all branches, and how many random
+        initial guesses shall be tried in addition.
         """
         branches = ik_branches(self.equations, self.lower, self.upper) if count else None
         if branches is None:
@@ -338,11 +310,8 @@ def sample_starts(machine: Machine, lower: Array, upper: Array, count: int, *, n
     span = np.where(prismatic, IK_SETTINGS.slide_spread, np.pi)
     low = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper - 2 * span, -span))
     high = np.where(np.isfinite(upper), upper, np.where(np.isfinite(lower), lower + 2 * span, span))
-    try:
-        first = np.zeros((0, size)) if near is None else np.atleast_2d(floats(near))
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"near {near!r} is not numeric", name="near", value=near, limit=(size,)) from error
-    if first.ndim != 2 or first.shape[1] != size or not np.isfinite(first).all():
+    first = np.zeros((0, size)) if near is None else np.atleast_2d(require.array("near", near))
+    if first.ndim != 2 or first.shape[1] != size:
         words = f"near has shape {first.shape}, ({size},) or (k, {size}) of finite numbers expected"
         raise ProblemError(words, name="near", value=first, limit=(size,))
     starts = np.vstack([first, low + (high - low) * rng.random((count, size))])
@@ -439,11 +408,7 @@ def _closest_collisions(
 def _collision_free(
     solutions: list[IkSolution], collisions: list[Collision | None], scene: CollisionScene, time: float
 ) -> list[IkSolution]:
-    """Return the collision-free IK solutions.
-
-    Raises:
-        Unreachable: There are none.
-    """
+    """Return the collision-free IK solutions; raise Unreachable, naming a pair of bodies, if there are none."""
     free = [solution for solution, collision in zip(solutions, collisions, strict=True) if collision is None]
     if free:
         return free

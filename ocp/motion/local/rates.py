@@ -15,9 +15,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from models import CollisionScene, Machine
-from models.checks import NOT_NUMBERS, Array, floats, real
+from models.checks import Array, real
 from models.files import INPUT_LIMITS
 from models.spatial import solve_spd
 from ocp.console import interruptible
@@ -30,8 +31,6 @@ from ocp.motion.tasks.goals import Start
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.motion.tasks.tracks import on_symbols
 from ocp.problem.values import Sampler, symbols_of
-
-__all__ = ["LocalMotion", "LocalSolution", "RateOptions", "least_rates", "resolve", "track_tasks"]
 
 MAX_INTEGRATOR_STEPS = 20000
 """Largest number of integrator steps between two samples; a smooth motion takes some tens."""
@@ -82,16 +81,10 @@ class LocalSolution:
         rates = np.array([np.interp(time, self.t, column) for column in self.joint_rates.T])
         if len(self.t) == 1:
             return {"base": self.base[0], "joints": self.joints[0], "joint_rates": rates}
-        k = int(np.clip(np.searchsorted(self.t, time) - 1, 0, len(self.t) - 2))
-        step = self.t[k + 1] - self.t[k]
-        s = (time - self.t[k]) / step
-
-        def hermite(value: Array, rate: Array) -> Array:
-            mean = (value[k + 1] - value[k]) / step
-            correction = (1 - s) * (rate[k] - mean) + s * (mean - rate[k + 1])
-            return np.asarray(value[k] + step * s * (mean + (1 - s) * correction))
-
-        base, joints = hermite(self.base, self.base_rates), hermite(self.joints, self.joint_rates)
+        base, joints = (
+            scipy.interpolate.CubicHermiteSpline(self.t, values, slopes)(time)
+            for values, slopes in ((self.base, self.base_rates), (self.joints, self.joint_rates))
+        )
         return {"base": base, "joints": joints, "joint_rates": rates}
 
 
@@ -200,11 +193,8 @@ def _sample_times(samples: Any, horizon: float) -> Array:
             words = f"samples must be at least 2 points or an array of times, not {samples!r}"
             raise ProblemError(words, name="samples", value=samples, limit=2)
         return np.linspace(0.0, horizon, int(count))
-    try:
-        times = floats(samples)
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"samples {samples!r} are not times", name="samples", value=samples) from error
-    if times.ndim != 1 or len(times) < 2 or times[0] != 0 or not np.isclose(times[-1], horizon, rtol=1e-12):
+    times = require.array("samples", samples, ("times",), least=2)
+    if times[0] != 0 or not np.isclose(times[-1], horizon, rtol=1e-12):
         words = f"samples must be times from 0 to the horizon {horizon:g} s"
         raise ProblemError(words, name="samples", value=times, limit=(0.0, horizon))
     if not (np.diff(times) > 0).all():
@@ -232,11 +222,6 @@ class _Model:
         outputs = [machine.tip_pose(base, joints).position, jacobian, equations.error(base, joints, targets)]
         self.outputs = ca.Function("outputs", [self.time, self.state], outputs)
 
-    def integrator(self, start: float, times: Array, tolerance: float) -> Any:
-        """Return the integrator of state and cost from `start` to the given times."""
-        problem = {"t": self.time, "x": self.state, "ode": self.ode, "quad": self.running}
-        return _cvodes(problem, start, times, tolerance)
-
     def one_interval(self, tolerance: float) -> Any:
         """Return an integrator over any one interval between samples; its parameters are start time and duration, s."""
         span, fraction = type(self.time).sym("span", 2), type(self.time).sym("fraction")
@@ -253,9 +238,10 @@ def _cvodes(problem: dict[str, Any], start: float, times: Array, tolerance: floa
 
 
 def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> tuple[Array, Array, str | None]:
-    """Return states and costs at all times that the integration reaches, and the reason if it stops early."""
+    """Return states and costs at all sample times that an integration reaches, and the reason if it stops early."""
     try:
-        result = model.integrator(times[0], times[1:], tolerance)(x0=first)
+        problem = {"t": model.time, "x": model.state, "ode": model.ode, "quad": model.running}
+        result = _cvodes(problem, times[0], times[1:], tolerance)(x0=first)
         states = np.vstack([first, np.array(result["xf"]).T])
         costs = np.concatenate([[0.0], np.array(result["qf"]).ravel()])
         if np.isfinite(states).all() and np.isfinite(costs).all():
@@ -286,7 +272,7 @@ def _integrate(model: _Model, first: Array, times: Array, tolerance: float) -> t
 def _report(
     machine: Machine, model: _Model, times: Array, states: Array, costs: Array, tolerance: float, stopped: str | None
 ) -> LocalSolution:
-    """Evaluate all outputs along integrated states and return them as a `LocalSolution`."""
+    """Return integrated states and costs as a `LocalSolution` with all quantities along the motion."""
     rates = np.array(model.rate.map(len(times))(times[None, :], states.T)).T
     tip, jacobians, error = (np.array(value) for value in model.outputs.map(len(times))(times[None, :], states.T))
     base_size, size = machine.base_size, error.size // len(times)
@@ -412,7 +398,7 @@ def track_tasks(
     bases, configurations, errors = [base_now], [joints_now], list[Array]()
 
     def linearise(k: int) -> tuple[Array, Array, Array, Array]:
-        """Return Jacobians (K, m, n), task velocities (K, m), pose errors (K, m) and largest residuals at times[k]."""
+        """Return Jacobians (K, m, n), task velocities and pose errors (K, m), and residuals (K,) at time sample k."""
         jacobian, right, error, residual, *leaning = task(base_now, joints_now, targets[:, k])
         matrix = jacobian.reshape(count, machine.joint_size, equations.size).transpose(0, 2, 1)
         errors_along = np.abs(residual).max(axis=1, initial=0.0)

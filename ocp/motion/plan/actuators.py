@@ -9,7 +9,7 @@ of the squared rates is then the guess of one motion, and the lowest of their co
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -23,6 +23,7 @@ from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics_plan import within_limits
 from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, ToolMotion
 from ocp.motion.builders.torques import Actuation, checked_motors, joint_torques, running_cost, weights_torques
+from ocp.motion.result.candidate import Reason, Rejection
 from ocp.motion.result.plan import CHECKED_TIMES
 from ocp.motion.result.request import declared_motion
 from ocp.motion.result.solved_plan import SolvedPlan
@@ -35,8 +36,8 @@ from ocp.solution import Solution
 from ocp.tolerances import RESOLVED_SHARE
 
 __all__ = [
-    "ActuatorDemand",
     "cost_of_motion",
+    "largest_demand",
     "limits_actuators",
     "solve_with_accelerations",
     "weights_actuators",
@@ -57,7 +58,7 @@ def weights_actuators(cost: Cost) -> bool:
 
 
 def without_actuators(limits: Limits) -> Limits:
-    """Return the limits after removing those of acceleration, jerk, torque and power."""
+    """Return a copy of the limits of a motion without those of acceleration, jerk, torque and power."""
     return replace(limits, acceleration=None, jerk=None, torque=None, power=None)
 
 
@@ -81,62 +82,37 @@ def cost_of_motion(plan: SolvedPlan, cost: Cost) -> float:
     return float(np.trapezoid(np.array(values)[0], sample.t) + cost.time * plan.horizon)
 
 
-@dataclass(frozen=True)
-class ActuatorDemand:
-    """Largest actuator demand of a motion relative to the limit: the quantity, joint, time and values.
+def largest_demand(plan: SolvedPlan, limits: Limits) -> Reason | None:
+    """Return which actuator a plan demands most of, relative to its limit; None if no actuator is limited.
 
-    Attributes:
-        quantity: "torque", "power" or "acceleration".
-        joint: Name of the joint.
-        time: Time, s.
-        required, allowed: Values in `unit`.
+    The reason names the joint, the time, and the value and the limit of its torque, power or acceleration. Joints that
+    the plan keeps at rest do not count.
     """
-
-    quantity: str
-    joint: str
-    time: float
-    required: float
-    allowed: float
-    unit: str
-
-    def __str__(self) -> str:
-        return (
-            f"{self.quantity} of {self.joint!r} is {self.required:.4g} {self.unit} at {self.time:.4g} s, "
-            f"{self.allowed:.4g} allowed"
-        )
-
-    @classmethod
-    def of(cls, plan: SolvedPlan, limits: Limits) -> ActuatorDemand | None:
-        """Return the largest actuator demand of a plan relative to the limit; None if no actuator is limited.
-
-        The limits are those of the joints that the plan does not keep at rest.
-        """
-        machine = checked_motors("limits", plan.machine)
-        robot, unlimited = machine.robot, dict.fromkeys(plan.held, np.inf)
-        own = limits.bounds(hold_joints(machine, plan.held) if plan.held else machine)
-        bounds = JointBounds(*(all_joints(robot, unlimited, values) for values in own))
-        sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
-        bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
-        symbols = [ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 3)]
-        torques_at = ca.Function("torques", symbols, [joint_torques(machine, (*symbols,))])
-        samples = bases.T, sample.joints.T, sample.rates.T, sample.accelerations.T
-        torques = np.array(torques_at.map(CHECKED_TIMES)(*samples)).T
-        largest: tuple[float, ActuatorDemand] | None = None
-        for quantity, values, most_allowed, units in (
-            ("acceleration", np.abs(sample.accelerations), bounds.acceleration, ("rad/s^2", "m/s^2")),
-            ("torque", np.abs(torques), bounds.torque, ("N m", "N")),
-            ("power", torques * sample.rates, bounds.power, ("W", "W")),
-        ):
-            ratios = values / most_allowed
-            if not np.isfinite(most_allowed).any():
-                continue
-            row, joint = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
-            if largest is None or ratios[row, joint] > largest[0]:
-                kind = robot.moving_joints[joint].kind
-                numbers = float(sample.t[row]), float(values[row, joint]), float(most_allowed[joint])
-                unit = units[kind == "prismatic"]
-                largest = ratios[row, joint], cls(quantity, robot.joint_names[joint], *numbers, unit)
-        return None if largest is None else largest[1]
+    machine = checked_motors("limits", plan.machine)
+    robot, unlimited = machine.robot, dict.fromkeys(plan.held, np.inf)
+    own = limits.bounds(hold_joints(machine, plan.held) if plan.held else machine)
+    bounds = JointBounds(*(all_joints(robot, unlimited, values) for values in own))
+    sample = plan.sampled(np.linspace(0.0, plan.horizon, CHECKED_TIMES))
+    bases = plan.at(sample.t)["base"] if machine.base_size else np.zeros((CHECKED_TIMES, 0))
+    symbols = [ca.SX.sym("v", size) for size in (machine.base_size, *[machine.joint_size] * 3)]
+    torques_at = ca.Function("torques", symbols, [joint_torques(machine, (*symbols,))])
+    samples = bases.T, sample.joints.T, sample.rates.T, sample.accelerations.T
+    torques = np.array(torques_at.map(CHECKED_TIMES)(*samples)).T
+    largest, demand = -np.inf, None
+    for quantity, values, most_allowed, units in (
+        ("acceleration", np.abs(sample.accelerations), bounds.acceleration, ("rad/s^2", "m/s^2")),
+        ("torque", np.abs(torques), bounds.torque, ("N m", "N")),
+        ("power", torques * sample.rates, bounds.power, ("W", "W")),
+    ):
+        ratios = values / most_allowed
+        row, joint = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
+        if np.isfinite(most_allowed).any() and ratios[row, joint] > largest:
+            largest, name = ratios[row, joint], robot.joint_names[joint]
+            unit = units[robot.moving_joints[joint].kind == "prismatic"]
+            time, value, allowed = float(sample.t[row]), float(values[row, joint]), float(most_allowed[joint])
+            words = f"{quantity} of {name!r} is {value:.4g} {unit} at {time:.4g} s, {allowed:.4g} allowed"
+            demand = Reason(Rejection.ACTUATORS, words, name, value, allowed, time)
+    return demand
 
 
 def solve_with_accelerations(request: PlanRequest, start: Array, reference: Array, unlimited: SolvedPlan) -> Solution:
@@ -181,12 +157,12 @@ def solve_with_accelerations(request: PlanRequest, start: Array, reference: Arra
     except SolveError as error:
         if isinstance(error.__cause__, KeyboardInterrupt):
             raise
-        raise _with_demand(error, ActuatorDemand.of(unlimited, limits)) from error
+        raise _with_demand(error, largest_demand(unlimited, limits)) from error
     return solution
 
 
 def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan) -> Array:
-    """Return orthogonal rows (k, n) of the joint velocities that the tasks leave undetermined at the end."""
+    """Return orthonormal rows (k, n) that span the joint velocities which tasks leave undetermined at the end."""
     last = request.stretches[-1]
     if last.equations is None:
         return np.eye(request.machine.joint_size)
@@ -196,14 +172,16 @@ def _undetermined_rows(request: PlanRequest, unlimited: SolvedPlan) -> Array:
     return np.asarray(rows[int((sizes > RESOLVED_SHARE * sizes.max(initial=0.0)).sum()) :])
 
 
-def _with_demand(error: SolveError, demand: ActuatorDemand | None) -> SolveError:
-    """Add to the text of an error the actuator demand of the motion that ignores the limits; return the error."""
-    details = {"name": error.name, "value": error.value, "limit": error.limit, "time": error.time}
+def _with_demand(error: SolveError, demand: Reason | None) -> SolveError:
+    """Return a copy of an error whose text also states what a motion demands of the actuators if it ignores limits."""
+    fault: Any = error
     words = "no motion within the actuator limits was found"
     if demand is not None:
-        words += f"; without them, {demand}"
-        if demand.required > demand.allowed:
-            details = {"name": demand.joint, "value": demand.required, "limit": demand.allowed, "time": demand.time}
+        words += f"; without them, {demand.detail}"
+        assert demand.value is not None
+        assert demand.limit is not None
+        fault = demand if demand.value > demand.limit else error
+    details = {key: getattr(fault, key) for key in ("name", "value", "limit", "time")}
     return SolveError(f"{words}\n{error}", error.solution, error.conflicts, **details)
 
 

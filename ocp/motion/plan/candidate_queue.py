@@ -167,7 +167,7 @@ class CandidateQueue:
             else:
                 self._audits += candidate.stage is Stage.REFINED
                 for advanced in self.solver.advance(candidate):
-                    self._take(candidate, advanced)
+                    self._store_or_push(candidate, advanced)
         waiting = [*(motion.waiting for motion in self._motions), *self._turned.values()]
         self.candidates += [each.with_rejection(Reason(Rejection.DUPLICATE)) for batch in waiting for each in batch]
 
@@ -243,14 +243,14 @@ class CandidateQueue:
             return bool(same)
         return any(c.solution is not None and self.solver.same_path(candidate.solution, c.solution) for c in same)
 
-    def _take(self, previous: Candidate, advanced: Candidate) -> None:
-        """Store an advanced candidate if it is finished or rejected; otherwise push it to the queue again."""
+    def _store_or_push(self, previous: Candidate, advanced: Candidate) -> None:
+        """Store a candidate that was advanced if it is finished or rejected; else push it to the queue again."""
         if not advanced.passed:
             self.candidates.append(advanced)
             self._failures += previous.stage is not Stage.SEED
             assert advanced.reason is not None
             if advanced.reason.kind is not Rejection.COLLISION and self._failures < self.settings.max_failures:
-                self._replace(advanced)
+                self._resume_duplicates(advanced)
         elif advanced.stage >= self.solver.last:
             repeated = self._has_passed(advanced)
             self.candidates.append(advanced.with_rejection(Reason(Rejection.DUPLICATE)) if repeated else advanced)
@@ -260,11 +260,11 @@ class CandidateQueue:
                 if advanced.solution is None or self.solver.reaches_limits(advanced.solution):
                     self._push_turned(previous)
             elif previous.stage < Stage.FINE <= advanced.stage:
-                self._learn_error(previous, advanced)
+                self._update_coarse_error(previous, advanced)
             self._push(advanced)
 
-    def _replace(self, rejected: Candidate) -> None:
-        """Resume the duplicates that waited for the result of a rejected candidate."""
+    def _resume_duplicates(self, rejected: Candidate) -> None:
+        """Queue the duplicates again that waited for the result of a candidate, which was now rejected."""
         self._push_turned(rejected)
         for motion in [motion for motion in self._motions if motion.first.seed is rejected.seed]:
             self._motions.remove(motion)
@@ -276,7 +276,7 @@ class CandidateQueue:
         for turned in self._turned.pop(id(candidate.seed), []):
             self._push(turned)
 
-    def _learn_error(self, coarse: Candidate, fine: Candidate) -> None:
+    def _update_coarse_error(self, coarse: Candidate, fine: Candidate) -> None:
         """Update the estimated cost error of the coarse mesh, unless the candidate converged to another motion."""
         assert coarse.solution is not None
         assert fine.solution is not None

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any
@@ -27,12 +26,21 @@ from ocp.motion.builders.tool_motion import CLOCK, SLOPES, ToolMotion
 from ocp.motion.local.collisions import Collision
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.plan.actuators import cost_of_motion, solve_with_accelerations
+from ocp.motion.plan.actuators import solve_with_accelerations
 from ocp.motion.plan.candidate_queue import Solver
-from ocp.motion.result.candidate import Candidate, MotionSample, Reason, Rejection, Seed, Stage, collision_reason
+from ocp.motion.result.candidate import (
+    Candidate,
+    MotionSample,
+    Reason,
+    Rejection,
+    Seed,
+    Stage,
+    collision_reason,
+    shortfall_reason,
+)  # fmt: skip
 from ocp.motion.result.plan import audit_key
 from ocp.motion.result.request import declared_motion
-from ocp.motion.result.solved_plan import SolvedPlan, parts_of
+from ocp.motion.result.solved_plan import Part, SolvedPlan
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
@@ -101,19 +109,8 @@ class CandidateSolver(Solver):
             return [advanced, Candidate(candidate.start, seed.cost, seed=seed)]
         return [advanced, *self._free_start(advanced)]
 
-    def with_own_cost(self) -> CandidateSolver:
-        """Return the solver with an additional last stage, which minimises the cost function of the request."""
-        solver = copy(self)
-        solver.last = Stage.ACTUATED
-        return solver
-
-    def own_cost(self, candidate: Candidate) -> float:
-        """Return the value of the request's own cost function for the motion of an audited candidate."""
-        assert self.request.cost is not None
-        return cost_of_motion(self.plan([candidate]), self.request.cost)
-
     def is_nearly_singular(self, local: Sequence[LocalMotion]) -> bool:
-        """Return whether to relax the tasks, because the task Jacobian is nearly singular along a local motion."""
+        """Return whether the tasks must be relaxed, as their Jacobian is nearly singular along a local motion."""
         samples = map(MotionSample.of_local, self.motion.stretches, local)
         return self._can_relax and any(sample.is_nearly_singular for sample in samples)
 
@@ -129,16 +126,15 @@ class CandidateSolver(Solver):
         return self._can_relax and seed.thorough and not seed.relaxed
 
     def _failure_reason(self, candidate: Candidate, words: str) -> Reason:
-        """Return the rejection reason: what the initial guess or, if tasks are relaxed, the last iterate violates."""
-        samples = list(map(MotionSample.of_local, self.motion.stretches, candidate.seed.local))
-        if not samples:
+        """Return why a candidate failed: what its guess or, if tasks are relaxed, the last iterate violates."""
+        if not candidate.seed.local:
             return Reason(Rejection.INFEASIBLE, words.split("\n")[0])
-        solution = candidate.solution
-        if solution is not None and candidate.seed.relaxed:
-            samples = self._motion_samples(solution)
-        return Reason.of_shortfall(self.request, samples)
+        if candidate.solution is not None and candidate.seed.relaxed:
+            return shortfall_reason(self.request, self._motion_samples(candidate.solution))
+        samples = map(MotionSample.of_local, self.motion.stretches, candidate.seed.local)
+        return shortfall_reason(self.request, list(samples))
 
-    def _turned_over(self, solution: Solution) -> Reason | None:
+    def _turned_tool_reason(self, solution: Solution) -> Reason | None:
         """Return a rejection reason if the tool at a free start is turned by more than 90 degrees from its target."""
         if self.request.start is not None:
             return None
@@ -186,7 +182,7 @@ class CandidateSolver(Solver):
             return self._separate_pairs(candidate, Stage.FINE, collisions)
         motion, mesh, _ = self.prepared(candidate, fine=True)
         assert candidate.solution is not None
-        if (reason := self._turned_over(candidate.solution)) is not None:
+        if (reason := self._turned_tool_reason(candidate.solution)) is not None:
             return candidate.with_rejection(reason)
         solution = self._refine_for_tasks(motion, mesh, candidate.solution, check=not _is_separated(candidate))
         if (deviation := self._deviations(motion, solution).max()) > self.settings.max_deviation:
@@ -231,7 +227,7 @@ class CandidateSolver(Solver):
         worst = audit.failures[0]
         if candidate.seed.relaxed and not audit.feasible:
             samples = self._motion_samples(solution)
-            reason = Reason.of_shortfall(self.request, samples)
+            reason = shortfall_reason(self.request, samples)
             return candidate.with_rejection(replace(reason, kind=Rejection.AUDIT))
         words = f"{worst.name} {worst.value:.2g}"
         return candidate.with_rejection(
@@ -244,7 +240,7 @@ class CandidateSolver(Solver):
         return replace(candidate, stage=Stage.ACTUATED, cost=solution.cost, solution=solution, audit=None)
 
     def _free_start(self, candidate: Candidate) -> list[Candidate]:
-        """Return a new candidate with a free start, derived from a candidate that passed with a fixed start."""
+        """Return a list with a copy of a candidate whose start is free, if the candidate passed with a fixed start."""
         if not (candidate.seed.fixed and candidate.passed and candidate.stage is Stage.AUDITED):
             return []
         constraints = self.request.clearance_constraints
@@ -480,7 +476,8 @@ class CandidateSolver(Solver):
 
     def plan(self, candidates: Sequence[Candidate]) -> SolvedPlan:
         """Return the plan of the first candidate, in which the other candidates are listed as well."""
-        best, parts = candidates[0], parts_of(self.motion.stretches)
+        best = candidates[0]
+        parts = tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in self.motion.stretches)
         assert best.solution is not None
         if self.request.time_cost is not None:
             parts = (parts[0]._replace(end=float(best.solution[CLOCK][-1, 0])),)

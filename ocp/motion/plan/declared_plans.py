@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import casadi as ca
 import numpy as np
 
 from models import Box, FixedBase, FreeFloating, Machine, Sphere, Stance, Standing
 from models.checks import Array, floats
 from models.machines.standing import External
-from ocp.console import report, time_left
+from ocp.console import time_left
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup
@@ -28,7 +27,6 @@ from ocp.motion.builders.space.capture import Capture, solve_capture
 from ocp.motion.builders.standing.plan import solve_standing, solve_steps
 from ocp.motion.builders.standing.problem import StandingSetup, Weights
 from ocp.motion.builders.standing.stances import Steps
-from ocp.motion.builders.standing.steps import StepWeights
 from ocp.motion.builders.torques import checked_motors
 from ocp.motion.local.inverse_kinematics import IkOptions, Unreachable, inverse_kinematics
 from ocp.motion.plan.candidate_queue import CandidateQueue, Solver
@@ -36,13 +34,14 @@ from ocp.motion.plan.goal_motions import GoalRequest
 from ocp.motion.plan.goal_plan import plan_to_goal
 from ocp.motion.plan.planner import PlanOptions
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
-from ocp.motion.result.solved_plan import Part, PhasedPlan, SolvedPlan, parts_of_phases
+from ocp.motion.result.solved_plan import Part, PhasedPlan, SolvedPlan
 from ocp.motion.search.configurations import PlannerSettings
-from ocp.motion.tasks.checks import check_rest, clip_to_limits, horizon_of
-from ocp.motion.tasks.equations import TaskEquations, bind
+from ocp.motion.tasks.checks import are_at_rest, clip_to_limits, horizon_of
+from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Goal, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
+from ocp.motion.tasks.tracks import on_symbols
 from ocp.problem.problem import Problem
 from ocp.solution import Solution
 
@@ -82,9 +81,7 @@ def plan_sequence(
         SolveError: No motion satisfies its limits.
     """
     motors, goals = checked_motors("plan", machine), require.each("goals", goals, Goal)
-    state, joints, base = Start.of(options.start, motors)
-    if joints is None:
-        raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
+    state, joints, base = Start.of_known(options.start, motors)
     own_limits = Limits() if options.limits is None else require.instance("limits", options.limits, Limits)
     cost = None if options.cost is None else require.instance("cost", options.cost, Cost)
     if len(goals) == 1 and goals[0].duration is None:  # one motion has the horizon
@@ -92,7 +89,8 @@ def plan_sequence(
     near, resolved = joints, list[Goal]()
     for goal in goals:
         if goal.has_pose:
-            near = nearest_configuration(goal.machine or motors, goal, near, limits=own_limits, seed=options.seed)
+            own = goal.machine or motors
+            near = goal_configurations(own, goal, near, limits=own_limits, constraints=None, seed=options.seed)[0]
             goal = with_joints(goal, near)
         elif goal.joints is not None:
             near = np.where(np.isnan(np.asarray(goal.joints, dtype=float)), near, goal.joints)
@@ -141,14 +139,8 @@ def has_only_target(goal: Goal) -> bool:
 def _goal_request(
     machine: FixedBase, goal: Goal, horizon: Any, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> GoalRequest:
-    """Check the arguments of a motion to one goal, and return them as a request.
-
-    Raises:
-        ProblemError: The start is missing, or as in `goal_configurations`.
-    """
-    state, joints, _ = Start.of(options.start, machine)
-    if joints is None:
-        raise ProblemError("start is missing: a goal is reached from somewhere; give plan(..., start=)", name="start")
+    """Check the arguments of a motion to one goal, and return them as a request."""
+    state, joints, _ = Start.of_known(options.start, machine)
     limits = Limits() if options.limits is None else require.instance("limits", options.limits, Limits)
     is_free = isinstance(horizon, str)
     if is_free:
@@ -166,18 +158,16 @@ def _goal_request(
         clearance_constraints=constraints,
         seed=options.seed,
         time_limit=time_left() if np.isfinite(time_left()) else None,
-        progress=report,
     )
 
 
-def plan_steps(
-    machine: Machine, steps: Steps, *, start: Any, cost: StepWeights | None, limits: Limits | None
-) -> PhasedPlan:
+def plan_steps(machine: Machine, steps: Steps, options: PlanOptions) -> PhasedPlan:
     """Plan the motion of a standing machine that makes given footsteps; see `steps_problem`.
 
     Args:
         machine: Machine of the first stance, `steps.stances[0]`.
-        start: Joint positions at the start, in the order of this machine.
+        steps: The steps.
+        options: Start, the joint positions in the order of this machine; cost; and limits.
 
     Raises:
         ProblemError: As `steps_problem`; or the machine is not that of the first stance.
@@ -187,21 +177,13 @@ def plan_steps(
     if not isinstance(machine, Stance) or machine.robot.joint_names != stance.robot.joint_names:
         words = "steps begin in their first stance: give plan(steps.stances[0], steps, start=...)"
         raise ProblemError(words, name="machine", value=machine)
-    joints = Start.of(start, stance)[1]
-    if joints is None:
-        raise ProblemError("start is missing; standing_configuration finds joints for a stance", name="start")
+    joints = Start.of_known(options.start, stance)[1]
     begin = steps.in_order(stance, joints[None])[0]
-    return _plan_of_phases(stance, solve_steps(steps, start=begin, cost=cost, limits=limits), joints)
+    return _plan_of_phases(stance, solve_steps(steps, start=begin, cost=options.cost, limits=options.limits), joints)
 
 
 def plan_capture(
-    machine: Machine,
-    capture: Capture,
-    *,
-    start: Any,
-    cost: Cost | None,
-    limits: Limits | None,
-    constraints: ClearanceConstraints | None,
+    machine: Machine, capture: Capture, options: PlanOptions, *, constraints: ClearanceConstraints | None
 ) -> PhasedPlan:
     """Plan the capture of a tumbling body by a free-floating chaser; see `capture_problem`.
 
@@ -210,9 +192,9 @@ def plan_capture(
         SolveError: No motion satisfies its limits.
     """
     chaser = require.instance("machine", machine, FreeFloating)
-    options: dict[str, Any] = {"cost": cost, "limits": limits, "clearance_constraints": constraints}
-    solution = solve_capture(chaser, capture, start=start, **options)
-    return _plan_of_phases(chaser, solution, np.asarray(Start.of(start, chaser)[1]))
+    setup: dict[str, Any] = {"cost": options.cost, "limits": options.limits, "clearance_constraints": constraints}
+    solution = solve_capture(chaser, capture, start=options.start, **setup)
+    return _plan_of_phases(chaser, solution, Start.of_known(options.start, chaser)[1])
 
 
 def with_joints(goal: Goal, joints: Array) -> Goal:
@@ -222,21 +204,10 @@ def with_joints(goal: Goal, joints: Array) -> Goal:
 
 
 def _plan_of_phases(machine: Machine, solution: Solution, start: Array) -> PhasedPlan:
-    """Return the plan whose motion is the solution of a problem with phases."""
+    """Convert the solution of a problem with phases to a plan, whose only candidate starts at `start`."""
     candidate = Candidate(start, solution.cost, None, Stage.AUDITED, solution)
-    return PhasedPlan(machine, solution, parts_of_phases(solution), (candidate,))
-
-
-def nearest_configuration(machine: Machine, goal: Goal, near: Array, *, limits: Limits, seed: int) -> Array:
-    """Return the configuration nearest to the configuration `near` that reaches the pose of a goal. Shape (n,).
-
-    Raises:
-        Unreachable, ProblemError: As `inverse_kinematics`.
-    """
-    options = IkOptions(limits=limits.joints)
-    solutions = inverse_kinematics(machine, goal.task, near=near, seed=seed, options=options)
-    distances = [float(np.linalg.norm(solution.joints - near)) for solution in solutions]
-    return np.asarray(solutions[int(np.argmin(distances))].joints)
+    parts = tuple(Part(begin, end, name) for name, (begin, end) in solution.phases.items())
+    return PhasedPlan(machine, solution, parts, (candidate,))
 
 
 def goal_configurations(
@@ -324,25 +295,29 @@ def plan_to_stand(
         SolveError: No start leads to a plan that passes its audit.
     """
     start, limits, cost = options.start, options.limits, options.cost
-    require.flag("cyclic", options.cyclic)
     if options.cyclic:
         words = "a standing motion cannot be cyclic; declare standing_problem with StandingSetup(end=...)"
         raise ProblemError(words, name="cyclic", value=options.cyclic)
     if cost is not None:
         require.instance("cost", cost, Weights)
-    all_tasks = [part.task for part in bind(machine, tasks).bound]
+    equations = bind(machine, tasks)
+    all_tasks = [part.task for part in equations.bound]
     duration = horizon_of(all_tasks, horizon)
     for number, task in enumerate(all_tasks):
         if task.begin > 0 or task.end < duration * (1 - 1e-9):
             words = f"task {number} lasts from {task.begin:g} to {task.end:g} s, not for the whole standing motion"
             raise ProblemError(words, name=f"task {number}", value=(task.begin, task.end), limit=(0.0, duration))
-    equations = bind(machine, all_tasks)
+
+    def accepted(symbols: Any) -> Any:
+        equations.targets(symbols.sym("time"))
+        return symbols
+
     setup = StandingSetup(
-        start_velocity=_rest(equations, 0.0),
-        end_velocity=_rest(equations, duration),
+        start_velocity="rest" if are_at_rest(equations, 0.0) else "free",
+        end_velocity="rest" if are_at_rest(equations, duration) else "free",
         external=wrenches,
         clearance_constraints=constraints,
-        symbols=ca.SX if _takes_scalars(equations) else ca.MX,
+        symbols=on_symbols(accepted),
     )
     arguments: dict[str, Any] = {"weights": cost, "limits": limits, "setup": setup}
     solver = _StandingSolver(machine, all_tasks, duration, arguments, start is not None)
@@ -385,24 +360,6 @@ class _StandingSolver(Solver):
         assert best is not None
         parts = (Part(0.0, self.duration, ""),)
         return SolvedPlan(self.machine, best, parts, tuple(candidates)).with_targets(self.tasks)
-
-
-def _rest(equations: TaskEquations, time: float) -> Literal["rest", "free"]:
-    """Return the condition on the joint velocities at a time: "rest" if the tips are at rest, else "free"."""
-    try:
-        check_rest(equations, time)
-    except ProblemError:
-        return "free"
-    return "rest"
-
-
-def _takes_scalars(equations: TaskEquations) -> bool:
-    """Return whether the functions of time in the tasks accept CasADi SX symbols."""
-    try:
-        equations.targets(ca.SX.sym("time"))
-    except (RuntimeError, NotImplementedError):
-        return False
-    return True
 
 
 def _start_configurations(

@@ -30,7 +30,7 @@ from ocp.motion.plan.declared_plans import (
     plan_to_stand,
 )  # fmt: skip
 from ocp.motion.plan.planner import PlanOptions, checked_request, clearance_for, plan_request
-from ocp.motion.plan.sequence import SequenceRequest, plan_consecutive, plan_in_segments
+from ocp.motion.plan.sequence import plan_consecutive, plan_in_segments
 from ocp.motion.plan.waypoints import plan_path
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.plan import Plan
@@ -118,7 +118,7 @@ def plan(
     require.count("seed", seed, 0, LARGEST_SEED)
     with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
         try:
-            return _plan(machine, tasks, horizon, start, cyclic, cost, limits, scene, search, seed)
+            return _plan(machine, tasks, horizon, scene, PlanOptions(start, cyclic, cost, limits, search, seed))
         except TimeLimitReached as error:
             if time_limit is None:  # that of an outer call
                 raise
@@ -126,63 +126,47 @@ def plan(
             raise SolveError(words, name="time_limit", limit=time_limit) from error
 
 
-def _plan(
-    machine: Machine,
-    tasks: Any,
-    horizon: Any,
-    start: Any,
-    cyclic: bool,
-    cost: Any,
-    limits: Limits | None,
-    scene: Any,
-    search: Search,
-    seed: int,
-) -> Plan:
+def _plan(machine: Machine, tasks: Any, horizon: Any, scene: Any, options: PlanOptions) -> Plan:
     """Select the planner for the tasks, and call this planner with the arguments of `plan`."""
-    options: dict[str, Any] = {"cost": cost, "limits": limits, "seed": seed}
+    cyclic = options.cyclic or None
     wrenches = scene.wrenches if isinstance(scene, Scene) else None
     if wrenches is not None and (not isinstance(machine, Standing) or isinstance(tasks, Steps)):
         words = "scene: wrenches act on a machine that stands and does tasks; for an arm on a fixed base, give them in "
         words += "DynamicsSetup(wrenches=...) of dynamics_problem"
         raise ProblemError(words, name="wrenches", value=wrenches)
     if isinstance(tasks, Waypoints):
-        _check_unused("a path through waypoints", horizon=horizon, start=start, cyclic=cyclic or None)
+        _check_unused("a path through waypoints", horizon=horizon, start=options.start, cyclic=cyclic)
+        return plan_path(require.instance("machine", machine, FixedBase), tasks, options, scene=scene)
+    if options.search == "segments":
+        _check_unused("search='segments'", cyclic=cyclic)
         arm = require.instance("machine", machine, FixedBase)
-        return plan_path(arm, tasks, scene=scene, **options)
-    options["start"] = start
-    if search == "segments":
-        _check_unused("search='segments'", cyclic=cyclic or None)
-        arm = require.instance("machine", machine, FixedBase)
-        return plan_in_segments(arm, tasks, horizon, scene=scene, **options)
+        return plan_in_segments(arm, tasks, horizon, options, scene=scene)
     if isinstance(tasks, Steps):
-        _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
+        _check_unused("a walk, whose phases have durations", horizon=horizon, cyclic=cyclic)
         _check_unused("a walk, whose feet stand on footholds,", scene=scene or None)
-        return plan_steps(machine, tasks, start=start, cost=cost, limits=limits)
+        return plan_steps(machine, tasks, options)
     if _is_sequence(tasks):
         if horizon is not None:
             require.choice("horizon", horizon, ("free",))
-        _check_unused("a sequence of goals and tasks", cyclic=cyclic or None)
-        own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
-        return plan_consecutive(own, tasks)
-    constraints = clearance_for(machine, limits, scene)
-    own_options = PlanOptions(start, cyclic, cost, limits, search, seed)
+        _check_unused("a sequence of goals and tasks", cyclic=cyclic)
+        return plan_consecutive(machine, tasks, options, scene=scene, free=horizon is not None)
+    constraints = clearance_for(machine, options.limits, scene)
     if isinstance(tasks, Capture):
-        _check_unused("a capture, whose phases have durations", horizon=horizon, cyclic=cyclic or None)
-        return plan_capture(machine, tasks, start=start, cost=cost, limits=limits, constraints=constraints)
+        _check_unused("a capture, whose phases have durations", horizon=horizon, cyclic=cyclic)
+        return plan_capture(machine, tasks, options, constraints=constraints)
     goals = (tasks,) if isinstance(tasks, Goal) else tasks
     if isinstance(goals, Sequence) and isinstance(next(iter(goals), None), Goal):
-        _check_unused("a motion to goals", cyclic=cyclic or None)
+        _check_unused("a motion to goals", cyclic=cyclic)
         if len(goals) == 1:
-            return plan_goal(machine, goals[0], horizon, own_options, constraints=constraints)
+            return plan_goal(machine, goals[0], horizon, options, constraints=constraints)
         moving = constraints is not None and constraints.scene.has_moving_obstacles
         is_open = horizon is None or (isinstance(horizon, str) and horizon == "free")
         if isinstance(machine, FixedBase) and is_open and not moving and _are_separate(goals):
-            own = SequenceRequest(machine, start, horizon is not None, cost, limits, scene, search, seed)
-            return plan_consecutive(own, goals)
-        return plan_sequence(machine, goals, horizon, own_options, constraints=constraints)
+            return plan_consecutive(machine, goals, options, scene=scene, free=horizon is not None)
+        return plan_sequence(machine, goals, horizon, options, constraints=constraints)
     if isinstance(machine, Standing):
-        return plan_to_stand(machine, tasks, horizon, own_options, constraints=constraints, wrenches=wrenches)
-    request = checked_request(machine, tasks, horizon, own_options)
+        return plan_to_stand(machine, tasks, horizon, options, constraints=constraints, wrenches=wrenches)
+    request = checked_request(machine, tasks, horizon, options)
     return plan_request(replace(request, clearance_constraints=constraints))
 
 
@@ -199,8 +183,7 @@ def _are_separate(goals: Sequence[Any]) -> bool:
 def _is_sequence(tasks: Any) -> bool:
     """Return whether the argument `tasks` lists consecutive motions: goals mixed with tasks, or several lists of tasks.
 
-    Raises:
-        ProblemError: A part is neither a goal nor tasks.
+    If one of these motions is neither a goal nor tasks, raise ProblemError.
     """
     if not isinstance(tasks, Sequence) or isinstance(tasks, str):
         return False

@@ -8,7 +8,6 @@ an optimal control problem. A motion that stops at the corners of the path is th
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,7 +16,7 @@ import numpy as np
 
 from models import FixedBase
 from models.checks import Array
-from ocp.console import TimeLimitReached, time_left, time_limited
+from ocp.console import TimeLimitReached, report, time_left, time_limited
 from ocp.direct.guess import Samples
 from ocp.errors import SolveError
 from ocp.motion.builders.clearance import ClearanceConstraints
@@ -107,7 +106,6 @@ class GoalRequest:
         clearance_constraints: Collision scene; None if collisions are not checked.
         seed: Seed of the random searches.
         time_limit: Wall time, s; None for the processor time of the settings.
-        progress: Function that is called with a text at each stage; None for none.
         settings: Settings.
     """
 
@@ -122,11 +120,10 @@ class GoalRequest:
     clearance_constraints: ClearanceConstraints | None = None
     seed: int = 0
     time_limit: float | None = None
-    progress: Callable[[str], None] | None = None
     settings: GoalSettings = field(default_factory=GoalSettings)
 
     def limited(self, seconds: float) -> AbstractContextManager[None]:
-        """Return the context that limits the time of the request or of a part of it."""
+        """Return the context that limits the time, s: wall time if the request limits it, else processor time."""
         return time_limited(seconds, processor=self.time_limit is None)
 
 
@@ -177,13 +174,9 @@ class GoalTask:
         """Whether the cost is the length of the path in joint space."""
         return bool(self.request.cost.length)
 
-    def report(self, text: str) -> None:
-        if self.request.progress is not None:
-            self.request.progress(text)
 
-
-def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return the audited candidate motions that follow paths at constant speed."""
+def _constant_speed_candidates(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
+    """Return audited candidates that follow collision-free joint paths at constant speed."""
     request = task.request
     fastest = np.where(np.isfinite(task.bounds.velocity), task.bounds.velocity, request.settings.unlimited_rate)
     candidates = []
@@ -204,13 +197,13 @@ def _at_constant_speed(task: GoalTask, paths: list[JointPath]) -> list[Candidate
 
 
 def motions_along(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
-    """Return audited candidate motions along paths, with the timing that the request needs.
+    """Return audited candidates along joint paths, with the timing that the request needs.
 
     That is the least time, any timing within the limits of the actuators, or constant speed.
     """
     if task.is_fastest:
-        return [_fastest(task, path) for path in paths]
-    return _within_actuator_limits(task, paths) if task.is_dynamic else _at_constant_speed(task, paths)
+        return [_fastest_candidate(task, path) for path in paths]
+    return _candidates_within_limits(task, paths) if task.is_dynamic else _constant_speed_candidates(task, paths)
 
 
 def synchronised_candidates(task: GoalTask) -> list[Candidate]:
@@ -234,16 +227,16 @@ def synchronised_candidates(task: GoalTask) -> list[Candidate]:
     return []
 
 
-def _fastest(task: GoalTask, path: JointPath) -> Candidate:
+def _fastest_candidate(task: GoalTask, path: JointPath) -> Candidate:
     """Return an audited, locally fastest motion near a path or, if none is found, one that stops at path corners."""
-    candidate = _spline(task, path, None)
+    candidate = _spline_candidate(task, path, None)
     if not candidate.passed:
         with suppress(TimeLimitReached):
-            return next((other for other in _within_actuator_limits(task, [path]) if other.passed), candidate)
+            return next((other for other in _candidates_within_limits(task, [path]) if other.passed), candidate)
     return candidate
 
 
-def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate:
+def _spline_candidate(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate:
     """Return an audited, locally optimal spline near a path; the horizon is free if it is None."""
     settings = task.request.settings.spline
     ends = (end_velocities("", velocity, len(task.start)) for velocity in task.end_velocities)
@@ -254,7 +247,7 @@ def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate
             with task.request.limited(task.request.settings.search_share * time_left()):
                 motion = optimal_motion_near(limits, path.joints, cost, horizon, settings=settings)
             candidate = _PathProblem(task, path, motion, horizon).candidate("is a locally optimal spline")
-            task.report(f"path of length {path.length:.4g}: {candidate}")
+            report(f"path of length {path.length:.4g}: {candidate}")
             if candidate.passed or candidate.reason is None or candidate.reason.kind is not Rejection.COLLISION:
                 break
             settings = replace(settings, margin=2 * settings.margin)
@@ -263,7 +256,7 @@ def _spline(task: GoalTask, path: JointPath, horizon: float | None) -> Candidate
     return candidate
 
 
-def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
+def _candidates_within_limits(task: GoalTask, paths: list[JointPath]) -> list[Candidate]:
     """Return audited motions along paths within actuator limits: with stops at corners or, if better, without."""
     request, settings, bounds = task.request, task.request.settings, task.bounds
     candidates, motions = list[Candidate](), list[tuple[JointPath, ConstantJerkMotion]]()
@@ -285,7 +278,7 @@ def _within_actuator_limits(task: GoalTask, paths: list[JointPath]) -> list[Cand
         enough = attains_bound(task, candidate) or (candidate.passed and (problem.path.length == 0 or task.is_fastest))
         best = candidate if enough else min(candidate, problem.without_stops(), key=lambda c: (not c.passed, c.cost))
         candidates.append(best)
-        task.report(f"path of length {problem.path.length:.4g}: {best}")
+        report(f"path of length {problem.path.length:.4g}: {best}")
     return candidates
 
 
@@ -299,19 +292,12 @@ def attains_bound(task: GoalTask, candidate: Candidate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _PathProblem:
-    """Optimal control problem of a motion near one path, within actuator limits.
-
-    Attributes:
-        task: Checked request.
-        path: The path.
-        motion: Feasible motion, such as one that stops at corners of the path.
-        fixed: Fixed horizon, s; None if it is free.
-    """
+    """Optimal control problem of a motion near one path, within actuator limits."""
 
     task: GoalTask
     path: JointPath
-    motion: ConstantJerkMotion
-    fixed: float | None
+    motion: ConstantJerkMotion  # a feasible motion, such as one that stops at the corners of the path
+    fixed: float | None  # horizon, s; None if it is free
 
     @property
     def horizon_guess(self) -> float:
@@ -319,7 +305,7 @@ class _PathProblem:
         return self.motion.duration if self.fixed is None else self.fixed
 
     def declare(self, clearance: ClearanceConstraints | None) -> Problem:
-        """Declare the optimal control problem, with or without clearance constraints."""
+        """Declare the optimal control problem of a motion between the ends of the path, with or without clearance."""
         task, ends = self.task, {"start": self.path.joints[0], "end": self.path.joints[-1]}
         guess = self.horizon_guess
         least = 0.0 if task.moves else least_durations(np.abs(ends["end"] - ends["start"]), task.bounds).max()
@@ -356,13 +342,13 @@ class _PathProblem:
     def without_stops(self) -> Candidate:
         """Return a locally optimal motion without stops near the path, with its audit."""
         if self.task.spline_cost is not None and not self.task.is_fastest:
-            spline = _spline(self.task, self.path, self.fixed)
+            spline = _spline_candidate(self.task, self.path, self.fixed)
             if spline.passed:
                 return spline
-        return self.smooth()
+        return self.solve()
 
-    def smooth(self) -> Candidate:
-        """Solve the optimal control problem, guessed from the path, and return the motion with its audit."""
+    def solve(self) -> Candidate:
+        """Solve the optimal control problem from a smooth guess along the path; return the audited candidate."""
         task, joints = self.task, self.path.joints
         settings, duration = task.request.settings, self.horizon_guess
         times = np.linspace(0.0, duration, settings.guess_times)
@@ -385,7 +371,7 @@ class _PathProblem:
 def _audit_candidate(task: GoalTask, solution: Solution, path: JointPath) -> Candidate:
     """Audit a solution; return it as a candidate, rejected if it is infeasible or could not be audited in time."""
     candidate = Candidate(path.joints[0], solution.cost, None, Stage.FINE, solution)
-    task.report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
+    report(f"audit of a motion of cost {solution.cost:.4g} along a path of length {path.length:.4g}")
     try:
         audit = solution.audit(only_feasible=True)
     except TimeLimitReached:

@@ -15,7 +15,7 @@ import numpy as np
 
 from models import FixedBase
 from models.checks import Array
-from ocp.console import TimeLimitReached, interruptible
+from ocp.console import TimeLimitReached, interruptible, report
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.constant_jerk import TorqueLimits
 from ocp.motion.local.inverse_kinematics import spread_points
@@ -53,13 +53,13 @@ def plan_to_goal(request: GoalRequest) -> SolvedPlan:
     seconds = request.settings.time_limit if request.time_limit is None else request.time_limit
     with request.limited(require.positive("time_limit", seconds)):
         try:
-            return _best(task, _candidates(task, seconds))
+            return _plan_of_best(task, _find_candidates(task, seconds))
         except TimeLimitReached as error:
             words = f"no motion was found within the time limit of {seconds:.4g} s; raise time_limit"
             raise SolveError(words, name="time_limit", limit=seconds) from error
 
 
-def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
+def _find_candidates(task: GoalTask, seconds: float) -> list[Candidate]:
     """Return all audited candidate motions to the goals that are found within the given time, s."""
     settings, candidates = task.request.settings, list[Candidate]()
     if task.is_fastest:
@@ -68,8 +68,8 @@ def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
     if not any(attains_bound(task, candidate) for candidate in candidates):
         try:
             with task.request.limited(settings.search_share * seconds):
-                paths = _paths(task, seconds)
-            task.report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
+                paths = _find_paths(task, seconds)
+            report(f"{len(paths)} paths, the shortest of length {paths[0].length:.4g}")
             candidates += motions_along(task, paths)
         except (SolveError, TimeLimitReached):
             if not any(candidate.passed for candidate in candidates):
@@ -78,11 +78,7 @@ def _candidates(task: GoalTask, seconds: float) -> list[Candidate]:
 
 
 def _check_request(request: GoalRequest) -> GoalTask:
-    """Check a request; return it with goals shifted towards the start by full turns of the unlimited joints.
-
-    Raises:
-        ProblemError: As `plan_to_goal`.
-    """
+    """Return a checked request, with goals shifted towards the start by full turns of the unlimited joints."""
     machine = require.instance("machine", request.machine, FixedBase)
     limits = Limits() if request.limits is None else require.instance("limits", request.limits, Limits)
     bounds = limits.bounds(machine)  # the problem that is declared warns of unknown limits
@@ -104,7 +100,7 @@ def _check_request(request: GoalRequest) -> GoalTask:
     space = JointSpace(machine, bounds.lower, bounds.upper, scale**2)
     start = _checked_end(machine, "start", request.start, bounds)
     if collisions := motions.collisions(start):
-        raise _collision(scene, "start", collisions[0])
+        raise _collision_error(scene, "start", collisions[0])
     within, errors = [], []
     for goal in goals:
         try:
@@ -116,7 +112,7 @@ def _check_request(request: GoalRequest) -> GoalTask:
     for joints, is_clear in zip(within, clear.tolist(), strict=True):
         collisions = [] if is_clear else motions.collisions(joints)  # without a proof it may be clear all the same
         if collisions:
-            errors.append(_collision(scene, "goal", collisions[0]))
+            errors.append(_collision_error(scene, "goal", collisions[0]))
         else:
             kept.append(joints)
     if not kept:
@@ -145,7 +141,7 @@ def _checked_end(machine: FixedBase, name: str, value: Any, bounds: JointBounds)
     return clip_to_limits(joints, bounds.lower, bounds.upper, label=name, names=names, hint=hint)
 
 
-def _collision(scene: Any, name: str, collision: Any) -> ProblemError:
+def _collision_error(scene: Any, name: str, collision: Any) -> ProblemError:
     first, second = collision.bodies
     how = (
         f"overlap by {-collision.distance:.3g} m" if collision.distance < 0 else f"are {collision.distance:.3g} m apart"
@@ -171,12 +167,8 @@ def _equivalent_goals(space: JointSpace, bounds: JointBounds, start: Array, goal
     return [np.array(joints) for joints in product(*shifts)]
 
 
-def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
-    """Search for collision-free paths of several homotopy classes, and sort them by length.
-
-    Raises:
-        SolveError: No path was found.
-    """
+def _find_paths(task: GoalTask, seconds: float) -> list[JointPath]:
+    """Return collision-free paths of several homotopy classes, the shortest first, or raise SolveError for none."""
     request, bounds, joints = task.request, task.bounds, np.vstack([task.start, task.goals])
     lower = np.where(np.isfinite(bounds.lower) & ~task.space.periodic, bounds.lower, joints.min(axis=0) - np.pi)
     upper = np.where(np.isfinite(bounds.upper) & ~task.space.periodic, bounds.upper, joints.max(axis=0) + np.pi)
@@ -204,12 +196,8 @@ def _paths(task: GoalTask, seconds: float) -> list[JointPath]:
     raise SolveError(words, name=name, value=worst.distance, limit=seconds if name == "time_limit" else None)
 
 
-def _best(task: GoalTask, candidates: list[Candidate]) -> SolvedPlan:
-    """Return the lowest-cost candidate as the plan, with a lower bound of the cost of all motions.
-
-    Raises:
-        SolveError: No candidate passed its audit.
-    """
+def _plan_of_best(task: GoalTask, candidates: list[Candidate]) -> SolvedPlan:
+    """Return the plan of the lowest-cost candidate, with a cost bound, or raise SolveError if no candidate passed."""
     passed = sorted((c for c in candidates if c.passed), key=lambda candidate: candidate.cost)
     if not passed:
         reasons = "\n".join(f"  {candidate.reason}" for candidate in candidates)

@@ -12,8 +12,9 @@ kind of seeds is used only if the kinds before it led to no plan, or to none tha
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,20 +23,19 @@ from models.checks import Array
 from ocp.console import report
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
-from ocp.motion.builders.tool_motion import Stretch, stretches_of
+from ocp.motion.builders.tool_motion import stretches_of
 from ocp.motion.builders.torques import checked_motors
-from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
+from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
-from ocp.motion.plan.actuators import limits_actuators, weights_actuators, without_actuators
+from ocp.motion.plan.actuators import cost_of_motion, limits_actuators, weights_actuators, without_actuators
 from ocp.motion.plan.candidate_queue import CandidateQueue
 from ocp.motion.plan.candidate_solver import CandidateSolver
-from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed
+from ocp.motion.result.candidate import Candidate, Reason, Rejection, Seed, Stage
 from ocp.motion.result.solved_plan import SolvedPlan
 from ocp.motion.search.cells import CellSearch, tracks_tasks
 from ocp.motion.search.configurations import (
     REACH_TOLERANCE,
     PlanRequest,
-    SearchKind,
     largest_pose_errors,
     local_motions_from,
     start_collisions,
@@ -51,7 +51,7 @@ from ocp.motion.search.held_joints import (
 )
 from ocp.motion.search.search import checked_bound
 from ocp.motion.search.task_search import TaskSearch
-from ocp.motion.tasks.checks import check_rest, checked_tasks, clip_to_limits, horizon_of
+from ocp.motion.tasks.checks import are_at_rest, checked_tasks, clip_to_limits, horizon_of
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Start
 from ocp.motion.tasks.limits import Limits
@@ -105,7 +105,7 @@ def plan_from_configurations(
     seeds = candidates_from(solver, motions)
     queue.run(seeds)
     if not queue.passed:
-        _repair(queue, solver, motions, configurations, seeds)
+        _search_again(queue, solver, motions, configurations, seeds)
     try:
         return _final_plan(queue, solver), None if search is None else search.bound
     except SolveError as error:
@@ -117,16 +117,15 @@ def plan_from_configurations(
 def _final_plan(queue: CandidateQueue, solver: CandidateSolver) -> SolvedPlan:
     """Return the plan of the candidate that costs least by the cost function of the request.
 
-    If the request has another cost than the squared rates, all motions that passed are solved again for this cost,
-    in the order of the value that it has for them before.
-
-    Raises:
-        SolveError: No motion passed.
+    If this is not the integral of the squared rates, all motions that passed are solved again for it, in the order of
+    their costs before. If no motion passed, raise SolveError.
     """
-    if solver.request.cost is None or not queue.passed:
+    if (cost := solver.request.cost) is None or not queue.passed:
         return queue.plan()
-    passed = [replace(c, cost=solver.own_cost(c)) for c in queue.candidates if c.passed]
-    weighted = CandidateQueue(solver.with_own_cost(), queue.settings, include_costlier=True)
+    passed = [replace(c, cost=cost_of_motion(solver.plan([c]), cost)) for c in queue.candidates if c.passed]
+    last_solver = copy(solver)
+    last_solver.last = Stage.ACTUATED  # the stage that minimises this cost
+    weighted = CandidateQueue(last_solver, queue.settings, include_costlier=True)
     weighted.run(passed)
     weighted.candidates += [replace(c, cost=np.nan) for c in queue.candidates if not c.passed]
     return weighted.plan()
@@ -166,14 +165,14 @@ def _approach_costs(request: PlanRequest, starts: Array) -> Array:
     return np.asarray(squares / 2 + (0.0 if request.cost is None else request.cost.time) * durations)
 
 
-def _repair(
+def _search_again(
     queue: CandidateQueue,
     solver: CandidateSolver,
     motions: Sequence[LocalMotion],
     configurations: Array,
     seeds: list[Candidate],
 ) -> None:
-    """Retry after all candidates failed: with separated bodies if some collided, otherwise from other guesses."""
+    """Search again after all candidates failed: with separated bodies if some collided, else from other guesses."""
     if queue.collided and not solver.no_clear_configuration:
         _try_alternatives(queue, solver, seeds)
     if queue.passed or queue.collided or queue.exhausted:
@@ -186,11 +185,7 @@ def _repair(
 
 
 def _try_one_by_one(queue: CandidateQueue, solver: CandidateSolver, configurations: Array, thorough: bool) -> None:
-    """Try start configurations one after the other, in order of their conditioning, until one leads to a plan.
-
-    Args:
-        thorough: Whether failures are diagnosed, since nothing else is tried.
-    """
+    """Try start configurations one after the other until one leads to a plan; if `thorough`, diagnose failures."""
     request = solver.request
     for joints in configurations[: request.settings.max_failures]:
         motions = local_motions_from(request, joints[None])
@@ -206,9 +201,6 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
 
     A free start and a coarse mesh may lead away from a nearly optimal motion. Motions of the search that promise a
     lower cost than the plan are therefore also solved with their start fixed, until the plan is close to its bound.
-
-    Raises:
-        DeadEnd: No motion of the search reaches the end.
     """
     settings = solver.settings
     _check_dead_end(search)
@@ -238,8 +230,7 @@ def _search_cells(
 ) -> None:
     """Solve candidates of a floating-base machine from motions of a `CellSearch` and from local motions.
 
-    Raises:
-        Unreachable, DeadEnd: As in `CellSearch`, if no local motion leads to a plan either.
+    If there are none, raise the error of the `CellSearch`.
     """
     request, include_costlier = solver.request, solver.request.search == "global"
     tracked = np.flatnonzero(tracks_tasks(request, motions))
@@ -325,11 +316,7 @@ def plan_request(request: PlanRequest) -> SolvedPlan:
 
 
 def _plan_attempt(whole: PlanRequest, request: PlanRequest) -> SolvedPlan:
-    """Plan a request with some joints held at rest; `whole` is the request before these were held.
-
-    Raises:
-        ProblemError, SolveError: As in `plan`.
-    """
+    """Plan a request with some joints held at rest; `whole` is the request before these were held."""
     report("inverse kinematics of the start")
     request, configurations = place_held_joints(whole, request)
     start = request.start
@@ -369,7 +356,7 @@ def clearance_for(
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """Unchecked options of `plan` for tip tasks.
+    """Options of `plan` besides machine, tasks, horizon and scene; they are not yet checked against the machine.
 
     Attributes:
         start, cyclic, cost, limits, search, seed: As in `plan`.
@@ -384,15 +371,12 @@ class PlanOptions:
 
 
 def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOptions) -> PlanRequest:
-    """Check the arguments of `plan`, except the scene, and return them as a request.
+    """Check the arguments of `plan` for tip tasks, except the scene, search, seed and `cyclic`; return the request.
 
     Raises:
         ProblemError: As in `plan`.
     """
     limits, search = options.limits, options.search
-    require.choice("search", search, get_args(SearchKind))
-    require.flag("cyclic", options.cyclic)
-    require.count("seed", options.seed, 0, LARGEST_SEED)
     all_tasks = (tasks,) if isinstance(tasks, TipTask) else require.each("tasks", tasks, TipTask)
     bind(machine, all_tasks)  # checks the tasks against the machine
     checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
@@ -427,33 +411,14 @@ def checked_request(machine: Machine, tasks: Any, horizon: Any, options: PlanOpt
         actuator_limits=checked_limits if limits_actuators(checked_limits) else None,
     )
     smooth = limits_actuators(checked_limits) or weights_actuators(own_cost)
-    return replace(request, rests=_rests(request)) if smooth else request
-
-
-def _rests(request: PlanRequest) -> tuple[bool, bool]:
-    """Return whether the tips are at rest at the start and at the end of a motion along tasks."""
-
-    def rest(stretch: Stretch, time: float) -> bool:
-        try:
-            if stretch.equations is not None:
-                check_rest(stretch.equations, time)
-        except ProblemError:
-            return False
-        return True
-
-    return rest(request.stretches[0], 0.0), rest(request.stretches[-1], request.horizon)
+    if not smooth:
+        return request
+    rests = are_at_rest(stretches[0].equations, 0.0), are_at_rest(stretches[-1].equations, duration)
+    return replace(request, rests=rests)
 
 
 def _checked_cost(machine: Machine, cost: Any, free: bool) -> Cost:
-    """Check the cost weights of a motion along tip tasks, and return the cost.
-
-    Args:
-        free: Whether the horizon is free.
-
-    Raises:
-        ProblemError: The time is weighted but fixed, or free without a weight; the machine has no base to turn, or its
-            torques are not known.
-    """
+    """Return the cost of a motion along tip tasks after checking that its weights fit the machine and the horizon."""
     if cost is None:
         return Cost(time=float(free))
     own = require.instance("cost", cost, Cost)

@@ -41,116 +41,109 @@ from ocp.motion.tasks.goals import Cost, Goal, Scene, Start
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask, retime_task
 
-__all__ = ["SequenceRequest", "plan_consecutive", "plan_in_segments"]
+__all__ = ["plan_consecutive", "plan_in_segments"]
 
 AT_START = 1e-6
 """Largest pose error, m and rad, with which a configuration counts as being at the start of a task or at a goal."""
 
 
-@dataclass(frozen=True, eq=False)
-class SequenceRequest:
-    """Options that all motions of a sequence share.
-
-    Attributes:
-        machine: Machine on a fixed or floating base.
-        start: Start of the first motion, as in `plan`; may be None if this motion is along a task.
-        free: Whether the planner chooses the durations.
-        cost, limits, scene, search, seed: As in `plan`.
-    """
-
-    machine: Machine
-    start: Any
-    free: bool
-    cost: Cost | None
-    limits: Limits | None
-    scene: Scene | Literal[False] | None
-    search: str
-    seed: int
-
-    @property
-    def smooth(self) -> bool:
-        """Whether joint rates must be continuous, because actuators are limited or weighted."""
-        limits = self.limits or Limits()
-        return limits_actuators(limits) or (self.cost is not None and weights_actuators(self.cost))
-
-
-class _State(NamedTuple):
-    """Configuration and joint velocities at the junction of two motions; unknown joint positions are None."""
+class _Junction(NamedTuple):
+    """Configuration and joint velocities where two motions of a sequence meet; unknown joint positions are None."""
 
     joints: Array | None
     base: Array
     rates: Any
 
     @classmethod
-    def end_of(cls, plan: SolvedPlan, smooth: bool) -> _State:
-        """Return the configuration and rates at the end of a motion; the rates count as zero if they may jump."""
+    def end_of(cls, plan: SolvedPlan, smooth: bool) -> _Junction:
+        """Return the state at the end of a motion; unless `smooth`, velocities may jump there and count as zero."""
         at = plan.at(plan.horizon)
-        return cls(at["joints"], at.get("base", np.zeros(0)), _velocity(at["rates"], smooth))
+        return cls(at["joints"], at.get("base", np.zeros(0)), _junction_velocity(at["rates"], smooth))
 
 
-def _velocity(rates: Array, smooth: bool) -> Any:
-    """Return the joint velocity at a junction of two motions; "rest" if it is zero or velocities may jump there."""
+def _junction_velocity(rates: Array, smooth: bool) -> Any:
+    """Return the joint velocity where two motions meet; "rest" if it is zero or, unless `smooth`, may jump there."""
     return rates if smooth and np.abs(rates).max(initial=0.0) > JUMP_TOLERANCE else "rest"
 
 
-def plan_consecutive(request: SequenceRequest, parts: Sequence[Goal | TipTask | Sequence[TipTask]]) -> SequencePlan:
+def plan_consecutive(
+    machine: Machine,
+    parts: Sequence[Goal | TipTask | Sequence[TipTask]],
+    options: PlanOptions,
+    *,
+    scene: Scene | Literal[False] | None,
+    free: bool,
+) -> SequencePlan:
     """Plan motions to goals and motions along tasks, one after the other.
 
     Args:
-        request: The options.
+        machine: Machine on a fixed or floating base.
         parts: Goals and tasks in their order. Tasks that are done at once form a sequence of their own.
+        options: Options that all motions share; the start may be None if the first motion is along a task.
+        scene: As in `plan`.
+        free: Whether the planner chooses the durations.
 
     Raises:
         ProblemError: The parts cannot be planned in sequence; names the part. Or as `plan` for each part.
         SolveError: A part has no motion; names the part.
     """
-    return _Sequence(request, tuple(parts)).plan()
+    return _Sequence(checked_motors("plan", machine), tuple(parts), options, scene, free).plan()
 
 
 @dataclass(eq=False)
 class _Sequence:
     """Planner of a sequence of motions, with the plans so far and the configuration and rates at their end."""
 
-    request: SequenceRequest
+    machine: Machine
     parts: tuple[Any, ...]
-    machine: Machine = field(init=False)
-    state: _State = field(init=False)
+    options: PlanOptions
+    scene: Scene | Literal[False] | None
+    free: bool
+    state: _Junction = field(init=False)
     plans: list[SolvedPlan] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.machine = checked_motors("plan", self.request.machine)
-        start, joints, base = Start.of(self.request.start, self.machine)
-        self.state = _State(joints, base, start.velocity)
-        if joints is None and isinstance(self.parts[0], Goal):
-            words = "start is missing: a goal is reached from somewhere; give plan(..., start=)"
-            raise ProblemError(words, name="start")
+        start_of = Start.of_known if isinstance(self.parts[0], Goal) else Start.of
+        start, joints, base = start_of(self.options.start, self.machine)
+        self.state = _Junction(joints, base, start.velocity)
+
+    @property
+    def horizon(self) -> Literal["free"] | None:
+        """Horizon of each motion of the sequence: "free", or None for the duration that its tasks or goal state."""
+        return "free" if self.free else None
+
+    @property
+    def smooth(self) -> bool:
+        """Whether joint rates must be continuous, because actuators are limited or weighted."""
+        limits, cost = self.options.limits or Limits(), self.options.cost
+        return limits_actuators(limits) or (cost is not None and weights_actuators(cost))
 
     def plan(self) -> SequencePlan:
         """Plan the motions to all goals and along all tasks of the sequence, one after the other."""
-        led: SolvedPlan | None = None  # plan of the next tasks, if the goal before them leads to their start
+        next_plan: SolvedPlan | None = None  # of the next tasks, if the goal before them leads to their start
         for number, (part, following) in enumerate(zip_longest(self.parts, self.parts[1:]), 1):
             if isinstance(part, Goal):
                 name = part.name or f"goal {number}"
                 if following is not None and not isinstance(following, Goal) and not self.machine.base_size:
-                    with _naming_part(f"task {number + 1}"):
-                        led = self._plan_tasks(following, self._joints_near(part))
-                    part = _led_to(self.machine, part, led, self.request.smooth)
-                with _naming_part(name):
+                    with _errors_named_after(f"task {number + 1}"):
+                        next_plan = self._plan_tasks(following, self._joints_near(part))
+                    part = _with_next_start(self.machine, part, next_plan, self.smooth)
+                with _errors_named_after(name):
                     self._append(self._plan_goal(part), name)
                 continue
-            with _naming_part(f"task {number}"):
-                plan = led or self._plan_tasks(part, self.state.joints)
-            with _naming_part(f"approach to task {number}"):
-                plan = self._approach(plan, part, f"approach to task {number}")
+            with _errors_named_after(f"task {number}"):
+                plan = next_plan or self._plan_tasks(part, self.state.joints)
+            with _errors_named_after(f"approach to task {number}"):
+                plan = self._with_approach(plan, part, f"approach to task {number}")
             self._append(plan, f"task {number}")
-            led = None
-        return SequencePlan(self.plans[0].machine, tuple(self.plans), tuple(self.names), self.request.smooth)
+            next_plan = None
+        return SequencePlan(self.plans[0].machine, tuple(self.plans), tuple(self.names), self.smooth)
 
     def _append(self, plan: SolvedPlan, name: str) -> None:
         self.plans.append(plan)
         self.names.append(name)
-        self.state = _State.end_of(plan, self.request.smooth)
+        self.state = _Junction.end_of(plan, self.smooth)
 
     def _joints_near(self, goal: Goal) -> Array | None:
         """Return the joint positions of a goal, with current positions for the joints that the goal leaves open."""
@@ -162,8 +155,7 @@ class _Sequence:
         return np.where(np.isnan(joints), self.state.joints, joints)
 
     def _plan_goal(self, goal: Goal) -> SolvedPlan:
-        """Plan the motion from the end of the previous motion to a goal."""
-        request = self.request
+        """Plan the motion to a goal from the configuration at which the previous motion of the sequence ends."""
         own = self.machine if goal.machine is None else checked_motors("goal: machine", goal.machine)
         if own.robot.joint_names != self.machine.robot.joint_names:
             words = "all machines of a sequence need the joints of the first one"
@@ -172,40 +164,36 @@ class _Sequence:
             raise ProblemError("a load is picked up or put down at rest", name="machine", value=goal.machine)
         self.machine = own
         start = Start(self.state.joints, self.state.base if own.base_size else None, self.state.rates)
-        options = PlanOptions(start, cost=request.cost, limits=request.limits, seed=request.seed)
-        horizon = "free" if request.free else None
-        return plan_goal(own, replace(goal, machine=None), horizon, options, constraints=self._constraints())
+        options = replace(self.options, start=start)
+        return plan_goal(own, replace(goal, machine=None), self.horizon, options, constraints=self._constraints())
 
     def _plan_tasks(self, tasks: Any, near: Array | None) -> SolvedPlan:
         """Return the motion along tasks from the configuration `near` or, if they do not start there, from any.
 
         Among start configurations, those count as better to which the motion from `near` costs less.
         """
-        request, machine = self.request, self.machine
-        options: dict[str, Any] = {"cost": request.cost, "limits": request.limits, "seed": request.seed}
-        options |= {"search": request.search, "start": None}
-        horizon = "free" if request.free else None
+        machine, start = self.machine, None
         if machine.base_size or (near is not None and _is_at_start(machine, tasks, near)):
-            options["start"] = Start(near, self.state.base if machine.base_size else None)
-        checked = checked_request(machine, tasks, horizon, PlanOptions(**options))
+            start = Start(near, self.state.base if machine.base_size else None)
+        checked = checked_request(machine, tasks, self.horizon, replace(self.options, start=start))
         checked = replace(checked, clearance_constraints=self._constraints())
-        if options["start"] is None and near is not None:
-            if request.search != "global":  # its bound is that of the task alone
+        if start is None and near is not None:
+            if checked.search != "global":  # its bound is that of the task alone
                 checked = replace(checked, near=near)
             idle = bind(machine, checked.tasks).idle
             names = np.array(machine.robot.joint_names)[idle].tolist()
             checked = checked.with_held(dict(zip(names, near[idle].tolist(), strict=True)))
         return plan_request(checked)
 
-    def _approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
-        """Append an approach motion to the start of a task, if one is needed, and return the plan along the task."""
+    def _with_approach(self, plan: SolvedPlan, tasks: Any, name: str) -> SolvedPlan:
+        """Append the motion to the start of a task to the sequence, if needed; return the plan along the task."""
         state, first = self.state, plan.at(0.0)
         if state.joints is None:
             return plan
-        rates = _velocity(first["rates"], self.request.smooth)
+        rates = _junction_velocity(first["rates"], self.smooth)
         if np.abs(first["joints"] - state.joints).max() <= JUMP_TOLERANCE:
-            jump = np.abs(_numbers(rates, first) - _numbers(state.rates, first)).max()
-            if not self.request.smooth or jump <= JUMP_TOLERANCE:
+            jump = np.abs(_velocity_array(rates, first) - _velocity_array(state.rates, first)).max()
+            if not self.smooth or jump <= JUMP_TOLERANCE:
                 return plan
             fastest = int(np.abs(first["rates"]).argmax())
             words = f"its joints move where it begins, {self.machine.robot.joint_names[fastest]!r} at "
@@ -219,12 +207,8 @@ class _Sequence:
         return self._plan_tasks(tasks, joints) if turned else plan
 
     def _constraints(self) -> ClearanceConstraints | None:
-        """Return the clearance constraints of the current machine.
-
-        Raises:
-            ProblemError: An obstacle moves.
-        """
-        constraints = clearance_for(self.machine, self.request.limits, self.request.scene)
+        """Return the clearance constraints of the machine in its scene; raise ProblemError if an obstacle moves."""
+        constraints = clearance_for(self.machine, self.options.limits, self.scene)
         if constraints is not None and constraints.scene.has_moving_obstacles:
             words = "obstacles of a sequence may not move, since it is not known when each part begins"
             raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
@@ -234,37 +218,39 @@ class _Sequence:
 def _is_at_start(machine: Machine, tasks: Any, joints: Array) -> bool:
     """Return whether a configuration satisfies the tasks at their start; velocity tasks may start anywhere."""
     first = [task for task in ((tasks,) if isinstance(tasks, TipTask) else tasks) if not task.begin]
-    return _misses(bind(machine, first), joints) <= AT_START if first else True
+    return _largest_pose_error(bind(machine, first), joints) <= AT_START if first else True
 
 
-def _misses(equations: TaskEquations, joints: Array) -> float:
-    """Return the largest pose error of a configuration at time 0, m or rad; a tool axis inside its cone has none."""
+def _largest_pose_error(equations: TaskEquations, joints: Array) -> float:
+    """Return the largest error of the poses that tasks require at time 0, m or rad; 0 for an axis inside its cone."""
     at: tuple[Any, ...] = np.zeros(1), None, joints[None]
     errors = equations.errors(*at), equations.cone_violations(*at)
     return max(float(np.abs(each).max(initial=0.0)) for each in errors)
 
 
-def _led_to(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
-    """Return the goal with the start configuration of the next task, or unchanged if that does not satisfy the goal."""
+def _with_next_start(machine: Machine, goal: Goal, plan: SolvedPlan, smooth: bool) -> Goal:
+    """Return the goal at the start configuration of the next task's plan, or unchanged if that misses the goal."""
     first = plan.at(0.0)
-    if goal.region is not None or (goal.has_pose and _misses(bind(machine, goal.task), first["joints"]) > AT_START):
+    if goal.region is not None or (
+        goal.has_pose and _largest_pose_error(bind(machine, goal.task), first["joints"]) > AT_START
+    ):
         return goal
     apart = 0.0 if goal.has_pose else float(np.nanmax(np.abs(floats(goal.joints).ravel() - first["joints"])))
     if not apart <= JUMP_TOLERANCE:
         return goal
     passes = isinstance(goal.velocity, str) and goal.velocity == "free"
-    velocity = _velocity(first["rates"], smooth) if passes else goal.velocity
+    velocity = _junction_velocity(first["rates"], smooth) if passes else goal.velocity
     return replace(with_joints(goal, first["joints"]), velocity=velocity)
 
 
-def _numbers(velocity: Any, like: Mapping[str, Array]) -> Array:
-    """Return a joint velocity as an array, which is zero for "rest"."""
+def _velocity_array(velocity: Any, like: Mapping[str, Array]) -> Array:
+    """Return a joint velocity, given as numbers or as "rest", as an array; "rest" is zero."""
     return np.zeros_like(like["rates"]) if isinstance(velocity, str) else floats(velocity)
 
 
 @contextmanager
-def _naming_part(part: str) -> Iterator[None]:
-    """Add the name of a motion of a sequence to errors that are raised while this motion is planned."""
+def _errors_named_after(part: str) -> Iterator[None]:
+    """Add the name of a motion of a sequence to the text of errors that are raised inside a `with` block."""
     try:
         yield
     except (ProblemError, SolveError) as error:
@@ -275,13 +261,10 @@ def _naming_part(part: str) -> Iterator[None]:
 def plan_in_segments(
     machine: FixedBase,
     tasks: TipTask | Sequence[TipTask],
-    horizon: Any = None,
+    horizon: Any,
+    options: PlanOptions,
     *,
-    start: Any = None,
-    cost: Any = None,
-    limits: Limits | None = None,
-    scene: Scene | Literal[False] | None = None,
-    seed: int = 0,
+    scene: Scene | Literal[False] | None,
 ) -> SegmentedPlan:
     """Plan tasks in the fewest segments, at the least cost; the arm reconfigures between segments.
 
@@ -291,9 +274,8 @@ def plan_in_segments(
 
     Args:
         machine: An arm on a fixed base.
-        tasks, horizon, start, cost, limits, seed: As in `plan`; the tasks are poses that leave at most two
-            degrees of freedom undetermined. Actuator limits do not influence the division, but the segments are planned
-            within them.
+        tasks, horizon, options: As in `plan`; the tasks are poses that leave at most two degrees of freedom
+            undetermined. Actuator limits do not influence the division, but the segments are planned within them.
         scene: As in `plan`, with static obstacles, since a reconfiguration takes time.
 
     Returns:
@@ -304,10 +286,8 @@ def plan_in_segments(
         DeadEnd: At some time no motion does the tasks even for the shortest while, in any configuration.
         SolveError: No segment could be planned, however the tasks were divided.
     """
-    require.instance("machine", machine, FixedBase)
-    options: dict[str, Any] = {"start": start, "cost": cost, "limits": limits, "seed": seed}
-    request = checked_request(machine, tasks, horizon, PlanOptions(search="global", **options))
-    constraints = clearance_for(machine, limits, scene)
+    request = checked_request(machine, tasks, horizon, replace(options, search="global"))
+    constraints = clearance_for(machine, options.limits, scene)
     if constraints is not None and constraints.scene.has_moving_obstacles:
         words = "moving obstacles do not wait while the arm reconfigures; give static obstacles"
         raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
@@ -347,11 +327,7 @@ def plan_in_segments(
 
 
 def _plan_segment(request: PlanRequest, begin: float, end: float) -> SolvedPlan:
-    """Plan the part of the tasks between two times as one segment.
-
-    Raises:
-        ProblemError, SolveError: As in `plan`.
-    """
+    """Plan the part of the tasks between two times as one segment."""
     tasks = tuple(part for task in request.tasks if (part := _task_between(task, begin, end)) is not None)
     stretches = stretches_of(request.machine, tasks, end - begin)
     start = request.start if begin == 0 else None

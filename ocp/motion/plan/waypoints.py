@@ -11,20 +11,20 @@ segments may be requested (see `ocp.motion.search.reconfigurations`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from models import FixedBase
-from models.checks import NOT_NUMBERS, Array, floats
+from models.checks import Array
 from ocp.errors import ProblemError, SolveError, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.local.collisions import Collision, distances_along, find_collisions
 from ocp.motion.local.ik_solver import idle_positions
-from ocp.motion.local.inverse_kinematics import LARGEST_SEED, Unreachable
-from ocp.motion.plan.planner import clearance_for
+from ocp.motion.local.inverse_kinematics import Unreachable
+from ocp.motion.plan.planner import PlanOptions, clearance_for
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
 from ocp.motion.result.path_plan import PathPlan, PathPoses
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
@@ -39,9 +39,7 @@ from ocp.motion.tasks.goals import Cost, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.tip_task import TipTask
 
-__all__ = ["Reconfigurations", "plan_path"]
-
-Reconfigurations: TypeAlias = Literal["forbidden", "counted"]
+__all__ = ["plan_path"]
 
 WAYPOINT = "waypoint {:g}"
 TOO_MANY_CHARTS = "configurations"
@@ -76,31 +74,17 @@ class WaypointSettings:
 
 
 class _Path(NamedTuple):
-    """Joint path through all waypoints, in one or several segments.
-
-    Attributes:
-        cost: Cost of the path.
-        failure: Why the path is not valid; "" if it is.
-        invalid: Waypoints where it is not valid.
-        joints: Configurations at the waypoints. Shape (N, n).
-        breaks: Waypoints after which the arm reconfigures.
-    """
+    """Joint path through all waypoints, in one or several segments."""
 
     cost: float
-    failure: str
-    invalid: NDArray[np.intp]
-    joints: Array
-    breaks: tuple[int, ...] = ()
+    failure: str  # why the path is not valid; "" if it is
+    invalid: NDArray[np.intp]  # waypoints where it is not valid
+    joints: Array  # at the waypoints, shape (N, n)
+    breaks: tuple[int, ...] = ()  # waypoints after which the arm reconfigures
 
 
 def plan_path(
-    machine: FixedBase,
-    waypoints: Waypoints,
-    *,
-    cost: Any = None,
-    limits: Limits | None = None,
-    scene: Scene | Literal[False] | None = None,
-    seed: int = 0,
+    machine: FixedBase, waypoints: Waypoints, options: PlanOptions, *, scene: Scene | Literal[False] | None
 ) -> PathPlan:
     """Plan the lowest-cost joint path through tool poses, within limits and collision-free at every waypoint.
 
@@ -109,11 +93,11 @@ def plan_path(
             paths are searched on sections in which the joint nearest to the base has one of several values (see
             `ocp.motion.search.reconfigurations`), and no bound is known.
         waypoints: Poses of the tip.
-        cost: `length`, the sum of all joint displacements with the `weights` of the joints, or `time`, s, by the
-            velocity limits of the joints, from waypoint to waypoint; None for the length.
-        limits: Limits of the joint positions, and of the velocities for a time; the robot's own if None.
+        options: Cost, limits, and seed of inverse kinematics. The cost is the `length`, the sum of all joint
+            displacements with the `weights` of the joints, which is the default, or the `time`, s, by the velocity
+            limits of the joints, from waypoint to waypoint. The limits are those of the joint positions and, for a
+            time, of the velocities; the robot's own if None.
         scene: As in `plan`, with static obstacles, since a path has no times.
-        seed: Seed of inverse kinematics.
 
     Raises:
         ProblemError: The request does not fit the machine. Its subclass Unreachable names the waypoint as time.
@@ -121,10 +105,8 @@ def plan_path(
             end, what obstructs them, and by how much the poses or the clearance would have to be relaxed.
         SolveError: No path was found, though some pass a part of the waypoints.
     """
-    require.instance("machine", machine, FixedBase)
-    require.count("seed", seed, 0, LARGEST_SEED)
-    positions, rotations = _poses(waypoints.positions, waypoints.quaternions)
-    n = machine.joint_size
+    cost, limits = options.cost, options.limits
+    poses = _poses(waypoints, machine.joint_size)
     checked_limits = Limits() if limits is None else require.instance("limits", limits, Limits)
     own_cost = Cost(velocity=0, length=1) if cost is None else require.instance("cost", cost, Cost)
     if own_cost.terms not in (("length",), ("time",)):
@@ -136,63 +118,54 @@ def plan_path(
         if getattr(checked_limits, quantity) is not None and not (quantity == "velocity" and is_timed):
             words = f"limits: a path through waypoints has no time, hence no {quantity}; leave it out, or give a step"
             raise ProblemError(words, name=quantity, value=getattr(checked_limits, quantity))
-    require.choice("reconfigurations", waypoints.reconfigurations, get_args(Reconfigurations))
+    require.choice("reconfigurations", waypoints.reconfigurations, ("forbidden", "counted"))
     if is_timed:
         if own_cost.weights is not None:
             words = "cost: the time of a path takes no weights; leave them out"
             raise ProblemError(words, name="weights", value=own_cost.weights)
         joint_weights = own_cost.time / checked_limits.bounds(machine, ("velocity",)).velocity
-        if not joint_weights.any():
-            raise ProblemError("cost: the time needs a joint with a velocity limit", name="velocity")
     else:
-        joint_weights = own_cost.length * _path_weights(own_cost.weights, n)
-    max_step = _step(waypoints.step, n)
+        joint_weights = np.full(machine.joint_size, float(own_cost.length))
+        if own_cost.weights is not None:
+            shape, meaning = joint_weights.shape, "one for each joint"
+            joint_weights *= require.array("weights", own_cost.weights, shape, sign="nonnegative", meaning=meaning)
+    if not joint_weights.any():
+        words = "cost: no joint adds to it; give a joint a velocity limit for the time, or a weight for the length"
+        raise ProblemError(words, name="velocity" if is_timed else "weights", value=joint_weights)
     constraints = clearance_for(machine, checked_limits, scene)
     if constraints is not None and constraints.scene.has_moving_obstacles:
         words = "a path through waypoints has no time at which obstacles would be somewhere; give static obstacles"
         raise ProblemError(words, name="obstacles", value=constraints.scene.obstacles)
-    planner = _WaypointPlanner(
-        machine,
-        positions,
-        rotations,
-        max_step,
-        (LargestMotion if is_timed else PathLength)(joint_weights),
-        checked_limits,
-        constraints,
-        int(seed),
-    )
+    cost_of_steps = (LargestMotion if is_timed else PathLength)(joint_weights)
+    planner = _WaypointPlanner(machine, poses, cost_of_steps, checked_limits, constraints, int(options.seed))
     return planner.plan(waypoints.reconfigurations == "counted")
 
 
+@dataclass(eq=False)
 class _WaypointPlanner:
     """Planner of a path through waypoints, with the checked arguments of `plan_path`."""
 
-    def __init__(
-        self,
-        machine: FixedBase,
-        positions: Array,
-        rotations: Array,
-        step: Array,
-        cost: Homogeneous,
-        limits: Limits,
-        constraints: ClearanceConstraints | None,
-        seed: int,
-        settings: WaypointSettings = WaypointSettings(),
-    ) -> None:
-        self.settings = settings
-        self.machine, self.positions, self.rotations, self.step = machine, positions, rotations, step
-        self.constraints, self.scene = constraints, None if constraints is None else constraints.scene
-        self.seed, self.limits, self.joint_limits, self.cost = seed, limits, limits.joints, cost
-        bounds = limits.bounds(machine)
+    machine: FixedBase
+    poses: PathPoses
+    cost: Homogeneous
+    limits: Limits
+    constraints: ClearanceConstraints | None
+    seed: int
+    settings: WaypointSettings = field(default_factory=WaypointSettings)
+
+    def __post_init__(self) -> None:
+        machine, bounds = self.machine, self.limits.bounds(self.machine)
+        self.positions, self.rotations, self.step = self.poses
+        self.scene = None if self.constraints is None else self.constraints.scene
         self.lower, self.upper = bounds.lower, bounds.upper
         self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
         pose = bind(machine, self._task(0))
         equations = TasksWithFixedJoints(machine, pose.bound, tuple(np.flatnonzero(pose.idle).tolist()))
         stationary = idle_positions(self.lower, self.upper)
-        targets = np.zeros((len(positions), 18))
-        targets[:, :3] = positions
-        targets[:, 6:15] = rotations.transpose(0, 2, 1).reshape(-1, 9)
-        targets = np.column_stack([targets, np.tile(stationary[pose.idle], (len(positions), 1))])
+        targets = np.zeros((len(self.positions), 18))
+        targets[:, :3] = self.positions
+        targets[:, 6:15] = self.rotations.transpose(0, 2, 1).reshape(-1, 9)
+        targets = np.column_stack([targets, np.tile(stationary[pose.idle], (len(targets), 1))])
         self.manifolds = SelfMotionManifolds(self.space, equations, targets)
         self._seed_cache = dict[int, Array]()
         if not 0 <= self.manifolds.size <= MAX_FREE_DIRECTIONS:
@@ -242,7 +215,7 @@ class _WaypointPlanner:
         return self._best_plan(paths, bound)
 
     def _segmented_paths(self, search: AtlasSearch, segmented: bool) -> tuple[list[list[Segment]], float]:
-        """Return paths through the waypoints of a search, each as a list of segments, and a lower cost bound."""
+        """Return paths through the waypoints of a search, each a list of segments, and a lower bound of their cost."""
         if segmented:
             result = fewest_segments(search)
             return ([], np.inf) if result is None else ([result[0]], result[1])
@@ -250,33 +223,27 @@ class _WaypointPlanner:
         return [[Segment(0, len(path) - 1, path, search.path_cost(path), bound)] for path in paths], bound
 
     def _best_plan(self, paths: list[_Path], bound: float) -> PathPlan:
-        """Return the plan of the valid path of lowest cost.
-
-        Raises:
-            SolveError: No path is valid.
-        """
+        """Return the plan of the valid path of lowest cost, or raise SolveError with the failures of all paths."""
         paths = sorted(paths, key=lambda path: (bool(path.failure), path.cost))
         if not paths or paths[0].failure:
             reasons = "; ".join(dict.fromkeys(path.failure for path in paths))
             raise SolveError(f"{NO_PATH}{reasons and ': '}{reasons}", name="waypoints")
-        candidates = [self._candidate(path, path is paths[0]) for path in paths]
         best, lower_bound = paths[0], checked_bound(bound, paths[0].cost)
+        candidates = [Candidate(best.joints[0], best.cost, None, Stage.FINE)]
+        for path in paths[1:]:
+            reason = Reason(Rejection.INFEASIBLE, path.failure) if path.failure else Reason(Rejection.COSTLIER)
+            candidates.append(Candidate(path.joints[0], path.cost, reason, Stage.FINE))
         return PathPlan(
             self.machine,
             best.joints,
             self.limits,
             best.cost,
             self.constraints,
-            PathPoses(self.positions, self.rotations, self.step),
+            self.poses,
             tuple(candidates),
             lower_bound or None,
             best.breaks,
         )
-
-    def _candidate(self, path: _Path, is_best: bool) -> Candidate:
-        """Return the path as a candidate of the plan, accepted or rejected with a reason."""
-        reason = Reason(Rejection.INFEASIBLE, path.failure) if path.failure else Reason(Rejection.COSTLIER)
-        return Candidate(path.joints[0], path.cost, None if is_best else reason, Stage.FINE)
 
     # ---- searched waypoints ------------------------------------------------------------------------------------------
 
@@ -352,8 +319,7 @@ class _WaypointPlanner:
     def _negligibly_relaxed_paths(self, search: AtlasSearch) -> list[_Path]:
         """Return paths that become possible if the poses are relaxed by no more than the pose tolerance.
 
-        Raises:
-            SolveError: There is no such path.
+        If there is none, raise the SolveError that says why.
         """
         uncovered = [float(time) for time, charts in zip(search.times, search.atlas, strict=True) if not len(charts)]
         if uncovered and self._section_joint is not None:
@@ -401,7 +367,7 @@ class _WaypointPlanner:
         """Return inverse kinematics solutions at a waypoint, from the cache if possible."""
         if number not in self._seed_cache:
             try:
-                seeds = self.manifolds.seeds(number, self.joint_limits, self.seed + number)
+                seeds = self.manifolds.seeds(number, self.limits.joints, self.seed + number)
             except Unreachable as error:
                 words = f"waypoint {number} at {self.positions[number].round(6).tolist()} m: {error}"
                 raise Unreachable(words, **{**vars(error), "time": float(number)}) from error
@@ -451,46 +417,16 @@ class _WaypointPlanner:
         return words, np.flatnonzero(invalid | colliding)
 
 
-def _path_weights(weights: Any, size: int) -> Array:
-    """Check the weights of the joints in the path length, and return the weight of each joint. Shape (size,)."""
-    if weights is None:
-        return np.ones(size)
-    array = require.array("weights", weights, (size,), meaning="one for each joint")
-    if not ((array >= 0).all() and array.any()):
-        words = f"weights {array.tolist()} must be non-negative and not all 0"
-        raise ProblemError(words, name="weights", value=array, limit=0.0)
-    return array
-
-
-def _step(step: Any, size: int) -> Array:
-    """Check the largest step between waypoints, and return the largest displacement of each joint. Shape (n,)."""
-    try:
-        steps = floats(step)
-        if steps.shape in ((), (1,), (size,)) and (steps > 0).all():
-            return np.array(np.broadcast_to(steps, (size,)))
-    except NOT_NUMBERS:
-        pass
-    words = f"step must be positive, one number or one for each of {size} joints, not {step!r}"
-    raise ProblemError(words, name="step", value=step, limit=0.0)
-
-
-def _poses(positions: ArrayLike, quaternions: ArrayLike) -> tuple[Array, Array]:
-    """Check the poses of waypoints, and return positions (N, 3) and rotation matrices (N, 3, 3)."""
-    arrays = []
-    for name, values, size in (("positions", positions, 3), ("quaternions", quaternions, 4)):
-        words = f"{name} must be finite numbers of shape (N, {size}) with N > 1"
-        try:
-            array = floats(values)
-        except NOT_NUMBERS as error:
-            raise ProblemError(words, name=name, value=values, limit=size) from error
-        if array.ndim != 2 or array.shape[1] != size or len(array) < 2 or not np.isfinite(array).all():
-            raise ProblemError(f"{words}, not {array.shape}", name=name, value=array.shape, limit=size)
-        arrays.append(array)
-    positions, rotations = arrays
-    if len(positions) != len(rotations):
-        words = f"there are {len(positions)} positions and {len(rotations)} quaternions"
-        raise ProblemError(words, name="quaternions", value=len(rotations), limit=len(positions))
-    norms = np.linalg.norm(rotations, axis=1)
+def _poses(waypoints: Waypoints, size: int) -> PathPoses:
+    """Return the poses of waypoints and the largest step of each of `size` joints, after checking all of them."""
+    step = require.broadcast("step", waypoints.step, size, "joints", entries="numbers", sign="positive")
+    positions = require.array("positions", waypoints.positions, ("waypoints", 3), least=2)
+    quaternions = require.array("quaternions", waypoints.quaternions, ("waypoints", 4), least=2)
+    if len(positions) != len(quaternions):
+        words = f"there are {len(positions)} positions and {len(quaternions)} quaternions"
+        raise ProblemError(words, name="quaternions", value=len(quaternions), limit=len(positions))
+    norms = np.linalg.norm(quaternions, axis=1)
     if not (norms > 0).all():
         raise ProblemError(f"quaternion {int(norms.argmin())} is zero", name="quaternions", value=0.0)
-    return positions, np.asarray(scipy.spatial.transform.Rotation.from_quat(rotations[:, [1, 2, 3, 0]]).as_matrix())
+    rotations = scipy.spatial.transform.Rotation.from_quat(quaternions[:, [1, 2, 3, 0]])
+    return PathPoses(positions, np.asarray(rotations.as_matrix()), step)

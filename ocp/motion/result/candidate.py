@@ -26,7 +26,10 @@ from ocp.motion.local.rates import LocalMotion
 from ocp.motion.search.configurations import PlanRequest
 from ocp.solution import Solution
 
-__all__ = ["Candidate", "MotionSample", "Reason", "Rejection", "Seed", "Stage", "collision_reason"]
+__all__ = [
+    "Candidate", "MotionSample", "Reason", "Rejection", "Seed", "Stage", "collision_reason",
+    "shortfall_reason",
+]  # fmt: skip
 
 
 class Stage(IntEnum):
@@ -101,11 +104,6 @@ class Reason:
         details: dict[str, Any] = {name: float(x) for name, x in numbers.items() if isinstance(x, int | float)}
         name = getattr(error, "name", None)
         return cls(kind, str(error).split("\n")[0], None if name is None else str(name), **details)
-
-    @classmethod
-    def of_shortfall(cls, request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
-        """Return the reason for a motion that misses its tasks: the worst rate over its limit, or the largest error."""
-        return _limit_reason(request, samples) or _describe_shortfall(request, samples)
 
 
 def collision_reason(pair: Collision | ClosestPair, limit: float, remedy: str = "") -> Reason:
@@ -217,7 +215,7 @@ class Candidate:
         return self.reason is None
 
     def with_rejection(self, reason: Reason) -> Candidate:
-        """Return the candidate as rejected for `reason` or, if bodies had been separated, for their collision."""
+        """Return the rejected candidate: for `reason` or, if colliding bodies were separated, for their collision."""
         if self.separated is not None and reason.kind not in (Rejection.COSTLIER, Rejection.DUPLICATE):
             reason = replace(self.separated, remedy=f"with separated bodies: {reason}")
         return replace(self, reason=reason, cost=np.nan if reason.kind is Rejection.UNTRACKED else self.cost)
@@ -230,7 +228,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class SingularSettings:
-    """Settings of the treatment of singular configurations.
+    """Thresholds below which a motion counts as nearly singular, and a joint as being at a limit.
 
     Attributes:
         conditioning: Ratio of the least to the largest singular value of the tasks' Jacobian below which tasks are
@@ -265,7 +263,7 @@ class MotionSample:
 
     @classmethod
     def of_local(cls, stretch: Stretch, motion: LocalMotion) -> MotionSample:
-        """Return the samples of the first of several local (resolved-rate) motions."""
+        """Convert the first of several local (resolved-rate) motions to samples in one time interval."""
         return cls(stretch, motion.t, motion.base[0], motion.joints[0], motion.rates[0])
 
     @property
@@ -312,7 +310,7 @@ def _limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reas
         shares = _rate_shares(request, sample.rates)
         k, joint = (int(i) for i in np.unravel_index(int(shares.argmax()), shares.shape))
         if shares[k, joint] > 1 + SINGULAR.at_limit:
-            name, unit = _joint(request, joint)
+            name, unit = _joint_name_and_unit(request, joint)
             rate, limit = float(abs(sample.rates[k, joint])), float(request.bounds.velocity[joint])
             words = (
                 f"at {sample.t[k]:.4g} s {name!r} would have to move at {rate:.4g} {unit}/s, its limit is {limit:.4g} "
@@ -322,8 +320,13 @@ def _limit_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reas
     return max(reasons, key=lambda entry: entry[0])[1] if reasons else None
 
 
-def _describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
-    """Return a rejection reason for a motion that misses its tasks: time, pose error, and a joint at its limit."""
+def shortfall_reason(request: PlanRequest, samples: Sequence[MotionSample]) -> Reason:
+    """Return the reason for rejecting a motion that misses its tasks: a rate beyond its limit, or the largest error.
+
+    The largest pose error is described together with a joint that is at its limit at that time.
+    """
+    if (reason := _limit_reason(request, samples)) is not None:
+        return reason
     sample, k, misses = samples[0], 0, (0.0, 0.0)
     for each in samples:
         distances, angles = each.misses()
@@ -336,14 +339,14 @@ def _describe_shortfall(request: PlanRequest, samples: Sequence[MotionSample]) -
         slack = np.nan_to_num(SINGULAR.at_limit * (bounds.upper - bounds.lower), nan=0.0, posinf=0.0)
     for limits in (bounds.lower, bounds.upper):
         for joint in np.flatnonzero(np.abs(joints - limits) <= slack).tolist():
-            name, unit = _joint(request, joint)
+            name, unit = _joint_name_and_unit(request, joint)
             words = (
                 f"{words}, with {name!r} at its limit {limits[joint]:.5g} {unit}; start elsewhere or leave a row free"
             )
             return Reason(Rejection.INFEASIBLE, words, name, float(joints[joint]), float(limits[joint]), time)
     shares = _rate_shares(request, sample.rates[k])
     fastest = int(shares.argmax())
-    name, unit = _joint(request, fastest)
+    name, unit = _joint_name_and_unit(request, fastest)
     value, limit = float(abs(sample.rates[k, fastest])), float(bounds.velocity[fastest])
     at_limit = shares[fastest] >= 1 - SINGULAR.at_limit
     words += (
@@ -358,7 +361,7 @@ def _rate_shares(request: PlanRequest, rates: Array) -> Array:
         return np.nan_to_num(np.abs(rates) / request.bounds.velocity, nan=0.0)
 
 
-def _joint(request: PlanRequest, joint: int) -> tuple[str, str]:
+def _joint_name_and_unit(request: PlanRequest, joint: int) -> tuple[str, str]:
     """Return the name of a joint, and the unit of its position."""
     moving = request.machine.robot.moving_joints[joint]
     return moving.name, "m" if moving.kind == "prismatic" else "rad"

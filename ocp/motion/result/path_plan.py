@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,20 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from models import FixedBase, ModelError
+from models import FixedBase
 from models.checks import Array
 from ocp.audit.audit import Audit, Finding, clearance_finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError
 from ocp.motion.builders.clearance import ClearanceConstraints, clearance_of
 from ocp.motion.result.candidate import Candidate
-from ocp.motion.result.plan import Plan
+from ocp.motion.result.plan import Plan, read_record, reading_plan, record_arrays
 from ocp.motion.result.request import restored_request, stored_request
 from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, tip_poses
-from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
-from ocp.problem.record_writer import pack_record
-from ocp.solution import Solution, read_head
+from ocp.solution import Solution
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
 __all__ = ["PathPlan", "PathPoses"]
@@ -105,7 +103,7 @@ class PathPlan(Plan):
 
     @property
     def t(self) -> Array:
-        """Times of the waypoints, s. Shape (N,)."""
+        """Times at which the plan passes the waypoints, s. Shape (N,)."""
         limits = self.limits.bounds(self.machine).velocity
         rates = np.where(np.isfinite(limits), limits, UNLIMITED_RATE)
         durations = (np.abs(np.diff(self.joints, axis=0)) / rates).max(axis=1, initial=0.0)
@@ -131,8 +129,7 @@ class PathPlan(Plan):
         if name == "joints":
             return np.stack([np.interp(times, t, column) for column in self.joints.T], axis=1)
         if name == "rates":
-            interval = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
-            return np.asarray((np.diff(self.joints, axis=0) / np.diff(t)[:, None])[interval])
+            return np.asarray((np.diff(self.joints, axis=0) / np.diff(t)[:, None])[segment_index(t, times)])
         return np.zeros((len(times), self.machine.joint_size if name == "accelerations" else 0))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
@@ -150,7 +147,7 @@ class PathPlan(Plan):
         rates[list(self.reconfigurations)] = 0.0
 
         def joints_at(fractions: Array) -> Array:
-            interval = np.clip(np.searchsorted(breaks, fractions, side="right") - 1, 0, len(t) - 2)
+            interval = segment_index(breaks, fractions)
             waiting = np.isin(interval, self.reconfigurations) & (fractions < 1.0)  # until the next waypoint
             ends = t[interval + np.where(waiting, 0, 1)]
             return self._values_at("joints", np.clip(fractions * horizon, t[interval], ends))
@@ -168,9 +165,7 @@ class PathPlan(Plan):
         findings = [_largest("joints beyond their limits", excess, STEP_TOLERANCE, t, self.names)]
         findings += self._pose_findings(self.poses) if self.poses is not None else []
         clearance = self.clearance()
-        if clearance is not None:
-            finding = clearance_finding(clearance, CLEARANCE_TOLERANCE_M)
-            findings.append(finding)
+        findings += [] if clearance is None else [clearance_finding(clearance, CLEARANCE_TOLERANCE_M)]
         clearances = {} if clearance is None else {clearance.name: clearance}
         undecided = UNDECIDED if self.gap is None else f"{UNDECIDED}; it may cost {self.gap:.2g} too much"
         return Audit("path through waypoints", tuple(findings), undecided, clearances=clearances)
@@ -207,32 +202,31 @@ class PathPlan(Plan):
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         """Return the arrays that are written to the file of the plan, by name."""
         arguments = {"machine": self.machine, "limits": self.limits, "constraints": self.constraints}
-        head, numbers = pack_record(
-            {
-                "request": stored_request("", arguments),
-                "cost": self.path_cost,
-                "bound": self.bound,
-                "reconfigurations": list(self.reconfigurations),
-                "candidates": [candidate.record() for candidate in self.candidates],
-                "joints": self.joints,
-                "poses": None if self.poses is None else self.poses._asdict(),
-            }
-        )
-        arrays = {"path": np.frombuffer(json.dumps(head).encode(), np.uint8)}
-        return {**arrays, **{f"path.{name}": values for name, values in numbers.items()}}
+        record = {
+            "request": stored_request("", arguments),
+            "cost": self.path_cost,
+            "bound": self.bound,
+            "reconfigurations": list(self.reconfigurations),
+            "candidates": [candidate.record() for candidate in self.candidates],
+            "joints": self.joints,
+            "poses": None if self.poses is None else self.poses._asdict(),
+        }
+        return record_arrays("path", record)
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> PathPlan:
         """Build the plan from the arrays of a file, which are checked because files are not trusted."""
-        try:
-            numbers = {name: arrays[f"path.{name}"] for name in ARRAY_NAMES}
-            head = unpack_record(read_head(path, arrays["path"]), numbers)
+        with reading_plan(path):
+            head = read_record(path, arrays, "path")
             arguments = restored_request(head["request"]).arguments
             machine, limits, constraints = (arguments[name] for name in ("machine", "limits", "constraints"))
             if not isinstance(limits, Limits) or not isinstance(machine, FixedBase):
                 raise TypeError(f"its machine is a {type(machine).__name__}, its limits a {type(limits).__name__}")
             count, values = len(head["joints"]), _checked_values(head, machine.joint_size)
-            _check_constraints(constraints)
+            if constraints is not None and not isinstance(constraints, ClearanceConstraints):
+                raise TypeError(f"its collision scene is a {type(constraints).__name__}")
+            if constraints is not None and constraints.scene.has_moving_obstacles:
+                raise ValueError("its obstacles move, though a path has no times")
             breaks = tuple(int(number) for number in head["reconfigurations"])
             if not all(0 <= number < count - 1 for number in breaks):
                 raise ValueError(f"it reconfigures at waypoints that it has not: {breaks}")
@@ -248,9 +242,6 @@ class PathPlan(Plan):
                 bound=None if head["bound"] is None else float(head["bound"]),
                 reconfigurations=breaks,
             )
-        except (*RECORD_ERRORS, ModelError, ProblemError) as error:
-            words = f"{path}: the plan in it is damaged: {error}"
-            raise ProblemError(words, name="path", value=str(path)) from error
 
 
 def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
@@ -267,14 +258,6 @@ def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
     if wrong or count < 2 or not finite:
         raise ValueError(f"its {', '.join(wrong) or 'values'} do not fit its machine")
     return values
-
-
-def _check_constraints(constraints: Any) -> None:
-    """Raise TypeError or ValueError unless `constraints` are clearance constraints with static obstacles, or None."""
-    if constraints is not None and not isinstance(constraints, ClearanceConstraints):
-        raise TypeError(f"its collision scene is a {type(constraints).__name__}")
-    if constraints is not None and constraints.scene.has_moving_obstacles:
-        raise ValueError("its obstacles move, though a path has no times")
 
 
 def _largest(

@@ -8,36 +8,44 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from models import Machine
-from models.checks import MAX_LISTED, NOT_NUMBERS, Array, floats
+from models import Machine, ModelError
+from models.checks import MAX_LISTED, Array
 from ocp.audit.audit import Audit, Finding
 from ocp.console import interruptible
-from ocp.errors import ProblemError, require, sample_times
+from ocp.errors import ProblemError, require, sample_times, values_within
 from ocp.motion.result.candidate import Candidate, Stage
 from ocp.motion.schedule.trajectory import JointTrajectory
+from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, tip_poses
-from ocp.solution import MAX_LINES, Solution
+from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
+from ocp.problem.record_writer import pack_record
+from ocp.solution import MAX_LINES, Solution, read_head
 from ocp.solution_data import call_registered
 from ocp.storage import table_head, write_arrays, write_text
 from ocp.tolerances import LIMIT_SHARE
 
-__all__ = ["CHECKED_TIMES", "ENDS", "Plan", "PlanSample", "describe_ends"]
+__all__ = [
+    "CHECKED_TIMES", "ENDS", "Plan", "PlanSample", "Rows", "audit_key", "describe_ends", "evaluate_parts",
+    "read_record", "reading_plan", "record_arrays",
+]  # fmt: skip
 
 ENDS = "speed at both ends"
 """Name of the audit finding that tells whether a motion starts and ends at rest."""
 CHECKED_TIMES = 2001
 """Number of samples at which joint limits are checked, besides the times of the plan."""
-TIME_TOLERANCE = 1e-9
-"""Largest amount by which a time may lie outside a plan, as a fraction of the horizon."""
+Rows: TypeAlias = NDArray[np.intp]
 
 
 class PlanSample(NamedTuple):
@@ -193,7 +201,7 @@ class Plan(ABC):
         """Audit the motion without using the cache of earlier audits."""
 
     def _with_rest_finding(self, audit: Audit) -> Audit:
-        """Add to an audit how fast the joints move at both ends; a controller expects a motion that starts at rest."""
+        """Return an audit with a further finding: how fast the joints move at the start and end of the motion."""
         ends = np.array([0.0, self.horizon])
         speeds = np.abs(self.at(ends)["rates"])
         speeds[speeds <= LIMIT_SHARE * np.abs(self._values("rates")).max(initial=0.0)] = 0.0
@@ -303,7 +311,7 @@ class Plan(ABC):
 
     @abstractmethod
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-        """Return the arrays of the file of the plan, by name; raise the same errors as `save`."""
+        """Return the data of the plan as arrays by name, as `save` writes them to a file."""
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -355,20 +363,49 @@ class Plan(ABC):
         return ("joints", "rates", *(("base",) if self.machine.base_size else ()))
 
     def _checked_times(self, time: Any) -> Array:
-        try:
-            times = floats(time)
-        except NOT_NUMBERS as error:
-            words = f"a time or an array of times is expected, not {time!r}"
-            raise ProblemError(words, name="time", value=time) from error
-        slack = TIME_TOLERANCE * self.horizon
-        if not ((times >= -slack) & (times <= self.horizon + slack)).all():
-            words = f"time {time!r} is outside the plan, 0 to {self.horizon:g} s"
-            raise ProblemError(words, name="time", value=time, limit=(0.0, self.horizon))
-        return np.asarray(np.clip(times, 0.0, self.horizon))
+        return values_within(time, self.horizon, "time", f"s is outside the plan, 0 to {self.horizon:g} s")
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
         """Return the poses of the machine's tip at checked times (M,). Shape (M, 7)."""
         return tip_poses(self.machine, bases, joints)
+
+
+def evaluate_parts(begins: Sequence[float], times: Array, width: int, evaluate: Callable[[int, Rows], Array]) -> Array:
+    """Evaluate a quantity at times (M,), each in the consecutive part of a motion that contains it. Shape (M, width).
+
+    Args:
+        begins: Times at which the parts begin, in order, s. A time at which a part begins belongs to this part.
+        times: Times, s.
+        width: Number of entries of the quantity.
+        evaluate: Function of the number of a part and of the indices (K,) of the times in it. It returns (K, width).
+    """
+    values, which = np.zeros((len(times), width)), segment_index([*begins, np.inf], times)
+    for number in np.unique(which).tolist():
+        rows = np.flatnonzero(which == number)
+        values[rows] = evaluate(number, rows)
+    return values
+
+
+def record_arrays(kind: str, record: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Convert a record of JSON values and arrays to arrays of a plan file, whose names begin with the kind of plan."""
+    head, numbers = pack_record(record)
+    text = np.frombuffer(json.dumps(head).encode(), np.uint8)
+    return {kind: text, **{f"{kind}.{name}": values for name, values in numbers.items()}}
+
+
+def read_record(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], kind: str) -> Any:
+    """Return the record that `record_arrays` has written to a plan file as arrays whose names begin with `kind`."""
+    return unpack_record(read_head(path, arrays[kind]), {name: arrays[f"{kind}.{name}"] for name in ARRAY_NAMES})
+
+
+@contextmanager
+def reading_plan(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Convert errors that damaged data of a plan file cause in a `with` block to a ProblemError that names the file."""
+    try:
+        yield
+    except (*RECORD_ERRORS, ModelError) as error:
+        name = getattr(error, "name", None) or "plan"
+        raise ProblemError(f"{path}: the plan in it is damaged: {error}", name=str(name), value=str(path)) from error
 
 
 def describe_ends(speeds: Array, names: Sequence[str], units: Sequence[str]) -> str:

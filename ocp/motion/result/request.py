@@ -284,7 +284,7 @@ def _scene_fields(scene: CollisionScene) -> dict[str, Any]:
 
 
 def _put_track(name: str, track: Callable[[Any], Any], writer: FunctionWriter) -> dict[str, Any]:
-    """Return the file record of a function of time and, if it is known, of the time derivative."""
+    """Return the file record of a function of time and, if it has a method `rate`, of its time derivative."""
     parts = {"track": track, "rate": getattr(track, "rate", None)}
     return {role: writer.write(_trace(name, part)) for role, part in parts.items() if part is not None}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -19,12 +18,11 @@ from ocp.audit.audit import COST_LOST, Audit, Finding
 from ocp.audit.clearance import Clearance
 from ocp.errors import ProblemError
 from ocp.motion.result.candidate import Candidate
-from ocp.motion.result.plan import Plan
+from ocp.motion.result.plan import Plan, Rows, evaluate_parts, read_record, reading_plan, record_arrays
 from ocp.motion.result.solved_plan import PHASED, PhasedPlan, SolvedPlan
+from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target
-from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
-from ocp.problem.record_writer import pack_record
-from ocp.solution import Solution, read_head
+from ocp.solution import Solution
 
 __all__ = ["JUMP_TOLERANCE", "ConsecutivePlans", "Piece", "Reconfiguration", "SegmentedPlan", "SequencePlan"]
 
@@ -145,18 +143,18 @@ class ConsecutivePlans(Plan):
 
     def _values_at(self, name: str, times: Array) -> Array:
         pieces = self.pieces
-        which = np.searchsorted([piece.begin for piece in pieces], times, side="right") - 1
-        values = np.zeros((len(times), self.machine.joint_size if name != "base" else self.machine.base_size))
-        for number in np.unique(which):
-            piece, rows = pieces[number], which == number
-            local = np.clip(times[rows] - piece.begin, 0.0, piece.plan.horizon)
-            values[rows] = piece.plan._values_at(name, local)
-        return values
+
+        def values(number: int, rows: Rows) -> Array:
+            local = np.clip(times[rows] - pieces[number].begin, 0.0, pieces[number].plan.horizon)
+            return pieces[number].plan._values_at(name, local)
+
+        size = self.machine.base_size if name == "base" else self.machine.joint_size
+        return evaluate_parts([piece.begin for piece in pieces], times, size, values)
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
         """Return the solutions of all consecutive plans; see `Plan.solved_parts`."""
         pieces = self.pieces
-        which = np.searchsorted([piece.begin for piece in pieces], times, side="right") - 1
+        which = segment_index([*(piece.begin for piece in pieces), np.inf], times)
         parts: list[tuple[Solution, str, Array]] = []
         for number, piece in enumerate(pieces):
             local = np.clip(times[which == number] - piece.begin, 0.0, piece.plan.horizon)
@@ -229,12 +227,12 @@ class SequencePlan(ConsecutivePlans):
         return tuple(map(Piece, begins, self.parts, self.phases))
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
-        pieces, poses = self.pieces, np.zeros((len(times), 7))
-        which = np.searchsorted([piece.begin for piece in pieces], times, side="right") - 1
-        for number in np.unique(which):
-            rows, own = which == number, pieces[number]
-            poses[rows] = own.plan._tips_at(times[rows] - own.begin, bases[rows], joints[rows])
-        return poses
+        pieces = self.pieces
+
+        def tips(number: int, rows: Rows) -> Array:
+            return pieces[number].plan._tips_at(times[rows] - pieces[number].begin, bases[rows], joints[rows])
+
+        return evaluate_parts([piece.begin for piece in pieces], times, 7, tips)
 
     def _junction_findings(self) -> list[Finding]:
         """Return the audit findings about jumps of joints, base and, if they must be continuous, rates at junctions."""
@@ -252,8 +250,7 @@ class SequencePlan(ConsecutivePlans):
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         """Return the arrays of the file of the plan, by name; a prefix of each name states the motion."""
-        head = {"phases": list(self.phases), "smooth": self.smooth}
-        arrays = {self.kind: np.frombuffer(json.dumps(head).encode(), np.uint8)}
+        arrays = record_arrays(self.kind, {"phases": list(self.phases), "smooth": self.smooth})
         for number, plan in enumerate(self.parts):
             arrays |= {f"part {number}/{name}": array for name, array in plan.arrays(path).items()}
         return arrays
@@ -261,17 +258,14 @@ class SequencePlan(ConsecutivePlans):
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SequencePlan:
         """Build the plan from the arrays of a file, which are checked because files are not trusted."""
-        try:
-            head = read_head(path, arrays[cls.kind])
+        with reading_plan(path):
+            head = read_record(path, arrays, cls.kind)
             phases = tuple(str(name) for name in head["phases"])
             parts = tuple(_plan_of(path, arrays, f"part {number}/") for number in range(len(phases)))
             machine, smooth = parts[0].machine, head["smooth"]
             if not all(plan.names == parts[0].names for plan in parts) or not isinstance(smooth, bool):
                 raise ValueError("its motions do not fit together")
             return cls(machine, parts, phases, smooth)
-        except RECORD_ERRORS as error:
-            words = f"{path}: the plan in it is damaged: {error}"
-            raise ProblemError(words, name="path", value=str(path)) from error
 
 
 def _plan_of(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], prefix: str) -> SolvedPlan:
@@ -361,18 +355,15 @@ class SegmentedPlan(ConsecutivePlans):
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         """Return the arrays of the file of the plan, by name; a prefix of each name states the motion."""
-        head, numbers = pack_record(
-            {
-                "start_times": list(self.start_times),
-                "reconfigurations": [
-                    [each.time, each.before, each.after, each.motion is not None, each.failure]
-                    for each in self.reconfigurations
-                ],
-                "fewest": self.fewest,
-            }
-        )
-        arrays = {self.kind: np.frombuffer(json.dumps(head).encode(), np.uint8)}
-        arrays |= {f"segments.{name}": values for name, values in numbers.items()}
+        record = {
+            "start_times": list(self.start_times),
+            "reconfigurations": [
+                [each.time, each.before, each.after, each.motion is not None, each.failure]
+                for each in self.reconfigurations
+            ],
+            "fewest": self.fewest,
+        }
+        arrays = record_arrays(self.kind, record)
         motions = [each.motion for each in self.reconfigurations]
         for kind, plans in (("segment", self.segments), ("reconfiguration", motions)):
             for number, plan in enumerate(plans):
@@ -383,9 +374,8 @@ class SegmentedPlan(ConsecutivePlans):
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SegmentedPlan:
         """Build the plan from the arrays of a file, which are checked because files are not trusted."""
-        try:
-            numbers = {name: arrays[f"segments.{name}"] for name in ARRAY_NAMES}
-            head = unpack_record(read_head(path, arrays["segments"]), numbers)
+        with reading_plan(path):
+            head = read_record(path, arrays, cls.kind)
             times = tuple(float(time) for time in head["start_times"])
             segments = tuple(_plan_of(path, arrays, f"segment {number}/") for number in range(len(times)))
             changes = tuple(
@@ -407,6 +397,3 @@ class SegmentedPlan(ConsecutivePlans):
             if not fits:
                 raise ValueError("its segments do not fit together")
             return cls(machine, segments, times, changes, int(head["fewest"]))
-        except RECORD_ERRORS as error:
-            words = f"{path}: the plan in it is damaged: {error}"
-            raise ProblemError(words, name="path", value=str(path)) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -13,22 +12,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models import Machine, ModelError
+from models import Machine
 from models.checks import Array
 from ocp.audit.audit import Audit
 from ocp.errors import ProblemError, StorageWarning
-from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES, Stretch
+from ocp.motion.builders.tool_motion import CLOCK, PACE, SLOPES
 from ocp.motion.result.candidate import Candidate
-from ocp.motion.result.plan import Plan
+from ocp.motion.result.plan import Plan, Rows, evaluate_parts, read_record, reading_plan, record_arrays
 from ocp.motion.result.request import MotionRequest, machines_of_phases, request_of, restored_request, stored_request
 from ocp.motion.search.held_joints import all_joints
+from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, targets_along, tip_poses
 from ocp.motion.tasks.tip_task import TipTask
-from ocp.problem.record_reader import ARRAY_NAMES, RECORD_ERRORS, unpack_record
-from ocp.problem.record_writer import pack_record
-from ocp.solution import Solution, read_head
+from ocp.solution import Solution
 
-__all__ = ["PHASED", "Part", "PhasedPlan", "SolvedPlan", "parts_of", "parts_of_phases"]
+__all__ = ["PHASED", "Part", "PhasedPlan", "SolvedPlan"]
 
 RATES = ("rates", SLOPES, "velocities")
 PHASED = "plan.phased"
@@ -93,7 +91,7 @@ class SolvedPlan(Plan):
         return self._of_all_joints(name, np.concatenate([self.solution[own + part.suffix] for part in self.parts]))
 
     def _of_all_joints(self, name: str, values: Array) -> Array:
-        """Extend joint values (M, m) of the solution by the values of the joints that stay at rest."""
+        """Insert the values of the joints that stay at rest into joint values (M, m) of the solution."""
         return values if name == "base" else all_joints(self.machine.robot, self.held, values, rates=name != "joints")
 
     def _values_at(self, name: str, times: Array) -> Array:
@@ -105,12 +103,12 @@ class SolvedPlan(Plan):
                 return sample[self.rate_name + part.suffix] / (sample[PACE] if self.rate_name == SLOPES else 1.0)
             return sample[name + part.suffix]
 
-        return self._of_all_joints(name, self._over(times, values))
+        size = self.machine.base_size if name == "base" else self.machine.joint_size - len(self.held)
+        return self._of_all_joints(name, self._evaluate(times, size, values))
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
         """Return the solution once for each time interval (part) of the plan; see `Plan.solved_parts`."""
-        begins = [part.begin for part in self.parts]
-        which = np.clip(np.searchsorted(begins, times, "right") - 1, 0, len(begins) - 1)
+        which = segment_index([*self._begins, np.inf], times)
         return [
             (self.solution, part.suffix, self._fractions(part, times[which == k]) * self.solution.horizon)
             for k, part in enumerate(self.parts)
@@ -128,10 +126,9 @@ class SolvedPlan(Plan):
         return self._fractions(self.parts[0], np.atleast_1d(self._checked_times(times)))
 
     def _audit(self, **settings: Any) -> Audit:
-        """Return the audit of the solution.
+        """Return the audit of the solution, with findings about all joint limits if the user declared the problem.
 
-        For a plan without a `request`, the limits of its machine are checked as well, since the meaning of the limits
-        in its problem is unknown.
+        The meaning of the limits in such a problem is unknown.
         """
         audit: Audit = self.solution.audit(**settings)
         if self.request is None:
@@ -174,21 +171,17 @@ class SolvedPlan(Plan):
             except ProblemError as error:
                 words = f"{path} is saved with the problem instead of the request: {error}"
                 warnings.warn(StorageWarning(words, name=error.name), stacklevel=2)
-        head, numbers = pack_record(
-            {
-                "request": request,
-                "parts": self.parts,
-                "bound": self.bound,
-                "held": [[name, position] for name, position in self.held.items()],
-                "candidates": [candidate.record() for candidate in self.candidates],
-                "targets": [
-                    np.column_stack([target.t, target.position, target.rotation.reshape(-1, 9)])
-                    for target in self.targets
-                ],
-            }
-        )
-        arrays = {**self.solution.arrays(path, hint), "plan": np.frombuffer(json.dumps(head).encode(), np.uint8)}
-        return {**arrays, **{f"plan.{name}": values for name, values in numbers.items()}}
+        record = {
+            "request": request,
+            "parts": self.parts,
+            "bound": self.bound,
+            "held": [[name, position] for name, position in self.held.items()],
+            "candidates": [candidate.record() for candidate in self.candidates],
+            "targets": [
+                np.column_stack([target.t, target.position, target.rotation.reshape(-1, 9)]) for target in self.targets
+            ],
+        }
+        return {**self.solution.arrays(path, hint), **record_arrays("plan", record)}
 
     @classmethod
     def of_arrays(cls, path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> SolvedPlan:
@@ -197,10 +190,8 @@ class SolvedPlan(Plan):
         if "plan" not in arrays:
             words = f"{path} holds a solution and no plan; read it with Solution.load"
             raise ProblemError(words, name="path", value=str(path))
-        try:
-            head = unpack_record(
-                read_head(path, arrays["plan"]), {name: arrays[f"plan.{name}"] for name in ARRAY_NAMES}
-            )
+        with reading_plan(path):
+            head = read_record(path, arrays, "plan")
             request = restored_request(head["request"])
             if request.builder:
                 solution = solution.tied_to(request.problem())
@@ -212,10 +203,6 @@ class SolvedPlan(Plan):
             plan = cls(request.machine, solution, parts, candidates, bound, targets, held)
             plan._check_parts()
             return plan.with_targets(request.tasks) if request.builder and targets else plan
-        except (*RECORD_ERRORS, ModelError) as error:
-            name = getattr(error, "name", None) or "plan"
-            words = f"{path}: the plan in it is damaged: {error}"
-            raise ProblemError(words, name=str(name), value=str(path)) from error
 
     # ---- time of the motion and time of the solution -----------------------------------------------------------------
 
@@ -239,7 +226,7 @@ class SolvedPlan(Plan):
 
     @property
     def rate_name(self) -> str:
-        """Name of the joint rates in the solution. SLOPES, with respect to task time, are divided by the pace."""
+        """Name of the state or control in the solution that holds the joint rates."""
         names = {**self.solution.states, **self.solution.controls}
         return next(name for name in RATES if name + self.parts[0].suffix in names)
 
@@ -274,25 +261,19 @@ class SolvedPlan(Plan):
             low, high = np.where(is_late, low, middle), np.where(is_late, middle, high)
         return np.asarray((low + high) / 2)
 
-    def _over(self, times: Array, evaluate: Callable[[Part, Array], Array]) -> Array:
-        """Evaluate a quantity at times (M,), using for each time the part (time interval) that contains the time.
+    @property
+    def _begins(self) -> list[float]:
+        """Times at which the parts of the plan begin, s."""
+        return [part.begin for part in self.parts]
 
-        `evaluate` takes a part and fractions of the solution's horizon. A junction belongs to the later part.
-        """
-        begins = [part.begin for part in self.parts]
-        which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(self.parts) - 1)
-        result: Array | None = None
-        for number in np.unique(which):
-            part, rows = self.parts[number], np.flatnonzero(which == number)
-            values = evaluate(part, self._fractions(part, times[rows]))
-            result = np.empty((len(times), values.shape[1])) if result is None else result
-            result[rows] = values
-        return np.zeros((0, self.machine.joint_size)) if result is None else result
-
-
-def parts_of(stretches: Sequence[Stretch]) -> tuple[Part, ...]:
-    """Return a part of the plan (time interval and suffix of names) for each time interval with the same tasks."""
-    return tuple(Part(stretch.begin, stretch.end, stretch.suffix) for stretch in stretches)
+    def _evaluate(self, times: Array, size: int, evaluate: Callable[[Part, Array], Array]) -> Array:
+        """Evaluate a quantity at times (M,), a function of a part of the plan and fractions of the horizon."""
+        return evaluate_parts(
+            self._begins,
+            times,
+            size,
+            lambda number, rows: evaluate(self.parts[number], self._fractions(self.parts[number], times[rows])),
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -341,8 +322,10 @@ class PhasedPlan(SolvedPlan):
 
     def _values_at(self, name: str, times: Array) -> Array:
         own = PHASED_RATES if name == "rates" else name
-        return self._over(
+        size = self.machine.base_size if name == "base" else self.machine.joint_size
+        return self._evaluate(
             times,
+            size,
             lambda part, fraction: self._in_order(part, name, self._solutions[part.suffix].at_fraction(fraction)[own]),
         )
 
@@ -351,21 +334,18 @@ class PhasedPlan(SolvedPlan):
         return values if name == "base" else values[:, self._joint_indices[part.suffix]]
 
     def _tips_at(self, times: Array, bases: Array, joints: Array) -> Array:
-        poses = np.full((len(times), 7), np.nan)
-        begins = [part.begin for part in self.parts]
-        which = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(begins) - 1)
-        for number in np.unique(which):
-            machine, rows = self.machines[number], which == number
+        def tips(number: int, rows: Rows) -> Array:
             order = np.argsort(self._joint_indices[self.phases[number]])
-            poses[rows] = tip_poses(machine, bases[rows], joints[rows][:, order])
-        return poses
+            return tip_poses(self.machines[number], bases[rows], joints[rows][:, order])
+
+        return evaluate_parts(self._begins, times, 7, tips)
 
     def arrays(self, path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         """Return the arrays that are written to the file of the plan, by name."""
         return {**super().arrays(path), PHASED: np.ones(1)}
 
     def solved_parts(self, times: Array) -> list[tuple[Solution, str, Array]]:
-        """Return the separately solved parts of the plan: none, because its phases are solved as one problem."""
+        """Return an empty list, since the phases of the plan are solved together as one problem."""
         return []
 
     def _check_parts(self) -> None:
@@ -381,8 +361,3 @@ class PhasedPlan(SolvedPlan):
             ]
             if set(machine.robot.joint_names) != set(self.names) or sizes != [machine.joint_size] * 2:
                 raise ValueError(f"the solution has no joints and velocities of its machine in phase {name!r}")
-
-
-def parts_of_phases(solution: Solution) -> tuple[Part, ...]:
-    """Return the parts of a plan with phases: the time interval and the name of each phase."""
-    return tuple(Part(begin, end, name) for name, (begin, end) in solution.phases.items())

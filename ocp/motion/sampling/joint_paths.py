@@ -37,9 +37,6 @@ from ocp.problem.hulls import Frames, frames_of
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
 __all__ = [
-    "LengthSettings",
-    "ShorteningSettings",
-    "StraightMotionSettings",
     "StraightMotions",
     "optimise_length",
     "path_length",
@@ -50,6 +47,8 @@ __all__ = [
 ]
 
 Indices = NDArray[np.intp]
+COMPARED_PLACES = 32
+"""Number of fractions of their length at which two paths are compared."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +75,9 @@ class StraightMotionSettings:
     block: int = 1_000_000
 
 
+PROOF = StraightMotionSettings()
+
+
 class StraightMotions:
     """Collision proofs for straight joint motions of a machine on a fixed base among fixed obstacles.
 
@@ -83,11 +85,10 @@ class StraightMotions:
         scene: Collision scene; None if nothing can collide.
     """
 
-    def __init__(self, scene: CollisionScene | None, settings: StraightMotionSettings = StraightMotionSettings()):
+    def __init__(self, scene: CollisionScene | None) -> None:
         self.scene = scene if scene is not None and len(scene.pairs) else None
-        self.settings = settings
         if self.scene is not None:
-            self._required = self.scene.clearance - settings.tolerance
+            self._required = self.scene.clearance - PROOF.tolerance
             self._placements, self._bodies = prepared_pairs(self.scene)
             self._levers, self._turns = self.scene.levers.joints, self.scene.levers.joint_turns
 
@@ -108,7 +109,7 @@ class StraightMotions:
         n = joints.shape[1]
         if self.scene is None:
             return np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, n))
-        near, step = self.scene.clearance + reach, self.settings.difference
+        near, step = self.scene.clearance + reach, PROOF.difference
         frames = self._frames(joints)
         at, pair = np.nonzero(self._bodies.all_balls(frames) < near)
         gap = self._bodies.gaps(frames, at, pair, near)
@@ -129,12 +130,12 @@ class StraightMotions:
             return clear
         distances = np.abs(ends - starts)
         approach, turning = distances @ self._levers.T, distances @ self._turns.T  # (M, P)
-        pieces = np.maximum(np.ceil(approach.max(axis=1) / self.settings.first), 1).astype(int)
+        pieces = np.maximum(np.ceil(approach.max(axis=1) / PROOF.first), 1).astype(int)
         motion = np.repeat(np.arange(len(starts)), pieces)
         number = np.arange(len(motion)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         width, middle = 1 / pieces[motion], (number + 0.5) / pieces[motion]
         order = np.argsort(np.abs(middle - 0.5), kind="stable")  # blocks are then spread over all motions
-        blocks = -(-len(order) * len(self._levers) // self.settings.block)
+        blocks = -(-len(order) * len(self._levers) // PROOF.block)
         for part in np.array_split(order, blocks):
             keep = part[clear[motion[part]]]
             self._prove((starts, ends), (approach, turning), clear, (motion[keep], middle[keep], width[keep]))
@@ -149,11 +150,8 @@ class StraightMotions:
     ) -> None:
         """Prove straight motions collision-free by bisection; unset the marks `clear` of motions that may collide.
 
-        Args:
-            lines: Starts and ends of the motions.
-            sizes: Approach and turning of each pair over each whole motion.
-            clear: Marks of the motions, which are changed.
-            intervals: Motion, middle and width of each.
+        `lines` are the starts and ends of the motions, `sizes` the approach and turning of each pair of bodies over
+        each whole motion, `intervals` the number of the motion, the middle and the width of each interval.
         """
         (approach, turning), (motion, middle, width) = sizes, intervals
         interval = pair = np.zeros(0, dtype=np.intp)  # undecided pairs of the intervals, after the first level
@@ -177,7 +175,7 @@ class StraightMotions:
             clear[motion[interval[gap < required]]] = False
             undecided = (gap < required + reach) & clear[motion[interval]]
             interval, pair, reach = interval[undecided], pair[undecided], reach[undecided]
-            uneven = np.flatnonzero(reach < self.settings.uneven)
+            uneven = np.flatnonzero(reach < PROOF.uneven)
             if len(uneven):
                 bow = reach[uneven] * (turning[motion[interval], pair] * width[interval])[uneven] / 2
                 facing, _, _ = self._bodies.nearest(frames, interval[uneven], pair[uneven])
@@ -185,7 +183,7 @@ class StraightMotions:
                 frames = self._frames_on(lines, np.tile(motion, 2), places)
                 chord = self._bodies.chords(facing, frames, (interval[uneven], interval[uneven] + len(motion)))
                 open_ = chord - bow < required
-                clear[motion[interval[uneven[open_ & (reach[uneven] < self.settings.finest)]]]] = False
+                clear[motion[interval[uneven[open_ & (reach[uneven] < PROOF.finest)]]]] = False
                 undecided = np.ones(len(interval), dtype=bool)
                 undecided[uneven] = open_
                 undecided &= clear[motion[interval]]
@@ -224,6 +222,9 @@ class ShorteningSettings:
     most_batches: int = 60
 
 
+SHORTENING = ShorteningSettings()
+
+
 def path_length(path: Array, scale: Array) -> float:
     """Return the length of a joint path (M, n) in the metric in which a displacement dq has length |scale * dq|."""
     return float(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1).sum())
@@ -235,14 +236,7 @@ def points_along(path: Array, scale: Array, shares: Array) -> Array:
     return np.column_stack([np.interp(shares * places[-1], places, column) for column in path.T])
 
 
-def shorten(
-    motions: StraightMotions,
-    path: Array,
-    scale: Array,
-    *,
-    random: np.random.Generator,
-    settings: ShorteningSettings = ShorteningSettings(),
-) -> Array:
+def shorten(motions: StraightMotions, path: Array, scale: Array, *, random: np.random.Generator) -> Array:
     """Shorten a joint path by random shortcuts; each straight motion of the result is proven collision-free.
 
     Args:
@@ -257,26 +251,27 @@ def shorten(
 
     path = shortest_through_corners(motions, path, lengths_of)
     lengths = [path_length(path, scale)]
-    for _ in range(settings.most_batches):
+    for _ in range(SHORTENING.most_batches):
         if len(path) == 2:
             break
-        path = shortest_through_corners(motions, _cut(motions, path, scale, random, settings.batch), lengths_of)
+        path = shortest_through_corners(
+            motions, _apply_shortcuts(motions, path, scale, random, SHORTENING.batch), lengths_of
+        )
         lengths.append(path_length(path, scale))
         if (
-            len(lengths) > settings.patience
-            and lengths[-1] > (1 - settings.least_gain) * lengths[-1 - settings.patience]
+            len(lengths) > SHORTENING.patience
+            and lengths[-1] > (1 - SHORTENING.least_gain) * lengths[-1 - SHORTENING.patience]
         ):
             break
     return path
 
 
-def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array, *, rungs: int = 32) -> bool:
+def same_class(motions: StraightMotions, first: Array, second: Array, scale: Array) -> bool:
     """Return whether collision-free straight motions at equal fractions of two paths prove the paths homotopic.
 
-    Paths of one homotopy class need not pass this test; paths that pass can replace each other as guesses. The paths
-    are compared at as many places as there are `rungs`.
+    Paths of one homotopy class need not pass this test; paths that pass can replace each other as guesses.
     """
-    shares = np.linspace(0.0, 1.0, rungs + 2)[1:-1]
+    shares = np.linspace(0.0, 1.0, COMPARED_PLACES + 2)[1:-1]
     return bool(motions.are_clear(*(points_along(path, scale, shares) for path in (first, second))).all())
 
 
@@ -311,7 +306,9 @@ def shortest_through_corners(motions: StraightMotions, path: Array, costs_of: Ca
     return path[corners[::-1]]
 
 
-def _cut(motions: StraightMotions, path: Array, scale: Array, random: np.random.Generator, batch: int) -> Array:
+def _apply_shortcuts(
+    motions: StraightMotions, path: Array, scale: Array, random: np.random.Generator, batch: int
+) -> Array:
     """Replace parts of a path by straight shortcuts between random points; the best shortcuts are applied first."""
     places = _places(path, scale)
     ends = np.sort(random.random((batch, 2)) * places[-1], axis=1)
@@ -367,14 +364,10 @@ class LengthSettings:
     most_steps: int = 20
 
 
-def optimise_length(
-    motions: StraightMotions,
-    path: Array,
-    scale: Array,
-    *,
-    limits: tuple[Array, Array],
-    settings: LengthSettings = LengthSettings(),
-) -> Array:
+OPTIMISATION = LengthSettings()
+
+
+def optimise_length(motions: StraightMotions, path: Array, scale: Array, *, limits: tuple[Array, Array]) -> Array:
     """Minimise the length of a path locally; each straight motion of the result is proven collision-free.
 
     Args:
@@ -382,26 +375,25 @@ def optimise_length(
         path: Configurations with clear straight motions between them. Shape (M, n).
         scale: The length of a displacement is |scale * dq|. Shape (n,).
         limits: Lower and upper limits of the joints. Shape (n,) each.
-        settings: Settings.
     """
     if len(path) == 2:
         return path
     length = path_length(path, scale)
-    count = int(np.clip(np.ceil(length / settings.motion), settings.fewest, settings.most))
+    count = int(np.clip(np.ceil(length / OPTIMISATION.motion), OPTIMISATION.fewest, OPTIMISATION.most))
     chain = _resample(motions, path, scale, count)
-    best, best_length, inertia, idle = path, length, settings.inertia, 0
-    for _ in range(settings.most_steps):
+    best, best_length, inertia, idle = path, length, OPTIMISATION.inertia, 0
+    for _ in range(OPTIMISATION.most_steps):
         check_time()
-        step = _step(motions, chain, scale, limits, inertia, settings)
-        moved, shares = _clear_step(motions, chain, chain + step, settings.smallest_share)
+        step = _length_step(motions, chain, scale, limits, inertia)
+        moved, shares = _clear_step(motions, chain, chain + step, OPTIMISATION.smallest_share)
         length = path_length(moved, scale)
         gain = 1 - length / best_length
         if gain > 0:
             best, best_length = moved, length
-        shortened = shares.mean() < settings.least_share
-        inertia *= settings.braking if shortened else 1 / settings.braking
-        idle = idle + 1 if gain < settings.least_gain else 0
-        if idle > settings.patience or inertia > settings.most_inertia:
+        shortened = shares.mean() < OPTIMISATION.least_share
+        inertia *= OPTIMISATION.braking if shortened else 1 / OPTIMISATION.braking
+        idle = idle + 1 if gain < OPTIMISATION.least_gain else 0
+        if idle > OPTIMISATION.patience or inertia > OPTIMISATION.most_inertia:
             break
         chain = _resample(motions, best, scale, count)
     return best
@@ -417,7 +409,7 @@ def _resample(motions: StraightMotions, path: Array, scale: Array, count: int) -
     blocked = np.flatnonzero(~motions.are_clear(chain[:-1], chain[1:]))
     if not len(blocked):
         return chain
-    places = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0) * scale, axis=1)))
+    places = _places(path, scale)
     places /= places[-1]
     inside = ((places > shares[blocked, None]) & (places < shares[blocked + 1, None])).any(axis=0)
     order = np.argsort(np.concatenate([shares, places[inside]]), kind="stable")
@@ -425,13 +417,8 @@ def _resample(motions: StraightMotions, path: Array, scale: Array, count: int) -
     return chain if motions.are_clear(chain[:-1], chain[1:]).all() else path
 
 
-def _step(
-    motions: StraightMotions,
-    chain: Array,
-    scale: Array,
-    limits: tuple[Array, Array],
-    inertia: float,
-    settings: LengthSettings,
+def _length_step(
+    motions: StraightMotions, chain: Array, scale: Array, limits: tuple[Array, Array], inertia: float
 ) -> Array:
     """Return displacements of a path's corners that minimise an upper bound of its length under linear constraints.
 
@@ -440,12 +427,12 @@ def _step(
     inner, n = len(chain) - 2, chain.shape[1]
     places = np.empty((2 * len(chain) - 1, n))
     places[::2], places[1::2] = chain, (chain[:-1] + chain[1:]) / 2
-    at, _, distance, gradient = motions.near_pairs(places[1:-1], settings.reach)
+    at, _, distance, gradient = motions.near_pairs(places[1:-1], OPTIMISATION.reach)
     weights = np.zeros((len(at), len(chain)))  # of the chain's configurations at the place of each row
     weights[np.arange(len(at)), (at + 1) // 2] += 0.5
     weights[np.arange(len(at)), (at + 2) // 2] += 0.5
     rows = (weights[:, 1:-1, None] * (gradient / scale)[:, None]).reshape(len(at), inner * n)
-    least = settings.margin - distance
+    least = OPTIMISATION.margin - distance
     flat = np.tile(scale, inner)
     for sign, limit in zip((1.0, -1.0), limits, strict=True):
         room = (sign * (chain[1:-1] - limit)).ravel()
@@ -455,7 +442,7 @@ def _step(
     # for the scaled step y of the inner configurations: y' H y / 2 + slope' y, with H the same for all joints
     changes = np.diff(chain * scale, axis=0)
     lengths = np.linalg.norm(changes, axis=1)
-    stiffness = 1 / np.maximum(lengths / lengths.mean(), settings.shortest)
+    stiffness = 1 / np.maximum(lengths / lengths.mean(), OPTIMISATION.shortest)
     hessian = np.diag(stiffness[:-1] + stiffness[1:] + inertia)
     hessian -= np.diag(stiffness[1:-1], 1) + np.diag(stiffness[1:-1], -1)
     factor = np.linalg.cholesky(hessian)

@@ -13,7 +13,7 @@ accept a seed only once for each process, so that a repeated call has another re
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from models.checks import Array
 from ocp.console import TimeLimitReached, check_time
 from ocp.motion.sampling.joint_paths import (
-    LengthSettings,
-    ShorteningSettings,
     StraightMotions,
     optimise_length,
     path_length,
@@ -30,7 +28,7 @@ from ocp.motion.sampling.joint_paths import (
     shorten,
 )  # fmt: skip
 
-__all__ = ["JointPath", "PathSearchSettings", "RandomTreeSettings", "TreeSearch", "connect", "find_paths"]
+__all__ = ["JointPath", "PathSearchSettings", "TreeSearch", "connect", "find_paths"]
 
 Indices = NDArray[np.intp]
 
@@ -48,22 +46,23 @@ class RandomTreeSettings:
     longest: float = 0.05
 
 
+TREES = RandomTreeSettings()
+
+
 @dataclass(frozen=True, eq=False)
 class TreeSearch:
-    """Settings and bounds of a search for a path from a start to goals by random trees.
+    """Request for a search for a path from a start to goals by random trees.
 
     Attributes:
         motions: Proofs of clearance.
         lower, upper: Range from which configurations are sampled; it contains start and goals. Shape (n,), rad or m.
         scale: Distances are lengths of scale * dq. Shape (n,).
-        settings: Settings.
     """
 
     motions: StraightMotions
     lower: Array
     upper: Array
     scale: Array
-    settings: RandomTreeSettings = RandomTreeSettings()
 
 
 class _Tree:
@@ -108,15 +107,15 @@ def connect(
     Raises:
         TimeLimitReached: The time limit has passed.
     """
-    lower, upper, settings = search.lower, search.upper, search.settings
-    step = settings.longest * float(np.linalg.norm((upper - lower) * search.scale))
+    lower, upper = search.lower, search.upper
+    step = TREES.longest * float(np.linalg.norm((upper - lower) * search.scale))
     trees = _Tree(start[None]), _Tree(goals)
     growing, tried = 0, 0
     while tried < most_samples:
         check_time()
-        tried += settings.batch
+        tried += TREES.batch
         tree, other = trees[growing], trees[1 - growing]
-        samples = lower + (upper - lower) * random.random((settings.batch, len(lower)))
+        samples = lower + (upper - lower) * random.random((TREES.batch, len(lower)))
         parents = tree.nearest(samples, search.scale)
         nodes = _step_towards(tree.nodes[parents], samples, step, search.scale)
         clear = search.motions.are_clear(tree.nodes[parents], nodes)
@@ -142,8 +141,7 @@ def _step_towards(starts: Array, targets: Array, step: float, scale: Array) -> A
 def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step: float) -> tuple[int, int] | None:
     """Extend a random tree step by step from new nodes towards target nodes (K, n) of another tree.
 
-    Returns:
-        Which of the targets is reached, and the tree's node there; None if none is.
+    Return the index of the first target that is reached and the tree's node there; None if no target is reached.
     """
     places = np.arange(len(new))
     while len(places):
@@ -160,22 +158,19 @@ def _grow_to(search: TreeSearch, tree: _Tree, new: Indices, targets: Array, step
 
 @dataclass(frozen=True)
 class PathSearchSettings:
-    """Settings of `find_paths`: random searches, shortening and optimisation.
+    """Settings of `find_paths`: numbers of random searches, of their samples and of paths.
 
     Attributes:
         classes: Number of random searches after the first one that finds a path, each as long as that.
         first, attempts: Number of samples of the first search, and of searches. Every second one has twice as many
             samples as those before: the duration of a search varies so much that restarts shorten it.
         most_paths: Largest number of paths, one for each class, the shortest first.
-        shortening, optimisation: Settings of `shorten` and `optimise_length`.
     """
 
     classes: int = 1
     first: int = 512
     attempts: int = 16
     most_paths: int = 3
-    shortening: ShorteningSettings = field(default_factory=ShorteningSettings)
-    optimisation: LengthSettings = field(default_factory=LengthSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,14 +224,14 @@ def find_paths(
             random = np.random.default_rng([seed, number])
             joints = connect(search, start, goals, random=random, most_samples=samples)
             if joints is not None:
-                joints = shorten(motions, joints, scale, random=random, settings=settings.shortening)
+                joints = shorten(motions, joints, scale, random=random)
                 paths = _with_path(search, paths, _path_of(joints, goals, scale))
                 last = min(last, number + 1 + settings.classes)
             number += 1
             if not paths and number % 2 == 0:
                 samples *= 2
         for path in paths[: settings.most_paths]:
-            joints = optimise_length(motions, path.joints, scale, limits=limits, settings=settings.optimisation)
+            joints = optimise_length(motions, path.joints, scale, limits=limits)
             paths = _with_path(search, [p for p in paths if p is not path], _path_of(joints, goals, scale))
     except TimeLimitReached:
         if not paths:

@@ -132,7 +132,7 @@ class SplineCost:
 
     @classmethod
     def of(cls, cost: Cost, size: int) -> SplineCost | None:
-        """Return a cost in this form for `size` joints; None if the cost has terms that this form lacks."""
+        """Convert a cost to a SplineCost for `size` joints; None if it has other terms than time and squares."""
         if not set(cost.terms) <= {"time", "velocity", "acceleration", "jerk"}:
             return None
         rows = cost.joint_weights(size) / 2, cost.acceleration, cost.jerk
@@ -181,10 +181,7 @@ def optimal_motion_near(
 def _local_optimum(search: _Search, state: _State, region: float, least_gain: float) -> tuple[_State, float]:
     """Solve linear or quadratic programs in sequence; return the best feasible motion and the trust region size.
 
-    If none is, return the last motion. The sequence ends when the cost decreases by less than `least_gain`.
-
-    Raises:
-        TimeLimitReached: The time limit has passed before one was feasible.
+    If no motion is feasible, return the last one. The sequence ends when the cost decreases by less than `least_gain`.
     """
     settings = search.settings
     penalty = settings.penalty if search.horizon is None else settings.violation
@@ -287,7 +284,7 @@ class _Search:
         self.residuals = [self._residuals(order) for order in (1, 2, 3) if cost.squares[order - 1].any()]
 
     def _residuals(self, order: int) -> tuple[int, Any]:
-        """Return power p and matrix L of the cost |L c|^2 / T^p of a derivative, at control points c, duration T."""
+        """Return p and matrix L of the cost |L c|^2 / T^p of a squared derivative; c: control points, T: duration."""
         places, weights = np.polynomial.legendre.leggauss(self.degree - order + 1)
         width = np.diff(self.breaks)[:, None]
         at = (self.breaks[:-1, None] + width * (places + 1) / 2).ravel()
@@ -424,7 +421,7 @@ class _Search:
         return scipy.sparse.csr_array((values, (row, column)), shape=(len(by_joint), self.count * self.size))
 
     def step(self, state: _State, region: float) -> _State | None:
-        """Return the next iterate, within a trust region; None if the linear or quadratic program has no solution."""
+        """Return the next iterate, by a linear or quadratic program in a trust region; None if that has no solution."""
         settings, bounds, count = self.settings, self.limits.bounds, len(self.free)
         travel = np.where(self.has_rate_limit, bounds.velocity * state.duration, self.spread) * region
         points = state.points.ravel()[self.free]
@@ -472,7 +469,7 @@ class _Search:
         return bool(worst)
 
     def motion(self, state: _State) -> ConstantJerkMotion:
-        """Return an iterate as a motion with phases of constant jerk."""
+        """Convert an iterate of the spline search to a motion with phases of constant jerk."""
         duration = state.duration
         joints, rates = (self._values(self.breaks[:-1], order) @ state.points for order in (0, 1))
         accelerations = (self.derivatives[2] @ state.points)[: len(self.breaks) - 1] / duration**2

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from models.checks import Array
 from ocp.errors import SolveError
-from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING
+from ocp.motion.builders.clearance import MARGIN, MAX_SOLVES, ROUNDING
 from ocp.motion.local.collisions import distances_along, find_collisions
 from ocp.motion.search.charts import Charts
 from ocp.motion.search.joint_space import TOLERANCE
@@ -383,7 +383,7 @@ def _find_relaxation(search: AtlasSearch, path: Array, turning: bool, kind: Rela
     if not any((sample.manifolds.equations.turning == turning).any() for sample in search.samples):
         return None
     scene, pairs = search.scene, list[int]()
-    for _ in range(LOOKS):
+    for _ in range(MAX_SOLVES):
         problem = _RelaxedProblem(search, turning, pairs)
         rough = problem.solve(path, None)  # a bound of the largest error component is smooth at zero, unlike a norm
         if rough is None:

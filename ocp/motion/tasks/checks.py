@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from models import Joint, Machine
 from models.checks import Array, warn_of_degrees
 from ocp.errors import ProblemError, format_distinct, require
 from ocp.motion.tasks.equations import TaskEquations
-from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, is_holonomic, target_size
+from ocp.motion.tasks.tip_task import ANGULAR, BoundTask, TipTask, is_holonomic, target_rows, target_size
 
 __all__ = [
-    "check_closed", "check_length", "check_rest", "check_speed", "checked_configuration",
+    "are_at_rest", "check_closed", "check_length", "check_rest", "check_speed", "checked_configuration",
     "checked_tasks", "checked_weights", "clip_to_limits", "dependent_rows", "horizon_of",
     "ignorable_joints", "rates_at_rest",
 ]  # fmt: skip
@@ -77,7 +79,7 @@ def checked_configuration(machine: Machine, joints: Any, base: Any) -> tuple[Arr
         ModelWarning: Angles that look like degrees.
     """
     if joints is None:
-        words = "start is missing; inverse_kinematics(machine, task) finds some for a pose"
+        words = "start is missing; give joint positions: inverse_kinematics(machine, task) finds some for a pose"
         raise ProblemError(words, name="start")
     positions = require.array("start", joints, (machine.joint_size,), meaning="one entry for each joint")
     for joint, angle in zip(machine.robot.moving_joints, positions, strict=True):
@@ -104,9 +106,7 @@ def clip_to_limits(joints: Array, lower: Array, upper: Array, *, label: str, nam
         ProblemError: A joint is outside its limits by more than rounding.
     """
     for name, value, low, high in zip(names, joints.tolist(), lower.tolist(), upper.tolist(), strict=True):
-        size = (
-            high - low if np.isfinite(high - low) else max(1.0, *(abs(x) for x in (low, high) if np.isfinite(x)), 1.0)
-        )
+        size = high - low if np.isfinite(high - low) else max([1.0, *(abs(x) for x in (low, high) if np.isfinite(x))])
         if value < low - CHECKS.rounding * size or value > high + CHECKS.rounding * size:
             at, least, greatest = format_distinct(value, low, high)
             verb = "ends" if label.startswith("end") else "starts"
@@ -119,16 +119,13 @@ def checked_weights(weights: Any, size: int) -> Array:
     """Return weights (size,) of squared joint rates, 1 if None is given; raise ProblemError if one is not positive."""
     if weights is None:
         return np.ones(size)
-    array = require.array("weights", weights, (size,), meaning="one for each joint")
-    if not (array > 0).all():
-        raise ProblemError(f"weights {array.tolist()} must be positive", name="weights", value=array, limit=0.0)
-    return array
+    return require.array("weights", weights, (size,), sign="positive", meaning="one for each joint")
 
 
 def checked_tasks(
     equations: TaskEquations, base: Array, joints: Array, horizon: float, *, check_start: bool = True
 ) -> None:
-    """Raise ProblemError if tasks require motions that the machine cannot perform, or a jump of a tip at the start.
+    """Raise ProblemError if the machine cannot perform the tasks, or if its tip is not at a task's target at the start.
 
     Args:
         equations: Equations of the tasks.
@@ -180,7 +177,7 @@ def checked_tasks(
 
 
 def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str | None:
-    """Return a description of the tasks if their equations are linearly dependent in a configuration, else None."""
+    """Return a text that names the task equations if they are linearly dependent in a configuration, else None."""
     if not equations.size:
         return None
     values = np.linalg.svd(np.array(ca.DM(equations.jacobian(base, joints))), compute_uv=False)
@@ -188,7 +185,7 @@ def dependent_rows(equations: TaskEquations, base: Array, joints: Array) -> str 
 
 
 def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]:
-    """Return which joint positions affect neither the joint rates that tasks require nor the base motion. Shape (n,).
+    """Return which joints' positions affect neither the joint rates that tasks require nor the base motion. Shape (n,).
 
     Evaluated to rounding in random configurations: the rates that do the tasks, the null space, the motion of the base,
     and the cones of tool axes do not depend on such a joint position.
@@ -215,7 +212,7 @@ def ignorable_joints(equations: TaskEquations, base: Array) -> NDArray[np.bool_]
 
 
 def _rows_by_name(equations: TaskEquations) -> list[int]:
-    """Return the numbers of task equations in error messages: twist components of a single task, else positions."""
+    """Return the numbers of task equations for messages: twist components 0..5 of a single task, else 0, 1, ..."""
     first = equations.bound[0].task
     if len(equations.bound) == 1 and not first.tilts:
         return list(first.chosen)
@@ -233,17 +230,11 @@ def _sample_targets(equations: TaskEquations, horizon: float, count: int) -> tup
     return times, np.array(equations.target_function().map(count)(times[None, :]))
 
 
-def _parts(equations: TaskEquations, values: Array) -> list[tuple[BoundTask, Array]]:
-    """Split the stacked targets of all tasks; return a pair for each task: the task and its own targets."""
-    ends = np.cumsum([target_size(part.task) for part in equations.bound])
-    return list(zip(equations.bound, np.split(values, ends[:-1]), strict=True))
-
-
 def _check_rotations(equations: TaskEquations, values: Array, times: Array) -> None:
     """Raise ProblemError if a target orientation is not a rotation matrix at one of the times."""
-    for part, targets in _parts(equations, values):
+    for part, targets in equations.by_task(values):
         if part.task.orientation is not None:
-            rotations = targets[-12:-3].T.reshape(-1, 3, 3)
+            rotations = targets[target_rows(part.task)["orientation"][0]].T.reshape(-1, 3, 3)
             invalid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 1e-6
             invalid |= np.linalg.det(rotations) < 0
             if invalid.any():
@@ -261,26 +252,23 @@ def _has_full_rank(jacobian: Array) -> bool:
 
 
 def check_closed(equations: TaskEquations, horizon: float) -> None:
-    """Raise ProblemError if the target of a task in a cyclic motion does not return to where it starts.
+    """Raise ProblemError if the target of a task does not return to its start, as a cyclic motion requires.
 
     Poses are checked by their targets, velocities by their integrals.
     """
     times, values = _sample_targets(equations, horizon, CHECKS.closure_samples)
-    for part, targets in _parts(equations, values):
+    for part, targets in equations.by_task(values):
         task = part.task
         if task.is_pose:
             gap = np.abs(np.delete(targets[:, -1] - targets[:, 0], _rate_rows(task))).max()
         else:
             holonomic = is_holonomic(part)
-            zeros = np.zeros(CHECKS.closure_samples)
-            angular = [targets[list(task.chosen).index(row)] if row in task.chosen else zeros for row in ANGULAR]
+            by_row, zeros = dict(zip(task.chosen, targets, strict=True)), np.zeros(CHECKS.closure_samples)
+            angular = [by_row.get(row, zeros) for row in ANGULAR]
             linear = [i for i, row in enumerate(task.chosen) if row not in ANGULAR and holonomic[i]]
-            displacement = _integral(targets[linear], times[1])
-            rotation = (
-                _rotation_angle(np.array(angular), times[1])
-                if holonomic[[row in ANGULAR for row in task.chosen]].any()
-                else 0.0
-            )
+            displacement = scipy.integrate.simpson(targets[linear], dx=times[1])
+            turns = holonomic[[row in ANGULAR for row in task.chosen]].any()
+            rotation = _rotation_angle(np.array(angular), times[1]) if turns else 0.0
             gap = max(float(np.abs(displacement).max(initial=0.0)), rotation)
         if gap > CHECKS.closed:
             words = (
@@ -291,19 +279,27 @@ def check_closed(equations: TaskEquations, horizon: float) -> None:
 
 
 def check_rest(equations: TaskEquations, *times: float | None) -> None:
-    """Raise ProblemError if a task prescribes motion at a time of rest of the joints; times of None are skipped."""
-    targets = equations.target_function()
-    for time in times:
-        if time is None:
-            continue
-        for part, values in _parts(equations, np.array(targets(time)).ravel()):
-            velocity = values[_rate_rows(part.task)] if part.task.is_pose else values
-            if np.linalg.norm(velocity) > CHECKS.still:
-                words = (
-                    f"the task of {_frame(part)!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where "
-                    "the joints are to be at rest; let it come to rest there, or say 'free' for that end"
-                )
-                raise ProblemError(words, name=_frame(part), value=velocity, limit=CHECKS.still, time=float(time))
+    """Raise ProblemError if a task prescribes motion at a given time at which the joints must rest; None is no time."""
+    for time in (time for time in times if time is not None):
+        for part, velocity in _moving_tasks(equations, time):
+            words = (
+                f"the task of {_frame(part)!r} moves at {velocity.tolist()} (m/s or rad/s) at {time:g} s, where "
+                "the joints are to be at rest; let it come to rest there, or say 'free' for that end"
+            )
+            raise ProblemError(words, name=_frame(part), value=velocity, limit=CHECKS.still, time=float(time))
+
+
+def are_at_rest(equations: TaskEquations | None, time: float) -> bool:
+    """Return whether all tasks prescribe rest at a time, s; without tasks (None), there is no motion."""
+    return equations is None or not any(_moving_tasks(equations, time))
+
+
+def _moving_tasks(equations: TaskEquations, time: float) -> Iterator[tuple[BoundTask, Array]]:
+    """Yield the tasks that prescribe motion at a time, and the velocities that they prescribe, m/s and rad/s."""
+    for part, values in equations.by_task(np.array(equations.target_function()(time)).ravel()):
+        velocity = values[_rate_rows(part.task)] if part.task.is_pose else values
+        if np.linalg.norm(velocity) > CHECKS.still:
+            yield part, velocity
 
 
 def check_length(equations: TaskEquations, base: Array, horizon: float) -> None:
@@ -337,7 +333,7 @@ def check_speed(equations: TaskEquations, rate_limits: Array, begin: float, end:
     """
     times = np.linspace(begin, end, CHECKS.track_samples)[1:-1]
     values = np.array(equations.target_function().map(len(times))(times[None, :]))
-    for part, targets in _parts(equations, values):
+    for part, targets in equations.by_task(values):
         chain = [joint for joint in part.tip.robot.path_to(part.tip.robot.tip_link) if joint.moves]
         task, coupled = part.task, any(joint.mimic is not None for joint in chain)
         if part.tip.base_size or part.reference or task.axes != "world" or coupled or task.start_gap > CHECKS.closed:
@@ -374,11 +370,8 @@ def _task_speeds(task: TipTask, targets: Array) -> tuple[Array, Array]:
         angular = targets[-3:] if task.tilts else targets[-3:][angular_rows]
         linear = targets[3:6][task.linear] if task.position is not None else targets[:0]
     else:
-        by_row = {row: targets[i] for i, row in enumerate(task.chosen)}
-        linear, angular = (
-            np.array([by_row[row] for row in by_row if (row in ANGULAR) == is_angular]).reshape(-1, targets.shape[1])
-            for is_angular in (False, True)
-        )
+        turning = np.isin(task.chosen, ANGULAR)
+        linear, angular = targets[~turning], targets[turning]
     return np.linalg.norm(linear, axis=0), np.linalg.norm(angular, axis=0)
 
 
@@ -404,41 +397,23 @@ def _shoulder_and_reach(machine: Machine, base: Array) -> tuple[Array, float]:
 
 
 def _rate_rows(task: TipTask) -> list[int]:
-    """Return the indices of the velocities among the target values of a pose task."""
-    tracks = [(task.position, [3, 4, 5], 6), (task.orientation, [9, 10, 11], 12), (task.direction, [3, 4, 5], 6)]
-    rows, at = [], 0
-    for track, entries, size in tracks:
-        if track is not None:
-            rows += [at + row for row in entries]
-            at += size
-    return rows
-
-
-def _integral(values: Array, step: float) -> Array:
-    """Integrate k functions from equidistant samples (k, samples), odd in number, by Simpson's rule. Shape (k,)."""
-    weights = np.ones(CHECKS.closure_samples)
-    weights[1:-1:2], weights[2:-1:2] = 4, 2
-    return np.asarray(values @ weights * step / 3)
+    """Return the indices of the velocities and angular velocities among the target values of a pose task."""
+    return [row for _, rates in target_rows(task).values() for row in range(rates.start, rates.stop)]
 
 
 def _rotation_angle(velocity: Array, step: float) -> float:
-    """Return the angle, rad, of the rotation that results from a sampled angular velocity (3, samples) in world."""
-    rotation = np.eye(3)
-    # fourth-order Magnus expansion over two steps at a time
-    for k in range(0, CHECKS.closure_samples - 1, 2):
-        first, middle, last = velocity[:, k], velocity[:, k + 1], velocity[:, k + 2]
-        width = 2 * step
-        vector = width / 6 * (first + 4 * middle + last) + width**2 / 12 * np.cross(last, first)
-        angle = float(np.linalg.norm(vector))
-        if angle > 0:
-            cross = np.array(ca.DM(ca.skew(ca.DM(vector / angle))))
-            rotation = (np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross) @ rotation
-    axial = np.array([rotation[i, j] - rotation[j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
-    return float(np.arctan2(np.linalg.norm(axial) / 2, (np.trace(rotation) - 1) / 2))
+    """Return the angle, rad, of the rotation that results from a sampled angular velocity (3, samples) in world.
+
+    A fourth-order Magnus expansion integrates two steps at a time.
+    """
+    first, middle, last = velocity[:, :-2:2], velocity[:, 1:-1:2], velocity[:, 2::2]
+    vectors = step / 3 * (first + 4 * middle + last) + step**2 / 3 * np.cross(last, first, axis=0)
+    turns = scipy.spatial.transform.Rotation.from_rotvec(vectors.T)
+    return float(reduce(lambda before, turn: turn * before, turns).magnitude())
 
 
 def rates_at_rest(equations: TaskEquations, base: Any, joints: Array, rows: NDArray[np.bool_] | None = None) -> Array:
-    """Return the joint velocities (n,) to prescribe where a motion begins or ends at rest, nan where left free.
+    """Return the joint velocities (n,) to prescribe at an end at rest: 0, or nan for as many joints as tasks fix there.
 
     A tip whose velocity or acceleration is prescribed comes to rest by itself. As many joints as the tasks have such
     rows then follow from the others, and prescribing their rest too would be redundant. The joints that move the tip

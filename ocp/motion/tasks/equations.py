@@ -160,7 +160,7 @@ class TaskEquations:
     def residual(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
         """Return the residual J u - b of the task equation at joint rates u. Shape (size, 1)."""
         rows = []
-        for part, target in self._with_targets(targets):
+        for part, target in self.by_task(targets):
             twist = relative_twist(part, base, joints, part.tip.tip_twist(base, joints, rates), rates=rates)
             if part.task.velocity is not None:
                 rows.append(task_rows(part, base, joints, twist) - target)
@@ -249,7 +249,7 @@ class TaskEquations:
     def error(self, base: Any, joints: Any, targets: Any) -> Any:
         """Return the pose errors (target minus pose) of all tasks, m and rad; 0 for velocity tasks. Shape (size, 1)."""
         rows = []
-        for part, target in self._with_targets(targets):
+        for part, target in self.by_task(targets):
             if part.task.velocity is not None:
                 rows.append(ca.DM(part.task.size, 1))
             else:
@@ -257,20 +257,20 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def gap(self, base: Any, joints: Any, rates: Any, targets: Any) -> Any:
-        """Return pose minus target for pose tasks, and the velocity residuals for velocity tasks. Shape (size, 1)."""
+        """Return pose minus target for pose tasks, and velocity residual for velocity tasks. Shape (size, 1)."""
         error, residual = self.error(base, joints, targets), self.residual(base, joints, rates, targets)
         return ca.vertcat(*((-error if is_pose else residual)[i] for i, is_pose in enumerate(self.pose_rows)))
 
     @on_scalars
     def pose_residual(self, base: Any, joints: Any, targets: Any) -> Any:
-        """Return a column of pose errors that, unlike `error`, does not vanish at a rotation error of half a turn.
+        """Return a column of pose errors (m, near zero rad) that does not vanish at a rotation error of half a turn.
 
         In m, and chords of the unit circle (2 sin(angle / 2), near zero the angle in rad). If all rotation is
         prescribed, these are the differences of the frame axes over sqrt 2, otherwise the rows of the half-angle
         vector. Velocity tasks have no entries.
         """
         rows: list[Any] = [ca.DM(0, 1)]
-        for part, target in self._with_targets(targets):
+        for part, target in self.by_task(targets):
             task = part.task
             if not task.is_pose:
                 continue
@@ -298,9 +298,9 @@ class TaskEquations:
         return ca.densify(ca.vertcat(*rows))
 
     def misses(self, base: Any, joints: Any, targets: Any) -> tuple[float, float]:
-        """Return the largest position error, m, and orientation error, rad, of the tips at numeric arguments."""
+        """Return the largest position error, m, and orientation error, rad, of all tips in a numeric configuration."""
         distance = angle = 0.0
-        for part, target in self._with_targets(ca.DM(targets)):
+        for part, target in self.by_task(ca.DM(targets)):
             task = part.task
             if not task.is_pose:
                 continue
@@ -319,7 +319,7 @@ class TaskEquations:
     def cone_cosines(self, base: Any, joints: Any, targets: Any) -> Any:
         """Return the cosine of the angle between tool axis and cone axis for each task with a cone. Shape (k, 1)."""
         rows: list[Any] = [ca.DM(0, 1)]
-        for part, target in self._with_targets(targets):
+        for part, target in self.by_task(targets):
             if part.task.within is not None:
                 rows.append(self._cosine(part, base, joints, target))
         return ca.densify(ca.vertcat(*rows))
@@ -337,7 +337,7 @@ class TaskEquations:
         return ca.dot(goal, ca.mtimes(part.tip.tip_pose(base, joints).rotation, ca.DM(part.task.tool_axis)))
 
     def reference_error(self, base: Any, joints: Any, at_base: Array, at_joints: Array) -> Any:
-        """Return the differences between tip poses of velocity tasks and the poses in a reference configuration.
+        """Return the differences of the tip poses of velocity tasks between a configuration and a reference one.
 
         For a start configuration that is free except for the pose of the tip. Shape (rows of all velocity tasks, 1).
         """
@@ -352,8 +352,8 @@ class TaskEquations:
                 rows.append(pose_error_rows(bound, base, joints, targets))
         return ca.vertcat(*rows)
 
-    def _with_targets(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
-        """Yield pairs of a task and its own part of the stacked targets of all tasks."""
+    def by_task(self, targets: Any) -> Iterator[tuple[BoundTask, Any]]:
+        """Yield each task together with the task's own rows of the stacked targets of all tasks."""
         at = 0
         for part in self.bound:
             size = target_size(part.task)
@@ -387,7 +387,7 @@ class TaskEquations:
 
     @cached_property
     def function(self) -> Any:
-        """CasADi Function of the matrix, right-hand side and pose errors of the task equations.
+        """CasADi Function of configuration and targets: task matrix J, right-hand side b and pose errors.
 
         (base, joints, targets) -> (J, b, pose error, pose residual).
         """
@@ -426,7 +426,7 @@ class TaskEquations:
         return on_symbols(build)
 
     def cyclic_rows(self, base: Array, joints: Array) -> Array:
-        """Return the combinations of task equations whose integral over a cyclic motion vanishes. Shape (size, k).
+        """Return the combinations of task equations whose integral vanishes if the joints return. Shape (size, k).
 
         If the joints return to their start, part of the closure conditions follows from the task: all of its rows on a
         fixed base; on a floating base the combinations of rows that are independent of the base pose while the centre
@@ -457,7 +457,7 @@ def _position_of(task: TipTask, track: Any, time: Any, name: str) -> Any:
 
 
 def bind(machine: Machine, tasks: TipTask | Sequence[TipTask]) -> TaskEquations:
-    """Return the equations of one or several tip tasks of a machine.
+    """Return the stacked equations of one or several tip tasks in the joint rates of a machine.
 
     If the robot has no tip, the machine of the equations has the frame of the first task as its tip.
 

@@ -35,7 +35,7 @@ class Start:
 
     @classmethod
     def of(cls, value: Any, machine: Machine) -> tuple[Start, Any, Any]:
-        """Convert a value to a Start; return the start, its joint positions (n,) or None if free, and its base.
+        """Return a value as (Start, joint positions of shape (n,) or None if free, base configuration), all checked.
 
         Args:
             value: A start, joint positions, or None.
@@ -50,7 +50,7 @@ class Start:
 
     @classmethod
     def of_known(cls, value: Any, machine: Machine) -> tuple[Start, Array, Array]:
-        """Convert a value to a Start that has joint positions; return this start, the positions (n,) and the base.
+        """Return a value as (Start, joint positions of shape (n,), base configuration); no position may be free.
 
         Args:
             value: A start with joint positions, or joint positions.
@@ -278,5 +278,5 @@ class Scene:
 
     @property
     def collision_options(self) -> dict[str, Any]:
-        """Keyword arguments of `models.CollisionScene` other than machine and limits."""
+        """Keyword arguments that describe the scene for `models.CollisionScene`, besides the machine and its limits."""
         return {name: value for name, value in vars(self).items() if name != "wrenches"}

@@ -46,7 +46,7 @@ class InFoot:
             raise ProblemError(words, name="margin", value=self.margin, limit=0.0)
 
     def check(self, machine: Standing) -> None:
-        """Raise ProblemError if the support polygon is too small for the margin."""
+        """Raise ProblemError if the support polygon of a machine is too small for the margin of the rule."""
         directions, support = machine.moving_directions, machine.support
         half_lengths = np.ptp(support.vertices @ directions.T, axis=0) / 2
         largest = support.inner_radius if len(directions) == 2 else float(half_lengths.min(initial=np.inf))
@@ -70,7 +70,7 @@ class IndexAtLeast:
             raise ProblemError(words, name="value", value=self.value, limit=1.0)
 
     def region(self, machine: Standing) -> tuple[Array, Array]:
-        """Return the corners of the rectangle in which the zero moment point satisfies the rule. Shape (2,) each, m."""
+        """Return two opposite corners of the rectangle of sufficient stability index. Shape (2,) each, m."""
         radius = machine.half_widths * np.sqrt(1 - self.value)
         return machine.most_stable_point - radius, machine.most_stable_point + radius
 
@@ -131,7 +131,7 @@ ZmpRule: TypeAlias = InFoot | IndexAtLeast | Pinned | Following | Anywhere
 
 
 def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
-    """Return the support edges, moved inwards by a margin, that a zero moment point rule needs as constraints.
+    """Return the support edges that must become constraints for a zero moment point rule; a margin moves them inwards.
 
     Returns:
         Inward normals n and offsets o: n . point >= o. Shapes (k, 2) and (k,).
@@ -151,7 +151,7 @@ def foot_edges(machine: Standing, zmp: ZmpRule) -> tuple[Array, Array]:
 
 
 def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> Any:
-    """Return the distances of the zero moment point from support edges, if the motion affects them. Shape (k, 1), m.
+    """Return the distances of the zero moment point from the support edges, if motions change them. Shape (k, 1), m.
 
     Args:
         machine, zmp: The machine and the rule for its zero moment point.
@@ -178,7 +178,7 @@ def foot_rows(machine: Standing, zmp: ZmpRule, point: Any, external: bool) -> An
 
 
 def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool) -> list[int]:
-    """Return the axes (0: x, 1: y) along which a motion can move the zero moment point out of the region of a rule.
+    """Return along which axes (0: x, 1: y) motions move the zero moment point out of a rule's rectangle.
 
     Args:
         machine, zmp, point, external: As for foot_rows.
@@ -200,7 +200,7 @@ def index_rows(machine: Standing, zmp: IndexAtLeast, point: Any, external: bool)
 
 
 def check_rule(machine: Standing, horizon: float, zmp: ZmpRule) -> None:
-    """Raise ProblemError if a rule for the zero moment point has the wrong type or is infeasible inside the support."""
+    """Raise ProblemError if a zero moment point rule has the wrong type or demands a point outside the support."""
     if not isinstance(zmp, ZmpRule):
         words = f"zmp must be InFoot, IndexAtLeast, Pinned, Following or Anywhere, not {zmp!r}"
         raise ProblemError(words, name="zmp", value=zmp, limit=get_args(ZmpRule))
@@ -278,10 +278,8 @@ class Limits:
 
     def __post_init__(self) -> None:
         for kind in LIMITED:
-            value = getattr(self, kind)
-            if value is not None and not (_numbers(value) > 0).all():
-                words = f"limits: {kind} must be positive, one number or one for each joint, not {value!r}"
-                raise ProblemError(words, name=kind, value=value, limit=0.0)
+            if getattr(self, kind) is not None:
+                require.array(f"limits: {kind}", getattr(self, kind), ("joints",), entries="numbers", sign="positive")
         if self.vertical_force is not None:
             require.positive("limits: vertical_force", self.vertical_force)
         require.flag("limits: joints", self.joints)
@@ -298,13 +296,8 @@ class Limits:
 
     def of_joints(self, chosen: NDArray[np.bool_]) -> Limits:
         """Return the limits of a subset of a machine's joints, given as a mask (n,)."""
-        values = {kind: getattr(self, kind) for kind in LIMITED}
-        own: dict[str, Any] = {
-            kind: _numbers(value)[chosen]
-            for kind, value in values.items()
-            if value is not None and _numbers(value).size > 1
-        }
-        return replace(self, **own)
+        own: dict[str, Any] = {kind: floats(getattr(self, kind)) for kind in LIMITED if np.ndim(getattr(self, kind))}
+        return replace(self, **{kind: values[chosen] for kind, values in own.items()})
 
     def bounds(self, machine: Machine, used: Collection[str] = ()) -> JointBounds:
         """Return the joint limits of a machine; limits that the robot description lacks are infinite.
@@ -325,11 +318,7 @@ class Limits:
         for kind in values:
             value = getattr(self, kind)
             if value is not None:
-                array = _numbers(value)
-                if array.size not in (1, n):
-                    words = f"limits: {kind} must be positive, one number or {n}, not {value!r}"
-                    raise ProblemError(words, name=kind, value=value, limit=n)
-                values[kind] = np.array(np.broadcast_to(array, n))
+                values[kind] = require.broadcast(f"limits: {kind}", value, n, "joints", entries="numbers")
             elif kind in used and (names := unknown_limits(robot, kind)):
                 words = f"the robot gives {', '.join(names)} a {kind} limit of 0, which is read as unknown: they are "
                 words += f"unlimited; set Limits({kind}=...), inf for no limit"
@@ -342,12 +331,3 @@ def unknown_limits(robot: Robot, kind: str) -> list[str]:
     """Return the joints whose "velocity" or "torque" limit in the robot description is 0, which means unknown."""
     attribute = {"velocity": "velocity", "torque": "effort"}.get(kind)
     return [joint.name for joint in robot.moving_joints if attribute and getattr(joint, attribute) == 0]
-
-
-def _numbers(value: Any) -> Array:
-    """Return a limit as a flat array of numbers, or as a single 0, which is no valid limit, if it is not numeric."""
-    try:
-        numbers = floats(value).ravel()
-        return numbers if numbers.size else np.zeros(1)
-    except NOT_NUMBERS:
-        return np.zeros(1)

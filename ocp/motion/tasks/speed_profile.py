@@ -16,8 +16,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.checks import NOT_NUMBERS, floats, short_repr
-from ocp.errors import ProblemError, require
+from models.checks import Array, short_repr
+from ocp.errors import ProblemError, require, values_within
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = [
@@ -25,7 +25,6 @@ __all__ = [
     "profile_through", "ramp_distance", "ramp_phases", "ramp_time", "reachable_speed", "rest_profile", "segment_index",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Phases = tuple[tuple[float, float], ...]
 """Durations (s) and jerks (m/s^3) of consecutive phases of constant jerk."""
 
@@ -63,25 +62,6 @@ def segment_index(bounds: ArrayLike, places: ArrayLike, side: Literal["left", "r
     return np.asarray(np.clip(np.searchsorted(bounds, places, side=side) - 1, 0, len(np.asarray(bounds)) - 2))
 
 
-def _checked_values(value: ArrayLike, upper: float, name: str, problem: str) -> Array:
-    """Return numbers clipped to [0, upper]; raise ProblemError if a number is outside by more than rounding."""
-    try:
-        # a contiguous array occupies its memory; a broadcast view could claim any size
-        plain = isinstance(value, np.ndarray) and value.dtype == float and value.flags.c_contiguous
-        array = np.atleast_1d(np.asarray(value, dtype=float) if plain else floats(value))
-    except NOT_NUMBERS as error:
-        raise ProblemError(f"{name} {value!r} is not numeric", name=name, value=value) from error
-    if array.ndim != 1:
-        message = f"{name} has shape {array.shape}; give one number or a row"
-        raise ProblemError(message, name=name, value=array.shape)
-    slack = 1e-9 * upper
-    inside = (array >= -slack) & (array <= upper + slack)
-    if not inside.all():
-        outside = array[~inside][:3].tolist()
-        raise ProblemError(f"{name} {outside} {problem}", name=name, value=outside[0], limit=(0.0, upper))
-    return np.asarray(np.clip(array, 0.0, upper))
-
-
 @dataclass(frozen=True, eq=False)
 class SpeedProfile:
     """Motion along a path as consecutive segments of constant jerk.
@@ -103,18 +83,9 @@ class SpeedProfile:
 
     def __post_init__(self) -> None:
         for name in ("t", "distance", "speed", "acceleration", "jerk"):
-            try:
-                row = floats(getattr(self, name))
-            except NOT_NUMBERS as error:
-                message = f"profile: {name} is not numeric: {getattr(self, name)!r}"
-                raise ProblemError(message, name=name, value=getattr(self, name)) from error
+            count = "times" if name == "t" else len(self.t) - (name == "jerk")
+            row = require.array(f"profile: {name}", getattr(self, name), (count,), least=2)
             object.__setattr__(self, name, row)
-            shape = (len(self.t) - (name == "jerk"),) if self.t.ndim == 1 and len(self.t) > 1 else None
-            if row.shape != shape or not np.isfinite(row).all():
-                message = (
-                    f"profile: {name} of shape {row.shape} must be finite, {shape or 'two times at least'} expected"
-                )
-                raise ProblemError(message, name=name, value=row, limit=shape)
             if name in ("t", "distance") and (np.diff(row) < 0).any():
                 raise ProblemError(f"profile: {name} must not decrease", name=name, value=row)
 
@@ -129,7 +100,8 @@ class SpeedProfile:
         Raises:
             ProblemError: A time is nan, or outside by more than rounding.
         """
-        t = _checked_values(time, self.duration, "time", f"s is outside the schedule, 0 to {self.duration:g} s")
+        words = f"s is outside the schedule, 0 to {self.duration:g} s"
+        t = np.atleast_1d(values_within(time, self.duration, "time", words))
         segment = segment_index(self.t, t)
         motion = self._motion(segment, t - self.t[segment])
         # integration reaches the known end only to rounding
@@ -144,7 +116,8 @@ class SpeedProfile:
             ProblemError: A distance is nan, or off the path by more than rounding.
         """
         length = float(self.distance[-1])
-        s = _checked_values(distance, length, "distance", f"m is off the path, which is {length:g} m long")
+        words = f"m is off the path, which is {length:g} m long"
+        s = np.atleast_1d(values_within(distance, length, "distance", words))
         segment = segment_index(self.distance, s, side="left")
         inside = self._time_inside(segment, s - self.distance[segment])
         # near rest the time has the cube root of the rounding error, but the end is known
@@ -280,14 +253,14 @@ def ramp_time(change: float, acceleration: float, jerk: float) -> float:
 
 
 def ramp_distance(first: float, last: float, acceleration: float, jerk: float) -> float:
-    """Return the distance (m) covered while the speed changes in the shortest time; raise the errors of `ramp_time`."""
+    """Return the distance (m) covered while the speed changes from `first` to `last` (m/s) in the shortest time."""
     for name, value in (("first", first), ("last", last)):
         require.nonnegative(f"ramp: {name}", value)
     return (first + last) / 2 * ramp_time(abs(last - first), acceleration, jerk)
 
 
 def reachable_speed(speed: float, distance: float, acceleration: float, jerk: float) -> float:
-    """Return the greatest speed (m/s) that can be reached within a distance (m), with zero acceleration at both ends.
+    """Return the greatest speed (m/s) reached from a given speed over a distance (m), acceleration zero at both ends.
 
     This is the inverse of ramp_distance; the same holds for slowing down from that speed.
     """

@@ -14,7 +14,7 @@ from models.checks import Array
 from models.spatial import quaternion_from_rotation
 from ocp.curves import lagrange
 from ocp.motion.tasks.equations import TaskEquations, bind
-from ocp.motion.tasks.tip_task import TipTask, target_size
+from ocp.motion.tasks.tip_task import TipTask, target_rows, target_size
 from ocp.problem.values import Sampler
 from ocp.tolerances import LIMIT_SHARE, ROUNDING_SHARE
 
@@ -82,11 +82,10 @@ def targets_along(
     """
     equations = bind(machine, tasks)
     count = len(times)
-    target_values = np.array(equations.target_function().map(count)(times[None, :])).reshape(-1, count).T
-    targets, at = [], 0
-    for bound in equations.bound:
-        task, values = bound.task, target_values[:, at : at + target_size(bound.task)]
-        at += target_size(task)
+    target_values = np.array(equations.target_function().map(count)(times[None, :])).reshape(-1, count)
+    targets = []
+    for bound, rows_of_task in equations.by_task(target_values):
+        task, values = bound.task, rows_of_task.T
         if not task.is_pose:
             continue
         position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
@@ -145,7 +144,7 @@ def required_nodes(equations: TaskEquations, breaks: Array) -> Array:
 
 
 def resolving_times(equations: TaskEquations, times: Array) -> Array:
-    """Return given times and further ones, between which the target poses are nearly linear: `NODES.chord_error`.
+    """Return the given times and additional ones, so that target poses are nearly linear in time between neighbours.
 
     Args:
         equations: Equations of the tasks.
@@ -153,7 +152,7 @@ def resolving_times(equations: TaskEquations, times: Array) -> Array:
     """
     time = ca.MX.sym("time")
     sampler = Sampler([time], [equations.target_function()(time)])
-    poses = [row for pose, _ in _target_rows(equations) for row in range(pose.start, pose.stop)]
+    poses, _ = _target_rows(equations)
     shortest = ROUNDING_SHARE * (times[-1] - times[0])
     while poses:
         middle = (times[:-1] + times[1:]) / 2
@@ -166,23 +165,24 @@ def resolving_times(equations: TaskEquations, times: Array) -> Array:
     return times
 
 
-def _target_rows(equations: TaskEquations) -> list[tuple[slice, slice]]:
-    """Return the rows of each position, orientation and direction among the target values, and those of its rate."""
-    rows, at = list[tuple[slice, slice]](), 0
-    for task in (bound.task for bound in equations.bound):
-        if task.velocity is not None:
-            at += task.size
-        for track, size in ((task.position, 3), (task.orientation, 9), (task.direction, 3)):
-            if track is not None:
-                rows.append((slice(at, at + size), slice(at + size, at + size + 3)))
-                at += size + 3
-    return rows
+def _target_rows(equations: TaskEquations) -> tuple[list[int], list[slice]]:
+    """Return the indices of the pose values among the stacked targets of tasks, and the rows of each pose's velocities.
+
+    The velocity of an orientation or of a direction is an angular velocity.
+    """
+    poses, rates, at = list[int](), list[slice](), 0
+    for task in (part.task for part in equations.bound):
+        for pose, rate in target_rows(task).values():
+            poses += range(at + pose.start, at + pose.stop)
+            rates.append(slice(at + rate.start, at + rate.stop))
+        at += target_size(task)
+    return poses, rates
 
 
 def _largest_errors(equations: TaskEquations, values: Array) -> Array:
     """Return the permitted interpolation error of each target value, from samples (M, size). Shape (size,)."""
     largest = np.full(values.shape[1], NODES.pose_error)
-    for _, rates in _target_rows(equations):
+    for rates in _target_rows(equations)[1]:
         largest[rates] = NODES.rate_error * np.linalg.norm(values[:, rates], axis=1).max()
     return largest
 
@@ -204,9 +204,5 @@ def tip_poses(machine: Machine, bases: Array, joints: Array) -> Array:
     """
     if machine.robot.tip is None:
         return np.full((len(joints), 7), np.nan)
-    b, q = ca.SX.sym("b", machine.base_size), ca.SX.sym("q", machine.joint_size)
-    pose = machine.tip_pose(b, q)
-    function = ca.Function("tip", [b, q], [pose.position, pose.rotation])
-    position, rotation = function.map(len(joints))(bases.T, joints.T)
-    turns = np.array(rotation).reshape(3, len(joints), 3).transpose(1, 0, 2)
-    return np.column_stack([np.array(position).T, quaternion_from_rotation(turns)])
+    rotations, positions = _frames(machine, bases, joints)
+    return np.column_stack([positions, quaternion_from_rotation(rotations)])

@@ -20,7 +20,8 @@ from models.checks import NOT_NUMBERS, Array, ArrayInput, floats, short_repr
 from models.robot.kinematics import checked_rows
 from models.spatial import Frame, expression, on_scalars, rotation_from_quaternion, skew
 from ocp.errors import ProblemError, require
-from ocp.motion.tasks.tracks import Track, path_tracks, reparametrize, rest_to_rest_speed
+from ocp.motion.tasks.speed_profile import rest_profile
+from ocp.motion.tasks.tracks import Track, checked_speed, path_tracks, ramp_limits, reparametrize
 from ocp.tolerances import ORIENTATION_TOLERANCE_RAD, POSITION_TOLERANCE_M
 
 __all__ = ["Axes", "Roll", "TipTask", "Velocity", "retime_task"]
@@ -180,7 +181,8 @@ class TipTask:
         elif steady:
             _refuse_ramps("a steady motion has no ramps", acceleration=acceleration, jerk=jerk)
         else:
-            speed = rest_to_rest_speed(path, speed, acceleration, jerk)
+            require.instance("path", path, SmoothPath)
+            speed = rest_profile(path.length, checked_speed(speed), *ramp_limits(acceleration, jerk))
         tracks = path_tracks(path, speed)
         attributes: dict[str, Any] = {"position": tracks.position, "duration": tracks.duration, "breaks": tracks.breaks}
         if path.path.oriented and not {"direction", "orientation"} & set(others):
@@ -230,7 +232,7 @@ class TipTask:
 
     @property
     def along_reference(self) -> bool:
-        """Whether the components that the task prescribes are along the axes of the reference frame of the pose."""
+        """Whether the task prescribes components along the axes of the frame in which its target pose is given."""
         return self.axes == "reference" or (self.axes == "world" and self.relative_to is None)
 
     @property
@@ -284,34 +286,41 @@ def retime_task(task: TipTask, clock: Callable[[Any], Any]) -> TipTask:
 
 
 class BoundTask(NamedTuple):
-    """A task, the machine whose tip is the task's frame, and the machine whose tip is the reference (None: world)."""
+    """A task, the machine whose tip is the task's frame, and that whose tip is the reference frame (None: world)."""
 
     task: TipTask
     tip: Machine
     reference: Machine | None
 
 
+def target_rows(task: TipTask) -> dict[str, tuple[slice, slice]]:
+    """Return, by name, which rows of a pose task's target column hold each target and which hold its velocity.
+
+    By name, as far as given: "position" (3 rows), "orientation" (9 rows, a rotation matrix by columns) and "direction"
+    (3 rows). A velocity or an angular velocity has 3 rows.
+    """
+    rows, at = dict[str, tuple[slice, slice]](), 0
+    for name, size in (("position", 3), ("orientation", 9), ("direction", 3)):
+        if getattr(task, name) is not None:
+            rows[name] = slice(at, at + size), slice(at + size, at + size + 3)
+            at += size + 3
+    return rows
+
+
 def target_size(task: TipTask) -> int:
     """Return the number of target values of a task in the stacked column of the targets of all tasks."""
-    if task.velocity is not None:
-        return task.size
-    sizes = [(task.position, 6), (task.orientation, 12), (task.direction, 6)]
-    return sum(size for track, size in sizes if track is not None)
+    return task.size if task.velocity is not None else max(rates.stop for _, rates in target_rows(task).values())
 
 
 def split_targets(task: TipTask, targets: Any) -> tuple[Any, Any]:
-    """Split targets of a pose task into (position, velocity) and (rotation or direction, angular velocity).
+    """Split the target column of a pose task: (position, velocity), (rotation or direction, angular velocity).
 
     Either part is None if the task does not prescribe it.
     """
-    translation, at = None, 0
-    if task.position is not None:
-        translation, at = (targets[0:3], targets[3:6]), 6
-    if task.orientation is not None:
-        return translation, (ca.reshape(targets[at : at + 9], 3, 3), targets[at + 9 : at + 12])
-    if task.direction is not None:
-        return translation, (targets[at : at + 3], targets[at + 3 : at + 6])
-    return translation, None
+    parts = {name: (targets[values], targets[rates]) for name, (values, rates) in target_rows(task).items()}
+    if "orientation" in parts:
+        parts["orientation"] = ca.reshape(parts["orientation"][0], 3, 3), parts["orientation"][1]
+    return parts.get("position"), parts.get("orientation", parts.get("direction"))
 
 
 def reference_pose(part: BoundTask, base: Any, joints: Any) -> Frame | None:
@@ -340,7 +349,7 @@ def relative_twist(part: BoundTask, base: Any, joints: Any, twist: Any, *, rates
 
 
 def task_rows(part: BoundTask, base: Any, joints: Any, twist: Any) -> Any:
-    """Return the components that a task prescribes, selected from a world-axes twist or a matrix of twist columns."""
+    """Return the components that a task prescribes of a twist in world axes, or of each column of a twist matrix."""
     task = part.task
     angular, linear = twist[0:3, :], twist[3:6, :]
     rotation = None
@@ -368,7 +377,7 @@ def _tool_normals(task: TipTask) -> Any:
 
 
 def pose_error(part: BoundTask, base: Any, joints: Any, targets: Any) -> Any:
-    """Return the rotation and position error of a pose, in world axes; the rotation as axis times sine of the angle."""
+    """Return the rotation error (axis times sine of angle) and position error of a tip in world axes. Shape (6, 1)."""
     position_target, goal = split_targets(part.task, targets)
     pose, reference = part.tip.tip_pose(base, joints), reference_pose(part, base, joints)
     angular, linear = ca.DM(3, 1), ca.DM(3, 1)
@@ -410,7 +419,7 @@ def pose_error_rows(part: BoundTask, base: Any, joints: Any, targets: Any) -> An
 
 
 def is_holonomic(part: BoundTask) -> Array:
-    """Return which velocity components of a task have a path-independent integral, a pose coordinate. Shape (size,)."""
+    """Return which velocity components of a task are rates of pose coordinates and so integrable. Shape (size,)."""
     task = part.task
     if task.is_pose:
         return np.ones(task.size, dtype=bool)
@@ -453,7 +462,7 @@ def angular_velocity(rotation: Any, rate: Any) -> Any:
 def closing_combinations(
     machine: FreeFloating, bound_tasks: Sequence[BoundTask], selected: NDArray[np.bool_], *, base: Array, joints: Array
 ) -> Array:
-    """Return the combinations of task equations that base motion with a fixed centre of mass does not affect.
+    """Return the combinations of task equations that no base motion with a fixed centre of mass affects.
 
     Raises:
         ProblemError: The momentum moves the centre of mass, and the joints cannot return.
@@ -481,7 +490,7 @@ def closing_combinations(
 
 
 def _combinations(jacobian: Array, count: int) -> Array:
-    """Return orthonormal combinations (count, k) of a matrix's first `count` rows that the other rows span."""
+    """Return orthonormal combinations (count, k) of a matrix's first `count` rows in the span of its other rows."""
     left, values, _ = np.linalg.svd(jacobian)
     rank = int(np.sum(values > 1e-9 * max(values[0], 1.0)))
     combinations, shares, _ = np.linalg.svd(left[:count, rank:], full_matrices=False)

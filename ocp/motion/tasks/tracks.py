@@ -20,11 +20,11 @@ from models.paths.functions import exponential, path_function, turn_function
 from models.paths.smooth_path import SmoothPath
 from models.spatial import expression, rotation_from_quaternion
 from ocp.errors import ProblemError, require
-from ocp.motion.tasks.speed_profile import SpeedProfile, rest_profile
+from ocp.motion.tasks.speed_profile import SpeedProfile
 
 __all__ = [
-    "PathTracks", "PoseLine", "Track", "TrackWithRate", "on_symbols", "path_tracks", "pose_line", "ramp_limits",
-    "reparametrize", "rest_to_rest_speed", "track_expression",
+    "PathTracks", "PoseLine", "Track", "TrackWithRate", "checked_speed", "on_symbols", "path_tracks", "pose_line",
+    "ramp_limits", "reparametrize", "track_expression",
 ]  # fmt: skip
 
 Track: TypeAlias = Any
@@ -123,7 +123,7 @@ class PathTracks(NamedTuple):
     breaks: Array
 
     def axis(self, tool_axis: Array) -> Callable[[Any], Any]:
-        """Return the function of time for the direction of an axis of the tool frame, shape (3,)."""
+        """Return the direction (3,) of an axis of the tool frame as a function of time with a rate."""
         rotation, angular_velocity = self.orientation, self.orientation.rate  # type: ignore[attr-defined]
 
         def direction(time: Any) -> Any:
@@ -140,21 +140,8 @@ def ramp_limits(acceleration: float | None, jerk: float | None) -> tuple[float, 
     return acceleration, acceleration / RISE_TIME_S if jerk is None else jerk
 
 
-def rest_to_rest_speed(path: SmoothPath, speed: Any, acceleration: Any = None, jerk: Any = None) -> SpeedProfile:
-    """Return the speed of a tool that starts and ends at rest and moves at the given speed, m/s, in between.
-
-    Raises the errors of `TipTask.along`.
-    """
-    _checked_path(path)
-    return rest_profile(path.length, _checked_speed(speed), *ramp_limits(acceleration, jerk))
-
-
-def _checked_path(path: Any) -> None:
-    if not isinstance(path, SmoothPath):
-        raise ProblemError(f"path must be a SmoothPath, as smooth makes it, not {path!r}", name="path", value=path)
-
-
-def _checked_speed(speed: Any) -> float:
+def checked_speed(speed: Any) -> float:
+    """Return a constant speed along a path, m/s, as a float; raise ProblemError if it is not positive and finite."""
     if not 0 < real(speed) < np.inf:
         words = f"speed must be a positive number of m/s, or a Schedule of the path, not {speed!r}"
         raise ProblemError(words, name="speed", value=speed, limit=0.0)
@@ -174,7 +161,7 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
     Raises:
         ProblemError: `path` is not a path, the speed is not positive, or the profile is of another path.
     """
-    _checked_path(path)
+    require.instance("path", path, SmoothPath)
     position_of, orientation_of = path_function(path), turn_function(path)
     pace: Callable[[Any], tuple[Any, Any]]
     profile = getattr(speed, "profile", speed)
@@ -191,7 +178,7 @@ def path_tracks(path: SmoothPath, speed: Any) -> PathTracks:
             return distance, rate
 
     else:
-        constant = _checked_speed(speed)
+        constant = checked_speed(speed)
         duration, breaks = path.length / constant, path.bounds / constant
 
         def pace(time: Any) -> tuple[Any, Any]:
@@ -227,7 +214,7 @@ def reparametrize(track: Track, clock: Callable[[Any], Any]) -> Track:
 
 
 def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]:
-    """Check a numeric pose, and return its rotation (3, 3) and position (3,)."""
+    """Check a numeric pose (orientation, position), and return its rotation matrix (3, 3) and position (3,)."""
     try:
         orientation, position = (np.array(ca.DM(expression(part))) for part in pose)
     except NOT_NUMBERS as error:
@@ -235,17 +222,12 @@ def _pose(pose: tuple[ArrayInput, ArrayInput], name: str) -> tuple[Array, Array]
         raise ProblemError(words, name=name, value=str(pose)) from error
     if orientation.size == 4 and np.linalg.norm(orientation) > 0:
         orientation = np.array(rotation_from_quaternion(ca.DM(orientation.ravel())))
-    if orientation.shape != (3, 3) or position.size != 3 or not np.isfinite(position).all():
-        words = f"the {name} pose has the shapes {orientation.shape}, {position.shape}; finite (3, 3), (3,) expected"
-        raise ProblemError(words, name=name, value=(orientation.shape, position.shape), limit=((3, 3), (3,)))
-    if not (np.abs(orientation @ orientation.T - np.eye(3)).max() < 1e-6 and np.linalg.det(orientation) > 0):
-        words = f"the {name} pose has the orientation {orientation.tolist()}, which is no rotation"
-        raise ProblemError(words, name=name, value=orientation)
-    return orientation, position.ravel()
+    rotation = require.rotation(f"{name} pose: orientation", orientation)
+    return rotation, require.array(f"{name} pose: position", position.ravel(), (3,))
 
 
 def on_symbols(build: Callable[[Any], _Result]) -> _Result:
-    """Call `build` with SX symbols or, if interpolants or external functions reject SX, with MX symbols."""
+    """Return `build(SX)` with CasADi's SX symbols or, if interpolants or external functions reject SX, `build(MX)`."""
     try:
         return build(ca.SX)
     except (RuntimeError, NotImplementedError):

@@ -13,7 +13,7 @@ from models.checks import Array
 from models.machines.scara import ScaraPath
 from models.paths import gamma
 from models.paths.blends import BlendKind, polynomial
-from ocp.motion.builders.timing import Fastest, solve_minimum_time
+from ocp.motion.builders.timing import FastestMotion, solve_minimum_time
 from ocp.motion.schedule import LineLimits, Schedule, peak_acceleration, schedule
 from scripts.papers.blend.example import (
     ARM,
@@ -48,7 +48,7 @@ class Plan:
     path: SmoothPath
     joints: ScaraPath
     schedule: Schedule
-    fastest: Fastest
+    fastest: FastestMotion
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import pytest
 from models import Box, Rig, Tunnel, optimal_inverse, reference_rig, reference_tunnel, solve_table
 from models.cts.clearance import Avoidance, CollisionScene, Radii, clearances, collision_free_inverse
 from models.cts.rig import INCH, Branch
-from models.cts.table import all_joint_sets, reachable_rolls
+from models.cts.table import reachable_rolls
 from tests.bad_values import (
     FINITE,
     FLAG,
@@ -123,12 +123,6 @@ CASES = [
         reachable_rolls,
         {"rig": RIG, "target": TARGET},
         {"rig": INSTANCE, "target": array(5), "branch": BRANCH},
-    ),
-    Case(
-        "all_joint_sets",
-        all_joint_sets,
-        {"rig": RIG, "target": TARGET, "roll": 0.1},
-        {"rig": INSTANCE, "target": array(5), "roll": FINITE | NOTHING},
     ),
 ]
 

@@ -14,16 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from models import Box, Capsule, Link, ModelError, reference_rig
-from models.cts.clearance import (
-    CollisionScene,
-    LinkCapsule,
-    box_distance,
-    capsule_in_box,
-    capsule_to_box,
-    capsule_to_capsule,
-    clearances,
-    rig_capsules,
-)
+from models.cts.clearance import CollisionScene, clearances, rig_capsules
 from models.cts.rig import dh_frames
 from models.shapes.distance import soft_minimum
 from scripts.papers.cts.release import GRAVITY, Ejector, SlenderAir, Store, release, yaw_pitch
@@ -112,65 +103,40 @@ def test_impossible_targets_are_refused_by_name(make: Callable[[], Any], message
 # ---- distances -------------------------------------------------------------------------------------------------
 
 
-def random_capsule(rng: np.random.Generator) -> Capsule:
-    return Capsule(float(rng.uniform(0.01, 0.2)), *rng.normal(size=(2, 3)))
-
-
-def along(capsule: Capsule, count: int = 2001) -> Any:
-    s = np.linspace(0, 1, count)[:, None]
-    return capsule.start + s * (capsule.end - capsule.start)
-
-
 @few
 @given(seeds)
-def test_distance_of_capsules_is_that_of_their_points(seed: int) -> None:
+def test_clearances_are_the_distances_of_the_capsules_points(seed: int) -> None:
+    """Between the links and random obstacles, by dense samples of the segments; overlaps only have the same sign."""
     rng = np.random.default_rng(seed)
-    one, other = random_capsule(rng), random_capsule(rng)
-    if seed % 5 == 0:
-        other = Capsule(other.radius, other.start, other.start + 0.5 * (one.end - one.start))  # parallel
-    result = number(capsule_to_capsule(one, other)) + one.radius + other.radius
-    p, q = along(one, 400), along(other, 400)
-    sampled = np.linalg.norm(p[:, None] - q[None], axis=2).min()
-    assert result <= sampled + 1e-9
-    assert result >= sampled - 0.02
-
-
-@few
-@given(seeds)
-def test_distance_of_a_capsule_to_a_box_is_that_of_its_points(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+    rig, q = reference_rig(), rng.uniform(-1, 1, 6)
     turn = turns(rng.normal(size=(1, 4)))[0]
-    box, capsule = Box(rng.uniform(0.2, 2, 3), rng.normal(size=3), turn), random_capsule(rng)
-    result = number(capsule_to_box(capsule, box)) + capsule.radius
-    over = np.abs((along(capsule) - box.position) @ turn) - box.size / 2
-    sampled = (np.linalg.norm(np.maximum(over, 0), axis=1) + np.minimum(over.max(axis=1), 0)).min()
-    assert result == pytest.approx(sampled, abs=2e-3)
-    assert result <= sampled + 1e-7
-
-
-def test_distance_to_a_box_has_the_derivative_of_the_nearest_points() -> None:
-    rng = np.random.default_rng(3)
-    box, shift = Box((0.8, 0.6, 0.4)), ca.SX.sym("shift", 3)
-    for _ in range(20):
-        capsule = random_capsule(rng)
-        moved = capsule_to_box(
-            LinkCapsule(capsule.radius, ca.DM(capsule.start) + shift, ca.DM(capsule.end) + shift), box
-        )
-        value = ca.Function("d", [shift], [moved, ca.gradient(moved, shift)])
-        slope = np.array(value(np.zeros(3))[1]).ravel()
-        if number(value(np.zeros(3))[0]) < 0.02:
-            continue
-        step = 1e-5
-        numeric = [(number(value(step * e)[0]) - number(value(-step * e)[0])) / (2 * step) for e in np.eye(3)]
-        np.testing.assert_allclose(slope, numeric, atol=1e-3)
+    box = Box(rng.uniform(0.2, 2, 3), rng.normal(size=3), turn)
+    other = Capsule(float(rng.uniform(0.01, 0.2)), *rng.normal(size=(2, 3)))
+    gaps = clearances(rig, q, CollisionScene(solids=(box,), capsules=(other,)))
+    share = np.linspace(0, 1, 801)[:, None]
+    beside = other.start + share[::4] * (other.end - other.start)
+    for name, link in rig_capsules(rig, q).items():
+        start, end = (np.array(ca.DM(point)).ravel() for point in (link.start, link.end))
+        points = start + share * (end - start)
+        over = np.abs((points - box.position) @ turn) - box.size / 2
+        sampled = (np.linalg.norm(np.maximum(over, 0), axis=1) + np.minimum(over.max(axis=1), 0)).min()
+        result = number(gaps[name, "solid 0"]) + link.radius
+        assert result == pytest.approx(sampled, abs=2e-3) or max(result, sampled) < 1e-9
+        assert result <= sampled + 1e-7
+        sampled = np.linalg.norm(points[:, None] - beside[None], axis=2).min()
+        result = number(gaps[name, "capsule 0"]) + link.radius + other.radius
+        assert sampled - 0.02 <= result <= sampled + 1e-9
 
 
 def test_a_box_without_ends_has_walls_only() -> None:
-    walls = Box((np.inf, 2.0, 4.0))
-    capsule = Capsule(0.1, (-50, 0.3, 0), (50, 0, -1.5))
-    assert number(capsule_in_box(capsule, walls)) == pytest.approx(0.4)
-    assert number(box_distance((100, 3.0, 0), walls)) == pytest.approx(2.0)
-    assert number(box_distance((100, 0.0, 0), walls)) == pytest.approx(-1.0)
+    rig = reference_rig()
+    link = rig_capsules(rig, np.zeros(6))["sting"]
+    high, low = float(link.start[2]), float(link.end[2])
+    size = 2 * (max(abs(high), abs(low)) + link.radius + 0.4)
+    gaps = clearances(rig, np.zeros(6), CollisionScene(walls=Box((np.inf, np.inf, size))))
+    assert number(gaps["sting", "walls"]) == pytest.approx(0.4)
+    with pytest.raises(ModelError, match="size"):
+        clearances(rig, np.zeros(6), CollisionScene(solids=(Box((np.inf, 1.0, 1.0)),)))
 
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=20), st.floats(1e-3, 1.0))

@@ -191,8 +191,8 @@ def test_scaled_machines_have_scaled_distances_and_levers() -> None:
 def test_which_pairs_are_left() -> None:
     machine = FixedBase(armoured_arm())
     scene = CollisionScene(machine, OBSTACLES, ignored=[("link6", "obstacle 1"), ("link2", "link4")])
-    assert scene.left["base", "obstacle 0"] == "neither moves"
-    assert scene.left["link6", "obstacle 1"] == "ignored by request"
+    assert scene.excluded["base", "obstacle 0"] == "neither moves"
+    assert scene.excluded["link6", "obstacle 1"] == "ignored by request"
     assert not {("link6", "obstacle 1"), ("link2", "link4"), ("base", "obstacle 3")} & set(scene.labels)
     assert ("link6", "obstacle 0") in scene.labels
     moving = CollisionScene(machine, [MovingObstacle(OBSTACLES[0], lambda t: (t, 0, 0))])

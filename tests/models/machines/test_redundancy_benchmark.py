@@ -80,7 +80,7 @@ def test_collisions_equal_those_of_coal(name: str) -> None:
         apart = by_others > 1e-6
         assert_allclose(seen[apart, k], by_others[apart], atol=1e-6)
         assert np.all(seen[by_others < -1e-6, k] < 0)
-    some = {frozenset(pair): why for pair, why in around.left.items()}
+    some = {frozenset(pair): why for pair, why in around.excluded.items()}
     for pair in expected.keys() - checked:
         assert some[pair] in (NEIGHBOURS, RIGID, ALWAYS, NEVER, "neither moves")
         assert some[pair] != NEVER or expected[pair].min() > 0

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from models import FixedBase, Robot
 from models.robot.kinematics import link_frames
 from models.robot.parts import Joint
-from models.robot.tree import planar_joint
+from models.robot.tree import replace_planar
 from ocp import TipTask, inverse_kinematics, plan
 from tests.models.robot.trees import Array, few, random_rotation, seeds
 
@@ -75,7 +75,7 @@ def test_a_plane_across_any_axis_contains_the_motion(seed: int, height: float) -
     rng = np.random.default_rng(seed)
     axis, place = rng.normal(size=3), Joint("p", "fixed", "a", "b", rng.normal(size=3), random_rotation(rng))
     normal = axis / np.linalg.norm(axis)
-    links, joints = planar_joint(place, axis)
+    links, joints = replace_planar(place, axis, [], [place])
     assert [link.name for link in links] == ["p_x_link", "p_y_link"]
     axes = np.array([joint.axis for joint in joints])
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)

@@ -147,7 +147,7 @@ def test_limits_couplings_and_shapes_are_those_of_the_file() -> None:
     (shown,) = robot.link("upper").visuals
     assert (shown.kind, shown.color.tolist(), shown.size.tolist()) == ("box", [1, 0, 0, 1], [0.2, 0.4, 0.6])
     scene = CollisionScene(FixedBase(robot), [Box((0.1, 0.1, 0.1), (2, 0, 0))], ignored=excluded_pairs(ARM))
-    assert ("base", "fore") in scene.left
+    assert ("base", "fore") in scene.excluded
     again = Robot.from_urdf(robot.to_urdf())
     q = np.array([0.3, -0.5, 0.02])
     np.testing.assert_allclose(numeric(tip_pose(again, q).position), numeric(tip_pose(robot, q).position), atol=1e-12)

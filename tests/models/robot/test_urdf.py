@@ -318,10 +318,9 @@ def test_another_root_and_tip_are_chosen_by_name(root: str) -> None:
     np.testing.assert_array_equal(robot.tip_rotation, np.diag([1, -1, -1]))
 
 
-def test_the_tree_is_printed_with_masses_and_limits(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_tree_is_printed_with_masses_and_limits() -> None:
     path = urdf_file("example-robot-data", "panda_description/urdf/panda.urdf")
-    Robot.from_urdf(path, tip="panda_hand_tcp", lock={"panda_finger_joint1": 0.02}).print()
-    lines = capsys.readouterr().out.splitlines()
+    lines = str(Robot.from_urdf(path, tip="panda_hand_tcp", lock={"panda_finger_joint1": 0.02})).splitlines()
     assert lines[0] == "panda of 13 links, 7 degrees of freedom, 17.4519 kg, tip on panda_hand_tcp"
     assert lines[2] == (
         "└─ panda_joint1 (revolute, -2.8973 .. 2.8973 rad, 2.175 rad/s, 87 N m) -> panda_link1  4.97068 kg"

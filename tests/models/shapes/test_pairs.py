@@ -67,13 +67,13 @@ def test_neighbours_are_left_and_the_others_checked() -> None:
     robot, bodies = chain(0.3, 0.3, 0.3, 0.3)
     pairs = checked_pairs(robot, bodies)
     assert pairs.checked == ((0, 2), (0, 3), (1, 3))
-    assert pairs.left == {(f"link{k}", f"link{k + 1}"): NEIGHBOURS for k in range(3)}
+    assert pairs.excluded == {(f"link{k}", f"link{k + 1}"): NEIGHBOURS for k in range(3)}
 
 
 def test_limits_prove_that_bodies_never_collide() -> None:
     """Folded by less than needed: with the middle link of 0.3 and joints of at most 60 degrees nothing comes back."""
     robot, bodies = chain(0.3, 0.3, 0.3, limit=np.deg2rad(60))
-    assert checked_pairs(robot, bodies).left["link0", "link2"] == NEVER
+    assert checked_pairs(robot, bodies).excluded["link0", "link2"] == NEVER
     assert checked_pairs(robot, bodies, limits=(-3.0, 3.0)).checked == ((0, 2),)
     assert checked_pairs(robot, bodies, clearance=0.5).checked == ((0, 2),)
 
@@ -90,7 +90,7 @@ def test_never_is_never() -> None:
     """Trees at random: of the pairs that are called so none touches in any of 500 postures, by the expression."""
     for seed in range(6):
         robot, bodies = random_robot(np.random.default_rng(seed))
-        never = {pair for pair, reason in checked_pairs(robot, bodies).left.items() if reason == NEVER}
+        never = {pair for pair, reason in checked_pairs(robot, bodies).excluded.items() if reason == NEVER}
         every = combinations(range(len(bodies)), 2)
         chosen = [(i, j) for i, j in every if (bodies[i].link, bodies[j].link) in never]
         if chosen:
@@ -163,7 +163,7 @@ def test_the_most_important_reason_of_several_is_reported() -> None:
     for several, reason in (((near, far), ALWAYS), ((loose, far), COVERED), ((near, loose), COVERED), ((far,), NEVER)):
         for own in (several, several[::-1]):
             pairs = checked_pairs(robot, (*own, between, Body("link2", ball)))
-            assert pairs.left["link0", "link2"] == reason
+            assert pairs.excluded["link0", "link2"] == reason
             assert pairs.checked == ()
 
 
@@ -183,12 +183,12 @@ def test_bodies_that_always_collide_are_named() -> None:
     robot, _ = chain(0.1, 0.001, 0.1)
     bodies = tuple(Body(f"link{k}", Sphere(0.05, (0.0, 0.0, 0.0))) for k in (1, 2))
     pairs = checked_pairs(robot, (Body("link0", Sphere(0.05, (0.1, 0, 0))), *bodies))
-    assert pairs.left["link0", "link2"] == ALWAYS
+    assert pairs.excluded["link0", "link2"] == ALWAYS
     assert pairs.checked == ()
     for overhang, reason in ((0.01, ALWAYS), (0.06, COVERED)):  # they overlap by 0.05 to 0.1
         loose = Body("link2", Sphere(0.05, (0.0, 0.0, 0.0)), 2 * overhang)
         pairs = checked_pairs(robot, (Body("link0", Sphere(0.05, (0.1, 0, 0))), bodies[0], loose))
-        assert pairs.left["link0", "link2"] == reason
+        assert pairs.excluded["link0", "link2"] == reason
 
 
 def test_fixed_links_are_one_rigid_part_and_links_without_bodies_are_passed_over() -> None:
@@ -202,11 +202,11 @@ def test_fixed_links_are_one_rigid_part_and_links_without_bodies_are_passed_over
     ball = Sphere(0.06, (0.0, 0.0, 0.0))
     bodies = tuple(Body(name, ball) for name in ("base", "flange", "arm", "hand"))
     pairs = checked_pairs(Robot(links, joints), bodies)
-    assert pairs.left["base", "flange"] == pairs.left["arm", "hand"] == RIGID
-    assert pairs.left["flange", "arm"] == pairs.left["base", "hand"] == NEIGHBOURS
+    assert pairs.excluded["base", "flange"] == pairs.excluded["arm", "hand"] == RIGID
+    assert pairs.excluded["flange", "arm"] == pairs.excluded["base", "hand"] == NEIGHBOURS
     with_cross = checked_pairs(Robot(links, joints), (*bodies, Body("cross", Sphere(0.001, (0.0, 0.0, 0.0)))))
-    assert with_cross.left["base", "cross"] == NEIGHBOURS
-    assert with_cross.left.get(("base", "hand")) != NEIGHBOURS
+    assert with_cross.excluded["base", "cross"] == NEIGHBOURS
+    assert with_cross.excluded.get(("base", "hand")) != NEIGHBOURS
 
 
 SRDF_TEXT = """<robot name="chain"><disable_collisions link1="link2" link2="link0" reason="Never"/>
@@ -224,7 +224,7 @@ def test_a_mesh_on_a_link_that_is_fixed_lies_where_it_is_fixed(shift: tuple[floa
     plate = Body("plate", Sphere(0.09, middle), 0.04, LinkMesh(0.05 * corners + middle))
     inner = Body("link2", Sphere(0.04, (0.0, 0.0, 0.0)), 0.1, LinkMesh(0.02 * corners))
     between = Body("link1", Sphere(0.01, (0.0, 0.0, 0.0)))
-    assert checked_pairs(robot, (plate, between, inner)).left["plate", "link2"] == ALWAYS
+    assert checked_pairs(robot, (plate, between, inner)).excluded["plate", "link2"] == ALWAYS
 
 
 def bound(one: Shape, other: Shape, turn: Array, shift: Array) -> Array:
@@ -300,7 +300,7 @@ def test_a_clearance_larger_than_that_of_bounding_balls_is_proven_by_the_bodies(
     bodies = (Body("link0", plate), Body("link1", Sphere(0.01, (9, 9, 0))), Body("link2", plate))
     for clearance, reason in ((0.97, NEVER), (0.99, None)):
         pairs = checked_pairs(Robot(links, joints), bodies, clearance=clearance)
-        assert pairs.left.get(("link0", "link2")) == reason
+        assert pairs.excluded.get(("link0", "link2")) == reason
 
 
 @pytest.mark.parametrize(("short", "reason"), [(0.5e-6, None), (2e-6, NEVER)])
@@ -311,7 +311,7 @@ def test_a_proof_leaves_room_for_rounding(short: float, reason: str | None) -> N
     joints = tuple(Joint(f"joint{k}", "revolute", f"link{k - 1}", f"link{k}", (0, 0, 0.5), **turn) for k in (1, 2))
     bodies = tuple(Body(f"link{k}", Sphere(0.1, (0, 0, 0))) for k in range(3))
     pairs = checked_pairs(Robot(links, joints), bodies, clearance=0.8 - short)
-    assert pairs.left.get(("link0", "link2")) == reason
+    assert pairs.excluded.get(("link0", "link2")) == reason
 
 
 @pytest.mark.parametrize(
@@ -334,7 +334,7 @@ def test_hulls_that_meet_in_few_configurations_are_checked(place: tuple[float, f
         Body("link1", Sphere(0.01, (9, 9, 9))),
         Body("link2", ball, 4.0, LinkMesh(corners)),
     )
-    assert checked_pairs(Robot(links, joints), bodies).left.get(("link0", "link2")) == reason
+    assert checked_pairs(Robot(links, joints), bodies).excluded.get(("link0", "link2")) == reason
 
 
 def test_an_srdf_file_and_the_user_leave_pairs_out(tmp_path: Path) -> None:
@@ -345,8 +345,8 @@ def test_an_srdf_file_and_the_user_leave_pairs_out(tmp_path: Path) -> None:
         with pytest.warns(ModelWarning, match="'ghost'"):
             pairs = checked_pairs(robot, bodies, srdf=source, ignored=[("link3", "link0")])
         assert pairs.checked == ((1, 3),)
-        assert pairs.left["link0", "link2"] == SRDF
-        assert pairs.left["link0", "link3"] == IGNORED
+        assert pairs.excluded["link0", "link2"] == SRDF
+        assert pairs.excluded["link0", "link3"] == IGNORED
 
 
 def test_names_and_the_order_of_declaration_do_not_matter() -> None:
@@ -372,7 +372,7 @@ def test_a_follower_counts_as_it_moves() -> None:
         right = Joint("right_slide", "prismatic", "palm", "right", axis=(1, 0, 0), mimic=mimic, **limits)
         palm = Body("palm", Sphere(0.001, (0.0, 1.0, 0.0)))
         pairs = checked_pairs(Robot(links, (left, right), tip="left"), (palm, *bodies))
-        assert pairs.left.get(("left", "right")) == reason
+        assert pairs.excluded.get(("left", "right")) == reason
 
 
 @pytest.mark.parametrize("name", redundancy_benchmark.ROBOTS)
@@ -386,7 +386,7 @@ def test_the_benchmark_of_redundant_arms(name: str) -> None:
     listed = {frozenset(pair) for pair in ignored}
     links = [body.link for body in bodies]
     every = [(i, j) for i, j in combinations(range(len(links)), 2) if frozenset((links[i], links[j])) not in listed]
-    reasons = {frozenset(key): why for key, why in pairs.left.items()}
+    reasons = {frozenset(key): why for key, why in pairs.excluded.items()}
     for i, j in set(every) - set(pairs.checked):
         assert reasons[frozenset((bodies[i].link, bodies[j].link))] in (NEIGHBOURS, NEVER, ALWAYS, RIGID)
     q = ca.SX.sym("q", robot.dof)
@@ -458,7 +458,7 @@ def test_arms_are_free_at_home(name: str) -> None:
         robot = Robot.from_urdf(urdf_file(package, ending), **options)
     bodies = collision_bodies(robot)
     pairs = checked_pairs(robot, bodies)
-    assert not {ALWAYS, COVERED} & set(pairs.left.values())
+    assert not {ALWAYS, COVERED} & set(pairs.excluded.values())
     frames = link_frames(robot, [HOME[name].get(joint, 0.0) for joint in robot.joint_names])
     for i, j in pairs.checked:
         one, other = bodies[i], bodies[j]
@@ -532,7 +532,7 @@ def test_meshes_are_checked_where_their_covers_always_overlap_and_their_hulls_do
     robot, bodies = far_meshes(-0.02)
     result = checked_pairs(robot, bodies)
     assert (0, 3) not in result.checked
-    assert result.left["link0", "link3"] in ASSUMED
+    assert result.excluded["link0", "link3"] in ASSUMED
 
 
 def test_a_joint_whose_limits_are_equal_but_for_the_sign_of_zero_is_no_error() -> None:

@@ -176,7 +176,7 @@ def test_a_report_of_a_check_names_the_faults(capsys: Any, tmp_path: Path) -> No
         ("speed = 0.1", "speed = -1", 8, "must be a number above 0, m/s"),
         ("speed = 0.1", 'speed = "fast"', 8, "must be a number above 0"),
         ("speed = 0.1", "speed 0.1", 8, "invalid TOML"),
-        ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", "points = [[0.75, 0.1, 0.3]]", 7, "two or more triples"),
+        ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", "points = [[0.75, 0.1, 0.3]]", 7, "lists of three numbers"),
         ("points = [[0.75, 0.1, 0.3], [0.75, 0.3, 0.3]]", 'file = "none.csv"', 7, "there is no file"),
         ("points =", 'file = "a.csv"\npoints =', 6, "not both"),
         ('tool = "free"', 'tool = "loose"', 9, 'one of "free roll", "given", "free"'),

@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from models import FreeFloating, center_of_mass, find_wheels
-from models.checks import NOT_NUMBERS, Array, floats, real
+from models.checks import Array
 from models.spatial import Expression
 from ocp.console import interruptible
 from ocp.direct.discretisation import Collocation
@@ -56,8 +56,6 @@ from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem, remembers_request
 from ocp.solution import Solution
 
-__all__ = ["Capture", "Cone", "Grasp", "capture_machines", "capture_problem", "chained_capture", "solve_capture"]
-
 APPROACH, DETUMBLE = "approach", "detumble"
 POINTS = Collocation(8, degree=4, scheme="legendre")
 
@@ -83,22 +81,16 @@ class Cone:
     depth: float = 0.01
 
     def __post_init__(self) -> None:
-        try:
-            direction = floats(self.direction).ravel()
-        except NOT_NUMBERS:
-            direction = np.zeros(0)
-        if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction) > 0:
-            words = f"cone: direction must be three numbers, not all zero, not {self.direction!r}"
-            raise ProblemError(words, name="direction", value=self.direction)
+        direction = require.array("cone: direction", self.direction, (3,))
+        if not direction.any():
+            raise ProblemError("cone: direction must not be zero", name="direction", value=self.direction)
         object.__setattr__(self, "direction", direction / np.linalg.norm(direction))
-        if not require.positive("cone: half_angle", self.half_angle) < np.pi / 2:
-            words = f"cone: half_angle must be below pi/2, not {self.half_angle}"
-            raise ProblemError(words, name="half_angle", value=self.half_angle, limit=np.pi / 2)
+        require.positive("cone: half_angle", self.half_angle, below=np.pi / 2)
         require.positive("cone: length", self.length)
         require.positive("cone: depth", self.depth)
 
     def inside(self, place: Expression) -> Expression:
-        """Return a constraint function, m, that is positive where a tip position is inside the cone. Shape (1, 1).
+        """Return a constraint function of a tip position, m, that is positive inside the cone. Shape (1, 1).
 
         Args:
             place: Position of the tip in the grasped frame. Shape (3, 1), m.
@@ -126,8 +118,7 @@ class Grasp:
 
     def __post_init__(self) -> None:
         for name, limit in vars(self).items():
-            if not real(limit) > 0:
-                raise ProblemError(f"grasp: {name} must be positive, not {limit!r}", name=name, value=limit, limit=0.0)
+            require.array(f"grasp: {name}", limit, (), entries="numbers", sign="positive")
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,10 +185,10 @@ def capture_problem(
             largest that they hold, N m s. Or with name "reach": `value` is the distance of the target and `limit` the
             reach of the arm, m.
     """
-    own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
+    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
     first, second = own.approach(), own.declare_second_phase(None)
     own.guess_approach(first)
-    guess_braking(second, own.pair, _end_of(first))
+    guess_braking(second, own.pair, _end_of_guess(first))
     problem = Phases("capture", {APPROACH: first, DETUMBLE: second})
     before, after = problem[APPROACH], problem[DETUMBLE]
     end = {name: before.at_end(name) for name in ("base", "target", "joints")}
@@ -263,7 +254,9 @@ def chained_capture(
     method: Collocation | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> tuple[Solution, Solution]:
-    """Plan the approach by itself, then the detumbling from its end; the total cost exceeds that of `solve_capture`.
+    """Plan the approach of a capture by itself, then the detumbling from its end, each at its own lowest cost.
+
+    The total cost exceeds that of `solve_capture`.
 
     Args, Raises: As for `solve_capture`.
 
@@ -271,7 +264,7 @@ def chained_capture(
         Both solutions, each with its own audit.
     """
     mesh = POINTS if method is None else require.instance("method", method, Collocation)
-    own = _Capture.take(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
+    own = _Capture.checked(chaser, capture, start, {"limits": limits, "cost": cost}, clearance_constraints)
     own.declare_second_phase(None)  # raises before the approach is solved
 
     def declare_approach(constraints: ClearanceConstraints | None) -> Problem:
@@ -295,7 +288,7 @@ def chained_capture(
 
 
 def capture_machines(chaser: FreeFloating, target: FreeFloating) -> tuple[FreeFloating, FreeFloating]:
-    """Return the machines of both phases: the chaser alone, and the chaser that holds the target as one machine.
+    """Return the machines of both phases of a capture: the chaser alone, and the chaser and its target as one machine.
 
     Raises:
         ProblemError: As `capture_problem`.
@@ -315,7 +308,7 @@ class _Capture:
     clearance_constraints: ClearanceConstraints | None
 
     @classmethod
-    def take(
+    def checked(
         cls,
         chaser: FreeFloating,
         capture: Capture,
@@ -344,10 +337,7 @@ class _Capture:
 
     @property
     def arm_weights(self) -> Array:
-        """Factors of the joint positions at the start of phase two: 1, but 0 for wheels, which restart at angle 0.
-
-        Shape (n,).
-        """
+        """Factors of joint positions at the start of the detumbling: 0 for wheels, which restart at 0, else 1."""
         wheels = find_wheels(self.chaser.robot)
         return np.array([float(name not in wheels) for name in self.chaser.robot.joint_names])
 
@@ -425,23 +415,21 @@ class _Capture:
         chaser, target, none = self.chaser, self.capture.target, ca.DM(0, 1)
         tip, grasped = chaser.tip_pose(base, joints), target.tip_pose(goal, none)
         turned = ca.mtimes(grasped.rotation.T, tip.rotation)
-        half = ca.vertcat(turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]) / 2
         place = ca.mtimes(grasped.rotation.T, tip.position - grasped.position)
         rows = chaser.twist_rows
-        problem.end("grasp pose", ca.vertcat(half, place)[rows], 0.0, 0.0, unit="rad, m")
+        problem.end("grasp pose", ca.vertcat(ca.inv_skew(turned), place)[rows], 0.0, 0.0, unit="rad, m")
         problem.end("grasp side", ca.trace(turned), lower=1.0)  # excludes half a turn
         twist = chaser.tip_twist(base, joints, rates) - target.tip_twist(goal, none, none)
         problem.end("grasp twist", twist[rows], 0.0, 0.0, unit="rad/s, m/s")
 
     def base_after(self, base: Any, joints: Any, time: Any) -> Any:
-        """Return the base configuration at a time, with a position from the uniform motion of the centre of mass.
+        """Return the base configuration at a time, its position from the uniform motion of the chaser's centre of mass.
 
-        The position of the centre of mass and the norm of the quaternion are conserved by the dynamics. Their
-        continuity would be a condition that no control influences, and would leave the second-order conditions
-        undetermined.
+        The dynamics conserve the position of the centre of mass and the norm of the quaternion. Their continuity would
+        be a condition that no control influences, and would leave the second-order conditions undetermined.
         """
         chaser, size = self.chaser, len(self.chaser.twist_rows) // 2 + (self.chaser.base == "planar")
-        attitude = base[size:] if chaser.base == "planar" else base[size:] / ca.norm_2(base[size:])
+        attitude = _of_unit_length(chaser, base)[size:]
         there = chaser.world_from_base(ca.vertcat(ca.DM(size, 1), attitude))
         begin = center_of_mass(chaser.robot, ca.DM(self.start.joints), chaser.world_from_base(ca.DM(self.start.base)))
         drift = np.asarray(chaser.conserved_momentum)[-size:] / chaser.robot.total_mass
@@ -455,7 +443,7 @@ class _Capture:
         guess_approach(problem, self.chaser, self.capture.target, self.start, out=out)
 
 
-def _end_of(problem: Problem) -> tuple[Array, Array, Array]:
+def _end_of_guess(problem: Problem) -> tuple[Array, Array, Array]:
     """Return joint positions, joint velocities and base configuration at the end of the guess of an approach."""
     end = np.array([guessed_horizon(problem)])
     guesses = [problem.declared.states[name].guess for name in ("joints", "velocities", "base")]

@@ -28,27 +28,12 @@ from models import FreeFloating, ModelError, Robot, attach_tool, center_of_mass,
 from models.checks import Array
 from models.machines.machine import with_tip
 from models.spatial import Expression, cross
+from ocp.curves import rk4_step
 from ocp.errors import ProblemError, require
 from ocp.motion.builders.dynamics import QUINTIC
 from ocp.motion.tasks.limits import JointBounds
 from ocp.problem.problem import Problem
 from ocp.problem.values import constant
-
-__all__ = [
-    "State",
-    "checked_pair",
-    "free_motion",
-    "grasp_wrench",
-    "guess_approach",
-    "guess_braking",
-    "guessed_horizon",
-    "join_target",
-    "motion_of",
-    "pair_momentum",
-    "require_capacity",
-    "require_reach",
-    "wheel_capacity",
-]
 
 
 def join_target(chaser: Robot, target: Robot) -> Robot:
@@ -88,9 +73,7 @@ def checked_pair(chaser: Any, target: Any) -> Robot:
 def pair_momentum(
     chaser: FreeFloating, target: FreeFloating, *, base: Any, target_base: Any, joints: Any
 ) -> Expression:
-    """Return the momentum of chaser and target about their common centre of mass.
-
-    It has the order of `FreeFloating.conserved_momentum`.
+    """Return the momentum of chaser and target about their common centre of mass, in the order of `conserved_momentum`.
 
     Args:
         base, target_base: Configurations of both bases. Shape (base_size,).
@@ -135,48 +118,31 @@ Guesses = dict[str, Any]
 
 @dataclass(frozen=True)
 class GuessSettings:
-    """Settings of the initial guess of a capture.
+    """Settings of the initial guess of a capture."""
 
-    Attributes:
-        steps: Integration steps of a motion.
-        durations: Number of durations tried if the time is free, evenly spaced in their logarithms.
-        tolerance: Distance to the grasp that counts as reached, m and rad.
-        meeting: Fraction of the approach after which the tip moves with the target.
-        closing: Fraction of the approach after which the tip approaches the grasp along the axis.
-        damping: Damping of the pseudo-inverse, m and 1.
-        newton_steps: Newton steps for the final wheel speeds, which depend on the final attitude.
-    """
-
-    steps: int = 200
-    durations: int = 9
-    tolerance: float = 1e-3
-    meeting: float = 0.75
-    closing: float = 0.5
-    damping: float = 0.05
-    newton_steps: int = 4
+    steps: int = 200  # integration steps of a motion
+    durations: int = 9  # number of durations tried if the time is free, evenly spaced in their logarithms
+    tolerance: float = 1e-3  # distance to the grasp that counts as reached, m and rad
+    meeting: float = 0.75  # fraction of the approach after which the tip moves with the target
+    closing: float = 0.5  # fraction of the approach after which the tip approaches the grasp along the axis
+    damping: float = 0.05  # damping of the pseudo-inverse, m and 1
+    newton_steps: int = 4  # newton steps for the final wheel speeds, which depend on the final attitude
 
 
 GUESS = GuessSettings()
 
 
 def free_motion(target: FreeFloating, base: Array, times: Array) -> Array:
-    """Return the configurations of a freely floating body at evenly spaced times by a Runge-Kutta method of order 4.
-
-    Shape (M, base_size) at times (M,), s.
-    """
+    """Return the configurations (M, base_size) of a freely floating body at evenly spaced times (M,), s."""
     b, step, none = ca.SX.sym("b", target.base_size), times[1] - times[0], ca.DM(0, 1)
     rate = ca.Function("rate", [b], [target.base_rate(b, none, none)])
-    k1 = rate(b)
-    k2 = rate(b + step / 2 * k1)
-    k3 = rate(b + step / 2 * k2)
-    k4 = rate(b + step * k3)
-    after = ca.Function("after", [b], [b + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+    after = ca.Function("after", [b], [rk4_step(lambda _, x: rate(x), b, step)])
     moved = after.mapaccum(len(times) - 1)(base)
     return np.vstack([base, np.array(moved).T])
 
 
 def guess_approach(problem: Problem, chaser: FreeFloating, target: FreeFloating, start: State, *, out: Array) -> None:
-    """Set the initial guess of the approach; try several durations if free, until the tip gets to the grasp.
+    """Set the initial guess of an approach; if its duration is free, try several until the tip gets to the grasp.
 
     Args:
         start: State of the capture; free velocities are guessed as zero.
@@ -233,7 +199,7 @@ class _TipTracker:
         for k in range(GUESS.steps):
             at, home = configurations[-1]
             position, rotation, matrix, drift = (np.array(part) for part in self.kinematics(home, at, drifting))
-            gap = _gap(places[k + 1], turns[k + 1], position, rotation)[self.rows]
+            gap = _pose_gap(places[k + 1], turns[k + 1], position, rotation)[self.rows]
             square = matrix @ matrix.T + GUESS.damping**2 * np.eye(len(self.rows))
             speed = drifting.copy()
             speed[self.arm] = matrix.T @ np.linalg.solve(square, gap / step - drift.ravel())
@@ -243,13 +209,13 @@ class _TipTracker:
             configurations.append((at + step * speed, self.step(step, home, at, speed)))
         at, home = configurations[-1]
         position, rotation, *_ = (np.array(part) for part in self.kinematics(home, at, drifting))
-        left = _gap(places[-1], turns[-1], position, rotation)[self.rows]
+        left = _pose_gap(places[-1], turns[-1], position, rotation)[self.rows]
         angles, poses = (np.array(part) for part in zip(*configurations, strict=True))
-        return float(np.abs(left).max()), _motion(times, angles, np.array([self.rates, *speeds]), poses)
+        return float(np.abs(left).max()), _guesses_of_motion(times, angles, np.array([self.rates, *speeds]), poses)
 
 
-def _gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
-    """Return rotation vector and displacement from an actual to a desired tip pose, in world axes. Shape (6,)."""
+def _pose_gap(place: Array, turn: Array, position: Array, rotation: Array) -> Array:
+    """Return rotation vector and displacement, rad and m, from an actual to a desired tip pose in world. Shape (6,)."""
     return np.concatenate(
         [scipy.spatial.transform.Rotation.from_matrix(turn @ rotation.T).as_rotvec(), place - position.ravel()]
     )
@@ -314,7 +280,7 @@ def guess_braking(problem: Problem, pair: FreeFloating, begin: tuple[Array, Arra
             bases.append(step(times[1], bases[-1], *middle))
         current, matrix = (np.array(part) for part in momentum_at(bases[-1], angles[-1], last))
         last[turning] += np.linalg.pinv(matrix) @ (np.asarray(pair.conserved_momentum)[angular] - current.ravel())
-    set_guess(problem, duration, _motion(times, angles, speeds, np.array(bases)))
+    set_guess(problem, duration, _guesses_of_motion(times, angles, speeds, np.array(bases)))
 
 
 def _stepper(machine: FreeFloating) -> Any:
@@ -330,7 +296,7 @@ def _stepper(machine: FreeFloating) -> Any:
     return lambda *arguments: np.array(function(*arguments)).ravel()
 
 
-def _motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
+def _guesses_of_motion(times: Array, joints: Array, velocities: Array, base: Array) -> Guesses:
     """Convert samples of joint positions, joint velocities and base configurations to guesses as functions of time."""
     second = np.gradient(velocities, times, axis=0)
     tables = {"joints": joints, "velocities": velocities, "accelerations": second, "base": base}
@@ -443,7 +409,7 @@ def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earl
         earliest: Earliest time of the grasp, s.
     """
     reach = _reach(chaser, target)
-    offset, drift = _offset(chaser, target, start)
+    offset, drift = _relative_motion(chaser, target, start)
     closest = -(offset @ drift) / (drift @ drift) if drift.any() else earliest
     distance = float(np.linalg.norm(offset + drift * np.clip(closest, earliest, start.approach)))
     if distance > reach * (1 + ROUNDING):
@@ -455,7 +421,7 @@ def require_reach(chaser: FreeFloating, target: FreeFloating, start: State, earl
         raise ProblemError(words, name="reach", value=distance, limit=reach)
 
 
-def _offset(chaser: FreeFloating, target: FreeFloating, start: State) -> tuple[Array, Array]:
+def _relative_motion(chaser: FreeFloating, target: FreeFloating, start: State) -> tuple[Array, Array]:
     """Return the vector (3,) from the chaser's to the target's centre of mass, m, and its time derivative, m/s."""
     centers, speeds = [], []
     for machine, base, joints in ((target, start.target_base, np.zeros(0)), (chaser, start.base, start.joints)):
@@ -469,12 +435,14 @@ def _offset(chaser: FreeFloating, target: FreeFloating, start: State) -> tuple[A
 def _reach(chaser: FreeFloating, target: FreeFloating) -> float:
     """Return an upper bound of the distance between both centres of mass when the tip is at the grasp, m."""
     robot, body = chaser.robot, target.robot
-    middle = sum(link.mass * _longest(robot, link.name, link.center_of_mass) for link in robot.links if link.mass)
-    reach = _longest(robot, str(robot.tip_link), robot.tip_translation) + middle / robot.total_mass
+    middle = sum(
+        link.mass * _longest_distance(robot, link.name, link.center_of_mass) for link in robot.links if link.mass
+    )
+    reach = _longest_distance(robot, str(robot.tip_link), robot.tip_translation) + middle / robot.total_mass
     return reach + float(np.linalg.norm(np.subtract(body.tip_translation, body.links[0].center_of_mass)))
 
 
-def _longest(robot: Robot, link: str, point: object) -> float:
+def _longest_distance(robot: Robot, link: str, point: object) -> float:
     """Return an upper bound of the distance of a link's point from the root, m; inf with unlimited prismatic joints."""
     length = float(np.linalg.norm(np.asarray(point, dtype=float)))
     for joint in robot.path_to(link):

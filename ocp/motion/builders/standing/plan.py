@@ -39,8 +39,6 @@ from ocp.problem.problem import Problem
 from ocp.solution import Solution
 from ocp.tightening import tighten
 
-__all__ = ["Attempt", "guess_in_time", "solve_standing", "solve_steps"]
-
 COARSE = Collocation(4, degree=2, scheme="legendre")
 COARSE_IPOPT = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
 """IPOPT options of the solves on a coarse mesh, which determine durations to about a percent."""
@@ -48,27 +46,17 @@ COARSE_IPOPT = {"tol": 1e-4, "acceptable_tol": 1e-3, "acceptable_iter": 5}
 
 @dataclass(frozen=True)
 class PaceSettings:
-    """Settings of the check, on a coarse mesh, whether footsteps are possible in their requested durations.
+    """Settings of the check, on a coarse mesh, whether footsteps are possible in their requested durations."""
 
-    Attributes:
-        iterations: Largest number of iterations with the requested durations; solvable cases took 31 to 51.
-        error: Relative error of a duration on so coarse a mesh; 3 and 12 intervals differ by up to 0.016.
-        price: Cost of doubling a duration, over that of accelerations and rates of 1 rad in that time.
-        guess: Guess of a duration, over the requested one.
-        longest: Upper bound of a duration, over the requested one.
-        samples: Number of samples of a phase at which active limits are searched.
-        active: Distance of a quantity from its limit, over its range along the motion, at which this counts as active.
-        names: Largest number of limits named in a message.
-    """
-
-    iterations: int = 60
-    error: float = 0.05
-    price: float = 1e4
-    guess: float = 5.0
-    longest: float = 50.0
-    samples: int = 21
+    iterations: int = 60  # largest number of iterations with the requested durations; solvable cases took 31 to 51
+    error: float = 0.05  # relative error of a duration on so coarse a mesh; 3 and 12 intervals differ by up to 0.016
+    price: float = 1e4  # cost of doubling a duration, over that of accelerations and rates of 1 rad in that time
+    guess: float = 5.0  # guess of a duration, over the requested one
+    longest: float = 50.0  # upper bound of a duration, over the requested one
+    samples: int = 21  # number of samples of a phase at which active limits are searched
+    # distance of a quantity from its limit, over its range along the motion, at which this counts as active
     active: float = 0.01
-    names: int = 3
+    names: int = 3  # largest number of limits named in a message
 
 
 PACE = PaceSettings()
@@ -77,7 +65,7 @@ PACE = PaceSettings()
 def guess_in_time(
     steps: Steps, start: Any, step_options: Mapping[str, Any], options: Mapping[str, Any]
 ) -> dict[str, Any] | None:
-    """Solve the motion of footsteps with the requested durations on a coarse mesh, for a guess; return None on failure.
+    """Solve a footstep motion in the requested durations on a coarse mesh, as an initial guess; return None on failure.
 
     Args:
         step_options: Cost and limits of steps_problem.
@@ -93,7 +81,7 @@ def guess_in_time(
         for name, phase in zip(steps.names, steps.phases, strict=True)
         if not isinstance(phase.duration, FreeTime)
     }
-    problem = _extensible(steps, start, step_options, seconds)
+    problem = _extensible_problem(steps, start, step_options, seconds)
     coarse = solve(problem, COARSE, options={**options, **COARSE_IPOPT}, check=False)
     if not coarse.success:
         if time_left() > 0:
@@ -106,7 +94,7 @@ def guess_in_time(
         requested = steps_problem(steps, start=start, **step_options)
         in_time = solve(requested, COARSE, options=limited_options, check=False)
         if not in_time.success:
-            raise _too_fast(problem, coarse, seconds, spans)
+            raise _too_fast_error(problem, coarse, seconds, spans)
         coarse = in_time
     durations = [f"{name}.{DURATION}" for name in seconds]
     return {
@@ -116,8 +104,10 @@ def guess_in_time(
     }
 
 
-def _extensible(steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]) -> Phases:
-    """Declare the problem of footsteps that may take longer than requested, with a large penalty on the extra time."""
+def _extensible_problem(
+    steps: Steps, start: Any, step_options: Mapping[str, Any], seconds: Mapping[str, float]
+) -> Phases:
+    """Declare the problem of footsteps that may take longer than requested, at a price above all other costs."""
     phases = [
         replace(phase, duration=FreeTime(each, PACE.longest * each, PACE.guess * each))
         if (each := seconds.get(name)) is not None
@@ -158,7 +148,7 @@ def _check_conflicts(problem: Phases, coarse: Solution) -> None:
         raise SolveError("\n".join([words, *lines]), coarse, error.conflicts, **details) from None
 
 
-def _too_fast(
+def _too_fast_error(
     problem: Phases, coarse: Solution, seconds: Mapping[str, float], spans: Mapping[str, float]
 ) -> SolveError:
     """Return an error that footsteps need more time than requested, naming the slow phases and their active limits."""
@@ -166,7 +156,7 @@ def _too_fast(
     late = [name for name in late if spans[name] > (1 + PACE.error) * seconds[name]]
     lines = [
         f"  phase {name!r}: {spans[name]:.3g} s, {seconds[name]:.3g} s are requested; "
-        f"{_active_limits(problem, coarse, name)}"
+        f"{_describe_active_limits(problem, coarse, name)}"
         for name in late
     ]
     words = "too fast: the quickest steps take longer than requested; give them more time, or shorten them"
@@ -175,7 +165,7 @@ def _too_fast(
     return SolveError("\n".join([words, *lines]), slow, name=worst, value=spans[worst], limit=seconds[worst])
 
 
-def _active_limits(problem: Phases, coarse: Solution, phase: str) -> str:
+def _describe_active_limits(problem: Phases, coarse: Solution, phase: str) -> str:
     """Describe which limits are active in a phase of a coarse solution, and for what part of the phase."""
     form = Formulation.of(problem)
     at = np.linspace(0.0, 1.0, PACE.samples)
@@ -223,14 +213,12 @@ class Attempt:
         solution: Plan, or last iterate; None if there is neither.
         failure: Reason why the solution is no plan; None if it is one.
         exceeded: Whether its only failures are inequalities exceeded between the points of the grid.
-        collision: Error that bodies collide, if that is its only failure.
     """
 
     name: str
     solution: Solution | None
     failure: SolveError | None = None
     exceeded: bool = False
-    collision: SolveError | None = None
 
 
 @interruptible
@@ -268,7 +256,7 @@ def solve_standing(
     solving = SolveSettings() if settings is None else require.instance("settings", settings, SolveSettings)
     setup = StandingSetup() if setup is None else require.instance("solve_standing: setup", setup, StandingSetup)
     along_parameter = setup.along == "parameter"
-    judge = _Judge(solving.tolerances, partial(_pose_error, machine, tasks, along_parameter))
+    judge = _Judge(solving.tolerances, partial(_error_of_tips, machine, tasks, along_parameter))
     timed = not (isinstance(horizon, FreeTime) or along_parameter)
     breaks = breaks_of(tasks, require.positive("horizon", horizon)) if timed else []
     trials = [
@@ -335,10 +323,8 @@ def _first_accepted(
     judge: _Judge,
     guess: Mapping[str, Any] | None = None,
 ) -> Solution:
-    """Try formulations and meshes in turn, and return the first plan that the audit accepts; see `solve_standing`.
-
-    Raises:
-        SolveError, ProblemError: As `solve_standing`; at once if collisions are all that is wrong with a plan.
+    """Try formulations and meshes in turn, and return the first plan that the audit accepts; raise SolveError or
+    ProblemError if there is none, or if collisions are all that is wrong with a plan.
     """
     reasons: list[str] = []
     failure = SolveError()
@@ -349,7 +335,7 @@ def _first_accepted(
             problem = declare(level)
         except ProblemError as error:  # one formulation may leave freedom where the other leaves none
             refused.append(error)
-            reasons.append(f"{_tip(level)}{error}")
+            reasons.append(f"{_label_of_level(level)}{error}")
             if len(refused) == len(trials):
                 raise refused[0] from None
             continue
@@ -357,8 +343,6 @@ def _first_accepted(
         for attempt in _attempts(problem, level, mesh, settings, judge, guess, diagnosed=diagnosed):
             if attempt.failure is None and attempt.solution is not None:
                 return attempt.solution
-            if attempt.collision:
-                raise attempt.collision
             last = attempt.solution or last
             reasons.append(f"{attempt.name}: {attempt.failure}")
             failure = attempt.failure or failure
@@ -391,12 +375,10 @@ def _attempts(
 ) -> Iterator[Attempt]:
     """Solve one formulation on finer and finer meshes and yield each attempt; the caller stops at an accepted one.
 
-    Args:
-        guess: Guess of the first attempt; None for that of the problem.
-        diagnosed: Whether a first solve that fails searches for conflicting constraints, which takes long.
+    With `diagnosed`, a first solve that fails searches for conflicting constraints, which takes long.
     """
     for k in range(MESHES):
-        name = f"{_tip(level)}{mesh.intervals} intervals"
+        name = f"{_label_of_level(level)}{mesh.intervals} intervals"
         first = diagnosed and k == 0
         attempt = judge(name, problem, partial(solve, problem, mesh, options=settings, guess=guess, check=first))
         yield attempt
@@ -409,17 +391,14 @@ def _attempts(
         mesh = mesh.halve()
 
 
-def _tip(level: Level | None) -> str:
+def _label_of_level(level: Level | None) -> str:
     return "" if level is None else f"tip {level}, "
 
 
 @dataclass(frozen=True)
 class _Judge:
-    """Callable that runs a solver, audits the resulting plan, and accepts or rejects the plan.
-
-    Attributes:
-        tolerances: Tolerances of the audit.
-        pose_error: Function that returns an error for a plan that passes its audit but leaves its tasks, else None.
+    """Callable that runs a solver, audits the resulting plan, and accepts or rejects it; `pose_error` rejects plans
+    that pass their audit but leave their tasks.
     """
 
     tolerances: Mapping[str, float] | None
@@ -437,12 +416,14 @@ class _Judge:
             return Attempt(name, solution, ended)
         audit = solution.audit(tolerances=self.tolerances)
         if not audit.passed and audit.failures:  # a plan of undetermined optimality is accepted
+            if collision := collision_error(audit, solution):
+                raise collision
             exceeded = all(_is_inequality(problem, finding.name) for finding in audit.failures)
-            return Attempt(name, solution, audit_error(audit, solution), exceeded, collision_error(audit, solution))
+            return Attempt(name, solution, audit_error(audit, solution), exceeded)
         return Attempt(name, solution, self.pose_error(audit))
 
 
-def _pose_error(
+def _error_of_tips(
     machine: Standing, tasks: TipTask | Sequence[TipTask], along_parameter: bool, audit: Audit
 ) -> SolveError | None:
     """Return an error if a tip of the re-integrated motion deviates from its task, else None."""

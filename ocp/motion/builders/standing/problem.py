@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal
 
 import casadi as ca
@@ -67,8 +68,6 @@ from ocp.motion.tasks.limits import (
 )
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.problem import Problem, remembers_request
-
-__all__ = ["FreeTime", "StandingSetup", "Weights", "declare_horizon", "motion_cost", "standing_problem"]
 
 
 @dataclass(frozen=True)
@@ -241,11 +240,14 @@ def standing_problem(
     if rests[1]:
         rows = ~equations.pose_rows if tip_level == "position" else None
         resting = rates_at_rest(equations, (), guess["joints"].values[-1], rows)
-    motion, jerks = _motion(problem, machine.robot, bounds, begin, resting, guess, setup)
+    starts, ends = (begin, 0.0 if rests[0] else None, None), (setup.end, resting, None)
+    jerk = setup.control == "jerk"
+    declared = declare_joints(problem, machine.robot, bounds, guess, starts=starts, ends=ends, jerk=jerk)
+    motion, jerks = declared[:3], declared[3]
     joints, velocities, accelerations = motion
     progress: tuple[Any, ...] = (problem.time,)
     if along_parameter:
-        progress = _progress(problem, rests, guess)
+        progress = _declare_progress(problem, rests, guess)
     _constrain_tips(problem, equations, motion, progress, tip_level, not rests[0])
 
     wrenches = wrenches_at(external, problem.time, machine.tip_pose((), joints).position)
@@ -278,7 +280,7 @@ def _constrain_tips(
     tip_level: str,
     moving: bool,
 ) -> None:
-    """Constrain the tips to their tasks, by poses or by accelerations; `moving` is true for a start not at rest."""
+    """Constrain the tips to the poses or accelerations of their tasks, and to velocities at a `moving` start."""
     none, (joints, velocities, accelerations) = ca.DM(0, 1), motion
     targets = equations.targets(*progress[:2])
     if tip_level == "position":
@@ -301,40 +303,44 @@ def declare_horizon(problem: Problem, horizon: float | FreeTime) -> Any:
     return problem.horizon(float(horizon))
 
 
-def _motion(
+def declare_joints(
     problem: Problem,
     robot: Robot,
     bounds: JointBounds,
-    begin: Array,
-    resting: Array | None,
     guess: Mapping[str, Any],
-    setup: StandingSetup,
-) -> tuple[tuple[Any, Any, Any], Any]:
-    """Declare joint positions, velocities and accelerations, and jerks if these are controls; return the symbols."""
-    n = len(begin)
-    joints = problem.state(
-        "joints", n, initial=begin, terminal=setup.end, lower=bounds.lower, upper=bounds.upper, guess=guess["joints"],
-        unit=robot.unit(),
-    )  # fmt: skip
-    velocities = problem.state(
-        "velocities", n, initial=0.0 if setup.start_velocity == "rest" else None, terminal=resting,
-        lower=-bounds.velocity, upper=bounds.velocity, guess=guess["velocities"], unit=robot.unit("/s"),
-    )  # fmt: skip
-    jerks: Any = ca.DM(0, 1)
-    declare: Any = problem.state if setup.control == "jerk" else problem.control
-    accelerations = declare(
-        "accelerations", n, lower=-bounds.acceleration, upper=bounds.acceleration, guess=guess["accelerations"],
-        unit=robot.unit("/s^2"),
-    )  # fmt: skip
-    if setup.control == "jerk":
-        jerks = problem.control("jerks", n, lower=-bounds.jerk, upper=bounds.jerk, unit=robot.unit("/s^3"))
-        problem.dynamics(accelerations, jerks)
-    problem.dynamics(joints, velocities)
-    problem.dynamics(velocities, accelerations)
-    return (joints, velocities, accelerations), jerks
+    *,
+    starts: Sequence[Any],
+    ends: Sequence[Any],
+    jerk: bool = False,
+    scales: Any = (None,) * 4,
+) -> tuple[Any, Any, Any, Any]:
+    """Declare joint positions, velocities and accelerations within limits, and jerks if `jerk`; return the symbols.
+
+    The last of these quantities is the control, the others are states, whose derivatives are declared.
+
+    Args:
+        problem, robot, bounds: Problem, robot, and the limits of its joints.
+        guess: Guesses by the names "joints", "velocities" and "accelerations".
+        starts, ends: Positions, velocities and accelerations at both ends of the motion; None, or nan, where free.
+        scales: Scales of the four quantities for the solver.
+    """
+    lower = (bounds.lower, -bounds.velocity, -bounds.acceleration, -bounds.jerk)
+    upper = (bounds.upper, bounds.velocity, bounds.acceleration, bounds.jerk)
+    symbols = []
+    for k, name in enumerate(("joints", "velocities", "accelerations", "jerks")[: 3 + jerk]):
+        options: dict[str, Any] = {"lower": lower[k], "upper": upper[k], "guess": guess.get(name), "scale": scales[k]}
+        options["unit"] = robot.unit(("", "/s", "/s^2", "/s^3")[k])
+        if k < 2 + jerk:
+            symbols.append(problem.state(name, robot.dof, initial=starts[k], terminal=ends[k], **options))
+        else:
+            symbols.append(problem.control(name, robot.dof, **options))
+    for state, derivative in pairwise(symbols):
+        problem.dynamics(state, derivative)
+    joints, velocities, accelerations, *jerks = symbols
+    return joints, velocities, accelerations, jerks[0] if jerk else ca.DM(0, 1)
 
 
-def _progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
+def _declare_progress(problem: Problem, rests: tuple[bool, bool], guess: Mapping[str, Any]) -> tuple[Any, Any, Any]:
     """Declare the path parameter, which runs from 0 to 1; return the parameter, its rate and its acceleration."""
     at = problem.state("path", initial=0.0, terminal=1.0, lower=0.0, upper=1.0, guess=guess["path"])
     first, last = (0.0 if rest else None for rest in rests)

@@ -28,8 +28,6 @@ from ocp.motion.local.rates import resolve
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.solution import Solution
 
-__all__ = ["StepsMotion", "resolve_steps", "steps_motion"]
-
 SAMPLES = 101
 
 
@@ -92,10 +90,7 @@ class StepsMotion:
         return np.asarray(np.einsum("kji,kj->ki", self.sole_rotation[foot], self.loads[foot][:, 3:]))
 
     def friction(self, foot: str) -> Array:
-        """Return the friction coefficient that a foot needs: tangential over normal force, nan in the air.
-
-        Shape (M,).
-        """
+        """Return the tangential over the normal force of a foot, which friction bears; nan in the air. Shape (M,)."""
         force = self._force(foot)
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
@@ -147,7 +142,7 @@ def steps_motion(steps: Steps, solution: Solution, samples: int = SAMPLES) -> St
 
 
 def motion_of(steps: Steps, parts: Sequence[Mapping[str, Array]]) -> StepsMotion:
-    """Join the quantities that `sample_stance` has sampled in each phase into one motion."""
+    """Join the quantities of each phase, as `sample_stance` returns them, into the motion of a legged machine."""
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def by_foot(quantity: str) -> dict[str, Array]:
@@ -169,7 +164,7 @@ def sample_stance(
         foot_loads: Components `Stance.load_rows` of the loads of the feet besides the first. Shape (M, k) each.
     """
     q, qd, qdd = motion
-    function, names = _function(steps, stance)
+    function, names = _stance_function(steps, stance)
     stacked = np.column_stack([np.zeros((len(q), 0)), *foot_loads.values()])
     outputs = function.map(len(q))(q.T, qd.T, qdd.T, stacked.T)
     values = {name: np.array(ca.DM(value)).T for name, value in zip(names, outputs, strict=True)}
@@ -190,10 +185,9 @@ def sample_stance(
     return values
 
 
-def _function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
-    """Return a casadi Function that computes torques, loads and frames in a stance, and the names of its outputs.
-
-    Its inputs are joint positions, velocities and accelerations, and the loads of the feet besides the first.
+def _stance_function(steps: Steps, stance: Stance) -> tuple[Any, list[str]]:
+    """Return a casadi Function from joint positions, velocities, accelerations and the loads of all feet but the first
+    to torques, loads and frames in a stance, and the names of its outputs.
     """
     n = stance.joint_size
     q, qd, qdd = (ca.SX.sym(name, n) for name in ("q", "qd", "qdd"))
@@ -240,7 +234,7 @@ def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsM
     parts, begin = [], 0.0
     for k, stance in enumerate(steps.stances):
         t = np.linspace(0.0, steps.phases[k].seconds, count)
-        motion = _phase(steps, k, joints[steps.order(stance)], t, steps.clearance)
+        motion = _resolve_phase(steps, k, joints[steps.order(stance)], t, steps.clearance)
         values = sample_stance(steps, stance, motion, _least_loads(stance, motion))
         joints = values["joints"][-1]
         parts.append({"t": begin + t, "phase": np.full(count, float(k)), **values})
@@ -248,8 +242,10 @@ def resolve_steps(steps: Steps, *, start: Any, samples: int = SAMPLES) -> StepsM
     return motion_of(steps, parts)
 
 
-def _phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> tuple[Array, Array, Array]:
-    """Return joint positions, rates and accelerations in phase k, in its stance's joint order. Shape (M, n) each."""
+def _resolve_phase(steps: Steps, k: int, joints: Array, t: Array, clearance: float) -> tuple[Array, Array, Array]:
+    """Return the resolved-rate motion in phase k of footsteps: joint positions, rates and accelerations in the joint
+    order of the stance. Shape (M, n) each.
+    """
     stance = steps.stances[k]
     swings = [swing for swing in steps.swings(k) if swing.lifted is not None and swing.landing is not None]
     if not swings:
@@ -292,9 +288,8 @@ def _swing_task(stance: Stance, swing: Swing, seconds: float, clearance: float) 
 
 
 def _least_loads(stance: Stance, motion: tuple[Array, Array, Array]) -> dict[str, Array]:
-    """Return the loads of all feet but the first for which the sum of the squared loads of all feet is least.
-
-    The loads have the components `Stance.load_rows`, shape (M, k) each.
+    """Return the loads of all feet but the first, in the rows `Stance.load_rows`, for which the sum of the squared
+    loads of all feet is least. Shape (M, k) each.
     """
     sizes = {name: len(stance.load_rows[name]) for name in stance.other_feet}
     if not sizes:

@@ -17,27 +17,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from models import Foot, Foothold, ModelError, Robot, Stance
+from models import Foot, Foothold, Robot, Stance
 from models.checks import Array
 from models.paths import rest_to_rest
 from ocp.direct.guess import Samples
-from ocp.errors import ProblemError, require
+from ocp.errors import ProblemError, problem_errors, require
 from ocp.motion.builders.standing.problem import FreeTime
 from ocp.motion.tasks.equations import TaskEquations, bind
 from ocp.motion.tasks.tip_task import TipTask
-
-__all__ = [
-    "PLACED",
-    "StancePhase",
-    "Steps",
-    "Swing",
-    "check_placed",
-    "first_guess",
-    "foot_task",
-    "foothold_equations",
-    "standing_configuration",
-    "walk",
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,10 +129,8 @@ class Steps:
                     raise ProblemError(words, name=name, value=k)
         object.__setattr__(self, "feet", feet)
         object.__setattr__(self, "phases", phases)
-        try:
+        with problem_errors():
             _ = self.stances
-        except ModelError as error:
-            raise ProblemError(str(error), **vars(error)) from error
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -232,37 +217,35 @@ def walk(
     return tuple(phases)
 
 
-PLACED = 1e-6
+PLACEMENT_TOLERANCE = 1e-6
 """Largest accepted gap between a foot and its foothold at the start, m or rad."""
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 200, "tol": 1e-10}
 
 
 @dataclass(frozen=True)
 class ConfigurationSettings:
-    """Settings of the search for a standing configuration.
+    """Settings of the search for a standing configuration."""
 
-    Attributes:
-        near: Weight of a joint's squared distance from its initial position, 1/rad^2.
-        over: Weight of the squared distance of the center of mass from its goal, 1/m^2: 1 cm costs less than a tenth of
-            a radian.
-        gap: Largest gap between a foot and its foothold, m or rad.
-        steps: Number of time steps in the guess of a phase.
-    """
-
-    near: float = 1.0
+    near: float = 1.0  # weight of a joint's squared distance from its initial position, 1/rad^2
+    # weight of the squared distance of the center of mass from its goal, 1/m^2: 1 cm costs less than a tenth of a
+    # radian
     over: float = 300.0
-    gap: float = 1e-9
-    steps: int = 40
+    gap: float = 1e-9  # largest gap between a foot and its foothold, m or rad
+    steps: int = 40  # number of time steps in the guess of a phase
 
 
 CONFIGURATIONS = ConfigurationSettings()
 
 
-def foothold_equations(stance: Stance, footholds: dict[str, Foothold]) -> TaskEquations:
+def foothold_equations(stance: Stance, footholds: Mapping[str, Foothold] | None = None) -> TaskEquations:
     """Return task equations that keep feet on footholds, for the pose components that the joints can change.
 
-    The first foot of the stance, at which the machine is rooted, must not be among the feet.
+    Args:
+        stance: Model of the machine with at least two feet on the ground, rooted at the first of them.
+        footholds: Footholds by foot, without the first foot of the stance; None for all other feet of the stance.
     """
+    if footholds is None:
+        footholds = {name: stance.footholds[name] for name in stance.other_feet}
     tasks = [foot_task(stance, name, foothold.position, foothold.rotation) for name, foothold in footholds.items()]
     return bind(stance, tasks)
 
@@ -303,7 +286,7 @@ def standing_configuration(stance: Stance, near: Any, over: Any = None) -> Array
     q, none = ca.SX.sym("q", stance.joint_size), ca.DM(0, 1)
     gap: Any = none
     if stance.other_feet:
-        equations = foothold_equations(stance, {name: stance.footholds[name] for name in stance.other_feet})
+        equations = foothold_equations(stance)
         gap = equations.error(none, q, ca.DM(equations.target_function()(0.0)))
     cost = CONFIGURATIONS.near * ca.sumsqr(q - begin)
     if over is not None:
@@ -325,15 +308,15 @@ def check_placed(stance: Stance, joints: Array) -> None:
     """Raise ProblemError if a foot is off its foothold in a start configuration, given in the stance's joint order."""
     if not stance.other_feet:
         return
-    equations = foothold_equations(stance, {name: stance.footholds[name] for name in stance.other_feet})
+    equations = foothold_equations(stance)
     errors = np.array(ca.DM(equations.error(ca.DM(0, 1), joints, equations.target_function()(0.0))))
     gap = float(np.abs(errors).max())
-    if gap > PLACED:
+    if gap > PLACEMENT_TOLERANCE:
         words = (
             f"start: a foot is {gap:.3g} (m or rad) away from its foothold; "
             "standing_configuration(stance, near) finds joints that put it there"
         )
-        raise ProblemError(words, name="start", value=gap, limit=PLACED)
+        raise ProblemError(words, name="start", value=gap, limit=PLACEMENT_TOLERANCE)
 
 
 def first_guess(steps: Steps, start: Array, lift: float) -> list[dict[str, Any]]:
@@ -378,7 +361,7 @@ def _raised_poses(swings: tuple[Swing, ...], lift: float) -> dict[str, Foothold]
 
 
 def _interpolate(configurations: Array, seconds: float) -> dict[str, Any]:
-    """Return a smooth rest-to-rest motion through 2 or 3 configurations as a guess of the states and controls."""
+    """Return a smooth rest-to-rest motion through 2 or 3 configurations (k, n) as a guess of joint variables."""
     share = np.linspace(0.0, 1.0, CONFIGURATIONS.steps + 1)
     first, last = configurations[0], configurations[-1]
     values = first + (last - first) * rest_to_rest(share)[:, None]

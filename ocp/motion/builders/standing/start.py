@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from models.checks import Array
 from models.machines.machine import Machine
@@ -27,26 +28,16 @@ from ocp.motion.tasks.limits import Following, IndexAtLeast, JointBounds, Pinned
 from ocp.motion.tasks.tip_task import retime_task
 from ocp.motion.tasks.tracks import on_symbols
 
-__all__ = ["check_freedom", "check_loads", "check_slope", "local_guess", "start_inside", "task_demand"]
-
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Settings of the check whether a motion can start from rest, and of the initial guess.
+    """Settings of the check whether a motion can start from rest, and of the initial guess."""
 
-    Attributes:
-        violation: Relative violation of a limit that is tolerated.
-        largest_acceleration: Bound of unlimited accelerations, rad/s^2 or m/s^2.
-        damping: Damping of null-space velocities in the guess, 1/s.
-        steps: Number of time steps of the guess.
-        largest_speed: Speed of a local motion near a singularity at which the guess stops, rad/s or m/s.
-    """
-
-    violation: float = 1e-6
-    largest_acceleration: float = 1e6
-    damping: float = 2.0
-    steps: int = 400
-    largest_speed: float = 100.0
+    violation: float = 1e-6  # relative violation of a limit that is tolerated
+    largest_acceleration: float = 1e6  # bound of unlimited accelerations, rad/s^2 or m/s^2
+    damping: float = 2.0  # damping of null-space velocities in the guess, 1/s
+    steps: int = 400  # number of time steps of the guess
+    largest_speed: float = 100.0  # speed of a local motion near a singularity at which the guess stops, rad/s or m/s
 
 
 STARTS = StartSettings()
@@ -158,7 +149,7 @@ def check_loads(
 
 
 def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) -> tuple[Array, Array]:
-    """Return matrix and right side of the equations that tasks impose on joint accelerations at a start from rest.
+    """Return matrix and right side of the linear equations that tasks impose on joint accelerations at rest.
 
     Along a parameter the acceleration in the path's direction is free, and only the equations across it remain.
     """
@@ -181,7 +172,7 @@ def task_demand(equations: TaskEquations, joints: Array, along_parameter: bool) 
 
 
 def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
-    """Return the half-planes, as inward normals and offsets, that must contain the zero moment point."""
+    """Return the half-planes, as inward normals and offsets, in which the zero moment point is required to be."""
     edges = list(zip(*foot_edges(machine, zmp), strict=True))
     unit = np.eye(2)
     if isinstance(zmp, IndexAtLeast):
@@ -199,7 +190,7 @@ def _edges(machine: Standing, zmp: ZmpRule) -> list[tuple[Array, float]]:
 def _least_violations(
     at_rest: Array, slopes: Array, low: Array, high: Array, largest: Array, demand: tuple[Array, Array] | None
 ) -> Array | None:
-    """Return the violations of torque and ground limits that minimise their sum; None if the tasks are impossible."""
+    """Return the violations of torque and ground limits with the least sum; None if the tasks are impossible."""
     m, n = slopes.shape
     inside = (at_rest >= low) & (at_rest <= high)
     if inside.all() and (demand is None or not np.any(demand[1])):
@@ -208,18 +199,13 @@ def _least_violations(
     matrix = np.block([[slopes, np.eye(m), -np.eye(m)], [rows, np.zeros((len(rows), 2 * m))]])
     lower, upper = np.concatenate([low - at_rest, wanted]), np.concatenate([high - at_rest, wanted])
     reach = np.minimum(largest, STARTS.largest_acceleration)
-    sizes = np.concatenate([np.zeros(n), np.ones(2 * m)])
-    settings = {"error_on_fail": False, "highs": {"output_flag": False}}
-    shape = {"a": ca.DM(matrix).sparsity(), "h": ca.Sparsity(n + 2 * m, n + 2 * m)}
-    solver = ca.conic("start", "highs", shape, settings)
-    result = solver(
-        a=ca.DM(matrix), g=sizes, lba=lower, uba=upper,
-        lbx=np.concatenate([-reach, np.zeros(2 * m)]), ubx=np.concatenate([reach, np.full(2 * m, np.inf)]),
-    )  # fmt: skip
-    if not solver.stats()["success"]:
-        return None
-    slack = np.array(result["x"]).ravel()[n:]
-    return np.asarray(slack[:m] + slack[m:])
+    largest_values = np.concatenate([reach, np.full(2 * m, np.inf)])
+    solved = scipy.optimize.milp(
+        np.concatenate([np.zeros(n), np.ones(2 * m)]),
+        constraints=scipy.optimize.LinearConstraint(matrix, lower, upper),
+        bounds=scipy.optimize.Bounds(np.concatenate([-reach, np.zeros(2 * m)]), largest_values),
+    )
+    return None if solved.x is None else np.asarray(solved.x[n : n + m] + solved.x[n + m :])
 
 
 def local_guess(

@@ -23,21 +23,25 @@ import casadi as ca
 import numpy as np
 
 from models.checks import Array
-from models.errors import ModelError
 from models.machines.stance import Stance
 from models.paths import rest_to_rest
 from models.robot.kinematics import joint_limit_index
 from ocp.console import interruptible
-from ocp.errors import ProblemError, require
-from ocp.motion.builders.standing.problem import FreeTime, declare_horizon
-from ocp.motion.builders.standing.stances import PLACED, Steps, Swing, check_placed, first_guess, foothold_equations
+from ocp.errors import ProblemError, problem_errors, require
+from ocp.motion.builders.standing.problem import FreeTime, declare_horizon, declare_joints
+from ocp.motion.builders.standing.stances import (
+    PLACEMENT_TOLERANCE,
+    Steps,
+    Swing,
+    check_placed,
+    first_guess,
+    foothold_equations,
+)
 from ocp.motion.builders.standing.start import start_inside
 from ocp.motion.tasks.checks import rates_at_rest
-from ocp.motion.tasks.limits import Limits
+from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem, remembers_request
-
-__all__ = ["StepWeights", "steps_problem"]
 
 GROUND_TOLERANCE = 0.01  # share of the clearance that a sole may be below the ground where it lifts and lands
 GUESSED_LIFT = 1.5  # height of a foot halfway in the guess, over the clearance
@@ -66,17 +70,6 @@ class StepWeights:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             require.nonnegative(f"step weights: {name}", value)
-
-
-@dataclass(frozen=True)
-class _Options:
-    """Options of `steps_problem` that all its phases share."""
-
-    balance: str
-    margin: float
-    clearance: float
-    weights: StepWeights
-    limits: Limits
 
 
 @remembers_request("steps")
@@ -117,18 +110,23 @@ def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, 
             words = f"limits: steps have no limit of {name}; limit torques and accelerations"
             raise ProblemError(words, name=name, value=getattr(limits, name))
     begin = require.array("start", start, (steps.robot.dof,), meaning="one entry for each joint")
-    options = _Options(steps.balance, float(steps.margin), float(steps.clearance), weights, limits)
     first = steps.stances[0]
     own = start_inside(first, begin[steps.order(first)], first.robot.lower, first.robot.upper)
-    _check_start(first, own, options)
+    check_placed(first, own)
+    if first.support is not None:
+        outside = steps.margin - float(first.support.margin(first.center_of_mass(own)[:2]))
+        if outside > PLACEMENT_TOLERANCE:
+            words = (
+                f"start: the center of mass is {outside:.3g} m outside the support, less its margin; "
+                "standing_configuration(stance, near, over=...) finds joints in balance"
+            )
+            raise ProblemError(words, name="start", value=outside, limit=0.0)
     begin = steps.in_order(first, own[None])[0]
     guesses = first_guess(steps, begin, GUESSED_LIFT * steps.clearance)
     problems = {}
     for k, name in enumerate(steps.names):
-        try:
-            problems[name] = _phase(steps, k, own if k == 0 else None, guesses[k], options)
-        except ModelError as error:
-            raise ProblemError(f"phase {name!r}: {error}", **vars(error)) from error
+        with problem_errors(f"phase {name!r}: "):
+            problems[name] = _declare_phase(steps, k, own if k == 0 else None, guesses[k], weights, limits)
     whole = Phases("steps", problems)
     for k, (before, after) in enumerate(zip(steps.names[:-1], steps.names[1:], strict=True)):
         old, new = steps.order(steps.stances[k]), steps.order(steps.stances[k + 1])
@@ -137,70 +135,42 @@ def steps_problem(steps: Steps, *, start: Any, cost: StepWeights | None = None, 
     return whole
 
 
-def _check_start(stance: Stance, joints: Array, options: _Options) -> None:
-    """Raise ProblemError if, at the start, a foot is off its foothold or the center of mass is not over the support."""
-    check_placed(stance, joints)
-    if stance.support is not None:
-        left = float(stance.support.margin(stance.center_of_mass(joints)[:2])) - options.margin
-        if left < -PLACED:
-            words = (
-                f"start: the center of mass is {-left:.3g} m outside the support, less its margin; "
-                "standing_configuration(stance, near, over=...) finds joints in balance"
-            )
-            raise ProblemError(words, name="start", value=-left, limit=0.0)
-
-
-def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], options: _Options) -> Problem:
+def _declare_phase(
+    steps: Steps, k: int, start: Array | None, guess: dict[str, Any], weights: StepWeights, limits: Limits
+) -> Problem:
     """Declare the problem of phase k of `steps_problem`, in which some feet are held and others swing."""
     phase, stance, last = steps.phases[k], steps.stances[k], k + 1 == len(steps.phases)
-    robot, n, weights = stance.robot, stance.joint_size, options.weights
-    bounds = _bounds(steps, stance, options.limits)
+    robot, n, bounds = stance.robot, stance.joint_size, _stance_bounds(steps, stance, limits)
     problem = Problem(steps.names[k])
     final = declare_horizon(problem, phase.duration)
     none = ca.DM(0, 1)
-    equations = (
-        foothold_equations(stance, {name: phase.footholds[name] for name in stance.other_feet})
-        if stance.other_feet
-        else None
-    )
+    equations = foothold_equations(stance) if stance.other_feet else None
 
     stationary: Any = None
     if last:
         stationary = np.zeros(n) if equations is None else rates_at_rest(equations, (), guess["joints"].values[-1])
-    joints = problem.state(
-        "joints", n, initial=start, lower=bounds["lower"], upper=bounds["upper"], guess=guess["joints"],
-        unit=robot.unit(),
-    )  # fmt: skip
-    rates = problem.state(
-        "velocities", n, initial=None if start is None else 0.0, terminal=stationary, lower=-bounds["velocity"],
-        upper=bounds["velocity"], guess=guess["velocities"], unit=robot.unit("/s"),
-    )  # fmt: skip
-    largest = bounds["acceleration"]
-    second = problem.control(
-        "accelerations", n, lower=-largest, upper=largest, guess=guess["accelerations"], unit=robot.unit("/s^2")
-    )
-    problem.dynamics(joints, rates)
-    problem.dynamics(rates, second)
+    starts, ends = (start, None if start is None else 0.0), (None, stationary)
+    joints, rates, second, _ = declare_joints(problem, robot, bounds, guess, starts=starts, ends=ends)
     if equations is not None:
         gap = equations.acceleration(none, joints, rates, second, progress=(problem.time,))
         problem.path("feet", gap, lower=0, upper=0, unit=equations.unit("/s^2", "/s^2"))
         for name, deviation in equations.deviations(none, joints, rates, equations.targets(problem.time)).items():
             problem.watch(name.replace("task", "feet"), **deviation)
     for swing in steps.swings(k):
-        _swing(problem, stance, swing, (joints, rates), problem.time / final, options.clearance)
+        _constrain_swing(problem, stance, swing, (joints, rates), problem.time / final, steps.clearance)
     over = _over_support(stance, joints)
     if over.numel():
-        if options.balance == "static":
-            problem.path("balance", over, lower=options.margin, unit="m")
+        if steps.balance == "static":
+            problem.path("balance", over, lower=steps.margin, unit="m")
         elif last:
-            problem.end("balance", over, lower=options.margin, unit="m")
+            problem.end("balance", over, lower=steps.margin, unit="m")
 
-    foot_loads = {name: _load(problem, stance, name) for name in stance.other_feet}
+    foot_loads = {name: _declare_load(problem, stance, name) for name in stance.other_feet}
     loads = stance.loads(joints, rates, second, foot_loads)
     for name, load in loads.items():
-        _limit_load(problem, stance, name, load, options)
+        _limit_load(problem, stance, name, load, steps.margin, limits)
     torques = stance.joint_torques(joints, rates, second, foot_loads)
-    effort = bounds["torque"]
+    effort = bounds.torque
     limited = np.flatnonzero(np.isfinite(effort)).tolist()
     if limited:
         problem.path("torques", torques[limited], lower=-effort[limited], upper=effort[limited], unit=robot.effort_unit)
@@ -214,19 +184,19 @@ def _phase(steps: Steps, k: int, start: Array | None, guess: dict[str, Any], opt
     return problem
 
 
-def _bounds(steps: Steps, stance: Stance, limits: Limits) -> dict[str, Array]:
-    """Return the limits of a phase by name, reordered from the robot's joint order to that of the stance."""
+def _stance_bounds(steps: Steps, stance: Stance, limits: Limits) -> JointBounds:
+    """Return the limits of joints and actuators by name, reordered from the robot's joint order to that of a stance."""
     order = steps.order(stance)
     bounds = limits.bounds(stance, ("velocity", "torque"))._asdict()
     for name in bounds:
         explicit = getattr(limits, name, None) if name not in ("lower", "upper") else None
         if explicit is not None and np.size(explicit) != 1:
             bounds[name] = np.asarray(explicit, dtype=float).ravel()[order]
-    return bounds
+    return JointBounds(**bounds)
 
 
-def _load(problem: Problem, stance: Stance, name: str) -> Any:
-    """Declare the load on a foot other than the first as a control, and return this load. Shape (6, 1)."""
+def _declare_load(problem: Problem, stance: Stance, name: str) -> Any:
+    """Declare the load on a foot other than the first as a control, and return the load. Shape (6, 1)."""
     rows = stance.load_rows[name]
     share = stance.weight / len(stance.footholds)
     guess = [share * (row == 5) for row in rows]
@@ -234,21 +204,21 @@ def _load(problem: Problem, stance: Stance, name: str) -> Any:
     return stance.full_load(name, problem.control(f"{name} load", len(rows), guess=guess, unit=unit))
 
 
-def _limit_load(problem: Problem, stance: Stance, name: str, load: Any, options: _Options) -> None:
+def _limit_load(problem: Problem, stance: Stance, name: str, load: Any, margin: float, limits: Limits) -> None:
     """Constrain a foot's load to what its sole can bear; the load of a grip is not limited."""
     if stance.feet[name].sole is None:
         return
-    least = 0.0 if options.limits.vertical_force is None else float(options.limits.vertical_force)
+    least = 0.0 if limits.vertical_force is None else float(limits.vertical_force)
     problem.path(f"{name} pressure", stance.pressure(name, load), lower=least, unit="N")
-    inside = stance.edge_moments(name, load, options.margin) / stance.weight
+    inside = stance.edge_moments(name, load, margin) / stance.weight
     if inside.numel():
         problem.path(f"{name} center of pressure", inside, lower=0.0, unit="m")
-    if np.isfinite(options.limits.friction):
-        reserve = stance.friction_margin(name, load, options.limits.friction) / stance.weight**2
+    if np.isfinite(limits.friction):
+        reserve = stance.friction_margin(name, load, limits.friction) / stance.weight**2
         problem.path(f"{name} friction", reserve, lower=0.0)
 
 
-def _swing(
+def _constrain_swing(
     problem: Problem, stance: Stance, swing: Swing, motion: tuple[Any, Any], share: Any, clearance: float
 ) -> None:
     """Constrain the sole of a swinging foot to stay above the ground and to land at rest on its foothold."""
@@ -276,7 +246,7 @@ def _swing(
 
 
 def _distinct_rows(rows: Any, joints: Any) -> list[int]:
-    """Return the indices of distinct components of a constraint; in planar machines, corners of soles coincide."""
+    """Return the indices of the distinct rows of a constraint; in planar machines, corners of soles coincide."""
     rng = np.random.default_rng(0)
     others = [
         symbol for symbol in ca.symvar(rows) if not any(ca.is_equal(symbol, each) for each in ca.vertsplit(joints))
@@ -289,11 +259,11 @@ def _distinct_rows(rows: Any, joints: Any) -> list[int]:
 
 
 def _over_support(stance: Stance, joints: Any) -> Any:
-    """Return the distances of the center of mass from support edges, if the joints affect them. Shape (k, 1), m."""
+    """Return those distances, m, of the center of mass from support edges that the joints can change. Shape (k, 1)."""
     if stance.support is None:
         return ca.DM(0, 1)
     distances = ca.densify(stance.support.distances(stance.center_of_mass(joints)[:2]))
     rng = np.random.default_rng(0)
     function = ca.Function("distances", [joints], [distances])
     values = np.column_stack([np.array(function(rng.normal(size=joints.numel()))).ravel() for _ in range(3)])
-    return distances[[i for i in range(len(values)) if np.ptp(values[i]) > PLACED]]
+    return distances[[i for i in range(len(values)) if np.ptp(values[i]) > PLACEMENT_TOLERANCE]]

@@ -102,7 +102,7 @@ def test_a_time_may_be_beyond_the_end_by_rounding_of_its_own_size_and_no_more(pr
     np.testing.assert_array_equal(slow.at(end * (1 + 9e-10)).position, slow.at(end).position)
     np.testing.assert_array_equal(slow.at(-9e-10 * end).position, slow.at(0.0).position)
     for beyond in (end * (1 + 2e-9), -2e-9 * end):
-        with pytest.raises(ProblemError, match="within the program"):
+        with pytest.raises(ProblemError, match="outside the program"):
             slow.at(beyond)
 
 

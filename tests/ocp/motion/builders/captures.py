@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from models import FreeFloating, Joint, Link, Robot, planar_chain, with_wheels
-from models.spatial import quaternion_about
+from models.paths.splines import exponential
 from ocp import Capture, Cone, Cost, FreeTime, Grasp, Solution
 from ocp.motion.builders.space.pair import join_target, pair_momentum
 from scripts.robots.simulation import mujoco_model
@@ -95,7 +95,7 @@ def called(function: Callable[..., Any], **request: Any) -> Any:
 
 def turned(axis: Any, angle: float) -> Array:
     """Unit quaternion. Shape (4,)."""
-    return np.array(ca.DM(quaternion_about(axis / np.linalg.norm(axis), angle))).ravel()
+    return exponential(angle * axis / np.linalg.norm(axis))
 
 
 def replayed_momentum(request: dict[str, Any], plan: Solution, samples: int = 41) -> tuple[Array, Array]:

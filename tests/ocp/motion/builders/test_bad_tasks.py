@@ -352,8 +352,6 @@ STANDINGS = [
             "stabiliser": but(INSTANCE, "None"),
             "null_damping": NONNEGATIVE | NOTHING,
             "step": POSITIVE | NOTHING,
-            "integrator": CHOICE,
-            "tolerance": POSITIVE | NOTHING,
             "stop_at_lift_off": FLAG,
             "speed_limit": POSITIVE | NOTHING,
         },

@@ -28,7 +28,14 @@ from models import (
 from ocp import ClearanceConstraints, Collocation, Problem, ProblemError, SolveError, solve
 from ocp.audit.audit import Finding
 from ocp.audit.clearance import Clearance, ClosestPair
-from ocp.motion.builders.clearance import LOOKS, MARGIN, ROUNDING, clearance_of, collision_error, solve_with_clearance
+from ocp.motion.builders.clearance import (
+    MARGIN,
+    MAX_SOLVES,
+    ROUNDING,
+    clearance_of,
+    collision_error,
+    solve_with_clearance,
+)
 from ocp.motion.local.collisions import Collision, distances_along
 from ocp.problem.values import constant
 from tests.models.machines.armoured import armoured_arm
@@ -210,13 +217,13 @@ def test_it_is_planned_anew_until_it_is_clear() -> None:
     def run(clearance_constraints: ClearanceConstraints | None) -> Any:
         assert clearance_constraints is not None
         seen.append(dict(clearance_constraints.margins))
-        if len(seen) < LOOKS:
+        if len(seen) < MAX_SOLVES:
             raise refused_pair(around, pair=0, least=0.01)
         return "clear"
 
     result: Any = solve_with_clearance(ClearanceConstraints(around), run)
     assert result == "clear"
-    margins = [MARGIN + k * (1.5 * 0.01 + MARGIN) for k in range(LOOKS - 1)]
+    margins = [MARGIN + k * (1.5 * 0.01 + MARGIN) for k in range(MAX_SOLVES - 1)]
     assert seen == [{}, *({0: pytest.approx(margin)} for margin in margins)]
 
 
@@ -230,7 +237,7 @@ def test_unavoidable_collisions_name_the_first_pair() -> None:
 
     with pytest.raises(SolveError, match=r"overlap by 0\.01 m at 0\.5 s") as caught:
         solve_with_clearance(ClearanceConstraints(around), never)
-    assert len(looks) == LOOKS
+    assert len(looks) == MAX_SOLVES
     assert (caught.value.name, caught.value.value, caught.value.limit, caught.value.time) == (
         "clearance",
         0.03,

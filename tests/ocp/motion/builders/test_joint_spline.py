@@ -68,6 +68,13 @@ def test_the_error_is_stated_and_falls_with_more_samples() -> None:
     assert many.error < few.error / 16
 
 
+def test_samples_at_random_distances_are_interpolated_as_well() -> None:
+    inside = np.random.default_rng(0).uniform(0, PATH.length, 1000)
+    s = np.concatenate([[0.0], np.sort(inside), [PATH.length]])
+    joints, fine = joint_path(arm(), (s, angles(s)), PATH), np.linspace(0, PATH.length, 3001)
+    assert np.abs(joints.at(fine).position - angles(fine)).max() < 1e-6
+
+
 def test_the_torque_is_a_linear_form_of_acceleration_and_squared_speed() -> None:
     machine, joints, s = arm(), sampled(), np.linspace(0, PATH.length, 20)
     along, torque = joints.at(s), joints.torques(s)

@@ -216,5 +216,5 @@ def test_weights_and_momentum_cost_less_than_instantly() -> None:
     request |= {"horizon": 2.0, "weights": (1.0, 3.0, 0.5)}
     solution = audited(machine, Collocation(intervals=20, degree=4), **request)
     assert solution.cost < resolved(machine, **request).cost[-1]
-    with pytest.raises(ProblemError, match="must be positive"):
+    with pytest.raises(ProblemError, match="is not positive"):
         minimum_velocity_problem(machine, **{**request, "weights": (1.0, 0.0, 1.0)})

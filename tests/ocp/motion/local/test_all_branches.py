@@ -153,7 +153,7 @@ def chain_of(machine: FixedBase) -> Chain:
 def least_singular_values(machine: FixedBase, joints: Array) -> Array:
     chain = chain_of(machine)
     positions, rotations = chain.poses(joints)
-    _, jacobian = chain.linearize(joints, chain.order, Motion(rotations, positions))
+    _, jacobian = chain.linearize(joints, Motion(rotations, positions), chain.order)
     return np.asarray(np.linalg.svd(jacobian, compute_uv=False)[:, -1])
 
 
@@ -205,7 +205,7 @@ def test_at_singular_poses_a_configuration_is_found_and_completeness_is_not_clai
 
     def determinant(joints: Array) -> Array:
         positions, rotations = chain.poses(joints)
-        return np.asarray(np.linalg.det(chain.linearize(joints, chain.order, Motion(rotations, positions))[1]))
+        return np.asarray(np.linalg.det(chain.linearize(joints, Motion(rotations, positions), chain.order)[1]))
 
     first, second = rng.uniform(-np.pi, np.pi, (2, 40, 6))
     opposite = determinant(first) * determinant(second) < 0

@@ -68,7 +68,7 @@ def counts(machine: FixedBase, form: ClosedForm, rng: Any, count: int) -> Any:
     joints = rng.uniform(-np.pi, np.pi, (count, machine.joint_size))
     joints[:, ~form.chain.revolute] /= 10
     places, turns = poses(machine, joints)
-    own, result = form.solutions(places, turns, joints[:, list(form.redundant)])
+    (own, result, _), _ = form.solve(places, turns, joints[:, list(form.redundant)])
     again = poses(machine, result)
     assert again[0] == pytest.approx(places[own], abs=1e-9)
     assert again[1] == pytest.approx(turns[own], abs=1e-9)
@@ -99,7 +99,7 @@ def test_newtons_method_from_many_starts_finds_the_same_branches(kind: str) -> N
     machine = random_arm(kind, 3 if kind == "meeting" else 1, rng)
     (form,) = closed_forms(machine)
     places, turns = poses(machine, rng.uniform(-np.pi, np.pi, (3, 6)))
-    own, result = form.solutions(places, turns, np.zeros((3, 0)))
+    (own, result, _), _ = form.solve(places, turns, np.zeros((3, 0)))
     for k in range(3):
         task = TipTask(position=places[k], orientation=turns[k])
         others = np.array([one.joints for one in inverse_kinematics(machine, task, starts=200, seed=k)])
@@ -165,7 +165,7 @@ def test_other_arms_have_no_closed_form_and_unreachable_poses_no_branch() -> Non
     )
     assert closed_forms(FixedBase(Robot(six.links, tuple(following), tip=six.tip))) == ()
     (form,) = closed_forms(ur5())
-    own, result = form.solutions(np.array([[5.0, 0.0, 0.0]]), np.eye(3)[None], np.zeros((1, 0)))
+    (own, result, _), _ = form.solve(np.array([[5.0, 0.0, 0.0]]), np.eye(3)[None], np.zeros((1, 0)))
     assert own.shape == (0,)
     assert result.shape == (0, 6)
 

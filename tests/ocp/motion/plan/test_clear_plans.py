@@ -316,7 +316,7 @@ def test_pairs_clear_within_limits_are_checked_without_limits() -> None:
     robot = armoured_arm()
     narrow = replace(robot, joints=tuple(replace(joint, lower=-0.3, upper=0.3) for joint in robot.joints))
     within, beyond = (CollisionScene(FixedBase(narrow), limits=limits) for limits in (True, False))
-    assert within.left["link2", "link6"] == "never in collision"
+    assert within.excluded["link2", "link6"] == "never in collision"
     assert ("link2", "link6") in beyond.labels
     free_of_limits = Limits(joints=False)
     required: dict[str, Any] = {"tasks": line(), "start": START, "horizon": SECONDS, "limits": free_of_limits}

@@ -13,7 +13,7 @@ from models import FixedBase, FreeFloating, Link, Machine, planar_chain
 from models.checks import Array
 from ocp import Limits, Plan, SolveError, TipTask, plan
 from ocp.__main__ import main
-from ocp.motion.plan.actuators import ActuatorDemand
+from ocp.motion.plan.actuators import largest_demand
 from ocp.motion.result.solved_plan import SolvedPlan
 from tests.ocp.app.motions import write_robot
 from tests.ocp.app.test_command import TASK
@@ -72,9 +72,11 @@ def test_accelerations_are_within_their_limits_or_reported() -> None:
     free = plan(FIXED, task, start=START)
     most = np.array([0.85, 9.0, 9.0])
     assert isinstance(free, SolvedPlan)
-    demand = ActuatorDemand.of(free, Limits(acceleration=most))
+    demand = largest_demand(free, Limits(acceleration=most))
     assert demand is not None
-    assert (demand.quantity, demand.joint, demand.allowed, demand.unit) == ("acceleration", "joint1", 0.85, "rad/s^2")
+    assert (demand.name, demand.limit) == ("joint1", 0.85)
+    assert demand.detail.startswith("acceleration of 'joint1' is ")
+    assert " rad/s^2 at " in demand.detail
     result = plan(FIXED, task, start=START, limits=Limits(acceleration=most))
     assert (np.abs(result.sample(0.001).accelerations).max(axis=0) <= most + 1e-5).all()
     assert result.cost > free.cost

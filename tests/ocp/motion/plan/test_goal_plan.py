@@ -126,7 +126,8 @@ def test_a_plan_is_read_from_its_file_and_audited_again(tmp_path: Path) -> None:
 
 def test_the_same_seed_gives_the_same_plan_and_stages_are_reported() -> None:
     results: list[str] = []
-    first, again = (plan_to_goal(request_of(BOX, seed=3, progress=results.append)) for _ in range(2))
+    with console.shown_progress("goal", results.append):
+        first, again = (plan_to_goal(request_of(BOX, seed=3)) for _ in range(2))
     np.testing.assert_array_equal(sampled(first), sampled(again))
     assert len(results) >= 4
 

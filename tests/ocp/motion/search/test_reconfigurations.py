@@ -81,7 +81,7 @@ def of_six_joints(seed: int) -> tuple[FixedBase, Array, Array, float, list[Array
         np.linspace(0, 1, COUNT)
     )
     (form,) = closed_forms(chain_of(machine))
-    own, joints = form.solutions(places, turns.as_matrix(), np.zeros((COUNT, 0)))
+    (own, joints, _), _ = form.solve(places, turns.as_matrix(), np.zeros((COUNT, 0)))
     joints = middle + np.remainder(joints - middle + np.pi, FULL_TURN) - np.pi  # less than two turns within the limits
     more = [joints]
     for j in range(6):

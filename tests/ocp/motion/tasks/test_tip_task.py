@@ -209,7 +209,7 @@ def test_a_pose_line_is_a_slerp_at_constant_pace_and_rests_at_its_ends() -> None
     np.testing.assert_allclose(numeric(same.orientation(0.5)), first, atol=1e-12)
     with pytest.raises(ProblemError, match="180 deg apart"):
         pose_line((np.eye(3), (0, 0, 0)), (np.diag([-1.0, -1.0, 1.0]), (0, 0, 0)), 1.0)
-    with pytest.raises(ProblemError, match="no rotation"):
+    with pytest.raises(ProblemError, match="not a rotation"):
         pose_line((np.eye(3), (0, 0, 0)), (np.ones((3, 3)), (0, 0, 0)), 1.0)
 
 
