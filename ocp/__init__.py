@@ -14,6 +14,7 @@ if _Path(_file := getattr(_find_spec("models"), "origin", None) or "").parent !=
 
 from ocp.adaptive import AdaptiveCollocation
 from ocp.audit.audit import Audit, Finding
+from ocp.direct.controller import Controller, ControlStep
 from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.errors import (
     AuditError,
@@ -77,6 +78,8 @@ __all__ = [
     "ClearanceConstraints",
     "Collocation",
     "Cone",
+    "ControlStep",
+    "Controller",
     "Cost",
     "DeadEnd",
     "DynamicsSetup",
