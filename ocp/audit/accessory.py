@@ -24,8 +24,6 @@ from ocp.audit.sizes import share_sizes
 from ocp.problem.formulation import Formulation
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, MACHINE_SHARE, RESOLVED_SHARE, SOLVER_SHARE
 
-__all__ = ["AccessoryProblem", "end_conditions"]
-
 
 class AccessoryProblem:
     """Linear-quadratic problem of the second variation of the cost: dynamics, Hamiltonian and active constraints.

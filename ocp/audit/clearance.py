@@ -29,16 +29,6 @@ from ocp.problem.hulls import BodyPairs, Frames, Separation, frames_of
 from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_variables_match, match_order
 
-__all__ = [
-    "Clearance",
-    "ClosestPair",
-    "Track",
-    "clearance",
-    "clearance_along",
-    "closest_pairs_along",
-    "separation_frames",
-]
-
 MAX_PRINTED = 4
 """Largest number of pairs that a text lists as left out of the proof by assumption; `Clearance.assumed` has all."""
 

@@ -20,8 +20,6 @@ from ocp.audit.sizes import FineGrid, plan_at
 from ocp.console import check_time
 from ocp.curves import lagrange
 
-__all__ = ["SETTINGS", "IntegratedMotion", "corrected_motion"]
-
 
 @dataclass(frozen=True)
 class IntegrationSettings:

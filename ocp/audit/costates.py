@@ -22,8 +22,6 @@ from ocp.curves import lagrange
 from ocp.solution import stack
 from ocp.tolerances import COSTATE_SHARE, ROUNDING_SHARE
 
-__all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "end_limits", "interval_end_costates"]
-
 
 class Ends(NamedTuple):
     """Residuals and multipliers of the optimality conditions at start and end of a plan.

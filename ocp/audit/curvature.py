@@ -19,8 +19,6 @@ from ocp.audit.principle import groups
 from ocp.problem.formulation import Formulation
 from ocp.tolerances import FLAT_SHARE, IMPLIED_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["Curvature", "curvature"]
-
 
 class RankTolerances(NamedTuple):
     """Singular values below which constraint gradients, scaled to length 1, count as linearly dependent.

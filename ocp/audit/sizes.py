@@ -21,18 +21,6 @@ from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
 from ocp.tolerances import HELD_SHARE, LIMIT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE, STANDSTILL
 
-__all__ = [
-    "FineGrid",
-    "Sizes",
-    "fine_grid",
-    "integral",
-    "plan_at",
-    "row_changes",
-    "share_sizes",
-    "sizes",
-    "sizes_along",
-]
-
 GRID_FACTOR = 10  # refinement of the fine grid over the points of the plan
 COSTS = ("running", "terminal")
 N_SAMPLES = 32  # number of samples at which the dependence of a constraint on its variables is evaluated

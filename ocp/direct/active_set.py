@@ -28,8 +28,6 @@ from ocp.direct.scaling import Scales
 from ocp.errors import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["RESOLVED", "Conditions", "Newton", "active_sides", "conditions"]
-
 Sides: TypeAlias = dict[str, np.ndarray]
 """Active limit of each variable (x) and each constraint row (g) of a program: -1 lower, 1 upper, 0 none."""
 RESOLVED = 10 * SOLVER_RESIDUAL

@@ -24,8 +24,6 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
-__all__ = ["Elastic", "diagnosis", "elastic_plan", "variable_names"]
-
 ELASTIC_IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
 REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or choose units in which they are near 1"
 

@@ -20,8 +20,6 @@ from ocp.indirect.seed import ControlArcs
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 
-__all__ = ["LOBATTO", "BoundaryProblem", "NewtonResult", "newton"]
-
 LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nodes of a reported segment, 0..1
 
 

@@ -18,8 +18,6 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import symbols_of
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Extremal", "Hamiltonian", "cost_gradient"]
-
 
 @dataclass(frozen=True)
 class Hamiltonian:
@@ -128,8 +126,6 @@ class Hamiltonian:
         arguments = [sym(f"a{i}", size) for i, size in enumerate(self.sizes)]
         results = inner.call([*arguments[:-1], self.unknowns.call(arguments)[0]])
         return ca.Function(name, arguments, results, {"cse": True})
-
-    # ---- the equations that make H stationary in the smooth controls, and their solution ----------------------
 
     def _solve(self) -> tuple[Any, str]:
         """Return the function that computes optimal controls and multipliers, and the name of the solution method.

@@ -36,8 +36,6 @@ from ocp.problem.values import evaluate_at_samples
 from ocp.solution import ByName, Guess, Solution, check_variables_match
 from ocp.tolerances import FLAT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["Indirect", "PreparedIndirect", "hamiltonian_defect"]
-
 
 def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> str:
     """Return the reason why the controls of an extremal do not minimise the Hamiltonian, or "" if they do.
@@ -266,8 +264,6 @@ class PreparedIndirect:
             raise SolveError(words, seed, error.conflicts, **details) from error
         status = seed.status if not seed.success else SolverStatus.REJECTED
         return dataclasses.replace(seed, success=False, status=status, message=f"{why}{error}")
-
-    # ---- check and report of the result ----------------------------------------------------------------------
 
     def _check_order(self, root: NewtonResult, arcs: ControlArcs, bounds: Bounds) -> NewtonResult:
         """Reject a result whose bang-bang switches are out of order, or whose horizon is outside its bounds."""

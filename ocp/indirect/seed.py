@@ -18,8 +18,6 @@ from ocp.problem.values import evaluate_at_samples
 from ocp.solution import Solution
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
-__all__ = ["ControlArcs", "read_arcs", "read_unknowns"]
-
 
 @dataclass(frozen=True)
 class SeedSettings:

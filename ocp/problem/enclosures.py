@@ -30,8 +30,6 @@ from ocp.problem.hulls import WORLD, CoveredPairs, Separation
 from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided_masks, evaluate, multiple_of
 from ocp.problem.values import identity
 
-__all__ = ["Enclosure", "Enclosures", "PrescribedMotion"]
-
 
 class Enclosure(NamedTuple):
     """Bounds of the values and slopes of expressions over intervals of their variable; -inf and inf if unbounded.
@@ -108,9 +106,6 @@ _SIDES: tuple[Callable[[_Jet], np.ndarray], ...] = (
     lambda jet: jet.slope.high,
 )
 ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_SUB))
-
-
-# ---- rules ----------------------------------------------------------------------------------------------------------
 
 
 def _where(valid: Any, slope: Interval) -> Interval:

@@ -28,8 +28,6 @@ from models.shapes.hull import gap_along, is_box, nearest_directions
 from ocp.errors import ProblemError, require
 from ocp.problem.values import check_finite, table
 
-__all__ = ["Separation", "index_rows", "stack_motion_bounds"]
-
 
 @dataclass(frozen=True, eq=False)
 class Hull:

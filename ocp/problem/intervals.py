@@ -17,8 +17,6 @@ import numpy as np
 
 from ocp.errors import ProblemError
 
-__all__ = ["NAMES", "RULES", "Interval", "check_instructions", "constant", "decided_masks", "evaluate", "multiple_of"]
-
 Array: TypeAlias = np.ndarray
 
 
@@ -69,9 +67,6 @@ def check_instructions(what: str, function: Any) -> None:
             name = NAMES.get(code, str(code))
             words = f"{what}: the operation {name!r} has no bounds; write it with elementary functions"
             raise ProblemError(words, name=name, value=code)
-
-
-# ---- rules ----------------------------------------------------------------------------------------------------------
 
 
 def _out(low: Any, high: Any) -> Interval:

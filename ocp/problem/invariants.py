@@ -20,8 +20,6 @@ import scipy
 from ocp.problem.formulation import Bounds, Formulation, is_free
 from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["bounds_to_solve"]
-
 MAX_DEGREE = 3  # of the polynomials
 
 

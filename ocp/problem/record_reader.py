@@ -17,8 +17,6 @@ import numpy as np
 
 from ocp.errors import ProblemError
 
-__all__ = ["ARRAY_NAMES", "RECORD_ERRORS", "FunctionReader", "from_record", "unpack_record"]
-
 UNARY = (
     "NEG", "EXP", "LOG", "SQRT", "SQ", "TWICE", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "NOT", "FLOOR", "CEIL",
     "FABS", "SIGN", "ERF", "INV", "SINH", "COSH", "TANH", "ASINH", "ACOSH", "ATANH", "ERFINV", "LOG1P", "EXPM1",
@@ -227,9 +225,6 @@ def _read_pattern(shape: Any) -> Any:
     return ca.Sparsity.nonzeros(rows, columns, places.tolist())
 
 
-# ---- functions that are not scalar arithmetic ------------------------------------------------------------------------
-
-
 def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild CasADi's function `low` from its record: the index of the table interval that contains a number."""
     table, modes = _floats(record["table"], finite=True), ("linear", "exact", "binary")
@@ -326,8 +321,6 @@ BUILDERS: dict[str, Callable[[Mapping[str, Any], Sequence[Any]], Any]] = {
     "integrator": _integrator,
 }
 
-
-# ---- records of problems and of other data ---------------------------------------------------------------------------
 
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
 RECORD_ERRORS = (

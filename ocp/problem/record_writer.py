@@ -27,8 +27,6 @@ from ocp.problem.record_reader import (
     from_entries,
 )
 
-__all__ = ["FunctionWriter", "pack_record", "to_record"]
-
 
 class FunctionWriter:
     """Writer of CasADi functions as records; each function is written once, after the functions that it calls.
@@ -357,9 +355,6 @@ def _integrator_record(function: Any, oracle: int) -> dict[str, Any]:
         "times": numbers["Integrator::tout"],
         "options": {option: numbers[name] for option, (name, _) in INTEGRATOR_OPTIONS.items() if name in numbers},
     }
-
-
-# ---- records of problems and of other data ---------------------------------------------------------------------------
 
 
 def to_record(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:

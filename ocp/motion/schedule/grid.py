@@ -29,8 +29,6 @@ from ocp.motion.schedule.limits import (
 from ocp.motion.tasks.speed_profile import Array, segment_index
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["GAUSS", "Grid", "coarse_grid", "make_grid", "reachable_bounds"]
-
 
 @dataclass(frozen=True)
 class GridSettings:

@@ -24,12 +24,6 @@ from ocp.errors import ProblemError, require
 from ocp.motion.tasks.speed_profile import Array, LineMotion
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "BLOCK_SIZE", "JointLimits", "JointPath", "JointRates", "LineLimits", "PathLike", "Rows", "ToolLimits",
-    "TorqueRates", "check_joints", "check_line", "check_smooth", "curvature_along", "limit_names", "limit_rows",
-    "rates_along", "tool_along", "torque_rows", "torques_along",
-]  # fmt: skip
-
 BLOCK_SIZE = 20_000
 """Largest number of points of a path whose limits are evaluated at once, to bound the memory for a long path."""
 

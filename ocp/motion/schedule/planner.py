@@ -34,8 +34,6 @@ from ocp.motion.schedule.window import Stretch
 from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, join_profiles, ramp_distance, segment_index
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Dip", "Schedule", "plan_below_velocity_curve", "schedule"]
-
 
 @dataclass(frozen=True)
 class ScheduleSettings:

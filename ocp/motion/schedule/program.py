@@ -35,8 +35,6 @@ from ocp.errors import SolveError
 from ocp.motion.tasks.speed_profile import Array
 from ocp.tolerances import SOLVER_SHARE
 
-__all__ = ["INTERIOR", "Program", "ProgramSettings", "Spline", "SplineRows", "least_time"]
-
 
 @dataclass(frozen=True)
 class ProgramSettings:

@@ -32,10 +32,6 @@ from ocp.motion.tasks.speed_profile import (
 )
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "Memory", "Zones", "fastest_motion", "peak_acceleration", "plan_zones", "reachability_passes",
-]  # fmt: skip
-
 Memory = MutableMapping[tuple[float, ...], Phases]
 """Cache of computed motions, keyed by distance, end speeds and limits."""
 

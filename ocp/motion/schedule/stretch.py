@@ -36,8 +36,6 @@ from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
 from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, join_profiles, profile_between
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ACTIVE_SHARE", "fastest_profile"]
-
 ACTIVE_SHARE = 0.98
 """Fraction of a limit above which it counts as active; limits that no motion can activate are left out at first."""
 

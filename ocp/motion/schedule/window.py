@@ -13,10 +13,6 @@ from ocp.motion.schedule.grid import Grid
 from ocp.motion.schedule.limits import Rows, limit_rows, torque_rows
 from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, profile_through
 
-__all__ = [
-    "HELD", "INSIDE", "Ends", "EnforcedRows", "Margins", "Motion", "Stretch", "Window", "limit_usage", "motion_profile",
-]  # fmt: skip
-
 
 @dataclass(frozen=True)
 class WindowSettings:
