@@ -172,12 +172,9 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
 def _halve_intervals(
     path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, requested: tuple[Array, Array]
 ) -> _Cells:
-    """Halve the intervals of a path until the coefficients of all limits vary almost linearly in each interval.
+    """Halve the intervals between distances `s` along a path until all limits vary almost linearly in each interval.
 
-    Args:
-        path, limits, joints: As for `make_grid`.
-        s: Distances of the positions. Shape (M + 1,), m.
-        requested: Bounds of the segments of the path, and the requested speed in each segment.
+    `requested` contains the bounds of the segments of the path, and the requested speed in each segment.
     """
     rows = limit_rows(path, limits, joints, s)
     _check_rest(rows, s, limit_names(limits, joints))
@@ -229,8 +226,7 @@ def _separate(places: Array, nodes: Array) -> Array:
     s = np.unique(places)
     for _ in range(3):
         gap = np.diff(s)
-        longer_gap = np.maximum(np.append(gap, 0.0), np.insert(gap, 0, 0.0))
-        close = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf)) < SETTINGS.closest * longer_gap
+        close = node_minimum(gap) < SETTINGS.closest * np.maximum(np.append(gap, 0.0), np.insert(gap, 0, 0.0))
         close &= ~np.isin(s, nodes)
         close[1:] &= ~close[:-1]  # of two close positions, keep one
         if not close.any():
@@ -298,17 +294,25 @@ def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tupl
     gain = np.concatenate([[0.0], np.cumsum(2 * rates * np.diff(distance))])
     squares = caps.copy()
     squares[[i for i, rest in zip((0, -1), at_rest, strict=True) if rest]] = 0.0
-    squares = np.minimum.accumulate(squares - gain) + gain
-    squares = np.minimum.accumulate((squares + gain)[::-1])[::-1] - gain
-    return np.asarray(np.maximum(squares, 0.0))
+    return np.maximum(limit_slope(squares, gain), 0.0)
+
+
+def limit_slope(values: Array, gain: Array) -> Array:
+    """Return the greatest values at nodes, at most `values` (N,), that change by at most the change of `gain` (N,)."""
+    lowered = np.minimum.accumulate(values - gain) + gain
+    return np.asarray(np.minimum.accumulate((lowered + gain)[::-1])[::-1] - gain)
+
+
+def node_minimum(of_intervals: Array) -> Array:
+    """Return the smaller of the values of the two intervals that meet at each node. Shape (N + 1,)."""
+    return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 
 def _time_nodes(cells: _Cells, length: float) -> Array:
     """Return grid nodes such that the motion passes every interval in a short time, refined towards the path's ends."""
     _, top, rates, acceleration, jerk = cells
     s = np.append(cells.begin, length)
-    caps = np.minimum(np.append(top, np.inf), np.insert(top, 0, np.inf)) ** 2
-    squares = _reachable_squares(s, caps, rates, (True, True))
+    squares = _reachable_squares(s, node_minimum(top) ** 2, rates, (True, True))
     ramp = top / acceleration
     with np.errstate(invalid="ignore"):
         build_up = np.minimum(acceleration / jerk, np.sqrt(top / jerk))
@@ -318,7 +322,8 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
     longest = np.minimum(speed * duration, length)
     # ceil with a margin for rounding: the unit of length must not change the nodes
     parts = np.clip(np.ceil(np.diff(s) / longest * (1 - ROUNDING_SHARE)), 1, SETTINGS.parts).astype(np.intp)
-    nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * _group_indices(parts), length)
+    index = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * index, length)
     near: list[Array] = [np.zeros(0), np.zeros(0)]
     for end in (0, -1):
         away = nodes if end == 0 else length - nodes
@@ -331,13 +336,6 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
         count = max(int(np.ceil(np.log(geometric_range / first) / np.log(SETTINGS.growth))), 1)
         near[end] = np.asarray(first * SETTINGS.growth ** np.arange(count + 1), dtype=float)
         # finer nodes, which resolve a limit such as a bend near the end, are kept
-        gap = np.diff(nodes)
-        finest = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf))
-        finer = finest < away * (1 - 1 / SETTINGS.growth)
+        finer = node_minimum(np.diff(nodes)) < away * (1 - 1 / SETTINGS.growth)
         nodes = nodes[(away == 0) | finer | (away >= near[end][-1] * (1 + (SETTINGS.growth - 1) / 2))]
     return np.unique(np.concatenate([nodes, near[0], length - near[1]]))
-
-
-def _group_indices(sizes: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return, for consecutive groups of elements of the given sizes, the index of each element within its group."""
-    return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require, sample_times
-from ocp.motion.schedule.grid import Grid, coarse_grid, make_grid
+from ocp.motion.schedule.grid import Grid, coarse_grid, limit_slope, make_grid, node_minimum
 from ocp.motion.schedule.limits import (
     BLOCK_SIZE,
     JointPath,
@@ -137,9 +137,7 @@ def _unresolved_intervals(
     It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.
     """
     low = np.minimum(permitted[:-1], permitted[1:])
-    gain = 2 * acceleration * (s - s[0])
-    reachable = np.minimum.accumulate(permitted**2 - gain) + gain
-    reachable = np.minimum.accumulate((reachable + gain)[::-1])[::-1] - gain
+    reachable = limit_slope(permitted**2, 2 * acceleration * (s - s[0]))
     reachable = np.sqrt(np.maximum(reachable[:-1], reachable[1:]))
     matters = (low < 1.1 * np.minimum(requested, reachable)) & (np.diff(s) > ROUNDING_SHARE * length)
     value = np.log(np.minimum(permitted, 2 * requested.max()))
@@ -379,7 +377,7 @@ def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], e
     count, s, limits = len(violated), grid.distance, grid.limits
     motion = profile.at_distance(s)
     steady = (np.abs(motion.acceleration) <= ROUNDING_SHARE * limits.acceleration) & (motion.jerk == 0)
-    requested = np.minimum(np.append(grid.requested, np.inf), np.insert(grid.requested, 0, np.inf))
+    requested = node_minimum(grid.requested)
     steady &= np.abs(motion.speed - requested) <= ROUNDING_SHARE * requested
     steady[[0, -1]] = True
     steady_nodes = np.flatnonzero(steady)

@@ -165,12 +165,10 @@ def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
     motions: list[Phases] = []
     for largest, length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
         key = (length, first, last, *largest)
-        if first == last == largest[0]:
-            motions.append(((length / first, 0.0),))
-        else:
-            motions.append(
-                cache[key] if key in cache else cache.setdefault(key, fastest_motion(length, first, last, largest))
-            )
+        if key not in cache:
+            steady = first == last == largest[0]
+            cache[key] = ((length / first, 0.0),) if steady else fastest_motion(length, first, last, largest)
+        motions.append(cache[key])
     return _profile(zones, np.array(ends), motions)
 
 

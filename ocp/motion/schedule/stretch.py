@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError, SolveError
-from ocp.motion.schedule.grid import GAUSS, Grid, reachable_bounds
+from ocp.motion.schedule.grid import GAUSS, Grid, limit_slope, node_minimum, reachable_bounds
 from ocp.motion.schedule.limits import Rows, limit_rows
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.motion.schedule.ramps import reachability_passes
@@ -31,6 +31,7 @@ from ocp.motion.schedule.window import (
     Window,
     limit_usage,
     motion_profile,
+    parabola_peak,
 )
 from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
 from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, join_profiles, profile_between
@@ -112,13 +113,8 @@ def _solve_window(
 ) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
     """Return the fastest motion in a window (intervals of a path solved at once), up to the start of the next window.
 
-    Args:
-        window: The window.
-        seam: Node at which the next window begins, or the last node.
-        before: Limit rows enforced in the previous window beyond its seam.
-
-    Returns:
-        The motion, squared speed and slope at the seam, and the limit rows enforced beyond it.
+    Also return the squared speed and its slope at that node, `seam`, and the limits enforced beyond it; `before` are
+    those that the previous window enforced beyond its own seam.
     """
     enforced = EnforcedRows.build(window)
     if before is not None:
@@ -136,12 +132,8 @@ def _solve_window(
 def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> Motion:
     """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
-    If few intervals still violate limits, these are planned again with their neighbours, between fixed motions.
-
-    Args:
-        window, seam: As for `_solve_window`.
-        enforced: Enforced limit rows and margins, changed in place.
-        checked: Number of intervals, from the first, that must keep the limits.
+    If few intervals still violate limits, these are planned again with their neighbours, between fixed motions. The
+    first `checked` intervals must keep the limits.
     """
     every = np.arange(window.last - window.first)
     accuracies, start, free = SETTINGS.accuracies, None, every
@@ -194,7 +186,7 @@ def _without_jerk(grid: Grid) -> SpeedProfile:
     sides = grid.ends(0, len(requested))
     middle = limit_rows(grid.path, grid.limits, grid.joints, (s[:-1] + s[1:]) / 2)
     for _ in range(SETTINGS.rounds):
-        caps = np.minimum(_node_minimum(requested) ** 2, _row_speed_caps(*sides))
+        caps = np.minimum(node_minimum(requested) ** 2, _row_speed_caps(*sides))
         caps[[0, -1]] = 0.0
         x, *rates = reachability_passes(s, caps, *(side.acceleration for side in sides))
         profile = profile_between(s, np.sqrt(x), (rates[0], rates[1]))
@@ -243,10 +235,7 @@ def _usage_without_jerk(profile: SpeedProfile, rows: tuple[Rows, ...], requested
     last = LineMotion(profile.t[1:], profile.distance[1:], profile.speed[1:], end, profile.jerk)
     motions = first, inside, last
     values = np.stack([each.usage(motion) for each, motion in zip(rows, motions, strict=True)])
-    begin, half, final = values
-    slope, bend = final - begin, begin + final - 2 * half
-    vertex = np.where(np.abs(slope) < 2 * np.abs(bend), half - slope**2 / np.where(bend == 0, np.inf, 8 * bend), 0.0)
-    peak = np.maximum(np.abs(values).max(axis=(0, 2)), np.abs(vertex).max(axis=1))
+    peak = np.maximum(np.abs(values).max(axis=(0, 2)), np.abs(parabola_peak(values, (0.0, 0.5, 1.0))).max(axis=1))
     used = np.maximum(np.abs(values).max(axis=2), [motion.speed / requested for motion in motions])
     return used, np.maximum(peak, used.max(axis=0))
 
@@ -256,11 +245,6 @@ def _row_speed_caps(left: Rows, right: Rows) -> Array:
     left, right = (side.speed.max(axis=1, initial=0.0) for side in (left, right))
     with np.errstate(divide="ignore"):
         return np.asarray(np.maximum(np.append(left, 0.0), np.insert(right, 0, 0.0)) ** -2.0)
-
-
-def _node_minimum(of_intervals: Array) -> Array:
-    """Return the smaller of the values of the two intervals that meet at each node."""
-    return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 
 def _with_jerk(
@@ -273,7 +257,7 @@ def _with_jerk(
     seam_shares = _seam_shares(window, seam)
     shares = enforced.margins.times(seam_shares)
     requested = grid.requested[begin:end] ** 2 * seam_shares**2
-    caps = np.minimum(_node_minimum(requested), _row_speed_caps(left, right) * _node_minimum(shares.speed) ** 2)
+    caps = np.minimum(node_minimum(requested), _row_speed_caps(left, right) * node_minimum(shares.speed) ** 2)
     reachable, rates = reachable_bounds(nodes, caps, left=left, right=right, at_rest=at_rest)
     # an interval next to rest has constant jerk and is not part of the program
     low, high = int(at_rest[0]), len(nodes) - int(at_rest[1])
@@ -354,13 +338,12 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
     motion may slow down likewise.
     """
     steady = np.minimum(left.steady()[0], right.steady()[0])
-    y = (SETTINGS.start * np.minimum(most, _node_minimum(steady) ** 2)) ** 0.75
+    y = (SETTINGS.start * np.minimum(most, node_minimum(steady) ** 2)) ** 0.75
     with np.errstate(divide="ignore"):
         sharp = 1 / np.maximum(*(np.abs(rows.jerk[:, :, 0]).max(axis=1) for rows in (left, right)))
     away = np.concatenate([[0.0], np.cumsum(np.sqrt(4.5 * sharp) * np.diff(nodes))])
     y[0], y[-1] = (x**0.75 for x, _ in ends)
-    y = np.minimum.accumulate(y - away) + away
-    y = np.minimum.accumulate((y + away)[::-1])[::-1] - away
+    y = limit_slope(y, away)
     start = np.maximum(y, np.maximum(ends[0][0] ** 0.75 - away, ends[1][0] ** 0.75 - (away[-1] - away))) ** (4 / 3)
     return np.asarray(np.maximum(start, 1e-9 * start.max()))
 
@@ -455,11 +438,7 @@ def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> Splin
 def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -> NDArray[np.bool_]:
     """Return which acceleration and jerk limits some motion can reach in each interval. Shape (N, K + L + P).
 
-    Args:
-        rows: Limit rows in N intervals.
-        squares: Greatest squared speed of any motion. Shape (N,).
-        rates: Greatest acceleration. Shape (N,).
-        shares: Shares of the limits that each interval may use.
+    `squares` and `rates` are the greatest squared speed and acceleration of any motion. Shape (N,) each.
     """
     a, j, top = np.abs(rows.acceleration), np.abs(rows.jerk), np.sqrt(squares)
     acceleration = a[:, :, 0] * rates[:, None] + a[:, :, 1] * squares[:, None] + a[:, :, 2]
@@ -467,6 +446,5 @@ def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -
     with np.errstate(divide="ignore", invalid="ignore"):
         sharp = np.where(j[:, :, 0] > 0, (1 + without_jerk) / j[:, :, 0], np.inf).min(axis=1, initial=np.inf)
         jerk = np.where(j[:, :, 0] > 0, j[:, :, 0] * sharp[:, None], 0.0) + without_jerk
-    none = np.zeros(rows.speed.shape, dtype=bool)
-    most = ACTIVE_SHARE
-    return np.concatenate([none, acceleration > most * shares.acceleration, jerk > most * shares.jerk], axis=1)
+    active = acceleration > ACTIVE_SHARE * shares.acceleration, jerk > ACTIVE_SHARE * shares.jerk
+    return np.concatenate([np.zeros(rows.speed.shape, dtype=bool), *active], axis=1)

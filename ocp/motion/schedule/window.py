@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple, TypeAlias
@@ -75,13 +76,12 @@ class Window(Stretch):
 
     Attributes:
         rows: Limit rows where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
-        bends: Largest errors of parabolas through the limit rows of acceleration and of jerk at three of these
-            positions. Shape (N, L, 3) and (N, P, 3).
+        bends: Largest errors of parabolas through the limit rows at three of these positions, 0 for speed. Shape (N,).
         close: Cache of limit rows at a finer spacing, by interval of the grid and whether with torques.
     """
 
-    rows: tuple[Rows, ...] = ()
-    bends: tuple[Array, Array] = (np.zeros((0, 0, 3)), np.zeros((0, 0, 3)))
+    rows: tuple[Rows, ...] = field(kw_only=True)
+    bends: Rows = field(kw_only=True)
     close: dict[tuple[int, bool], Rows] = field(default_factory=dict)
 
     @classmethod
@@ -94,11 +94,9 @@ class Window(Stretch):
         rows = limit_rows(grid.path, grid.limits, grid.joints, places)
         inside = [rows.take(slice(k * len(h), (k + 1) * len(h))) for k in range(len(INSIDE))]
         every = (left, *inside, right)
-        bends = (
-            _parabola_errors([each.acceleration for each in every]),
-            _parabola_errors([each.jerk for each in every]),
-        )
-        return cls(grid, first, last, ends, every, bends)
+        kinds = ([each.acceleration for each in every], [each.jerk for each in every])
+        bends = Rows(np.zeros_like(left.speed), *map(_parabola_errors, kinds))
+        return cls(grid, first, last, ends, rows=every, bends=bends)
 
     def fine_rows(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
         """Return the coefficients of all limits at closely spaced points in intervals, ordered by point, then interval.
@@ -299,12 +297,11 @@ def limit_usage(
     shares = (zero, INSIDE[0] + zero, f, f, INSIDE[2] + zero, zero + 1)
     places_of = [place[at_row[0]] for place in shares]
     for three in (slice(0, 3), slice(3, 6)):
-        peak = _vertex(high[three], places_of[three])
+        peak = parabola_peak(high[three], places_of[three])
         for side, value in zip(used, (peak, -peak), strict=True):
             side[at_row] = np.maximum(side[at_row], value)
     if closely:
-        bends = window.bends if every else (window.bends[0][which], window.bends[1][which])
-        missed = _inaccurate_rows(bends, used, (first, met, last))
+        missed = _inaccurate_rows(window.bends if every else window.bends.take(which), used, (first, met, last))
         inaccurate, by_torques = missed.any(axis=1), missed[:, window.torques].any(axis=1)
         for torques, these in ((False, np.flatnonzero(inaccurate & ~by_torques)), (True, np.flatnonzero(by_torques))):
             if these.size:
@@ -332,33 +329,19 @@ def _parabola_errors(rows: list[Array]) -> Array:
     return np.asarray(np.maximum(np.abs(d - a + 3 * (b - c)), np.abs(e - b + 3 * (c - d))) / (9 * np.sqrt(3)))
 
 
-def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
+def _inaccurate_rows(bends: Rows, used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
     """Return which limits a motion may exceed within the errors of interpolation. Shape (N, K + L + P)."""
-    v, a, j = (
-        np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
-        for kind in ("speed", "acceleration", "jerk")
-    )
-    acceleration, jerk = bends
-    errors = [
-        np.zeros((len(v), used.shape[2] - acceleration.shape[1] - jerk.shape[1])),
-        acceleration[:, :, 0] * a + acceleration[:, :, 1] * v**2 + acceleration[:, :, 2],
-        jerk[:, :, 0] * j + jerk[:, :, 1] * v * a + jerk[:, :, 2] * v**3,
-    ]
-    error = np.concatenate(errors, axis=1)
+    error = bends.usage(LineMotion(*np.abs(motions).max(axis=0)))
     return np.asarray((error > SETTINGS.bend) & (used.max(axis=0) + error > 1))
 
 
 def _fine_usage(
     window: Window, profile: SpeedProfile, intervals: NDArray[np.intp], f: Array, known: Array, torques: bool
 ) -> Array:
-    """Return the largest fraction used of each limit, in both directions, from dense samples. Shape (2, B, R).
+    """Return the largest fraction used of each limit in B intervals, in both directions, from dense samples.
 
-    Args:
-        window, profile: As for `limit_usage`.
-        intervals: The intervals. Shape (B,).
-        f: Positions in them, 0..1, at which the jerk changes. Shape (B,).
-        known: Usage at their beginning, before and after that change, and at their end. Shape (4, B, R).
-        torques: Whether the limits of torques are evaluated.
+    The jerk changes at the fraction `f` (B,) of each interval. `known` contains the usage at the beginning of each
+    interval, before and after that change, and at the end. Shape (4, B, R). The result has shape (2, B, R).
     """
     parts, half = SETTINGS.fine, SETTINGS.fine // 2
     places = window.nodes[intervals] + np.arange(1, parts)[:, None] / parts * np.diff(window.nodes)[intervals]
@@ -374,12 +357,12 @@ def _fine_usage(
     ):
         used = np.maximum(used, [values.max(axis=0), -values.min(axis=0)])
         for k in range(0, half, 2):
-            peak = _vertex(values[k : k + 3], [place[:, None] for place in at[k : k + 3]])
+            peak = parabola_peak(values[k : k + 3], [place[:, None] for place in at[k : k + 3]])
             used = np.maximum(used, [peak, -peak])
     return used
 
 
-def _vertex(values: Array, places: list[Array]) -> Array:
+def parabola_peak(values: Array, places: Sequence[Array | float]) -> Array:
     """Return the extreme value of the parabola through three points if it lies between them, else the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)
