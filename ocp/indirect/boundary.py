@@ -84,14 +84,11 @@ class BoundaryProblem:
 
     def _backward(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
         """Return unknowns, data and equations of backward shooting from an unknown end state to the given start."""
-        form = self.form
-        of = self._data(arcs)
-        total = sum(arcs.segments)
-        z, data = ca.MX.sym("z", form.nx), ca.MX.sym("data", of["guess"].stop)
-        _, y_start = self._chain(z, data, arcs, total)
-        return z, data, y_start[: form.nx, :] - data[of["ends"]][form.nx : 2 * form.nx]
+        nx, of = self.form.nx, self._data(arcs)
+        z, data = ca.MX.sym("z", nx), ca.MX.sym("data", of["guess"].stop)
+        return z, data, self._chain(z, data, arcs)[-1][:nx, :] - data[of["ends"]][nx : 2 * nx]
 
-    def _chain(self, state: Any, data: Any, arcs: ControlArcs, total: int) -> tuple[list[Any], Any]:
+    def _chain(self, state: Any, data: Any, arcs: ControlArcs) -> list[Any]:
         """Integrate states and costates backwards from an end state; return them at all nodes, last node first."""
         form, of = self.form, self._data(arcs)
         horizon = data[of["horizon"]]
@@ -100,11 +97,10 @@ class BoundaryProblem:
         y = ca.vertcat(state, terminal(state, horizon, horizon, data[of["p"]]))
         inputs = self._segment_data(ca.MX(0, 1), horizon, data, arcs)
         nodes = [y]
-        for k in reversed(range(total)):
+        for k in reversed(range(sum(arcs.segments))):
             q = ca.vertcat(inputs[0, k] + inputs[1, k], -inputs[1, k], inputs[2:, k])
-            y = self.step(y, q)[0]
-            nodes.append(y)
-        return nodes, y
+            nodes.append(self.step(nodes[-1], q)[0])
+        return nodes
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
         """Return the integrator's data vectors q of all shooting segments as the columns of a matrix."""
@@ -134,15 +130,9 @@ class BoundaryProblem:
     def layout(self, arcs: ControlArcs) -> dict[str, slice]:
         """Return, by name, the slice of every part of the vector of unknowns, such as the switch times."""
         form = self.form
-        total = sum(arcs.segments)
-        sizes = {
-            "y": 2 * form.nx * (total + 1),
-            "switches": len(arcs.switches),
-            "horizon": int(form.horizon_is_free),
-            "start": len(form.start),
-            "end": len(form.end),
-        }
-        return side_by_side(sizes)
+        sizes = {"y": 2 * form.nx * (sum(arcs.segments) + 1), "switches": len(arcs.switches)}
+        ends = {"start": len(form.start), "end": len(form.end)}
+        return side_by_side({**sizes, "horizon": int(form.horizon_is_free), **ends})
 
     def _data(self, arcs: ControlArcs) -> dict[str, slice]:
         """Return the slice of every part of the data vector (parameters, fixed values and guesses), by name."""
@@ -182,13 +172,6 @@ class BoundaryProblem:
         except RuntimeError:
             return np.full(segment.size_out(0), np.nan), np.full(2, np.nan)
 
-    def end_multipliers(self, z: np.ndarray, arcs: ControlArcs) -> tuple[np.ndarray, np.ndarray]:
-        """Return the multipliers of the start constraints and of the end constraints."""
-        if self.backward:
-            return np.zeros(0), np.zeros(0)
-        at = self.layout(arcs)
-        return z[at["start"]], z[at["end"]]
-
     def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
         """Return states and costates at a position 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
         if place == 0.0:
@@ -203,8 +186,7 @@ class BoundaryProblem:
         horizon, switches = float(data[0]), np.zeros(0)
         if self.backward:
             symbols = ca.MX.sym("z", form.nx), ca.MX.sym("data", data.size)
-            nodes, _ = self._chain(*symbols, arcs, total)
-            chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(nodes))])
+            chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(self._chain(*symbols, arcs)))])
             try:
                 with casadi_silenced():
                     y = np.asarray(chain(z, data).full())
@@ -354,10 +336,9 @@ def newton(
             if not np.all(np.isfinite(step)):
                 word = "Newton's matrix is singular: the plan is not unique"
                 if polished:
-                    return NewtonResult(
-                        z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps; {word}"
-                    )
-                return NewtonResult(z, size, steps, SolverStatus.STEP_FAILED, word)
+                    word = f"Converged in {steps} Newton steps; {word}"
+                status = SolverStatus.SOLVED if polished else SolverStatus.STEP_FAILED
+                return NewtonResult(z, size, steps, status, word)
             length = 1.0
             for _ in range(settings.halvings):
                 trial = z + length * step

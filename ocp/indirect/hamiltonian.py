@@ -59,10 +59,9 @@ class Hamiltonian:
         lam, mu = sym("lam", form.nx), sym("mu", len(form.path))
         value = form.running + ca.dot(lam, form.f) + ca.dot(mu, rows)
         symbols = [form.x, form.u, lam, mu, form.t, form.T, form.p]
-        curved = used_columns(nonzeros(ca.hessian(value, form.u)[0], symbols))
-        in_path = used_columns(ca.jacobian_sparsity(rows, form.u))
-        smooth = [i for i in range(form.nu) if curved[i] or in_path[i]]
-        linear = [i for i in range(form.nu) if i not in smooth]
+        patterns = nonzeros(ca.hessian(value, form.u)[0], symbols), ca.jacobian_sparsity(rows, form.u)
+        curved = {column for pattern in patterns for column in pattern.get_col()}
+        smooth, linear = ([i for i in range(form.nu) if (i in curved) == kind] for kind in (True, False))
         system = cls(form, lam, mu, rows, value, tuple(smooth), tuple(linear), None, "")
         unknowns, how = system._solve()
         return replace(system, unknowns=unknowns, how=how)
@@ -137,14 +136,17 @@ class Hamiltonian:
         self._check_linear()
         w, bang, guess = sym("w", n + m), sym("bang", len(self.linear)), sym("guess", n + m)
         known = [form.x, self.lam, form.t, form.T, form.p, bang]
-        residual = self._residual(w, bang)
+        gradient = ca.gradient(self.value, form.u)[list(self.smooth)] if n else form.problem.symbols(0, 1)
+        control = _assemble_control(form, self.smooth, self.linear, w, bang)
+        stationarity = ca.densify(ca.vertcat(gradient, self.rows))
+        residual = ca.substitute([stationarity], [form.u, self.mu], [control, w[n:, :]])[0]
         matrix = ca.jacobian(residual, w) if n + m else self.form.problem.symbols(0, 0)
         pattern = nonzeros(matrix, [*known, w])
         if isinstance(matrix, ca.SX):
             matrix = ca.sparsify(matrix)
         self._check_regular(matrix, [*known, w])
-        bounded = self._has_bounds()
         index = form.bounds.places["control"][list(self.smooth)].tolist()
+        bounded = bool(np.isfinite([bound[index] for bound in numeric_bounds(form)]).any())
         low, high = (bound[index] for bound in form.bounds.function(form.p))
         separate = m == 0 and pattern.is_diag()
         if not ca.depends_on(matrix, w) and (not bounded or separate):
@@ -162,20 +164,8 @@ class Hamiltonian:
         symbols = [ca.MX.sym(f"a{i}", s.numel()) for i, s in enumerate([*known, guess])]
         return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
 
-    def _residual(self, w: Any, bang: Any) -> Any:
-        """Return the Hamiltonian's gradient in the smooth controls, stacked on path equalities. Shape (n + m, 1)."""
-        n = len(self.smooth)
-        gradient = ca.gradient(self.value, self.form.u)[list(self.smooth)] if n else self.form.problem.symbols(0, 1)
-        stacked = ca.densify(ca.vertcat(gradient, self.rows))
-        control = _assemble_control(self.form, self.smooth, self.linear, w, bang)
-        return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:, :]])[0]
-
-    def _has_bounds(self) -> bool:
-        low, high = numeric_bounds(self.form)
-        index = self.form.bounds.places["control"][list(self.smooth)]
-        return bool(np.any(np.isfinite(low[index]) | np.isfinite(high[index])))
-
     def _check_linear(self) -> None:
+        """Raise ProblemError if a control in which the Hamiltonian is linear is not bounded on both sides."""
         low, high = numeric_bounds(self.form)
         for i in self.linear:
             at = self.form.bounds.places["control"][i]
@@ -242,9 +232,8 @@ def check_constraints(form: Formulation) -> None:
                 if not equality:
                     raise ProblemError(f"the indirect method does not support the {kind} inequality {label!r}")
                 if form.nu and ca.depends_on(rows.expression[i], controls):
-                    raise ProblemError(
-                        f"the indirect method does not support {kind} constraint {label!r} on the control"
-                    )
+                    words = f"the indirect method does not support {kind} constraint {label!r} on the control"
+                    raise ProblemError(words)
 
 
 def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
@@ -257,12 +246,6 @@ def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
     rng = np.random.default_rng(0)
     size = np.abs([numbers(matrix, symbols, rng) for _ in range(3)]).max(axis=0)  # nan counts as nonzero
     return ca.sparsify(ca.DM(np.where(size == 0, 0.0, 1.0))).sparsity()
-
-
-def used_columns(pattern: Any) -> list[bool]:
-    """Return which columns of a sparsity pattern contain an entry."""
-    starts = pattern.colind()
-    return [starts[i + 1] > starts[i] for i in range(pattern.size2())]
 
 
 def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
@@ -285,7 +268,8 @@ def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
     if not isinstance(matrix, ca.SX):
         return ca.solve(matrix, rhs)
     curvature, constraint = matrix[:n, :n], matrix[n:, :n]
-    if not positive(curvature):
+    values = np.linalg.eigvalsh(numbers(curvature, ca.symvar(curvature), np.random.default_rng(0)))
+    if not (np.isfinite(values).all() and values[0] > ROUNDING_SHARE * values[-1]):  # not positive definite
         return ca.solve(ca.densify(matrix), rhs)
     factor = ca.ldl(curvature)
     first = ca.ldl_solve(rhs[:n], *factor)
@@ -295,13 +279,6 @@ def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
     schur = ca.mtimes(constraint, through)
     multiplier = ca.ldl_solve(ca.mtimes(constraint, first) - rhs[n:], *ca.ldl(schur))
     return ca.vertcat(first - ca.mtimes(through, multiplier), multiplier)
-
-
-def positive(matrix: Any) -> bool:
-    """Return whether a symmetric matrix is positive definite at a random point."""
-    sample = numbers(matrix, ca.symvar(matrix), np.random.default_rng(0))
-    values = np.linalg.eigvalsh(sample)
-    return bool(np.all(np.isfinite(values)) and values[0] > ROUNDING_SHARE * values[-1])
 
 
 @dataclass(frozen=True)
