@@ -27,7 +27,16 @@ import numpy as np
 
 from ocp.errors import ProblemError
 from ocp.problem.hulls import WORLD, CoveredPairs, Separation
-from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided_masks, evaluate, multiple_of
+from ocp.problem.intervals import (
+    RULES,
+    Interval,
+    check_instructions,
+    constant,
+    decided_masks,
+    evaluate,
+    interpret,
+    multiple_of,
+)
 from ocp.problem.values import identity
 
 
@@ -69,27 +78,15 @@ class Enclosures:
 
         The intervals reach from ``low`` to ``high``. Shape (M,) each.
         """
-        jets = self._jets(_Jet(Interval(low, high), constant(1.0, low)))
-        return Enclosure(*(np.column_stack([side(jet) for jet in jets]) for side in _SIDES))
 
-    def _jets(self, time: _Jet) -> list[_Jet]:
-        function, slots, outputs = self._function, dict[int, _Jet](), dict[int, _Jet]()
-        zero = constant(0.0, time.value.low)
+        def apply(code: int, *operands: _Jet) -> _Jet:
+            return _KINKED[code](code, *operands) if code in _KINKED else _smooth(code, *operands)
+
+        symbol, zero = _Jet(Interval(low, high), constant(1.0, low)), constant(0.0, low)
         with np.errstate(all="ignore"):
-            for k in range(function.n_instructions()):
-                code, inputs = function.instruction_id(k), function.instruction_input(k)
-                if code == ca.OP_OUTPUT:
-                    outputs[function.instruction_output(k)[1]] = slots[inputs[0]]
-                    continue
-                if code == ca.OP_INPUT:
-                    jet = time
-                elif code == ca.OP_CONST:
-                    jet = _Jet(constant(function.instruction_constant(k), zero.low), zero)
-                else:
-                    rule: Callable[..., _Jet] = _KINKED.get(code, _smooth)
-                    jet = rule(code, *(slots[slot] for slot in inputs))
-                slots[function.instruction_output(k)[0]] = jet
-        return [outputs[k] for k in range(len(outputs))]
+            jets = interpret(self._function, [symbol], lambda value: _Jet(constant(value, low), zero), apply)
+        sides = zip(*((*jet.value[:2], *jet.slope[:2]) for jet in jets), strict=True)
+        return Enclosure(*(np.column_stack(side) for side in sides))
 
 
 class _Jet(NamedTuple):
@@ -99,12 +96,6 @@ class _Jet(NamedTuple):
     slope: Interval
 
 
-_SIDES: tuple[Callable[[_Jet], np.ndarray], ...] = (
-    lambda jet: jet.value.low,
-    lambda jet: jet.value.high,
-    lambda jet: jet.slope.low,
-    lambda jet: jet.slope.high,
-)
 ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_SUB))
 
 
@@ -116,8 +107,10 @@ def _where(valid: Any, slope: Interval) -> Interval:
 def _smooth(code: int, *jets: _Jet) -> _Jet:
     """Return bounds of the value and slope of a smooth operation, by the mean value theorem."""
     value = RULES[code](*(jet.value for jet in jets))
-    is_power = code in (ca.OP_POW, ca.OP_CONSTPOW)
-    exponent = _number(jets[1].value) if is_power else None
+    exponent = None
+    if code in (ca.OP_POW, ca.OP_CONSTPOW):
+        low, high = jets[1].value[:2]
+        exponent = float(low[0]) if (low == low[0]).all() and (high == low[0]).all() else None
     slope = constant(0.0, value.low)
     inputs = [jet.value for jet in jets[: 1 if exponent is not None else None]]
     for partial, jet in zip(evaluate(_partials(code, len(jets), exponent), inputs), jets, strict=False):
@@ -136,12 +129,6 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
         return ca.Function("partials", [x], [exponent * ca.constpow(x, exponent - 1)])
     both = ca.vertcat(x, y)
     return ca.Function("partials", [x, y], [ca.densify(ca.gradient(ca.SX.binary(code, x, y), both))])
-
-
-def _number(x: Interval) -> float | None:
-    """Return the number if all intervals consist of one and the same number; else None."""
-    first = float(x.low[0])
-    return first if bool((x.low == first).all() and (x.high == first).all()) else None
 
 
 def _steps(code: int, *jets: _Jet) -> _Jet:

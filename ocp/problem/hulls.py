@@ -107,21 +107,21 @@ class HullPairs:
         self.has = np.zeros(len(pairs), dtype=bool)
         self.has[members] = True
         self.row = np.cumsum(self.has) - 1
-        self._cores = [
-            np.array([_pad_points(pair[side].core, kind or 8) for pair in chosen]) for side, kind in enumerate(kinds)
-        ]
+        self._cores = []
+        for side, kind in enumerate(kinds):
+            cores, index = [pair[side].core for pair in chosen], np.arange(kind or 8)
+            self._cores.append(np.array([core[np.minimum(index, len(core) - 1)] for core in cores]))  # of one length
         self._boxes = kinds[0] == 0, kinds[1] == 0
         self._frames = [np.array([pair[side].frame for pair in chosen]) for side in (0, 1)]
         self._observer = pairs[members, 2]
         self.radii = np.array([first.radius + second.radius for first, second in chosen])
-        self.flat = np.array([bool(first.normal.size or second.normal.size) for first, second in chosen])
         self.normals = np.array([_normal(*pair) for pair in chosen])
+        self.flat = np.asarray(self.normals.any(axis=1))
         self._box_side = None if set(kinds) not in ({0, 1}, {1}) or self.flat.any() else kinds.index(min(kinds))
         if self._box_side is not None:
             corners = self._cores[self._box_side]
-            edges = (
-                corners[:, [4, 2, 1]] - corners[:, :1] if kinds[self._box_side] == 0 else np.zeros((len(corners), 3, 3))
-            )
+            has_edges = kinds[self._box_side] == 0
+            edges = corners[:, [4, 2, 1]] - corners[:, :1] if has_edges else np.zeros((len(corners), 3, 3))
             lengths = np.linalg.norm(edges, axis=2)
             self._halves, self._centres = lengths / 2, corners.mean(axis=1)
             self._axes = np.where(lengths[:, :, None] > 0, edges / np.maximum(lengths, 1e-300)[:, :, None], np.eye(3))
@@ -245,15 +245,17 @@ class BodyPairs:
         self._middles = np.array([hull.middle for hull in hulls]).reshape(-1, 3)
         sizes = np.array([hull.size + hull.radius for hull in hulls])
         self._reach = sizes[self._first] + sizes[self._second]
-        bodies = [(hulls[first], hulls[second]) for first, second in pairs[:, :2]]
-        self._flat = np.array([bool(first.normal.size or second.normal.size) for first, second in bodies], dtype=bool)
-        self._normals = np.array([_normal(*pair) for pair in bodies]).reshape(-1, 3)
+        normals = [_normal(hulls[first], hulls[second]) for first, second in pairs[:, :2]]
+        self._normals = np.array(normals).reshape(-1, 3)
+        self._flat = np.asarray(self._normals.any(axis=1))
 
     def balls(self, frames: Frames, at: np.ndarray, pair: np.ndarray) -> np.ndarray:
         """Return the gap between the bounding balls of the two bodies of each pair at a given sample. Shape (K,), m."""
         bodies = self._first[pair], self._second[pair]
         first, second = (self._in_world(frames, at, self._middles[k], self._frames[k]) for k in bodies)
-        return self._ball_distance(second - first, pair)
+        offset = second - first
+        along_normal = (offset * self._normals[pair]).sum(axis=-1)
+        return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
         """Return the distances of all pairs at all samples, or lower bounds of distances above `near`. Shape (M, n), m.
@@ -321,11 +323,6 @@ class BodyPairs:
         """Transform points that are fixed in moving frames to world coordinates at given samples."""
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
-    def _ball_distance(self, offset: np.ndarray, pair: np.ndarray) -> np.ndarray:
-        """Return the gap between the two bounding balls of each pair, whose centres differ by `offset`."""
-        along_normal = (offset * self._normals[pair]).sum(axis=-1)
-        return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
-
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
         """Split pairs by the kinds of their hulls; yield each group, its places in `rows`, and indices in the group."""
         for kind in self._kinds:
@@ -340,11 +337,6 @@ def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
     for i, (first, second, _) in enumerate(pairs):
         kinds.setdefault((hulls[first].kind, hulls[second].kind), []).append(i)
     return [HullPairs(hulls, pairs, members, kind) for kind, members in kinds.items()]
-
-
-def _pad_points(core: np.ndarray, count: int) -> np.ndarray:
-    """Return the points of a hull, with the last point repeated until there are `count` points."""
-    return np.concatenate([core, np.repeat(core[-1:], count - len(core), axis=0)])
 
 
 def frames_of(placements: np.ndarray) -> Frames:

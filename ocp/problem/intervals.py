@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import product
 from math import tau
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from ocp.errors import ProblemError
 
 Array: TypeAlias = np.ndarray
+Value = TypeVar("Value")
 
 
 class Interval(NamedTuple):
@@ -42,20 +43,34 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
         function: Function of scalars whose instructions are those of `RULES`, see `check_instructions`.
         inputs: The range of each input, over the same M intervals.
     """
-    slots: dict[int, Interval] = {}
-    outputs: dict[int, Interval] = {}
+    return interpret(
+        function, inputs, lambda value: constant(value, inputs[0].low), lambda code, *operands: RULES[code](*operands)
+    )
+
+
+def interpret(
+    function: Any, inputs: Sequence[Value], constant: Callable[[float], Value], apply: Callable[..., Value]
+) -> list[Value]:
+    """Return the entries of the single output of an SX function, evaluated in another arithmetic.
+
+    Args:
+        function: Function of scalars.
+        inputs: The value of each input in that arithmetic.
+        constant: Function that converts a number to that arithmetic.
+        apply: Function (instruction code, operands) that evaluates an operation.
+    """
+    slots: dict[int, Value] = {}
+    outputs: dict[int, Value] = {}
     for k in range(function.n_instructions()):
         code, operands = function.instruction_id(k), function.instruction_input(k)
         if code == ca.OP_OUTPUT:
             outputs[function.instruction_output(k)[1]] = slots[operands[0]]
+        elif code == ca.OP_INPUT:
+            slots[function.instruction_output(k)[0]] = inputs[operands[0]]
+        elif code == ca.OP_CONST:
+            slots[function.instruction_output(k)[0]] = constant(function.instruction_constant(k))
         else:
-            slots[function.instruction_output(k)[0]] = (
-                inputs[operands[0]]
-                if code == ca.OP_INPUT
-                else constant(function.instruction_constant(k), inputs[0].low)
-                if code == ca.OP_CONST
-                else RULES[code](*(slots[slot] for slot in operands))
-            )
+            slots[function.instruction_output(k)[0]] = apply(code, *(slots[slot] for slot in operands))
     return [outputs[k] for k in range(len(outputs))]
 
 
@@ -100,13 +115,12 @@ def _without_warnings(rule: Callable[..., Interval]) -> Callable[..., Interval]:
 
 
 def _add(x: Interval, y: Interval) -> Interval:
-    if x.part is not None and y.part is not None and _opposite(x.part[0], y.part[0]):
-        return _either(x.part[0], x.part[1], y.part[1])
+    """Return the range of a sum, or that of an if_else, which casadi writes as a sum of both branches."""
+    if x.part is not None and y.part is not None:
+        (test, yes), (opposite, no) = x.part, y.part
+        if test.negates is opposite or opposite.negates is test:
+            return _either(test, yes, no)
     return _out(x.low + y.low, x.high + y.high)
-
-
-def _opposite(first: Interval, second: Interval) -> bool:
-    return first.negates is second or second.negates is first
 
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
@@ -143,15 +157,9 @@ def _inverse(x: Interval) -> Interval:
     return _out(np.where(about_zero, -np.inf, 1 / x.high), np.where(about_zero, np.inf, 1 / x.low))
 
 
-def _divide(x: Interval, y: Interval) -> Interval:
-    return _multiply(x, _inverse(y))
-
-
 def _square(x: Interval) -> Interval:
-    largest = np.maximum(np.abs(x.low), np.abs(x.high))
-    smallest = np.maximum(0.0, np.maximum(x.low, -x.high))
-    squares = _out(smallest * smallest, largest * largest)
-    return Interval(np.maximum(squares.low, 0.0), squares.high)
+    size = _absolute(x)
+    return _clamp(_out(size.low * size.low, size.high * size.high), low=0.0)
 
 
 def _power(x: Interval, y: Interval) -> Interval:
@@ -190,13 +198,6 @@ def _increasing_rule(
         return Interval(np.where(undefined, -np.inf, result.low), np.where(undefined, np.inf, result.high))
 
     return rule
-
-
-def _decreasing_rule(function: Callable[[Any], Any], low: float, high: float) -> Callable[..., Interval]:
-    """Return the interval rule of a decreasing function with the domain from `low` to `high`."""
-    rising = _increasing_rule(lambda x: -function(x), low, high)
-
-    return lambda x: _negative(rising(x))
 
 
 def _negative(x: Interval) -> Interval:
@@ -252,7 +253,7 @@ def _copysign(x: Interval, y: Interval) -> Interval:
 
 def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tuple[Any, Any]:
     """Return the rounded quotient x / y, and a mask of the intervals in which the rounded quotient is constant."""
-    quotient = _divide(x, y)
+    quotient = _multiply(x, _inverse(y))
     multiple = rounded(quotient.low)
     known = np.isfinite(multiple) & (multiple == rounded(quotient.high))
     return np.where(known, multiple, 0.0), known
@@ -260,22 +261,22 @@ def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tupl
 
 def _modulo(x: Interval, y: Interval) -> Interval:
     """Return the range of fmod: x minus a multiple of y, with the sign of x."""
-    multiple, known = multiple_of(x, y, np.trunc)
-    result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     largest = np.minimum(_absolute(y).high, _absolute(x).high)
-    low, high = np.where(x.low < 0, -largest, 0.0), np.where(x.high > 0, largest, 0.0)
-    return Interval(
-        np.where(known, np.maximum(result.low, low), low), np.where(known, np.minimum(result.high, high), high)
-    )
+    return _reduce(x, y, np.trunc, np.where(x.low < 0, -largest, 0.0), np.where(x.high > 0, largest, 0.0))
 
 
 def _remainder(x: Interval, y: Interval) -> Interval:
     """Return the range of the remainder: x minus the nearest integer multiple of y."""
-    multiple, known = multiple_of(x, y, np.rint)
-    result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     half = np.minimum(_absolute(y).high / 2, _absolute(x).high)
+    return _reduce(x, y, np.rint, -half, half)
+
+
+def _reduce(x: Interval, y: Interval, rounded: Callable[[Any], Any], low: Array, high: Array) -> Interval:
+    """Return the range of x minus y times the rounded quotient x / y, which lies between `low` and `high` (M,)."""
+    multiple, known = multiple_of(x, y, rounded)
+    result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     return Interval(
-        np.where(known, np.maximum(result.low, -half), -half), np.where(known, np.minimum(result.high, half), half)
+        np.where(known, np.maximum(result.low, low), low), np.where(known, np.minimum(result.high, high), high)
     )
 
 
@@ -302,11 +303,6 @@ def _and(x: Interval, y: Interval) -> Interval:
     return Interval(np.where(first & second, 1.0, 0.0), np.where(first_fails | second_fails, 0.0, 1.0))
 
 
-def _or(x: Interval, y: Interval) -> Interval:
-    (first, first_fails), (second, second_fails) = decided_masks(x), decided_masks(y)
-    return Interval(np.where(first | second, 1.0, 0.0), np.where(first_fails & second_fails, 0.0, 1.0))
-
-
 def _step(function: Callable[[Any], Any]) -> Callable[..., Interval]:
     """Return the interval rule of an increasing step function, whose integer values need no widening for rounding."""
     return lambda x: Interval(function(x.low), function(x.high))
@@ -317,7 +313,7 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "ADD": _add,
     "SUB": _subtract,
     "MUL": _multiply,
-    "DIV": _divide,
+    "DIV": lambda x, y: _multiply(x, _inverse(y)),
     "NEG": _negative,
     "INV": _inverse,
     "TWICE": lambda x: _out(2 * x.low, 2 * x.high),
@@ -333,7 +329,7 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "COS": _sinusoid_rule(np.cos, 0.0),
     "TAN": _tangent,
     "ASIN": _increasing_rule(np.arcsin, -1.0, 1.0),
-    "ACOS": _decreasing_rule(np.arccos, -1.0, 1.0),
+    "ACOS": lambda x: _negative(_increasing_rule(lambda a: -np.arccos(a), -1.0, 1.0)(x)),
     "ATAN": _increasing_rule(np.arctan),
     "ATAN2": _angle,
     "SINH": _increasing_rule(np.sinh),
@@ -358,7 +354,7 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "NE": lambda x, y: _not(_equal(x, y))._replace(negates=None),
     "NOT": _not,
     "AND": _and,
-    "OR": _or,
+    "OR": lambda x, y: _not(_and(_not(x), _not(y)))._replace(negates=None),
     "IF_ELSE_ZERO": _if_else_zero,
 }
 RULES = {getattr(ca, f"OP_{name}"): _without_warnings(rule) for name, rule in _BY_NAME.items()}

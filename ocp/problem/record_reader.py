@@ -141,13 +141,8 @@ class FunctionReader:
                 raise ProblemError(words, name="operation", value=operation, limit=len(OPERATIONS) - 1)
         patterns = [_read_pattern(shape) for shape in record["outputs"]]
         results = _integers(record["results"], (sum(pattern.nnz() for pattern in patterns),)).tolist()
-        outputs, begin = [], 0
-        for pattern in patterns:
-            outputs.append(
-                from_entries(pattern, [operand(row) for row in results[begin : begin + pattern.nnz()]], kind)
-            )
-            begin += pattern.nnz()
-        return ca.Function(name, inputs, outputs), work
+        entries = [operand(row) for row in results]
+        return ca.Function(name, inputs, matrices_from(patterns, entries, kind)), work
 
 
 def from_entries(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any:
@@ -155,7 +150,14 @@ def from_entries(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any
     return kind(pattern, ca.vertcat(*entries) if entries else kind(0, 1))
 
 
+def matrices_from(patterns: Sequence[Any], entries: Sequence[Any], kind: Any) -> list[Any]:
+    """Return matrices with given sparsity patterns from the nonzero entries of all of them, one after the other."""
+    ends = np.cumsum([0, *(pattern.nnz() for pattern in patterns)]).tolist()
+    return [from_entries(pattern, entries[a:b], kind) for pattern, (a, b) in zip(patterns, pairwise(ends), strict=True)]
+
+
 def _nonzeros(matrix: Any) -> list[Any]:
+    """Return the nonzero entries of an SX or MX matrix as scalar expressions, column by column."""
     return matrix.nonzeros() if isinstance(matrix, ca.SX) else [matrix.nz[k] for k in range(matrix.nnz())]
 
 
@@ -168,6 +170,7 @@ def _declared_entries(record: Mapping[str, Any]) -> int:
 
 
 def _entries(function: Any) -> int:
+    """Return the number of nonzero entries of all arguments of a function."""
     return sum(function.nnz_in(k) for k in range(function.n_in()))
 
 
@@ -175,20 +178,19 @@ def _call(callee: Any, entries: list[Any]) -> list[Any]:
     """Call a function with the entries of all its arguments; return the entries of all its results."""
     if len(entries) != _entries(callee):
         raise ProblemError(f"a call has {len(entries)} arguments, not {_entries(callee)}", name="arguments")
-    arguments, begin = [], 0
-    for k in range(callee.n_in()):
-        arguments.append(from_entries(callee.sparsity_in(k), entries[begin : begin + callee.nnz_in(k)], ca.MX))
-        begin += callee.nnz_in(k)
+    arguments = matrices_from([callee.sparsity_in(k) for k in range(callee.n_in())], entries, ca.MX)
     return [entry for result in callee.call(arguments, False, True) for entry in _nonzeros(result)]
 
 
 def _place(place: int, count: int, what: str) -> int:
+    """Return an index into `count` items, such as "operand"s; raise ProblemError if there is no such item."""
     if not 0 <= place < count:
         raise ProblemError(f"{what} {place} does not exist, there are {count}", name=what, value=place, limit=count)
     return place
 
 
 def _whole(value: Any, what: str, least: int, most: int) -> int:
+    """Return a value of untrusted data; raise ProblemError unless it is an integer from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         words = f"{what} {value!r} is not an integer from {least} to {most}"
         raise ProblemError(words, name=what, value=value, limit=(least, most))
@@ -196,6 +198,7 @@ def _whole(value: Any, what: str, least: int, most: int) -> int:
 
 
 def _integers(values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Return untrusted values as an array of integers; raise ProblemError if a size differs from `shape`."""
     array = np.asarray(values)
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
     if not fits or (array.dtype.kind not in "iu" and array.size):
@@ -204,6 +207,7 @@ def _integers(values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
 
 
 def _floats(values: Any, *, finite: bool = False) -> np.ndarray:
+    """Return untrusted values as an array (n,) of floats; raise ProblemError if this is impossible."""
     array = np.asarray(values)
     if array.ndim != 1 or (array.dtype.kind not in "fiu" and array.size) or (finite and not np.isfinite(array).all()):
         raise ProblemError(f"a list of {'finite ' if finite else ''}numbers is expected", name="constants")
@@ -349,6 +353,7 @@ def from_record(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, 
 
 
 def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[str, Any, Any, Any]:
+    """Rebuild a problem from its record like `from_record`, without a summary of the errors of a damaged record."""
     symbols, functions = SYMBOLS[record["symbols"]], FunctionReader(record["functions"]).functions
     expressions = functions[record["expressions"]]
     time = symbols.sym("time")
@@ -358,9 +363,8 @@ def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[
             raise ValueError(f"symbol {symbol['input']} occurs twice")
         size = expressions.size_in(symbol["input"])
         if size != (symbol["size"], 1):
-            raise ValueError(
-                f"symbol {symbol['name']!r} has {symbol['size']} entries, the input of the function {size}"
-            )
+            words = f"symbol {symbol['name']!r} has {symbol['size']} entries, the input of the function {size}"
+            raise ValueError(words)
         inputs[symbol["input"]] = symbols.sym(symbol["name"], size[0])
     outputs = expressions.call(inputs, True, False)
 
