@@ -51,17 +51,17 @@ class BoundaryProblem:
         """
         key = tuple(arcs.segments)
         if key not in self._systems:
-            build = self._backward if self.backward else self._multiple
+            build = self._backward_shooting if self.backward else self._multiple_shooting
             z, data, residual = build(arcs)
             jacobian = ca.jacobian(residual, z)
             named = (("residual", residual), ("jacobian", jacobian))
             self._systems[key] = tuple(ca.Function(name, [z, data], [value]) for name, value in named)
         return self._systems[key]
 
-    def _multiple(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
+    def _multiple_shooting(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
         """Return unknowns, data and equations of multiple shooting: continuity, switching and end conditions."""
         form = self.form
-        at, of = self.layout(arcs), self._data(arcs)
+        at, of = self.layout(arcs), self._data_layout(arcs)
         z, data = ca.MX.sym("z", at["end"].stop), ca.MX.sym("data", of["guess"].stop)
         total = sum(arcs.segments)
         y = ca.reshape(z[at["y"]], 2 * form.nx, total + 1)
@@ -82,15 +82,15 @@ class BoundaryProblem:
             residuals.append(values[2] + by_horizon + ca.sum2(quads[1, :]))
         return z, data, ca.vertcat(*residuals)
 
-    def _backward(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
+    def _backward_shooting(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
         """Return unknowns, data and equations of backward shooting from an unknown end state to the given start."""
-        nx, of = self.form.nx, self._data(arcs)
+        nx, of = self.form.nx, self._data_layout(arcs)
         z, data = ca.MX.sym("z", nx), ca.MX.sym("data", of["guess"].stop)
-        return z, data, self._chain(z, data, arcs)[-1][:nx, :] - data[of["ends"]][nx : 2 * nx]
+        return z, data, self._integrate_backwards(z, data, arcs)[-1][:nx, :] - data[of["ends"]][nx : 2 * nx]
 
-    def _chain(self, state: Any, data: Any, arcs: ControlArcs) -> list[Any]:
+    def _integrate_backwards(self, state: Any, data: Any, arcs: ControlArcs) -> list[Any]:
         """Integrate states and costates backwards from an end state; return them at all nodes, last node first."""
-        form, of = self.form, self._data(arcs)
+        form, of = self.form, self._data_layout(arcs)
         horizon = data[of["horizon"]]
         gradient = ca.gradient(form.terminal, form.x)
         terminal = ca.Function("terminal", [form.x, form.t, form.T, form.p], [gradient])
@@ -104,7 +104,7 @@ class BoundaryProblem:
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
         """Return the integrator's data vectors q of all shooting segments as the columns of a matrix."""
-        of, total = self._data(arcs), sum(arcs.segments)
+        of, total = self._data_layout(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
         begins, lengths = [], []
         for a, count in enumerate(arcs.segments):
@@ -134,7 +134,7 @@ class BoundaryProblem:
         ends = {"start": len(form.start), "end": len(form.end)}
         return side_by_side({**sizes, "horizon": int(form.horizon_is_free), **ends})
 
-    def _data(self, arcs: ControlArcs) -> dict[str, slice]:
+    def _data_layout(self, arcs: ControlArcs) -> dict[str, slice]:
         """Return the slice of every part of the data vector (parameters, fixed values and guesses), by name."""
         sizes = self.ham.sizes
         total = sum(arcs.segments)
@@ -186,7 +186,7 @@ class BoundaryProblem:
         horizon, switches = float(data[0]), np.zeros(0)
         if self.backward:
             symbols = ca.MX.sym("z", form.nx), ca.MX.sym("data", data.size)
-            chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(self._chain(*symbols, arcs)))])
+            chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(self._integrate_backwards(*symbols, arcs)))])
             try:
                 with casadi_silenced():
                     y = np.asarray(chain(z, data).full())

@@ -59,7 +59,7 @@ class Hamiltonian:
         lam, mu = sym("lam", form.nx), sym("mu", len(form.path))
         value = form.running + ca.dot(lam, form.f) + ca.dot(mu, rows)
         symbols = [form.x, form.u, lam, mu, form.t, form.T, form.p]
-        patterns = nonzeros(ca.hessian(value, form.u)[0], symbols), ca.jacobian_sparsity(rows, form.u)
+        patterns = nonzero_pattern(ca.hessian(value, form.u)[0], symbols), ca.jacobian_sparsity(rows, form.u)
         curved = {column for pattern in patterns for column in pattern.get_col()}
         smooth, linear = ([i for i in range(form.nu) if (i in curved) == kind] for kind in (True, False))
         system = cls(form, lam, mu, rows, value, tuple(smooth), tuple(linear), None, "")
@@ -141,7 +141,7 @@ class Hamiltonian:
         stationarity = ca.densify(ca.vertcat(gradient, self.rows))
         residual = ca.substitute([stationarity], [form.u, self.mu], [control, w[n:, :]])[0]
         matrix = ca.jacobian(residual, w) if n + m else self.form.problem.symbols(0, 0)
-        pattern = nonzeros(matrix, [*known, w])
+        pattern = nonzero_pattern(matrix, [*known, w])
         if isinstance(matrix, ca.SX):
             matrix = ca.sparsify(matrix)
         self._check_regular(matrix, [*known, w])
@@ -182,7 +182,7 @@ class Hamiltonian:
         if 0 in matrix.shape:
             return
         rng = np.random.default_rng(0)
-        sample = numbers(matrix, symbols, rng)
+        sample = random_values(matrix, symbols, rng)
         singular = np.linalg.svd(sample, compute_uv=False) if np.all(np.isfinite(sample)) else np.ones(1)
         if singular[-1] < ROUNDING_SHARE * singular[0]:
             raise ProblemError(
@@ -236,7 +236,7 @@ def check_constraints(form: Formulation) -> None:
                     raise ProblemError(words)
 
 
-def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
+def nonzero_pattern(matrix: Any, symbols: list[Any]) -> Any:
     """Return the sparsity pattern of the entries of a matrix that are not identically zero.
 
     Of an MX expression these are the entries that are nonzero at one of three random points.
@@ -244,7 +244,7 @@ def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
     if isinstance(matrix, ca.SX):
         return ca.sparsify(matrix).sparsity()
     rng = np.random.default_rng(0)
-    size = np.abs([numbers(matrix, symbols, rng) for _ in range(3)]).max(axis=0)  # nan counts as nonzero
+    size = np.abs([random_values(matrix, symbols, rng) for _ in range(3)]).max(axis=0)  # nan counts as nonzero
     return ca.sparsify(ca.DM(np.where(size == 0, 0.0, 1.0))).sparsity()
 
 
@@ -254,7 +254,7 @@ def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def numbers(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
+def random_values(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
     """Return the value of a matrix expression at random values of its symbols between 0.1 and 1."""
     function = ca.Function("matrix", symbols, [ca.densify(matrix)])
     return np.asarray(function.call([ca.DM(rng.uniform(0.1, 1.0, s.numel())) for s in symbols])[0].full())
@@ -268,7 +268,7 @@ def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
     if not isinstance(matrix, ca.SX):
         return ca.solve(matrix, rhs)
     curvature, constraint = matrix[:n, :n], matrix[n:, :n]
-    values = np.linalg.eigvalsh(numbers(curvature, ca.symvar(curvature), np.random.default_rng(0)))
+    values = np.linalg.eigvalsh(random_values(curvature, ca.symvar(curvature), np.random.default_rng(0)))
     if not (np.isfinite(values).all() and values[0] > ROUNDING_SHARE * values[-1]):  # not positive definite
         return ca.solve(ca.densify(matrix), rhs)
     factor = ca.ldl(curvature)

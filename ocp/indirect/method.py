@@ -207,14 +207,14 @@ class PreparedIndirect:
             try:
                 seed = direct.prepare(self.problem, **self._seeding).solve(parameters, guess)
             except SolveError as error:
-                return self._no_seed("the direct solution for its seed failed: ", error, error.solution, check)
+                return self._reject_seed("the direct solution for its seed failed: ", error, error.solution, check)
             note = f"; seeded by its own direct solution ({seed.method['type']}, {direct.intervals} intervals)"
         began = time.monotonic()
         try:
             count = self.method.segments
             arcs = read_arcs(self.hamiltonian, self.boundary.outputs, seed, p, bounds=bounds, segments=count)
         except SolveError as error:
-            return self._no_seed("", error, seed, check)
+            return self._reject_seed("", error, seed, check)
         system = self.boundary.system(arcs)
         start, data = read_unknowns(self.hamiltonian, seed, arcs, p, bounds=bounds, backward=self.boundary.backward)
         root = newton(system, start, data, scale=float(max(1.0, np.max(np.abs(start)))), tolerance=self.method.residual)
@@ -235,7 +235,7 @@ class PreparedIndirect:
             )
         return solution
 
-    def _no_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
+    def _reject_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
         """Raise SolveError about an unusable seed or, if ``check`` is false, return the seed as a failed solution."""
         if check or seed is None:
             words = f"problem {self.problem.name!r}: the indirect method failed: {why}{error}"

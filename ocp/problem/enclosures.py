@@ -99,7 +99,7 @@ class _Jet(NamedTuple):
 ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_SUB))
 
 
-def _where(valid: Any, slope: Interval) -> Interval:
+def _slope_where(valid: Any, slope: Interval) -> Interval:
     """Return the given slope bounds in intervals that a mask marks as valid, and infinite bounds in the others."""
     return Interval(np.where(valid, slope.low, -np.inf), np.where(valid, slope.high, np.inf))
 
@@ -116,7 +116,7 @@ def _smooth(code: int, *jets: _Jet) -> _Jet:
     for partial, jet in zip(evaluate(_partials(code, len(jets), exponent), inputs), jets, strict=False):
         if jet.slope.low.any() or jet.slope.high.any():
             slope = ADD(slope, MULTIPLY(partial, jet.slope))
-    return _Jet(value, _where(np.isfinite(value.low) & np.isfinite(value.high), slope))
+    return _Jet(value, _slope_where(np.isfinite(value.low) & np.isfinite(value.high), slope))
 
 
 @lru_cache(maxsize=4096)
@@ -131,10 +131,10 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
     return ca.Function("partials", [x, y], [ca.densify(ca.gradient(ca.SX.binary(code, x, y), both))])
 
 
-def _steps(code: int, *jets: _Jet) -> _Jet:
+def _piecewise_constant(code: int, *jets: _Jet) -> _Jet:
     """Return bounds of the value and slope of a piecewise constant operation: floor, ceil, sign, comparisons."""
     value = RULES[code](*(jet.value for jet in jets))
-    return _Jet(value, _where(value.low == value.high, constant(0.0, value.low)))
+    return _Jet(value, _slope_where(value.low == value.high, constant(0.0, value.low)))
 
 
 def _absolute(code: int, x: _Jet) -> _Jet:
@@ -159,27 +159,27 @@ def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
 def _if_else_zero(code: int, test: _Jet, x: _Jet) -> _Jet:
     holds, fails = decided_masks(test.value)
     slope = Interval(np.where(holds, x.slope.low, 0.0), np.where(holds, x.slope.high, 0.0))
-    return _Jet(RULES[code](test.value, x.value), _where(holds | fails, slope))
+    return _Jet(RULES[code](test.value, x.value), _slope_where(holds | fails, slope))
 
 
 def _modulo(code: int, x: _Jet, y: _Jet) -> _Jet:
     multiple, known = multiple_of(x.value, y.value, np.trunc if code == ca.OP_FMOD else np.rint)
     slope = SUBTRACT(x.slope, MULTIPLY(Interval(multiple, multiple), y.slope))
-    return _Jet(RULES[code](x.value, y.value), _where(known, slope))
+    return _Jet(RULES[code](x.value, y.value), _slope_where(known, slope))
 
 
 def _copysign(code: int, x: _Jet, y: _Jet) -> _Jet:
     size = _absolute(ca.OP_FABS, x).slope
     down = y.value.high < 0
     slope = Interval(np.where(down, -size.high, size.low), np.where(down, -size.low, size.high))
-    return _Jet(RULES[code](x.value, y.value), _where(down | (y.value.low > 0), slope))
+    return _Jet(RULES[code](x.value, y.value), _slope_where(down | (y.value.low > 0), slope))
 
 
 def _angle(code: int, y: _Jet, x: _Jet) -> _Jet:
     """Return bounds of the value and slope of atan2, which jumps by a full turn on a half-line."""
     smooth = _smooth(code, y, x)
     continuous = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
-    return _Jet(smooth.value, _where(continuous, smooth.slope))
+    return _Jet(smooth.value, _slope_where(continuous, smooth.slope))
 
 
 _KINKED: dict[int, Callable[..., _Jet]] = {
@@ -192,7 +192,7 @@ _KINKED: dict[int, Callable[..., _Jet]] = {
     ca.OP_COPYSIGN: _copysign,
     ca.OP_ATAN2: _angle,
     **{
-        getattr(ca, f"OP_{name}"): _steps
+        getattr(ca, f"OP_{name}"): _piecewise_constant
         for name in ("FLOOR", "CEIL", "SIGN", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR")
     },
 }

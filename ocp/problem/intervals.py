@@ -84,7 +84,7 @@ def check_instructions(what: str, function: Any) -> None:
             raise ProblemError(words, name=name, value=code)
 
 
-def _out(low: Any, high: Any) -> Interval:
+def _widen(low: Any, high: Any) -> Interval:
     """Return an interval that is widened by possible rounding errors; a bound that is nan becomes infinite."""
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     # the functions of a C library are accurate to four units in the last place
@@ -101,7 +101,7 @@ def constant(value: float, like: Array) -> Interval:
 def _range_of(corners: list[Array]) -> Interval:
     """Return the interval from the smallest to the largest value of an operation at the corners of its inputs."""
     stacked = np.array(corners)
-    return _out(stacked.min(axis=0), stacked.max(axis=0))
+    return _widen(stacked.min(axis=0), stacked.max(axis=0))
 
 
 def _without_warnings(rule: Callable[..., Interval]) -> Callable[..., Interval]:
@@ -120,7 +120,7 @@ def _add(x: Interval, y: Interval) -> Interval:
         (test, yes), (opposite, no) = x.part, y.part
         if test.negates is opposite or opposite.negates is test:
             return _either(test, yes, no)
-    return _out(x.low + y.low, x.high + y.high)
+    return _widen(x.low + y.low, x.high + y.high)
 
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
@@ -142,7 +142,7 @@ def _if_else_zero(test: Interval, value: Interval) -> Interval:
 
 
 def _subtract(x: Interval, y: Interval) -> Interval:
-    return _out(x.low - y.high, x.high - y.low)
+    return _widen(x.low - y.high, x.high - y.low)
 
 
 def _multiply(x: Interval, y: Interval) -> Interval:
@@ -154,12 +154,12 @@ def _multiply(x: Interval, y: Interval) -> Interval:
 
 def _inverse(x: Interval) -> Interval:
     about_zero = (x.low <= 0) & (x.high >= 0)
-    return _out(np.where(about_zero, -np.inf, 1 / x.high), np.where(about_zero, np.inf, 1 / x.low))
+    return _widen(np.where(about_zero, -np.inf, 1 / x.high), np.where(about_zero, np.inf, 1 / x.low))
 
 
 def _square(x: Interval) -> Interval:
     size = _absolute(x)
-    return _clamp(_out(size.low * size.low, size.high * size.high), low=0.0)
+    return _clamp(_widen(size.low * size.low, size.high * size.high), low=0.0)
 
 
 def _power(x: Interval, y: Interval) -> Interval:
@@ -170,8 +170,8 @@ def _power(x: Interval, y: Interval) -> Interval:
             return _inverse(_power(x, constant(-exponent, x.low)))
         if exponent % 2 == 0:
             base = _absolute(x)
-            return _clamp(_out(base.low**exponent, base.high**exponent), low=0.0)
-        return _out(x.low**exponent, x.high**exponent)
+            return _clamp(_widen(base.low**exponent, base.high**exponent), low=0.0)
+        return _widen(x.low**exponent, x.high**exponent)
     base = _clamp(x, low=0.0)
     powers = _range_of([a**b for a, b in product((base.low, base.high), (y.low, y.high))])
     unknown = (x.high < 0) | ((x.low < 0) & ~fixed)  # y may contain an integer exponent
@@ -193,7 +193,7 @@ def _increasing_rule(
 
     def rule(x: Interval) -> Interval:
         inside = _clamp(x, low, high)
-        result = _out(function(inside.low), function(inside.high))
+        result = _widen(function(inside.low), function(inside.high))
         undefined = (x.high < low) | (x.low > high)
         return Interval(np.where(undefined, -np.inf, result.low), np.where(undefined, np.inf, result.high))
 
@@ -216,7 +216,7 @@ def _sinusoid_rule(function: Callable[[Any], Any], crest: float) -> Callable[...
 
     def rule(x: Interval) -> Interval:
         ends = function(x.low), function(x.high)
-        result = _out(np.minimum(*ends), np.maximum(*ends))
+        result = _widen(np.minimum(*ends), np.maximum(*ends))
         high = np.where(_contains_multiple(x, crest, tau), 1.0, np.minimum(result.high, 1.0))
         low = np.where(_contains_multiple(x, crest + tau / 2, tau), -1.0, np.maximum(result.low, -1.0))
         unbounded = ~(np.isfinite(x.low) & np.isfinite(x.high))
@@ -227,7 +227,7 @@ def _sinusoid_rule(function: Callable[[Any], Any], crest: float) -> Callable[...
 
 def _tangent(x: Interval) -> Interval:
     pole = _contains_multiple(x, tau / 4, tau / 2) | ~(np.isfinite(x.low) & np.isfinite(x.high))
-    result = _out(np.tan(x.low), np.tan(x.high))
+    result = _widen(np.tan(x.low), np.tan(x.high))
     return Interval(np.where(pole, -np.inf, result.low), np.where(pole, np.inf, result.high))
 
 
@@ -241,7 +241,7 @@ def _angle(y: Interval, x: Interval) -> Interval:
 
 def _hypot(x: Interval, y: Interval) -> Interval:
     first, second = _absolute(x), _absolute(y)
-    return _clamp(_out(np.hypot(first.low, second.low), np.hypot(first.high, second.high)), low=0.0)
+    return _clamp(_widen(np.hypot(first.low, second.low), np.hypot(first.high, second.high)), low=0.0)
 
 
 def _copysign(x: Interval, y: Interval) -> Interval:
@@ -303,7 +303,7 @@ def _and(x: Interval, y: Interval) -> Interval:
     return Interval(np.where(first & second, 1.0, 0.0), np.where(first_fails | second_fails, 0.0, 1.0))
 
 
-def _step(function: Callable[[Any], Any]) -> Callable[..., Interval]:
+def _step_rule(function: Callable[[Any], Any]) -> Callable[..., Interval]:
     """Return the interval rule of an increasing step function, whose integer values need no widening for rounding."""
     return lambda x: Interval(function(x.low), function(x.high))
 
@@ -316,7 +316,7 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "DIV": lambda x, y: _multiply(x, _inverse(y)),
     "NEG": _negative,
     "INV": _inverse,
-    "TWICE": lambda x: _out(2 * x.low, 2 * x.high),
+    "TWICE": lambda x: _widen(2 * x.low, 2 * x.high),
     "SQ": _square,
     "SQRT": _increasing_rule(np.sqrt, low=0.0),
     "POW": _power,
@@ -345,9 +345,9 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "FMOD": _modulo,
     "REMAINDER": _remainder,
     "COPYSIGN": _copysign,
-    "FLOOR": _step(np.floor),
-    "CEIL": _step(np.ceil),
-    "SIGN": _step(np.sign),
+    "FLOOR": _step_rule(np.floor),
+    "CEIL": _step_rule(np.ceil),
+    "SIGN": _step_rule(np.sign),
     "LT": lambda x, y: _below(x, y, strict=True),
     "LE": lambda x, y: _below(x, y, strict=False),
     "EQ": _equal,

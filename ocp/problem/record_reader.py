@@ -108,19 +108,19 @@ class FunctionReader:
         values: list[Any] = []  # a scalar of each row; for a call the list of its results
 
         def operand(row: int) -> Any:
-            value = values[_place(row, len(values), "operand")]
+            value = values[_check_index(row, len(values), "operand")]
             if isinstance(value, list):
                 raise ProblemError(f"operand {row} is a call, not a number", name="rows", value=row)
             return value
 
         for operation, first, second in rows:
             if operation == INPUT:
-                entries = input_entries[_place(first, len(input_entries), "input")]
-                values.append(entries[_place(second, len(entries), "entry")])
+                entries = input_entries[_check_index(first, len(input_entries), "input")]
+                values.append(entries[_check_index(second, len(entries), "entry")])
             elif operation == CONSTANT:
-                values.append(kind(constants[_place(first, len(constants), "constant")]))
+                values.append(kind(constants[_check_index(first, len(constants), "constant")]))
             elif operation == CALL:
-                callee = self.functions[_place(first, len(self.functions), "function")]
+                callee = self.functions[_check_index(first, len(self.functions), "function")]
                 work += self._work[first]
                 self._passed += _entries(callee)
                 if self._passed > MAX_OPERATIONS:
@@ -128,10 +128,10 @@ class FunctionReader:
                     raise ProblemError(words, name="arguments", limit=MAX_OPERATIONS)
                 values.append(_call(callee, [operand(row) for row in arguments[max(second, 0) :][: _entries(callee)]]))
             elif operation == RESULT:
-                results = values[_place(first, len(values), "call")]
+                results = values[_check_index(first, len(values), "call")]
                 if not isinstance(results, list):
                     raise ProblemError(f"row {first} is not a call", name="rows", value=first)
-                values.append(results[_place(second, len(results), "result")])
+                values.append(results[_check_index(second, len(results), "result")])
             elif CALL < operation < FIRST_BINARY:
                 values.append(kind.unary(CODES[operation - len(STRUCTURAL)], operand(first)))
             elif operation < len(OPERATIONS) and operation > 0:
@@ -182,14 +182,14 @@ def _call(callee: Any, entries: list[Any]) -> list[Any]:
     return [entry for result in callee.call(arguments, False, True) for entry in _nonzeros(result)]
 
 
-def _place(place: int, count: int, what: str) -> int:
+def _check_index(place: int, count: int, what: str) -> int:
     """Return an index into `count` items, such as "operand"s; raise ProblemError if there is no such item."""
     if not 0 <= place < count:
         raise ProblemError(f"{what} {place} does not exist, there are {count}", name=what, value=place, limit=count)
     return place
 
 
-def _whole(value: Any, what: str, least: int, most: int) -> int:
+def _check_integer(value: Any, what: str, least: int, most: int) -> int:
     """Return a value of untrusted data; raise ProblemError unless it is an integer from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         words = f"{what} {value!r} is not an integer from {least} to {most}"
@@ -218,7 +218,7 @@ def _read_pattern(shape: Any) -> Any:
     """Return the sparsity pattern of a stored shape: row count, column count and, if sparse, entry positions."""
     if not isinstance(shape, list) or len(shape) not in (2, 3):
         raise ProblemError(f"a shape is expected, not {shape!r:.80}", name="shape")
-    rows, columns = (_whole(size, "size", 0, MAX_ENTRIES) for size in shape[:2])
+    rows, columns = (_check_integer(size, "size", 0, MAX_ENTRIES) for size in shape[:2])
     if rows * columns > MAX_ENTRIES:
         raise ProblemError(f"{rows} x {columns} entries, at most {MAX_ENTRIES}", name="shape", limit=MAX_ENTRIES)
     if len(shape) == 2:
@@ -229,27 +229,27 @@ def _read_pattern(shape: Any) -> Any:
     return ca.Sparsity.nonzeros(rows, columns, places.tolist())
 
 
-def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild CasADi's function `low` from its record: the index of the table interval that contains a number."""
     table, modes = _floats(record["table"], finite=True), ("linear", "exact", "binary")
-    count, mode = _whole(record["count"], "count", 0, MAX_ENTRIES), _whole(record["mode"], "mode", 0, 2)
+    count, mode = _check_integer(record["count"], "count", 0, MAX_ENTRIES), _check_integer(record["mode"], "mode", 0, 2)
     if len(table) < 2 or (np.diff(table) < 0).any():
         raise ProblemError("the grid of a table does not increase", name="table")
     x = ca.MX.sym("x", count)
     return ca.Function("low", [x], [ca.low(ca.DM(table), x, {"lookup_mode": modes[mode]})], OPAQUE)
 
 
-def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild from its record a function that looks up table entries at computed positions; nan outside the table."""
-    table, x = _floats(record["table"]), ca.MX.sym("x", _whole(record["count"], "count", 0, MAX_ENTRIES))
+    table, x = _floats(record["table"]), ca.MX.sym("x", _check_integer(record["count"], "count", 0, MAX_ENTRIES))
     if not len(table):
         raise ProblemError("a table is empty", name="table")
     return ca.Function("gather", [x], [ca.MX(ca.DM(table)).get_nz(False, x)], OPAQUE)
 
 
-def _solve(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_solve(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild from its record a function that solves a system of linear equations."""
-    size, columns = (_whole(record[what], what, 1, 1024) for what in ("size", "columns"))
+    size, columns = (_check_integer(record[what], what, 1, 1024) for what in ("size", "columns"))
     matrix, right = ca.MX.sym("A", size, size), ca.MX.sym("b", size, columns)
     return ca.Function("solve", [matrix, right], [ca.solve(matrix, right)], OPAQUE)
 
@@ -265,12 +265,12 @@ def _grids(record: Mapping[str, Any], what: str) -> list[list[float]]:
     return [grid.tolist() for grid in grids]
 
 
-def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild from its record a B-spline of one or several variables."""
     knots, coefficients = _grids(record, "knots"), _floats(record["coefficients"])
-    degrees = [_whole(degree, "degree", 0, MAX_DEGREE) for degree in record["degrees"]]
-    modes = [("linear", "exact", "binary")[_whole(mode, "mode", 0, 2)] for mode in record["modes"]]
-    size, count = (_whole(record[what], what, 1, MAX_ENTRIES) for what in ("size", "count"))
+    degrees = [_check_integer(degree, "degree", 0, MAX_DEGREE) for degree in record["degrees"]]
+    modes = [("linear", "exact", "binary")[_check_integer(mode, "mode", 0, 2)] for mode in record["modes"]]
+    size, count = (_check_integer(record[what], what, 1, MAX_ENTRIES) for what in ("size", "count"))
     if len(degrees) != len(knots) or len(modes) != len(knots):
         raise ProblemError(f"{len(degrees)} degrees for {len(knots)} dimensions", name="degrees")
     lengths = [len(grid) - degree - 1 for grid, degree in zip(knots, degrees, strict=True)]
@@ -283,7 +283,7 @@ def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     return ca.Function("bspline", [x], [value], OPAQUE)
 
 
-def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild from its record a linear interpolant of a table, or the derivative of such an interpolant."""
     grids, values = _grids(record, "grid"), _floats(record["values"])
     cells = int(np.prod([len(grid) for grid in grids], dtype=object))
@@ -293,9 +293,10 @@ def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     return function.jacobian() if record["derivative"] is True else function
 
 
-def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
+def _build_integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
     """Rebuild from its record an integrator, whose differential equations are another stored function."""
-    equations = functions[_place(_whole(record["equations"], "equations", 0, MAX_ENTRIES), len(functions), "equations")]
+    number = _check_integer(record["equations"], "equations", 0, MAX_ENTRIES)
+    equations = functions[_check_index(number, len(functions), "equations")]
     if record["plugin"] not in INTEGRATORS.values():
         raise ProblemError(f"integrator {record['plugin']!r} is unknown", name="plugin", value=record["plugin"])
     begin, times = float(record["begin"]), _floats(record["times"], finite=True)
@@ -305,7 +306,7 @@ def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
     for option, value in options.items():
         kind = INTEGRATOR_OPTIONS[option][1]
         if kind is int:
-            _whole(value, option, 0, 9 if option == "interpolation_order" else 100_000)
+            _check_integer(value, option, 0, 9 if option == "interpolation_order" else 100_000)
         elif not (isinstance(value, float) and 0 < value < 1):
             raise ProblemError(f"{option} {value!r} is not a tolerance", name=option, value=value)
     names = [("t", "x", "z", "p", "u"), ("ode", "alg", "quad", "zero")]
@@ -317,12 +318,12 @@ def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
 
 
 BUILDERS: dict[str, Callable[[Mapping[str, Any], Sequence[Any]], Any]] = {
-    "low": _low,
-    "gather": _gather,
-    "solve": _solve,
-    "bspline": _bspline,
-    "interpolant": _interpolant,
-    "integrator": _integrator,
+    "low": _build_low,
+    "gather": _build_gather,
+    "solve": _build_solve,
+    "bspline": _build_bspline,
+    "interpolant": _build_interpolant,
+    "integrator": _build_integrator,
 }
 
 

@@ -115,7 +115,7 @@ class Grid:
         s = np.sort(np.concatenate([self.distance, (self.distance[:-1] + self.distance[1:]) / 2]))
         return replace(self, distance=s, requested=np.repeat(self.requested, 2), jumps=2 * self.jumps)
 
-    def parts(self) -> list[tuple[int, int]]:
+    def blocks(self) -> list[tuple[int, int]]:
         """Divide the grid into consecutive blocks of bounded size; return the first and last node of each block."""
         ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]
         return list(pairwise(ends))
@@ -125,7 +125,7 @@ class _Cells(NamedTuple):
     """Intervals of a path, short enough to resolve the limits, and bounds of speed and acceleration in each interval.
 
     Attributes:
-        begin: Distances at which the intervals begin. Shape (N,), m, as of the others.
+        begin: Distances at which the intervals begin. Shape (N,) like all others, m.
         top: Fastest steady speeds, m/s.
         rates: Upper bounds of the acceleration of any motion, m/s^2.
         acceleration, jerk: Largest acceleration and jerk along the path at rest, m/s^2 and m/s^3.
@@ -298,7 +298,7 @@ def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tupl
 
 
 def limit_slope(values: Array, gain: Array) -> Array:
-    """Return the greatest values at nodes, at most `values` (N,), that change by at most the change of `gain` (N,)."""
+    """Return the greatest values (N,), at most the given ones, that change by at most the change of `gain` (N,)."""
     lowered = np.minimum.accumulate(values - gain) + gain
     return np.asarray(np.minimum.accumulate((lowered + gain)[::-1])[::-1] - gain)
 

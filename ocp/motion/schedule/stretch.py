@@ -21,7 +21,7 @@ from ocp.motion.schedule.limits import Rows, limit_rows
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.motion.schedule.ramps import reachability_passes
 from ocp.motion.schedule.window import (
-    HELD,
+    ENFORCED_AT,
     INSIDE,
     Ends,
     EnforcedRows,
@@ -92,7 +92,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
         ProblemError: No motion keeps the limits, with the distance at fault.
     """
     if not stretch.grid.sharp:
-        return _without_jerk(stretch.grid)  # a path without jerk limits is one stretch
+        return _solve_without_jerk(stretch.grid)  # a path without jerk limits is one stretch
     parts: list[SpeedProfile] = []
     begin, state, behind = stretch.first, stretch.ends[0], None
     while True:
@@ -120,9 +120,9 @@ def _solve_window(
     if before is not None:
         for margin, previous in zip(enforced.margins, before.margins, strict=True):
             margin[: len(previous)] = previous
-        enforced.held[:, :, : before.held.shape[2]] = before.held
-        enforced.speeds[:, : before.held.shape[2]] = before.speeds
-        enforced.inherited = before.held.shape[2]
+        enforced.mask[:, :, : before.mask.shape[2]] = before.mask
+        enforced.speeds[:, : before.mask.shape[2]] = before.speeds
+        enforced.inherited = before.mask.shape[2]
     to_seam, checked = seam - window.first, min(seam + SETTINGS.overlap // 2, window.last) - window.first
     x, slope = _tighten(window, enforced, seam, checked)
     state = float(x[to_seam]), float(slope[to_seam])
@@ -140,7 +140,7 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
     for number in range(SETTINGS.rounds):
         accuracy = accuracies[min(number, len(accuracies) - 1)]
         try:
-            x, slope = _with_jerk(window, enforced, seam, start, accuracy, free)
+            x, slope = _solve_with_jerk(window, enforced, seam, start, accuracy, free)
         except ProblemError:
             if len(free) == len(every):
                 raise
@@ -149,7 +149,7 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
         used, values = limit_usage(window, motion_profile(window, x, slope), free, start is not None)
         used /= _seam_shares(window, seam)[:, None]
         if start is None:
-            enforced.hold_near(used, values, window.rows[1].jerk[:, :, 0])
+            enforced.enforce_near(used, values, window.rows[1].jerk[:, :, 0])
             start = x, slope
             continue
         violated = used > 1 + ROUNDING_SHARE
@@ -158,7 +158,7 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
             return x, slope
         if number == 1:
             enforced.release(values, window.rows[1].jerk[:, :, 0], seam - window.first)
-        enforced.lower(used, enforced.hold(violated, values), window.rows[0], seam - window.first)
+        enforced.lower(used, enforced.enforce(violated, values), window.rows[0], seam - window.first)
         start = x, slope
         near = np.flatnonzero(scipy.ndimage.maximum_filter1d(affected, 2 * SETTINGS.around + 1))
         free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
@@ -173,7 +173,7 @@ def _seam_shares(window: Window, seam: int) -> Array:
     return np.where(np.arange(window.first, window.last) < seam, 1.0, SETTINGS.seam)
 
 
-def _without_jerk(grid: Grid) -> SpeedProfile:
+def _solve_without_jerk(grid: Grid) -> SpeedProfile:
     """Return the fastest motion along a path for unlimited jerk, by two passes on a grid that is refined in rounds.
 
     An interval is halved while a limit is violated inside it, and in the first rounds where a limit is active at both
@@ -224,7 +224,7 @@ def _without_jerk(grid: Grid) -> SpeedProfile:
 
 
 def _usage_without_jerk(profile: SpeedProfile, rows: tuple[Rows, ...], requested: Array) -> tuple[Array, Array]:
-    """Return the largest usage of any limit at beginning, middle and end of each interval (3, N), and between (N,).
+    """Return the largest usage of any limit at start, middle and end of each interval, (3, N), and inside it, (N,).
 
     Each row is interpolated by a parabola through the three places.
     """
@@ -247,7 +247,7 @@ def _row_speed_caps(left: Rows, right: Rows) -> Array:
         return np.asarray(np.maximum(np.append(left, 0.0), np.insert(right, 0, 0.0)) ** -2.0)
 
 
-def _with_jerk(
+def _solve_with_jerk(
     window: Window, enforced: EnforcedRows, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
 ) -> Motion:
     """Return squared speeds and their derivatives at the nodes of a window for the fastest motion under jerk limits."""
@@ -274,12 +274,12 @@ def _with_jerk(
     with np.errstate(divide="ignore"):
         between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0
     upper = np.concatenate([caps[inner][:1], np.minimum(requested, between)[cells], caps[inner][-1:]])
-    held = enforced.held
+    mask = enforced.mask
     if known is None:
-        held = held.copy()
+        mask = mask.copy()
         start = _initial_squares(nodes, np.minimum(reachable, caps), left, right, ends)[inner]
         b = np.concatenate([start[:1], np.minimum(start[:-1], start[1:]), start[-1:]])
-        held[1] |= _reachable_rows(window.rows[1], np.maximum(reachable[1:], reachable[:-1]), rates, shares)
+        mask[1] |= _reachable_rows(window.rows[1], np.maximum(reachable[1:], reachable[:-1]), rates, shares)
     else:
         b = spline.through(known[0][inner], known[1][inner])
         b = np.maximum(b, 1e-9 * b.max())
@@ -299,7 +299,7 @@ def _with_jerk(
     with np.errstate(invalid="ignore"):
         implied = (1 - spline.share) * upper[:-1] + spline.share * upper[1:]
     rows = _spline_rows(
-        places, held[:, :, cells], caps[inner], implied, own_shares, enforced.speeds[:, cells], in_motion
+        places, mask[:, :, cells], caps[inner], implied, own_shares, enforced.speeds[:, cells], in_motion
     )
     program = Program(spline, rows, upper, (rest[0], rest[1]), np.array(fixed, dtype=np.intp))
     try:
@@ -361,7 +361,7 @@ def _rest_jerk(left: Rows, right: Rows, width: float, side: int, shares: Array) 
 
 def _spline_rows(
     places: tuple[Rows, ...],
-    held: NDArray[np.bool_],
+    mask: NDArray[np.bool_],
     caps: Array,
     implied: Array,
     shares: Margins,
@@ -372,10 +372,10 @@ def _spline_rows(
 
     Args:
         places: Limit rows where intervals begin, inside them, and where they end. Shape (N,) each.
-        held: Which of them are enforced, at the `HELD` positions. Shape (4, 2, N, K + L + P).
+        mask: Which of them are enforced, at the `ENFORCED_AT` positions. Shape (4, 2, N, K + L + P).
         caps, implied: Greatest squared speed at nodes by the speed limits, and by coefficient bounds. Shape (N + 1,).
         shares: Shares of the limits that each interval may use.
-        speeds: Speed ratios at the `HELD` positions, see `EnforcedRows`. Shape (4, N).
+        speeds: Speed ratios at the `ENFORCED_AT` positions, see `EnforcedRows`. Shape (4, N).
         in_motion: Whether the program begins and ends with a known motion, whose own rows are left out.
     """
     count, first = len(caps) - 1, places[0].speed.shape[1]
@@ -387,7 +387,7 @@ def _spline_rows(
     for inside, rows in zip(INSIDE, places[1:-1], strict=True):
         most = (rows.speed[slow].max(axis=1, initial=0.0) / shares.speed[slow]) ** 2
         parts.append(_speed_rows(slow, np.full(len(slow), inside), most))
-    for which, at_place, speed in zip(held, HELD, speeds, strict=True):
+    for which, at_place, speed in zip(mask, ENFORCED_AT, speeds, strict=True):
         inside, rows, active = (0.0, *INSIDE, 1.0)[at_place], places[at_place], which[:, :, first:second].copy()
         if inside in (0.0, 1.0) and in_motion[int(inside)]:
             active[:, -int(inside)] = False
@@ -417,7 +417,7 @@ def _jerk_place(inside: float) -> float:
 
 
 def _speed_ratios(spline: Spline, b: Array) -> Array:
-    """Return the speeds at which limits are enforced, divided by those at the points of `_jerk_place`. Shape (4, N)."""
+    """Return the speeds at the points where limits are enforced over those at the points of `_jerk_place`."""
     x, slope = spline.at_nodes(b)
     second = np.diff(slope) / spline.h
 
@@ -425,7 +425,7 @@ def _speed_ratios(spline: Spline, b: Array) -> Array:
         distance = inside * spline.h
         return np.asarray(np.maximum(x[:-1] + distance * (slope[:-1] + distance * second / 2), SETTINGS.dive * x[:-1]))
 
-    places = [(0.0, *INSIDE, 1.0)[k] for k in HELD]
+    places = [(0.0, *INSIDE, 1.0)[k] for k in ENFORCED_AT]
     return np.sqrt([at(inside) / at(_jerk_place(inside)) for inside in places])
 
 

@@ -44,7 +44,7 @@ SETTINGS = WindowSettings()
 
 INSIDE = (0.25, 0.5, 0.75)
 """Positions inside each interval at which limits are evaluated, as fractions of the length of the interval."""
-HELD = (0, 1, 3, 4)
+ENFORCED_AT = (0, 1, 3, 4)
 """Indices in (0, *INSIDE, 1) of the positions where limits are enforced: all but the middle, where the jerk may jump.
 """
 
@@ -153,7 +153,7 @@ class EnforcedRows:
     Attributes:
         margins: Usable shares of the limits, lowered where limits are violated although they are enforced there.
         times: Number of reductions of each margin.
-        held: Which rows are enforced at the `HELD` positions of each interval, upwards and downwards.
+        mask: Which rows are enforced at the `ENFORCED_AT` positions of each interval, upwards and downwards.
             Shape (4, 2, N, K + L + P).
         speeds: Speeds at these positions over those to which the jerk there is proportional. Shape (4, N).
         inherited: Number of intervals taken over from the previous window.
@@ -161,7 +161,7 @@ class EnforcedRows:
 
     margins: Margins
     times: Margins
-    held: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
     speeds: Array
     inherited: int = 0
 
@@ -171,15 +171,15 @@ class EnforcedRows:
         count, rows = window.last - window.first, window.rows[0]
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
-        held = np.zeros((len(HELD), 2, count, rows.total), dtype=bool)
-        return cls(margins, times, held, np.ones((len(HELD), count)))
+        mask = np.zeros((len(ENFORCED_AT), 2, count, rows.total), dtype=bool)
+        return cls(margins, times, mask, np.ones((len(ENFORCED_AT), count)))
 
     def after(self, first: int) -> EnforcedRows:
         """Return the enforced limits in the intervals from `first` on, as views of the same memory."""
         part = slice(first, None)
-        return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
+        return EnforcedRows(self.margins.take(part), self.times.take(part), self.mask[:, :, part], self.speeds[:, part])
 
-    def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
+    def enforce_near(self, used: Array, values: Array, jerks: Array) -> None:
         """Enforce limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in each interval.
 
         Args:
@@ -189,9 +189,9 @@ class EnforcedRows:
         close = used > SETTINGS.near
         close[:, 1:] |= close[:, :-1].copy()
         close[:, :-1] |= close[:, 1:].copy()
-        self.held[[0, -1]] |= close
-        self.hold(close, values)
-        self.hold_jerk(jerks)
+        self.mask[[0, -1]] |= close
+        self.enforce(close, values)
+        self.enforce_jerk(jerks)
 
     def release(self, values: Array, jerks: Array, seam: int) -> None:
         """Stop enforcing limits that a motion does not come near, but keep at least one jerk limit in each interval.
@@ -199,16 +199,16 @@ class EnforcedRows:
         Intervals shared with the previous or next window keep all rows.
         """
         own = slice(self.inherited, seam)
-        self.held[:, :, own] &= np.stack([values, -values], axis=1)[:, :, own] > SETTINGS.near
-        self.hold_jerk(jerks)
+        self.mask[:, :, own] &= np.stack([values, -values], axis=1)[:, :, own] > SETTINGS.near
+        self.enforce_jerk(jerks)
 
-    def hold_jerk(self, jerks: Array) -> None:
+    def enforce_jerk(self, jerks: Array) -> None:
         """Enforce at least one jerk limit in every interval, to bound the second derivative of the squared speed."""
-        first = self.held.shape[3] - jerks.shape[1]
-        sign, free = np.nonzero(~self.held[:, :, :, first:].any(axis=(0, 3)))
-        self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
+        first = self.mask.shape[3] - jerks.shape[1]
+        sign, free = np.nonzero(~self.mask[:, :, :, first:].any(axis=(0, 3)))
+        self.mask[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
-    def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
+    def enforce(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
         """Add limits as constraints at the point of an interval where each is nearest; return which were there already.
 
         Masks of shape (2, N, K + L + P).
@@ -216,21 +216,21 @@ class EnforcedRows:
         already = np.zeros(rows.shape, dtype=bool)
         sign, at, row = np.nonzero(rows)
         place = (values[:, at, row] * (1 - 2 * sign)).argmax(axis=0)
-        already[sign, at, row] = self.held[place, sign, at, row]
-        self.held[place, sign, at, row] = True
+        already[sign, at, row] = self.mask[place, sign, at, row]
+        self.mask[place, sign, at, row] = True
         return already
 
-    def lower(self, used: Array, held: NDArray[np.bool_], rows: Rows, seam: int) -> None:
+    def lower(self, used: Array, mask: NDArray[np.bool_], rows: Rows, seam: int) -> None:
         """Tighten the limits that are violated although they are enforced, by more at each call.
 
         Args:
             used: Usage of the limits. Shape (2, N, K + L + P).
-            held: Which rows are enforced. Shape (2, N, K + L + P).
+            mask: Which rows are enforced. Shape (2, N, K + L + P).
             rows: Rows of the window.
             seam: Interval at which the next window begins.
         """
         ends = np.cumsum([0, *(kind.shape[1] for kind in rows)])
-        largest = np.where(held, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
+        largest = np.where(mask, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
         largest[:, : ends[1]] = np.minimum(used[0, :, : ends[1]], SETTINGS.lowered)
         for margin, times, (a, z) in zip(self.margins, self.times, pairwise(ends), strict=True):
             ratio = largest[:, a:z] if margin.ndim == 2 else largest[:, a:z].max(axis=1, initial=0.0)
@@ -240,11 +240,11 @@ class EnforcedRows:
             if margin.ndim == 2:
                 # the next window starts on this motion with these margins and must keep them at all positions
                 inherited = at[0] >= seam
-                self.held[:, :, at[0][inherited], a + at[1][inherited]] = True
+                self.mask[:, :, at[0][inherited], a + at[1][inherited]] = True
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
-    """Return the speed profile through given squared speeds and derivatives at the first nodes of a part."""
+    """Return the speed profile through squared speeds and their derivatives at the first nodes of a part of a path."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     return profile_through(s, np.sqrt(x), slope[: len(x)] / 2)
 
@@ -252,7 +252,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return the largest ratio of each limited quantity to its limit in given intervals, and the ratios at `HELD`.
+    """Return the largest ratio of each quantity to its limit in given intervals, and the ratios at `ENFORCED_AT`.
 
     Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 
@@ -310,11 +310,11 @@ def limit_usage(
                 if not torques:
                     finer[:, :, window.torques] = used[:, these, window.torques]
                 used[:, these] = finer
-    held_values = values[[0, 1, 4, 5]]
+    point_values = values[[0, 1, 4, 5]]
     if every:
-        return used, held_values
-    everywhere = [np.zeros((len(kind), window.last - window.first, kind.shape[2])) for kind in (used, held_values)]
-    for kind, compact in zip(everywhere, (used, held_values), strict=True):
+        return used, point_values
+    everywhere = [np.zeros((len(kind), window.last - window.first, kind.shape[2])) for kind in (used, point_values)]
+    for kind, compact in zip(everywhere, (used, point_values), strict=True):
         kind[:, which] = compact
     return everywhere[0], everywhere[1]
 
