@@ -297,7 +297,7 @@ class _Search:
         return f"the prescribed motion between {names} {cause} at {begin[k]:.6g} s"
 
     def at(self, time: float) -> list[ClosestPair]:
-        """Return the distance and the closest points of every pair of bodies at one time, s."""
+        """Return the distance and the closest points of every pair of bodies at one time of a plan, s."""
         self.best[:] = np.inf
         self._evaluate(np.full(len(self.apart), np.clip(time / self.track.horizon, 0.0, 1.0)))
         return self._closest(self.best)
@@ -349,7 +349,7 @@ class _Search:
         return np.where(margin >= 0, self.apart.least + max(smallest - max(share * smallest, finest), 0.0), reduced)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower distance bounds on time intervals, and the sufficient bounds of all pairs. Shapes (K,), (n,), m.
+        """Return lower bounds of distances in time intervals (K,), and the sufficient bounds of all pairs (n,), m.
 
         Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. The smallest
         distances are stored.

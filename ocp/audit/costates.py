@@ -237,7 +237,7 @@ class BackwardIntegration:
 def _forces(
     back: BackwardIntegration, k: int, first: np.ndarray, last: np.ndarray, cost: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the state limits in interval ``k`` that best explain its reported costates.
+    """Return the multipliers of the state limits in mesh interval ``k`` that best explain the reported costates.
 
     Those at the Gauss points (q, m) are multiplied by quadrature weights; those at both ends (2, m) are impulses.
     """

@@ -115,7 +115,7 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
 
 
 class _Swept(NamedTuple):
-    """Result of one backward sweep, with the fields of `Curvature` except for ``t``.
+    """Result of one backward sweep of the second variation, with the fields of `Curvature` except for the times.
 
     ``dependent``: Whether it is inconclusive because constraints are nearly dependent.
     """

@@ -170,7 +170,7 @@ def share_sizes(size: np.ndarray, places: Mapping[str, slice], declared: Mapping
 
 
 def _select(bounds: Bounds, index: np.ndarray) -> Bounds:
-    """Return the lower and upper bounds at given indices."""
+    """Return the lower and upper bounds of a problem at given indices of its bound table."""
     return bounds[0][index], bounds[1][index]
 
 

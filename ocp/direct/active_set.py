@@ -353,7 +353,7 @@ def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, n
 
 
 def _same(sides: Sides, other_sides: Sides) -> bool:
-    """Return whether two active sets are the same."""
+    """Return whether two active sets contain the same limits of variables and constraints."""
     return all(np.array_equal(side, other_sides[kind]) for kind, side in sides.items())
 
 
@@ -451,7 +451,7 @@ class Cholesky:
 
 
 def _border(row: np.ndarray, column: np.ndarray, distance: np.ndarray, size: int) -> np.ndarray:
-    """Choose the variables for the border of a banded matrix, so that its factorisation takes little work."""
+    """Choose the variables for the border of a banded matrix, so that the matrix is factorised with little work."""
     degree = np.bincount(row, minlength=size) + np.bincount(column, minlength=size)
     is_border, border, least_work, count = np.zeros(size, dtype=bool), list[int](), np.inf, 0
     for k in np.argsort(-distance, kind="stable"):

@@ -121,7 +121,10 @@ class BoundaryProblem:
         )
 
     def arguments(self, y: Any, at: Any, horizon: Any, q: Any) -> list[Any]:
-        """Return states, costates, times ``at`` and data as arguments of the Hamiltonian system's functions."""
+        """Split states and costates ``y`` and data ``q`` into arguments of the Hamiltonian system's functions.
+
+        ``at`` are the times, s.
+        """
         sizes = self.ham.sizes
         cuts = np.cumsum([3, *sizes[4:]])
         tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
@@ -135,7 +138,7 @@ class BoundaryProblem:
         return side_by_side({**sizes, "horizon": int(form.horizon_is_free), **ends})
 
     def _data_layout(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Return the slice of every part of the data vector (parameters, fixed values and guesses), by name."""
+        """Return, by name, the slice of every part of the data vector, such as parameters, fixed values and guesses."""
         sizes = self.ham.sizes
         total = sum(arcs.segments)
         parts = {"horizon": 1, "p": sizes[4], "ends": 4 * sizes[0], "bang": sizes[5] * total, "guess": sizes[6] * total}
@@ -274,7 +277,7 @@ class NewtonSettings:
 
 @dataclass(frozen=True)
 class NewtonResult:
-    """Last iterate and status of Newton's method."""
+    """Last iterate of Newton's method, its residual, the number of steps, and the status with a message."""
 
     unknowns: np.ndarray
     residual: float

@@ -31,7 +31,7 @@ class Hamiltonian:
         smooth, linear: Indices of the controls in which H is curved, and of those in which it is linear.
         unknowns: Function (x, lam, t, T, p, bang, guess) -> w = [smooth controls; mu] that minimises H. ``bang`` are
             the values of the linear controls, each at one of its bounds; ``guess`` starts an iteration for w.
-        how: ``quadratic`` (solved symbolically), ``projected`` (then projected on its bounds) or ``iterated``.
+        solved: ``quadratic`` (symbolically), ``projected`` (then projected on the bounds) or ``iterated`` (by Newton).
     """
 
     form: Formulation
@@ -42,11 +42,11 @@ class Hamiltonian:
     smooth: tuple[int, ...]
     linear: tuple[int, ...]
     unknowns: Any
-    how: str
+    solved: str
 
     @classmethod
     def of(cls, form: Formulation) -> Hamiltonian:
-        """Derive the Hamiltonian system of a problem.
+        """Derive the Hamiltonian system of an optimal control problem, with the controls that minimise H.
 
         Raises:
             ProblemError: An unsupported constraint, a control without bounds in which H is linear, or a control that H
@@ -63,8 +63,8 @@ class Hamiltonian:
         curved = {column for pattern in patterns for column in pattern.get_col()}
         smooth, linear = ([i for i in range(form.nu) if (i in curved) == kind] for kind in (True, False))
         system = cls(form, lam, mu, rows, value, tuple(smooth), tuple(linear), None, "")
-        unknowns, how = system._solve()
-        return replace(system, unknowns=unknowns, how=how)
+        unknowns, solved = system._solve()
+        return replace(system, unknowns=unknowns, solved=solved)
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -201,7 +201,7 @@ def _assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang:
 
 
 def check_constraints(form: Formulation) -> None:
-    """Raise ProblemError, naming the constraint, for a constraint that the indirect method does not support."""
+    """Raise ProblemError if the indirect method does not support a constraint of the problem, by its name."""
     for name, place in form.states.items():
         index = form.bounds.places["state"][place]
         low, high = (bound[index] for bound in numeric_bounds(form))

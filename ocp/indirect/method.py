@@ -101,7 +101,7 @@ def control_derivatives(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list
 
 @dataclass(frozen=True)
 class Indirect:
-    """Indirect method: the equations of the minimum principle, solved by multiple or backward shooting.
+    """Indirect method: the equations of Pontryagin's minimum principle, solved by multiple or backward shooting.
 
     Attributes:
         segments: Number of segments, distributed over the arcs between switches of bang-bang controls.
@@ -139,7 +139,7 @@ class Indirect:
         compiled: bool = False,
         scaling: bool = True,
     ) -> PreparedIndirect:
-        """Derive the Hamiltonian system of a problem once; see :func:`ocp.methods.prepare`.
+        """Derive the Hamiltonian system of a problem once, for repeated solves; see :func:`ocp.methods.prepare`.
 
         ``solver``, ``options``, ``compiled`` and ``scaling`` apply to the direct solution that is its initial guess.
         """
@@ -150,7 +150,7 @@ class Indirect:
 
 
 class PreparedIndirect:
-    """A problem with its Hamiltonian system, derived once for repeated solves.
+    """A problem with its Hamiltonian system, derived once for repeated solves by the indirect method.
 
     Attributes:
         formulation, hamiltonian, boundary: The derived system. seconds: Wall time of the derivation.
@@ -170,7 +170,7 @@ class PreparedIndirect:
         self.seconds = time.monotonic() - began
 
     def __reduce__(self) -> Any:
-        """Represent the object for pickling and copying by its arguments, from which it is prepared again."""
+        """Return the class and the arguments from which pickle and copy prepare the problem again."""
         return type(self), (self.problem, self.method, self._seeding)
 
     @interruptible
@@ -321,7 +321,7 @@ class PreparedIndirect:
         settings = dataclasses.asdict(self.method)
         return Solution(
             name=form.name,
-            method={"type": "Indirect", **settings, "control": ham.how, "switches": switches.tolist()},
+            method={"type": "Indirect", **settings, "control": ham.solved, "switches": switches.tolist()},
             solver="newton",
             success=root.success and bool(np.isfinite(cost)),
             status=root.status,
@@ -345,7 +345,7 @@ class PreparedIndirect:
         )
 
     def _segments(self, y: np.ndarray, inputs: np.ndarray, bounds: Bounds) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return initial values and data of reported segments: shooting segments split where controls reach bounds."""
+        """Return initial values and data of all shooting segments, each split where a control reaches a bound."""
         index = self.formulation.bounds.places["control"]
         low, high = bounds[0][index], bounds[1][index]
 
@@ -361,7 +361,7 @@ class PreparedIndirect:
         segments: list[tuple[np.ndarray, np.ndarray]] = []
         for first, q in zip(y.T[:-1], inputs.T, strict=True):
             splits = [0.0]
-            if self.hamiltonian.how != "quadratic":
+            if self.hamiltonian.solved != "quadratic":
                 at_bounds = [at_bound(position, first, q) for position in LOBATTO]
                 for a, b, before, after in zip(LOBATTO, LOBATTO[1:], at_bounds, at_bounds[1:], strict=False):
                     if np.any(before != after):

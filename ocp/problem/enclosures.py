@@ -55,7 +55,7 @@ class Enclosure(NamedTuple):
 
 
 class Enclosures:
-    """Evaluator of bounds of expressions of one scalar symbol over intervals of that symbol.
+    """Evaluator of bounds of the values and slopes of expressions of one scalar symbol over intervals of the symbol.
 
     The bounds hold wherever an entry and all its subexpressions are defined: the square root of a function that becomes
     negative counts where it is real.
@@ -74,10 +74,7 @@ class Enclosures:
         check_instructions(what, self._function)
 
     def __call__(self, low: np.ndarray, high: np.ndarray) -> Enclosure:
-        """Return bounds of the expressions over M intervals of the symbol.
-
-        The intervals reach from ``low`` to ``high``. Shape (M,) each.
-        """
+        """Return bounds of the expressions over M intervals of the symbol, from ``low`` (M,) to ``high`` (M,)."""
 
         def apply(code: int, *operands: _Jet) -> _Jet:
             return _KINKED[code](code, *operands) if code in _KINKED else _smooth(code, *operands)
@@ -144,7 +141,7 @@ def _absolute(code: int, x: _Jet) -> _Jet:
 
 
 def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
-    """Return bounds of the value and slope of fmin or fmax; both slopes count where the selection is unknown."""
+    """Return bounds of the value and slope of fmin or fmax, from both operands where either may be the extreme one."""
     low, high = (x, y) if code == ca.OP_FMIN else (y, x)
     first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
     ends = [
@@ -176,7 +173,7 @@ def _copysign(code: int, x: _Jet, y: _Jet) -> _Jet:
 
 
 def _angle(code: int, y: _Jet, x: _Jet) -> _Jet:
-    """Return bounds of the value and slope of atan2, which jumps by a full turn on a half-line."""
+    """Return bounds of the value and slope of atan2, which jumps by a full turn on the negative x axis."""
     smooth = _smooth(code, y, x)
     continuous = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
     return _Jet(smooth.value, _slope_where(continuous, smooth.slope))

@@ -229,7 +229,7 @@ class SeparatingDirections(NamedTuple):
     along: np.ndarray
 
     def of(self, selected: np.ndarray) -> SeparatingDirections:
-        """Return the directions of the pairs that a boolean mask of shape (K,) selects."""
+        """Return the separating directions of the pairs of bodies that a boolean mask of shape (K,) selects."""
         keep = selected[self.place]
         return SeparatingDirections((np.cumsum(selected) - 1)[self.place[keep]], self.row[keep], self.along[keep])
 
@@ -258,7 +258,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return the distances of all pairs at all samples, or lower bounds of distances above `near`. Shape (M, n), m.
+        """Return the distances of all pairs of bodies at all samples, or lower bounds above `near`. Shape (M, n), m.
 
         With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
@@ -283,7 +283,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return distances of given pairs at given samples, or lower bounds of those above `near`. Shape (K,), m."""
+        """Return the distances of pairs of bodies at given samples, or lower bounds above `near`. Shape (K,), m."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -299,7 +299,7 @@ class BodyPairs:
     def nearest(
         self, frames: Frames, at: np.ndarray, pair: np.ndarray
     ) -> tuple[SeparatingDirections, np.ndarray, np.ndarray]:
-        """Return directions, distances (K,), m, and nearest points before inflation (K, 2, 3), m, of pairs."""
+        """Return separating directions, distances (K,), m, and nearest points of the cores (K, 2, 3), m, of pairs."""
         place, rows = self._covered.of(pair)
         along, gap, points = np.empty((len(rows), 3)), np.empty(len(rows)), np.empty((len(rows), 2, 3))
         for kind, chosen, row in self._by_kind(rows):
@@ -308,7 +308,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the smaller of each pair's gaps along a direction at start and end of an interval. Shape (K,), m.
+        """Return the smaller of two bodies' gaps along a direction at start and end of an interval. Shape (K,), m.
 
         The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
         """
@@ -324,7 +324,7 @@ class BodyPairs:
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Split pairs by the kinds of their hulls; yield each group, its places in `rows`, and indices in the group."""
+        """Split pairs by the kinds of their hulls; yield each group, the places in `rows`, and indices in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -340,7 +340,10 @@ def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
 
 
 def frames_of(placements: np.ndarray) -> Frames:
-    """Return poses from samples of rotation matrices, by columns, and positions (M, 12 F); the world is added last."""
+    """Return the poses of F frames from M samples of rotation matrices, by columns, and positions. Shape (M, 12 F).
+
+    The world is added as the last frame.
+    """
     count = len(placements)
     world = np.broadcast_to(np.vstack([np.eye(3), np.zeros(3)]), (count, 1, 4, 3))
     values = np.concatenate([placements.reshape(count, placements.shape[1] // 12, 4, 3), world], axis=1)
@@ -348,7 +351,7 @@ def frames_of(placements: np.ndarray) -> Frames:
 
 
 def _normal(first: Hull, second: Hull) -> np.ndarray:
-    """Return the half-space normal of a pair, directed from first to second body; zero if no body is a half-space."""
+    """Return the half-space normal of a pair, directed from first to second body; zero if neither is a half-space."""
     return first.normal if first.normal.size else -second.normal if second.normal.size else np.zeros(3)
 
 
@@ -358,7 +361,7 @@ WORLD = -1
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Declaration of minimum distances between pairs of bodies.
+    """Declaration of minimum distances between pairs of bodies, which the audit proves along the whole motion.
 
     Attributes:
         name: Unique among the constraints of a problem.
@@ -437,7 +440,7 @@ class Separation:
         return tuple((names[first], names[second]) for first, second, _ in self.pairs)
 
     def of(self, pairs: Sequence[int]) -> Separation:
-        """Return the separation constraint of a subset of the pairs."""
+        """Return the separation constraint of a subset of the pairs of bodies, given by their indices."""
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
         covers = {row: self.covers[pair] for row, pair in enumerate(keep) if pair in self.covers}
@@ -481,7 +484,9 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
 
 
 def stack_motion_bounds(what: str, bounds: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
-    """Stack bounds of the displacement of the bodies of pairs per unit change of each state; 0 for a state without one.
+    """Return bounds of the relative displacement of pairs of bodies per unit change of each state. Shape (n, k).
+
+    A state for which `bounds` has no entry has the bound 0.
 
     Args:
         movers: Size of each state that moves a body. count: Number of pairs.

@@ -99,7 +99,7 @@ def constant(value: float, like: Array) -> Interval:
 
 
 def _range_of(corners: list[Array]) -> Interval:
-    """Return the interval from the smallest to the largest value of an operation at the corners of its inputs."""
+    """Return the interval from the smallest to the largest of given values, widened by possible rounding errors."""
     stacked = np.array(corners)
     return _widen(stacked.min(axis=0), stacked.max(axis=0))
 
@@ -232,7 +232,7 @@ def _tangent(x: Interval) -> Interval:
 
 
 def _angle(y: Interval, x: Interval) -> Interval:
-    """Return the range of atan2 over rectangles: from the corner values, or a full turn if the branch cut is met."""
+    """Return the range of atan2(y, x): from its values at the ends of both intervals, or a full turn at its jump."""
     result = _range_of([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
     crosses_cut = ~((x.low > 0) | (y.low > 0) | (y.high < 0))
     half = float(np.nextafter(np.pi, 4))

@@ -255,7 +255,7 @@ def _build_solve(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
 
 
 def _grids(record: Mapping[str, Any], what: str) -> list[list[float]]:
-    """Return the stored grid of a table along each dimension, after checks."""
+    """Return the grid of a stored table along each dimension; raise ProblemError if it does not increase."""
     places, offsets = _floats(record[what], finite=True), _integers(record["offsets"], (None,)).tolist()
     if not 2 <= len(offsets) <= MAX_DIMENSIONS + 1 or offsets[0] != 0 or offsets[-1] != len(places):
         raise ProblemError(f"the offsets of a grid of {len(offsets) - 1} dimensions are inconsistent", name="offsets")
@@ -354,7 +354,7 @@ def from_record(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, 
 
 
 def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[str, Any, Any, Any]:
-    """Rebuild a problem from its record like `from_record`, without a summary of the errors of a damaged record."""
+    """Rebuild a problem from its record like `from_record`, but raise various errors if the record is damaged."""
     symbols, functions = SYMBOLS[record["symbols"]], FunctionReader(record["functions"]).functions
     expressions = functions[record["expressions"]]
     time = symbols.sym("time")

@@ -279,7 +279,7 @@ def _numbers(matrix: Any) -> np.ndarray:
 
 
 def _fields(function: Any, kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Return internal fields of a CasADi function, read from CasADi's debugging output, by name.
+    """Return the values of internal fields of a CasADi function by name, read from CasADi's debugging output.
 
     ``kinds`` gives the type of each field: `int`, `float`, or a list of one of them for an array. The text comes from a
     function of this process, never from a file.
