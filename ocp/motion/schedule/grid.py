@@ -200,7 +200,7 @@ def _halve_intervals(
     with np.errstate(divide="ignore"):
         jerk = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
     acceleration = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
-    return _Cells(s[:-1], top, _acceleration_bounds(left, right, top**2, top**2), acceleration, jerk)
+    return _Cells(s[:-1], top, acceleration_bounds(left, right, top**2, top**2), acceleration, jerk)
 
 
 def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
@@ -245,10 +245,8 @@ def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Arr
 def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Array) -> NDArray[np.bool_]:
     """Return in which intervals a limit varies too nonlinearly with distance for linear interpolation. Shape (N,).
 
-    Args:
-        places: Limit rows at the beginning, at a fraction of the length, and at the end of each interval. Shape (N,).
-        fraction: That fraction.
-        top: Fastest steady speeds. Shape (N,), m/s.
+    `places` contains the limits at the beginning, at a fraction of the length, and at the end of each interval. `top`
+    are the fastest steady speeds (N,), m/s.
     """
     kinds = (
         # by the squared speed, as the rows of speed are in the program
@@ -263,23 +261,11 @@ def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Arr
     return uneven
 
 
-def reachable_bounds(
-    distance: Array, caps: Array, *, left: Rows, right: Rows, at_rest: tuple[bool, bool]
-) -> tuple[Array, Array]:
-    """Return bounds that no motion exceeds: of squared speeds at nodes (N + 1,) and accelerations in intervals (N,).
+def acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> Array:
+    """Return upper bounds of the acceleration in each interval from the squared speeds at both ends. Shape (N,).
 
-    Args:
-        distance: Distances of the nodes. Shape (N + 1,), m.
-        caps: Greatest permitted squared speed at each node. Shape (N + 1,).
-        left, right: Limit rows at both ends of each interval. Shape (N,).
-        at_rest: Whether the motion begins and ends at rest.
+    `left` and `right` are the limits at both ends of each interval.
     """
-    rates = _acceleration_bounds(left, right, caps[:-1], caps[1:])
-    return _reachable_squares(distance, caps, rates, at_rest), rates
-
-
-def _acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> Array:
-    """Return upper bounds of the acceleration in each interval from the squared speeds at both ends. Shape (N,)."""
     rates = np.full(len(first), np.inf)
     for side, most in ((left, first), (right, last)):
         rows = np.abs(side.acceleration)
@@ -289,8 +275,12 @@ def _acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> 
     return rates
 
 
-def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
-    """Return the highest squared speeds that can be reached at nodes under speed caps and acceleration bounds."""
+def reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
+    """Return squared speeds at nodes (N + 1,) that no motion exceeds under speed caps and acceleration bounds.
+
+    `caps` are the greatest permitted squared speeds at the nodes, `rates` bound the accelerations in the intervals, and
+    `at_rest` tells whether the motion begins and ends at rest.
+    """
     gain = np.concatenate([[0.0], np.cumsum(2 * rates * np.diff(distance))])
     squares = caps.copy()
     squares[[i for i, rest in zip((0, -1), at_rest, strict=True) if rest]] = 0.0
@@ -312,7 +302,7 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
     """Return grid nodes such that the motion passes every interval in a short time, refined towards the path's ends."""
     _, top, rates, acceleration, jerk = cells
     s = np.append(cells.begin, length)
-    squares = _reachable_squares(s, node_minimum(top) ** 2, rates, (True, True))
+    squares = reachable_squares(s, node_minimum(top) ** 2, rates, (True, True))
     ramp = top / acceleration
     with np.errstate(invalid="ignore"):
         build_up = np.minimum(acceleration / jerk, np.sqrt(top / jerk))

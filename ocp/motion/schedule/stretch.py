@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError, SolveError
-from ocp.motion.schedule.grid import GAUSS, Grid, limit_slope, node_minimum, reachable_bounds
+from ocp.motion.schedule.grid import GAUSS, Grid, acceleration_bounds, limit_slope, node_minimum, reachable_squares
 from ocp.motion.schedule.limits import Rows, limit_rows
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.motion.schedule.ramps import reachability_passes
@@ -258,7 +258,8 @@ def _solve_with_jerk(
     shares = enforced.margins.times(seam_shares)
     requested = grid.requested[begin:end] ** 2 * seam_shares**2
     caps = np.minimum(node_minimum(requested), _row_speed_caps(left, right) * node_minimum(shares.speed) ** 2)
-    reachable, rates = reachable_bounds(nodes, caps, left=left, right=right, at_rest=at_rest)
+    rates = acceleration_bounds(left, right, caps[:-1], caps[1:])
+    reachable = reachable_squares(nodes, caps, rates, at_rest)
     # an interval next to rest has constant jerk and is not part of the program
     low, high = int(at_rest[0]), len(nodes) - int(at_rest[1])
     rest = [0.0, 0.0]

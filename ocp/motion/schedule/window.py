@@ -182,9 +182,7 @@ class EnforcedRows:
     def enforce_near(self, used: Array, values: Array, jerks: Array) -> None:
         """Enforce limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in each interval.
 
-        Args:
-            used, values: Usage of the limits, see `limit_usage`.
-            jerks: Coefficients of the jerk in the jerk limits. Shape (N, P).
+        `used` and `values` are those of `limit_usage`, `jerks` (N, P) the coefficients of the jerk in its limits.
         """
         close = used > SETTINGS.near
         close[:, 1:] |= close[:, :-1].copy()
@@ -223,11 +221,8 @@ class EnforcedRows:
     def lower(self, used: Array, mask: NDArray[np.bool_], rows: Rows, seam: int) -> None:
         """Tighten the limits that are violated although they are enforced, by more at each call.
 
-        Args:
-            used: Usage of the limits. Shape (2, N, K + L + P).
-            mask: Which rows are enforced. Shape (2, N, K + L + P).
-            rows: Rows of the window.
-            seam: Interval at which the next window begins.
+        `used` is the usage of the limits and `mask` tells which are enforced. Shape (2, N, K + L + P). The next window
+        begins at the interval `seam`.
         """
         ends = np.cumsum([0, *(kind.shape[1] for kind in rows)])
         largest = np.where(mask, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
