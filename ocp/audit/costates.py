@@ -103,7 +103,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
         before = control_multipliers != 0
         back = BackwardIntegration(along, control_multipliers, across)
         for k in limited.tolist():
-            inside[k], atoms[k] = _forces(back, k, first[k], last[k], cost)
+            inside[k], atoms[k] = _state_limit_multipliers(back, k, first[k], last[k], cost)
         costate, start = back.integrate(last, inside, atoms)
         control_multipliers, across = find_control_multipliers(along, costate, curved)
         if not (limited.size or along.mixed.size) or (before == (control_multipliers != 0)).all():
@@ -234,7 +234,7 @@ class BackwardIntegration:
         return np.where(np.isfinite(total), total, np.inf)
 
 
-def _forces(
+def _state_limit_multipliers(
     back: BackwardIntegration, k: int, first: np.ndarray, last: np.ndarray, cost: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the multipliers of the state limits in mesh interval ``k`` that best explain the reported costates.
