@@ -19,7 +19,7 @@ from ocp.direct.active_set import Newton, active_sides
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.code_generation import block_derivatives, write_controller
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
-from ocp.direct.guess import STARTS, alternative_starts, guessed_names, initial_point, shifted_indices
+from ocp.direct.guess import STARTS, alternative_starts, displace, guessed_names, initial_point, shifted_indices
 from ocp.direct.nlp import (
     SOLVERS,
     Outcome,
@@ -142,6 +142,7 @@ class Prepared:
         tighter: Mapping[str, np.ndarray] | None = None,
         time_limit: float | None = None,
         shift: int = 0,
+        start: str = "guess",
     ) -> Solution:
         """Solve the prepared problem with given parameters from a given guess; see :func:`ocp.methods.solve`.
 
@@ -158,6 +159,7 @@ class Prepared:
             shift: Number of intervals by which a receding horizon has advanced since the guess, a plan on equal
                 intervals. Each interval starts from the values, limits and multipliers of the plan so many intervals
                 later; the last ones from their own.
+            start: ``guess``, or ``displaced guess``: displaced by seeded random shares of the sizes of the variables.
 
         Raises:
             ProblemError: Wrong arguments.
@@ -168,7 +170,8 @@ class Prepared:
             words = "solve: shift requires as guess a plan of this problem, method and mesh, with equal intervals"
             raise ProblemError(words, name="shift", value=shift)
         with time_limited(checked_time_limit(time_limit)), self._lock:
-            return self._solve(parameters, guess, check, tighter, ahead)
+            require.choice("solve: start", start, ("guess", "displaced guess"))
+            return self._solve(parameters, guess, check, tighter, ahead, start)
 
     @interruptible
     def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
@@ -195,7 +198,13 @@ class Prepared:
             return write_controller(form, transcription, point, place)
 
     def _solve(
-        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, shift: int
+        self,
+        parameters: ByName,
+        guess: Guess,
+        check: bool,
+        tighter: Mapping[str, np.ndarray] | None,
+        shift: int,
+        start: str,
     ) -> Solution:
         """Solve by Newton steps near a known plan, else from the guess, other points or a relaxed problem."""
         form, transcription = self.formulation, self.transcription
@@ -211,7 +220,9 @@ class Prepared:
         if shift and isinstance(guess, Solution):
             point = guess.variables[shifted_indices(transcription, shift)[0]]
         names = guessed_names(form, guess)
-        first = self._attempt("guess", point, names, arguments, bounds)
+        if start != "guess":
+            point = displace(transcription, point, self._sizes(point, names, bounds, p))
+        first = self._attempt(start, point, names, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
         attempts: list[Attempt] = [first, *(self._alternative_attempts(first, arguments, bounds) if check else ())]
@@ -220,8 +231,8 @@ class Prepared:
         elastic = None if attempts[-1].is_final else self._elastic(first)
         remaining = self._max_iterations - sum(attempt.outcome.iterations for attempt in attempts[1:])
         if elastic is not None and check and remaining > 0:
-            start = "elastic plan", elastic.plan, self._variable_names
-            attempts.append(self._attempt(*start, arguments, bounds, self._short_solver))
+            relaxed = "elastic plan", elastic.plan, self._variable_names
+            attempts.append(self._attempt(*relaxed, arguments, bounds, self._short_solver))
             if attempts[-1].plan is not None:
                 return attempts[-1].plan
         decisive = attempts[-1] if attempts[-1].is_final else first
@@ -247,12 +258,13 @@ class Prepared:
         attempts, remaining, x0 = list[Attempt](), self._max_iterations, first.arguments["x0"]
         if first.is_final:
             return attempts
-        limits = arguments["lbx"], arguments["ubx"]
-        for start, point in alternative_starts(self.formulation, self.transcription, x0, arguments["p"], bounds=limits):
+        limits, p = (arguments["lbx"], arguments["ubx"]), arguments["p"]
+        sizes = sizes_along(self._pattern, x0, first.names, bounds=bounds, p=p).of_variables(self.transcription)
+        for start, point in alternative_starts(self.formulation, self.transcription, x0, p, bounds=limits, sizes=sizes):
             if remaining <= 0 or np.array_equal(point, x0):
                 continue
             attempts.append(self._attempt(start, point, first.names, arguments, bounds, self._short_solver))
-            if attempts[-1].is_final or all(attempt.is_broken for attempt in (first, *attempts)):
+            if attempts[-1].is_final:
                 break
             remaining -= attempts[-1].outcome.iterations
         return attempts
@@ -355,6 +367,10 @@ class Prepared:
             # its tolerances are absolute: do not enlarge the adjoint variables
             return dataclasses.replace(scales, cost=max(scales.cost, 1.0))
         return scales
+
+    def _sizes(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> np.ndarray:
+        """Return the typical size of each variable at a guess; ``names`` are variables with meaningful values."""
+        return sizes_along(self._pattern, point, names, bounds=bounds, p=p).of_variables(self.transcription)
 
     @property
     def _variable_names(self) -> set[str]:
