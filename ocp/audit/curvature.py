@@ -19,8 +19,6 @@ from ocp.audit.principle import describe_singular_arcs, groups, is_convex
 from ocp.problem.formulation import Formulation
 from ocp.tolerances import FLAT_SHARE, IMPLIED_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["Curvature", "curvature"]
-
 
 class RankTolerances(NamedTuple):
     """Singular values below which constraint gradients, scaled to length 1, count as linearly dependent.
@@ -124,7 +122,7 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
 
 
 class _Swept(NamedTuple):
-    """Result of one backward sweep, with the fields of `Curvature` except for ``t``.
+    """Result of one backward sweep of the second variation, with the fields of `Curvature` except for the times.
 
     ``dependent``: Whether it is inconclusive because constraints are nearly dependent.
     """

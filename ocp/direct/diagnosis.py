@@ -25,8 +25,6 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.tolerances import IMPLIED_SHARE, MACHINE_SHARE, RESOLVED_SHARE, SOLVER_SHARE
 
-__all__ = ["Elastic", "diagnosis", "elastic_plan", "variable_names"]
-
 ELASTIC_IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
 MISSED = 1e-8  # violation of a constraint above which it counts as missed: the tolerance of ipopt
 REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or choose units in which they are near 1"

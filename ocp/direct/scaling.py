@@ -29,18 +29,6 @@ from ocp.errors import SolverStatus
 from ocp.problem.formulation import Bounds, Formulation
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "SCALING",
-    "Pattern",
-    "PredeterminedVariables",
-    "Scales",
-    "compute_scales",
-    "scaled_program",
-    "scaling_fault",
-    "sizes_along",
-    "unit_scales",
-]
-
 SIDES = ("lbx", "ubx", "lbg", "ubg")
 
 
@@ -175,9 +163,6 @@ def scaled_program(program: Program) -> Program:
         hessian=ca.Function("nlp_hess_l", [x, q, sigma, lam], [scaled_hessian], names, ["triu_hess_gamma_x_x"]),
         values=ca.Function("values", [x, q], [value / c, rows / b]),
     )
-
-
-# ---- sizes -------------------------------------------------------------------------------------------------------
 
 
 def sizes_along(

@@ -21,8 +21,6 @@ import scipy
 from ocp.problem.formulation import Bounds, Formulation, is_free
 from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["bounds_to_solve"]
-
 MAX_DEGREE = 3  # of the polynomials
 
 
@@ -107,7 +105,7 @@ def coupled_parts(form: Formulation) -> list[np.ndarray]:
 
 
 def monomials(part: np.ndarray) -> np.ndarray:
-    """Return all monomials of given states up to the highest allowed degree; see `FirstIntegrals`. Shape (m, 3)."""
+    """Return all monomials of given states up to the highest allowed degree, as indices of 3 factors. Shape (m, 3)."""
     degree = max(d for d in range(MAX_DEGREE + 1) if comb(len(part) + d, d) <= SETTINGS.monomials + 1)
     rows = combinations_with_replacement([0, *(part + 1)], degree)
     return np.array([(0,) * (MAX_DEGREE - degree) + row for row in rows if any(row)], int).reshape(-1, MAX_DEGREE)
@@ -121,7 +119,7 @@ def factor_derivatives(monomials: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def sample_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most ``count`` random states with finite time derivatives, and the derivatives. Shapes (K, nx)."""
+    """Return at most ``count`` random states whose time derivatives are finite, and these. Shape (K, nx) each."""
     rng = np.random.default_rng(0)
     x, u, t = (rng.normal(size=(count, n)) for n in (form.nx, form.nu, 1))
     horizon, p = 1.0, np.exp(0.3 * rng.normal(size=form.np))
@@ -151,9 +149,9 @@ def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
 def implied_conditions(
     form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.ndarray
 ) -> list[tuple[int, float]]:
-    """Return the start and end conditions that first integrals or path equalities imply.
+    """Return the indices of start and end conditions that first integrals or path equalities imply, with leeways.
 
-    These are their indices in the bound table, and the violations allowed.
+    The indices are those of the bound table, the leeways the allowed violations.
     """
     nx, n, places = form.nx, form.nx + form.nu, form.bounds.places
     index = np.concatenate([places[kind] for kind in ("initial", "start", "terminal", "end")])
