@@ -26,7 +26,7 @@ from tests.conformance.suite.page import PAGE, write_page
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = {"seconds": ("selfmotion", "blue"), "rockit_seconds": ("rockit", "orange")}
 PANELS = 9  # a row
-SIZE = (11.0, 11.0)  # inches
+SIZE = (9.0, 9.0)
 
 
 def profile(path: Path, rows: Mapping[str, Mapping[str, str]]) -> None:
