@@ -35,8 +35,6 @@ from ocp.console import Progress
 from ocp.errors import AuditError, ProblemError, SolveError, require
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 
-__all__ = ["main", "parser"]
-
 ABOUT = """Plan motions of kinematically redundant robot arms, and check joint trajectories from any source."""
 PART = re.compile(r"\.[0-9a-f]{8}\.part$")
 """Pattern of the suffix that the name of a file has while the file is being written."""

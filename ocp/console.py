@@ -26,9 +26,6 @@ import numpy as np
 
 from ocp.errors import ProblemError, SolverStatus
 
-__all__ = ["IterationMonitor", "report", "shown_progress"]
-
-
 LOG = logging.getLogger("ocp")
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -18,9 +18,6 @@ import numpy as np
 from ocp.errors import ProblemError, SolverStatus, require
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["call_registered", "register"]
-
-
 T = TypeVar("T")
 MAX_HEAD_BYTES = 2**24  # enough for a mesh of half a million intervals
 HEAD = {

@@ -193,6 +193,7 @@ def check_contents(path: Any, stream: IO[bytes], size: int) -> None:
 
 
 def name_of(member: zipfile.ZipInfo) -> str:
+    """Return the name of an array from its member in an archive; raise ValueError if the member is no array."""
     name, dot, kind = member.filename.rpartition(".")
     if not dot or kind != "npy":
         raise ValueError(f"{member.filename!r} is not an array")

@@ -21,9 +21,8 @@ from math import factorial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_lsq_spline
-from scipy.special import comb
 
 from models.checks import ROUNDING, Array, ArrayInput, require
 from models.errors import ModelError
@@ -210,7 +209,7 @@ def _between(coefficients: Array, first: Array, last: Array) -> Array:
     """
     power, own = np.arange(6), np.arange(6)[:, None]
     shift = np.where(power >= own, first[:, None, None] ** np.maximum(power - own, 0), 0.0)
-    matrix = comb(power, own) * shift * (last - first)[:, None, None] ** own
+    matrix = scipy.special.comb(power, own) * shift * (last - first)[:, None, None] ** own
     return np.asarray(matrix @ coefficients)
 
 
@@ -284,17 +283,17 @@ def _interpolated(x: Array, places: Array, values: Array) -> Array:
     return np.stack([np.interp(x, places, column) for column in values.T], axis=-1)
 
 
-def _least_squares(x: Array, values: Array, knots: Array) -> BSpline:
+def _least_squares(x: Array, values: Array, knots: Array) -> scipy.interpolate.BSpline:
     """Return the B-spline with given knots that is closest to values (M, k) at x (M,) and equal to them at the ends."""
     degree, weights = FIT.degree, np.ones(len(x))
     weights[[0, -1]] = FIT.end_weight
     whole = np.concatenate([np.repeat(knots[0], degree), knots, np.repeat(knots[-1], degree)])
-    curve = make_lsq_spline(x, values, whole, k=degree, w=weights, method="norm-eq")
+    curve = scipy.interpolate.make_lsq_spline(x, values, whole, k=degree, w=weights, method="norm-eq")
     curve.c[[0, -1]] = values[[0, -1]]
     return curve
 
 
-def _pieces(curve: BSpline, knots: Array) -> Array:
+def _pieces(curve: scipy.interpolate.BSpline, knots: Array) -> Array:
     """Return the pieces of a B-spline as polynomials of u from 0 to 1. Shape (P, 6, 3)."""
     width = np.diff(knots)[:, None]
     orders = range(FIT.degree + 1)
@@ -307,10 +306,12 @@ def _pieces(curve: BSpline, knots: Array) -> Array:
 def _bernstein() -> Array:
     """Return the matrix from values at six equidistant points to Bernstein coefficients of degree 5. Shape (6, 6)."""
     u, k = np.linspace(0, 1, FIT.degree + 1)[:, None], np.arange(FIT.degree + 1)
-    return np.linalg.inv(comb(FIT.degree, k) * u**k * (1 - u) ** (FIT.degree - k))
+    return np.linalg.inv(scipy.special.comb(FIT.degree, k) * u**k * (1 - u) ** (FIT.degree - k))
 
 
-def _with_orientation(spline: Spline, poses: BSpline, curve: BSpline, knots: Array) -> Spline:
+def _with_orientation(
+    spline: Spline, poses: scipy.interpolate.BSpline, curve: scipy.interpolate.BSpline, knots: Array
+) -> Spline:
     """Return a spline with tool orientations that have the values and two derivatives of a B-spline at the knots."""
     q, first, second = (poses(knots, order) for order in range(3))
     square = (q * q).sum(axis=1, keepdims=True)

@@ -26,30 +26,17 @@ from ocp.app.files.exchange import ROBOT_LANGUAGES
 from ocp.app.files.safe_files import MARK, SUFFIXES, checked_output, missing_package
 from ocp.app.files.settings import read_obstacles
 from ocp.app.files.task_file import Task, read_task
+from ocp.app.view.animation import animate_plan, animate_solution, animate_trajectory
+from ocp.app.view.player import PageServer, build_page
+from ocp.app.view.report import report_of_check, report_of_plan
 from ocp.console import Progress
 from ocp.errors import ProblemError, require
 from ocp.motion.plan import Plan, plan
 from ocp.motion.result.segmented_plan import SegmentedPlan
 from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import Limits
+from ocp.solution import Solution
 from ocp.storage import write_text
-
-__all__ = [
-    "EXPORT_KINDS",
-    "base_pose",
-    "check_period",
-    "export_plan",
-    "motions_of",
-    "read_robot",
-    "run_cache",
-    "run_check",
-    "run_completion",
-    "run_export",
-    "run_plan",
-    "run_report",
-    "run_task",
-    "run_view",
-]
 
 
 def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
@@ -89,8 +76,6 @@ def run_check(options: argparse.Namespace, progress: Progress) -> tuple[int, str
     check = replace(check, notes=(*check.notes, *notes))
     if options.report is not None:
         progress("report")
-        from ocp.app.view.report import report_of_check  # imports matplotlib, which is slow
-
         report = report_of_check(check, machine, limits, scene)
         write_text(checked_output("report", options.report, force=options.force), report.html())
     return (0 if check.passed else 1), str(check), check.to_dict()
@@ -132,8 +117,6 @@ def run_export(options: argparse.Namespace, progress: Progress) -> tuple[int, st
 
 def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """Run `selfmotion report`: audit a plan and write an HTML report of it."""
-    from ocp.app.view.report import report_of_plan
-
     file = checked_output("report", options.file, force=options.force)
     plan = Plan.load(options.plan)
     check_period(plan, options.period)
@@ -147,8 +130,6 @@ def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, st
 
 def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """Run `selfmotion view`: write or serve an HTML page that shows motions."""
-    from ocp.app.view.player import PageServer, build_page
-
     if options.page is not None:
         checked_output("report", options.page, force=options.force)
     progress("reading the motions")
@@ -180,9 +161,6 @@ def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str,
 
 def motions_of(options: argparse.Namespace) -> list[Any]:
     """Read the motions in the files given to `selfmotion view`; the motion of the plan comes first."""
-    from ocp.app.view.animation import animate_plan, animate_solution, animate_trajectory
-    from ocp.solution import Solution
-
     files = [options.plan, *options.beside]
     base_names = [file.name for file in files]
     names = [file.name if base_names.count(file.name) == 1 else str(file) for file in files]
@@ -291,7 +269,9 @@ def run_task(
     progress("audit")
     audit = result.audit()
     write(result, outputs)
-    lines = [str(result), f"The plan {audit.sentence}.", *_output_lines(list(outputs.values()))]
+    hint = "no file is written: give -o FILE.npz, or [output] in the task file"
+    written = [f"written: {file}" for file in outputs.values()] or [hint]
+    lines = [str(result), f"The plan {audit.sentence}.", *written]
     data = {
         "passed": audit.passed,
         "verdict": audit.sentence,
@@ -324,11 +304,6 @@ def _segments(result: Plan) -> dict[str, Any]:
         ],
         "reconfigurations": [{name: getattr(each, name) for name in names} for each in result.reconfigurations],
     }
-
-
-def _output_lines(files: list[Path]) -> list[str]:
-    hint = "no file is written: give -o FILE.npz, or [output] in the task file"
-    return [f"written: {file}" for file in files] or [hint]
 
 
 def export_plan(
@@ -373,12 +348,6 @@ def _yaml(plan: Plan, file: Path, period: float) -> None:
     write_text(file, f"# {MARK}\n{yaml.safe_dump(plan.to_ros(period), sort_keys=False)}")
 
 
-def _report(plan: Plan, file: Path, period: float, title: str) -> None:
-    from ocp.app.view.report import report_of_plan  # imports matplotlib, which is slow
-
-    write_text(file, report_of_plan(plan, period, title).html())
-
-
 WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
     "plan": lambda plan, file, period, title: plan.save(file),
     "csv": lambda plan, file, period, title: plan.write_csv(file, period),
@@ -387,7 +356,7 @@ WRITERS: dict[str, Callable[[Plan, Path, float, str], Any]] = {
     "mcap": lambda plan, file, period, title: write_mcap(plan, file, period),
     **dict.fromkeys(ROBOT_LANGUAGES, lambda plan, file, period, title: write_robot_program(plan, file, period=period)),
     "urdf": lambda plan, file, period, title: write_text(file, plan.machine.robot.to_urdf()),
-    "report": _report,
+    "report": lambda plan, file, period, title: write_text(file, report_of_plan(plan, period, title).html()),
 }
 """Functions that write each kind of output; arguments are the plan, the file, the sampling period in s, and a title."""
 EXPORT_KINDS = ("csv", "json", "yaml", "mcap", *ROBOT_LANGUAGES, "urdf")

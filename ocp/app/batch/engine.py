@@ -30,20 +30,6 @@ from models.errors import ModelError
 from ocp.app.batch.result_store import Payload, canonical_text, digest_of, pack_result, unpack_result
 from ocp.errors import DetailedError, ProblemError, SolveError
 
-__all__ = [
-    "Engine",
-    "EngineSettings",
-    "Function",
-    "Job",
-    "Outcome",
-    "WorkerFailure",
-    "attempt",
-    "attempts",
-    "cached",
-    "checked_cluster",
-    "failure_payload",
-]
-
 Function = Callable[..., Any]
 CACHE_SIZE = 8
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
@@ -61,7 +47,11 @@ _LOCK = threading.RLock()
 
 
 def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: bool, limit_s: float) -> list[Payload]:
-    """Run jobs (task, guess) in sequence in a worker and return their payloads; start no job after `limit_s`."""
+    """Run the tasks of a batch one after the other in a worker, and return the payloads of their results.
+
+    Each job is a task as JSON text and, as its initial guess, the payload of a similar task or None. No job is started
+    after `limit_s` seconds.
+    """
     began, results = time.perf_counter(), list[Payload]()
     for task, guess in jobs:
         results.append(attempt(function, task, near, guess))
@@ -71,7 +61,7 @@ def attempts(function: Function, jobs: list[tuple[str, Payload | None]], near: b
 
 
 def attempt(function: Function, task: str, with_guess: bool, guess: Payload | None) -> Payload:
-    """Call the function of a batch with one task, which is given as JSON text.
+    """Call the function of a batch with one task, given as JSON text; return the payload of its result or exception.
 
     If `with_guess` is true, the result of a similar task, `guess`, is the second argument.
 
@@ -331,7 +321,7 @@ class Engine:
 
     @property
     def is_idle(self) -> bool:
-        """Whether no job is running."""
+        """Whether no worker is running a job of the batch."""
         return not self._running
 
     def free_slots(self) -> int:
@@ -349,7 +339,7 @@ class Engine:
         return max(0, self._threads - len(self._running))
 
     def share(self, ready: int) -> int:
-        """Return how many of the waiting jobs to send as one group, so that each worker thread gets several groups."""
+        """Return how many of `ready` waiting jobs to send as one group, so that each thread gets several groups."""
         return max(1, min(self._chunk_size, ready // (4 * max(1, self._threads))))
 
     def submit(self, jobs: list[Job]) -> None:

@@ -36,18 +36,6 @@ from ocp.motion.plan import Plan
 from ocp.solution import Solution
 from ocp.storage import END_RECORD, checked_path, open_unlinked, write_whole
 
-__all__ = [
-    "STATUSES",
-    "Payload",
-    "ResultStore",
-    "as_data",
-    "canonical_text",
-    "digest_of",
-    "key_of",
-    "pack_result",
-    "unpack_result",
-]
-
 MAX_DEPTH = 64
 """Largest permitted nesting depth of the lists and dictionaries in tasks and results."""
 KINDS: dict[str, type[Plan] | type[Solution]] = {"Plan": Plan, "Solution": Solution}
@@ -248,7 +236,7 @@ class ResultStore:
 
     @classmethod
     def at(cls, folder: Any) -> ResultStore:
-        """Return the store that already exists in a folder.
+        """Return the store of results that already exists in a folder.
 
         Raises:
             ProblemError: The folder is invalid, has no store, or has one of another format.
@@ -275,7 +263,7 @@ class ResultStore:
 
     @classmethod
     def of(cls, folder: Any, function: str, version: str, chosen: bool) -> ResultStore:
-        """Return the store of a function in a folder; create it if the folder is new or empty.
+        """Return the store of the results of a function in a folder; create it if the folder is new or empty.
 
         Args:
             folder: The folder.
@@ -404,7 +392,7 @@ class ResultStore:
         return Payload(record, tuple(files))
 
     def value(self, record: dict[str, Any]) -> Any:
-        """Return the result of a task, read from the task's record and the files of the record."""
+        """Return the result of a task, given its record, with the plans and solutions that are stored in its files."""
         return unpack_result(self.payload(record))
 
     def stored_keys(self) -> Iterator[str]:
@@ -436,7 +424,7 @@ def finite(text: str) -> float:
 
 
 def file_at(place: Path, number: int) -> Path:
-    """Return the path of a record's file with a given number, which contains a plan or a solution."""
+    """Return the path of the file of a result's plan or solution, from the path of its record and a number from 0."""
     return place.with_suffix(f".{number}.npz")
 
 

@@ -15,7 +15,7 @@ from functools import cache
 from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 from tqdm import tqdm
 
 from models.checks import NOT_NUMBERS, Array, check_entries, floats
@@ -24,8 +24,6 @@ from ocp.app.batch.engine import Engine, Function, Job, checked_cluster, failure
 from ocp.app.batch.result_store import STATUSES, Payload, ResultStore, canonical_text, digest_of, key_of
 from ocp.app.batch.table import Batch, Result, row_of
 from ocp.errors import ProblemError, require
-
-__all__ = ["neighbours", "run_batch"]
 
 MAX_WORKERS = 4096
 
@@ -336,7 +334,7 @@ def neighbours(tasks: Mapping[str, Any], names: Sequence[str]) -> dict[str, str 
     while begin < len(order):
         keys = order[begin:end]
         if begin:
-            nearest = cKDTree(points[:begin]).query(points[begin:end])[1]
+            nearest = scipy.spatial.cKDTree(points[:begin]).query(points[begin:end])[1]
             parents |= {key: order[int(i)] for key, i in zip(keys, nearest, strict=True)}
         else:
             parents |= dict.fromkeys(keys)

@@ -15,8 +15,6 @@ from ocp.app.batch.result_store import ResultStore
 from ocp.errors import DetailedError, ProblemError, SolveError, require
 from ocp.storage import cell, checked_path, write_text, write_whole
 
-__all__ = ["Batch", "BatchError", "Result", "read_batch", "row_of"]
-
 COLUMNS = ("key", "status", "cost", "verdict", "seconds", "error", "message")
 Group = str | Callable[[Any], Any]
 

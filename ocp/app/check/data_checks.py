@@ -21,21 +21,10 @@ from ocp.app.files import RawTrajectory
 from ocp.errors import ProblemError
 from ocp.motion.tasks.limits import JointBounds
 
-__all__ = [
-    "PLANAR_BASE",
-    "SMALL_UNITS",
-    "THRESHOLDS",
-    "CleanedTrajectory",
-    "DataThresholds",
-    "Fault",
-    "clean_trajectory",
-    "likely_unit",
-]
-
 
 @dataclass(frozen=True)
 class DataThresholds:
-    """Thresholds of the data checks.
+    """Thresholds for implausible positions, jumps, sample times and signs of exchanged joints in a trajectory file.
 
     Attributes:
         wild: Relative to a limit, plus 1 rad or m: a position beyond it is unlikely to be in rad or m.
@@ -223,7 +212,7 @@ def _columns(
 
 
 def _finite(raw: RawTrajectory, used: list[int], joints: Indices, faults: list[Fault], notes: list[str]) -> Indices:
-    """Return the indices of the samples whose values are all finite; add faults for the other samples. Shape (K,)."""
+    """Return the indices (K,) of samples whose values are all finite; append faults about all others to `faults`."""
     finite = np.isfinite(raw.t)
     if not finite.all():
         k = int(np.flatnonzero(~finite)[0])
@@ -260,7 +249,7 @@ def _count(invalid: Any, raw: RawTrajectory, k: int) -> str:
 
 
 def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> Indices:
-    """Return the indices of the samples in order of increasing time; add faults for times that decrease or repeat."""
+    """Return the indices of samples in order of time; append faults for decreasing or repeated times to `faults`."""
     t = raw.t[finite_rows]
     steps = np.diff(t)
     descriptions = (steps < 0, "goes back from {:.6g} s to {:.6g} s"), (steps == 0, "{:.6g} s is repeated")
@@ -275,8 +264,7 @@ def _in_order(raw: RawTrajectory, finite_rows: Indices, faults: list[Fault]) -> 
 
 
 def likely_unit(t: Array, q: Array, velocity: Array) -> tuple[str, float]:
-    """Return the unit, smaller than 1 s, that the times must have for plausible joint speeds ("" if there is none), and
-    the highest joint speed for times in seconds.
+    """Return the unit below 1 s in which sample times give plausible joint speeds, "" if there is none, and a speed.
 
     The speed is that of the fastest joint, relative to its limit, if the times are in seconds. Plausible are samples at
     10 kHz or less, and a fastest joint at 1 to 1000 % of its limit, or of 1 if it has none.
@@ -393,7 +381,7 @@ def _unwrap(
 
 
 def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str], faults: list[Fault]) -> Array:
-    """Return the times in s, converted if the velocities imply a smaller unit; add faults for wrong velocities."""
+    """Return the times in s, converted if the velocities imply a smaller unit; append faults for wrong velocities."""
     if v is None or len(t) < 10:
         return t
     h = np.diff(t)[:, None]
@@ -434,7 +422,7 @@ def _time_by_velocities(t: Array, q: Array, v: Array | None, names: Sequence[str
 def _jumps(
     t: Array, q: Array, names: Sequence[str], kinds: Sequence[str], velocity: Array, faults: list[Fault]
 ) -> None:
-    """Add a fault for each joint that jumps: it moves far more between two samples than between their neighbours."""
+    """Append a fault for each joint that moves far more between two samples than between the samples around them."""
     h = np.diff(t)
     steps = np.diff(q, axis=0)
     speeds = steps / h[:, None]
@@ -470,7 +458,7 @@ def _jumps(
 
 
 def _followers(raw: RawTrajectory, robot: Robot, rows: Indices, faults: list[Fault]) -> None:
-    """Add a fault for each mimic joint that does not follow the joint that it mimics."""
+    """Append a fault for each mimic joint that does not follow the joint that it mimics."""
     for joint in robot.joints:
         if joint.mimic is None or not joint.moves or joint.name not in raw.names:
             continue

@@ -27,8 +27,6 @@ from models.checks import Array
 from ocp.errors import ProblemError
 from ocp.tolerances import LIMIT_SHARE
 
-__all__ = ["Indices", "Motion", "MotionQuantity", "PiecewisePolynomial", "Rule", "half_digits", "polynomial_maxima"]
-
 Indices: TypeAlias = NDArray[np.intp]
 Rule: TypeAlias = Literal["linear", "cubic", "quintic"]
 
@@ -52,8 +50,9 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(self.t, degree * np.diff(self.coefficients, axis=1) / width)
 
     def at(self, times: Array) -> Array:
-        """Return the values at times (M,), clipped to the range of `t`; a break belongs to the later piece. Shape (M,
-        n).
+        """Return the values at times (M,), clipped to the range of `t`; the shape is (M, n).
+
+        At a break point the value is that of the later piece.
         """
         interval = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
         begin, end = self.t[interval], self.t[interval + 1]
@@ -144,7 +143,7 @@ class Motion:
 
     @property
     def rule(self) -> Rule:
-        """Name of the interpolation rule."""
+        """Name of the rule of interpolation between the samples: "linear", "cubic" or "quintic"."""
         return "linear" if self.v is None else "cubic" if self.a is None else "quintic"
 
     def by(self, rule: Rule) -> Motion:
@@ -205,14 +204,12 @@ class Motion:
 
     @cached_property
     def digits(self) -> tuple[Array, Array, Array]:
-        """Rounding errors of positions, velocities and accelerations: half of the last digit in the file. Shape (n,)
-        each.
-        """
+        """Rounding errors of positions, velocities and accelerations: half of their last digits. Shape (n,) each."""
         none = np.zeros(self.q.shape[1])
         return tuple(none if values is None else half_digits(values) for values in (self.q, self.v, self.a))  # type: ignore[return-value]
 
     def quantity(self, name: str) -> MotionQuantity | None:
-        """Return "position", "velocity", "acceleration" or "jerk" along the motion; None for too few samples."""
+        """Return a quantity along the motion, such as "velocity" or "jerk"; None if there are too few samples."""
         h = np.diff(self.t)[:, None]
         eq, ev, ea = self.digits
         smooth = {"linear": 0, "cubic": 1, "quintic": 2}[self.rule]
@@ -235,8 +232,8 @@ class Motion:
         return self._differences(values, digits, order)
 
     def needed(self, name: str) -> tuple[Any, Any]:
-        """Return, for each interval, the smallest possible maxima of a quantity and of its negative in a motion through
-        the samples.
+        """Return the least possible maxima, in each interval, of a quantity and of its negative in motions through the
+        samples.
 
         Acceleration: a motion between given positions and velocities needs the least if it switches once from A to -A,
         where A = (2 |e| + sqrt(4 e^2 + h^2 d^2)) / h^2, d is the change of velocity, and e is the displacement minus h
@@ -283,6 +280,11 @@ class Motion:
         middle = (begin + end) / 2
         edges = np.concatenate([[begin[0]], (middle[1:] + middle[:-1]) / 2, [end[-1]]])
         return MotionQuantity(PiecewisePolynomial(edges, table[:, None]), blur, False)
+
+
+def interpolate(times: Array, t: Array, values: Array) -> Array:
+    """Interpolate `values` (M, n), given at increasing times `t` (M,), linearly at other times (K,). Shape (K, n)."""
+    return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def half_digits(values: Array) -> Array:

@@ -18,7 +18,17 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models import FixedBase, FreeFloating, Robot, Standing, inverse_dynamics, momentum, robot_inertia, simplify
+from models import (
+    FixedBase,
+    FreeFloating,
+    Machine,
+    Robot,
+    Standing,
+    inverse_dynamics,
+    momentum,
+    robot_inertia,
+    simplify,
+)
 from models.checks import Array, real
 from models.machines.standing import center_of_pressure
 from models.robot.dynamics import GRAVITY
@@ -26,26 +36,12 @@ from models.spatial import cross, rotation_from_quaternion
 from ocp.app.check.data_checks import CleanedTrajectory, Fault
 from ocp.app.check.interpolation import Indices, Motion, MotionQuantity, polynomial_maxima
 from ocp.console import check_time
+from ocp.curves import rk4_step
 from ocp.errors import ProblemError, require
 from ocp.motion.result.plan import ENDS, describe_ends
 from ocp.motion.tasks.limits import JointBounds, Limits
 from ocp.problem.values import Sampler
 from ocp.tolerances import MOMENTUM_SHARE, ROUNDING_SHARE
-
-__all__ = [
-    "ORDERS",
-    "Row",
-    "RowVerdict",
-    "effort_rows",
-    "floating_base_rows",
-    "floating_torques",
-    "integrate_base",
-    "limit_rows",
-    "limits_by_name",
-    "standing_rows",
-    "torque_rows",
-    "torque_samples",
-]
 
 ORDERS = {"position": "", "velocity": "/s", "acceleration": "/s^2", "jerk": "/s^3"}
 """Checked quantities of a joint, and the suffix that turns rad or m into the unit of the quantity."""
@@ -92,7 +88,7 @@ class Row:
 
     @property
     def urgency(self) -> float:
-        """Order of the row in a table: 2 if it is not ok, else how near the value is to its limit, 0 to 1."""
+        """Sort key of the row: 2 if it failed or is undetermined, else how near its value is to its limit, 0 to 1."""
         small, large = sorted(abs(one) for one in (self.value, self.limit or 0.0))
         nearness = small / large if large > 0 else 0.0
         return 2.0 if self.verdict in (RowVerdict.FAILED, RowVerdict.UNDECIDED) else nearness
@@ -144,14 +140,13 @@ def limit_rows(
             if np.isfinite(getattr(bounds, order)[joints]).any():
                 unchecked.append(f"{order}, because there are too few samples")
             continue
-        note = "" if quantity.closed else "of any motion through the samples, by divided differences"
         most = None if order == "position" else getattr(bounds, order)
         for column, joint in enumerate(joints):
             name = robot.joint_names[joint]
             unit = robot.joint(name).unit + per
             low, high = (bounds.lower[joint], bounds.upper[joint]) if most is None else (-most[joint], most[joint])
-            row, remark, fault = _check_limits(quantity, column, order, name, unit, float(low), float(high), share)
-            rows.append(Row(f"{order} of {name}", *row, "; ".join(filter(None, (remark, note)))))
+            row, fault = _check_limits(quantity, column, order, name, unit, float(low), float(high), share)
+            rows.append(row)
             faults += fault
     return rows, faults, unchecked
 
@@ -188,7 +183,7 @@ class _Side(NamedTuple):
 
     @classmethod
     def of(cls, quantity: MotionQuantity, column: int, sign: float, limit: float, tolerance: float) -> _Side:
-        """Return the largest values of a joint's quantity towards one limit; `tolerance` is added to the limit."""
+        """Return the largest values of a quantity of one joint towards its upper (sign 1) or lower limit (-1)."""
         coefficients, t = sign * quantity.pieces.coefficients[:, :, column], quantity.pieces.t
         needed = np.broadcast_to(quantity.needed[0 if sign > 0 else 1], quantity.blur.shape)[:, column]
         ends, enclosed = np.maximum(coefficients[:, 0], coefficients[:, -1]), coefficients.max(axis=1)
@@ -217,16 +212,15 @@ class _Side(NamedTuple):
 
 def _check_limits(
     quantity: MotionQuantity, column: int, order: str, name: str, unit: str, low: float, high: float, share: float
-) -> tuple[tuple[float, float | None, str, float | None, RowVerdict], str, list[Fault]]:
-    """Check a quantity of one joint; return value, limit, unit, time and verdict of its table row, a remark, and
-    faults.
-    """
+) -> tuple[Row, list[Fault]]:
+    """Check a quantity of one joint against its limits; return the table row, and a list with a fault or without."""
+    note = "" if quantity.closed else "of any motion through the samples, by divided differences"
     t, blur = quantity.pieces.t, np.asarray(quantity.blur)[:, column]
     tolerance = share * max((abs(one) for one in (low, high) if np.isfinite(one)), default=0.0)
     sides = [_Side.of(quantity, column, *one, tolerance) for one in ((1.0, high), (-1.0, -low))]
     if not np.isfinite([low, high]).any():
         worst = max(sides, key=lambda side: float(side.values.max()))
-        return (worst.worst_value, None, unit, worst.time, RowVerdict.UNLIMITED), "", []
+        return Row(f"{order} of {name}", worst.worst_value, None, unit, worst.time, RowVerdict.UNLIMITED, note), []
     sides.sort(key=lambda side: side.excess, reverse=True)
     worst = sides[0]
     beyond = np.any([side.values > side.limit + tolerance for side in sides], axis=0)
@@ -236,12 +230,15 @@ def _check_limits(
     if verdict is RowVerdict.FAILED and not certain[0].any():
         worst = sides[1]
     value, allowed, time = worst.worst_value, worst.sign * worst.limit, worst.time
-    row = value, allowed, unit, time, verdict
-    if verdict != "FAILED":
-        remark = f"beyond, by less than the {100 * share:g} % allowed" if worst.excess > 0 else ""
-        if any(side.eased for side in sides):
-            remark = "the interpolant is beyond, but not every motion through the samples"
-        return row, remark if verdict is RowVerdict.OK else "", []
+    remark = ""
+    if verdict is RowVerdict.OK and any(side.eased for side in sides):
+        remark = "the interpolant is beyond, but not every motion through the samples"
+    elif verdict is RowVerdict.OK and worst.excess > 0:
+        remark = f"beyond, by less than the {100 * share:g} % allowed"
+    note = "; ".join(filter(None, (remark, note)))
+    row = Row(f"{order} of {name}", value, allowed, unit, time, verdict, note)
+    if verdict is not RowVerdict.FAILED:
+        return row, []
     starts = np.flatnonzero(violated & ~np.concatenate([[False], violated[:-1]]))
     first = float(t[starts[0]])
     between = ", between two samples" if quantity.closed and time not in t else ""
@@ -249,7 +246,7 @@ def _check_limits(
     share_over = abs(value) / abs(allowed) - 1 if allowed else np.inf
     much = f", {100 * share_over:.3g} % beyond" if 1e-4 < share_over < 10 else ""
     text = f"{value:.5g} {unit} at {time:.6g} s{between}, limit {allowed:.5g}{much}{stretches}"
-    return row, "", [Fault(order, name, text, time, first, value, allowed, unit)]
+    return row, [Fault(order, name, text, time, first, value, allowed, unit)]
 
 
 def effort_rows(
@@ -286,14 +283,7 @@ def torque_rows(
     robot = machine.robot
     n = robot.dof
     q, v, a = (ca.SX.sym(name, n) for name in ("q", "v", "a"))
-    if isinstance(machine, FreeFloating):
-        torque = floating_torques(machine, q, v, a)
-    else:
-        bodies = simplify(robot, frozenset())
-        gravity = getattr(machine, "gravity_in_world", GRAVITY)
-        torque = inverse_dynamics(
-            bodies, q, v, a, wrenches=(), gravity=gravity, world_from_base=machine.world_from_base()
-        )
+    torque = torque_expression(machine, q, v, a)
     sampler = Sampler([q, v, a], [torque])
     times, *values = torque_samples(motion)
     if not len(times):
@@ -324,8 +314,19 @@ def torque_rows(
     return rows, faults
 
 
-def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.SX:
-    """Return the joint torques of a robot whose floating base moves so that momentum is conserved. Shape (n, 1)."""
+def torque_expression(machine: Machine, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.SX:
+    """Return the joint torques of a machine without external forces as functions of its joint motion. Shape (n, 1).
+
+    A floating base moves so that momentum is conserved.
+
+    Args:
+        machine: The machine.
+        q, v, a: Symbols of the joint positions, velocities and accelerations. Shape (n, 1) each.
+    """
+    if not isinstance(machine, FreeFloating):
+        gravity = getattr(machine, "gravity_in_world", GRAVITY)
+        frame = machine.world_from_base(())
+        return inverse_dynamics(simplify(machine.robot), q, v, a, wrenches=(), gravity=gravity, world_from_base=frame)
     base = ca.SX.sym("base", machine.base_size)
     rows = ca.SX(ca.DM.eye(6)[:, machine.twist_rows])
     twist = ca.mtimes(rows, machine.base_twist(base, q, v))
@@ -339,7 +340,7 @@ def floating_torques(machine: FreeFloating, q: ca.SX, v: ca.SX, a: ca.SX) -> ca.
 
 
 def torque_samples(motion: Motion) -> tuple[Array, Array, Array, Array]:
-    """Return times (K,), positions, velocities and accelerations (K, n) at which to evaluate the torques."""
+    """Return times (K,), s, and positions, velocities and accelerations (K, n) of a motion for inverse dynamics."""
     t, h = motion.t, np.diff(motion.t)
     if motion.acceleration is None:
         if len(t) < 3:
@@ -396,22 +397,8 @@ def standing_rows(machine: Standing, motion: Motion, friction: float) -> tuple[l
     return rows, faults
 
 
-def floating_base_rows(
-    machine: FreeFloating, motion: Motion, base: Array | None
-) -> tuple[Array, list[Row], list[Fault]]:
-    """Return the configurations (M, base_size) of a floating base at the samples, and the table rows and faults of its
-    check.
-
-    If the file gives the base, its momentum is checked; otherwise it moves so that momentum is conserved.
-    """
-    if base is None:
-        return (*integrate_base(machine, motion), [])
-    return (base, *momentum_rows(machine, motion, base))
-
-
 def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[Row]]:
-    """Integrate the motion of a floating base; return its configurations at the samples, (M, base_size), and table
-    rows.
+    """Return the configurations (M, base_size) of a floating base at the samples of a joint motion, and table rows.
 
     The base starts at its home and moves so that momentum stays zero. The classical Runge-Kutta method takes one step
     in every interval.
@@ -420,14 +407,10 @@ def integrate_base(machine: FreeFloating, motion: Motion) -> tuple[Array, list[R
     base, h = ca.SX.sym("base", size), ca.SX.sym("h")
     q, v = ca.SX.sym("q", n, 3), ca.SX.sym("v", n, 3)
 
-    def rate(at: int, value: ca.SX) -> ca.SX:
-        return machine.base_rate(value, q[:, at], v[:, at])
+    def rate(place: float, value: ca.SX) -> ca.SX:
+        return machine.base_rate(value, q[:, int(2 * place)], v[:, int(2 * place)])
 
-    k1 = rate(0, base)
-    k2 = rate(1, base + h / 2 * k1)
-    k3 = rate(1, base + h / 2 * k2)
-    k4 = rate(2, base + h * k3)
-    next_base = base + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    next_base = rk4_step(rate, base, h)
     if size == 7:
         next_base = ca.vertcat(next_base[:3], next_base[3:] / ca.norm_2(next_base[3:]))
     count = len(motion.t) - 1

@@ -17,7 +17,7 @@ import numpy as np
 from models import CollisionScene, FixedBase, Machine, Robot
 from models.checks import Array
 from ocp.app.check.data_checks import SMALL_UNITS, THRESHOLDS, Fault, likely_unit
-from ocp.app.check.interpolation import Indices, Motion
+from ocp.app.check.interpolation import Indices, Motion, interpolate
 from ocp.app.check.joint_limits import Row, RowVerdict
 from ocp.app.files import Waypoints
 from ocp.audit.clearance import Clearance
@@ -26,14 +26,12 @@ from ocp.motion.local.collisions import distances_along
 from ocp.problem.values import Sampler
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = ["clearance_rows", "doubtful_times", "exchanged_joints", "path_rows", "prove_clearance", "with_wide_limits"]
-
 MAX_REPORTED_PAIRS = 20
 """Largest number of pairs of bodies that are listed in the table of clearances."""
 
 
 def with_wide_limits(machine: Machine, motion: Motion) -> Machine:
-    """Return the machine with joint limits that contain a motion, and with finite limits for all prismatic joints."""
+    """Return the machine with joint limits widened to contain a motion, and finite limits of all prismatic joints."""
     robot = machine.robot
     low, high = (getattr(motion.position.coefficients, side)(axis=(0, 1)) for side in ("min", "max"))
     joints = []
@@ -192,8 +190,11 @@ def path_rows(
     times = np.append(motion.t[interval] + fraction * np.diff(motion.t)[interval], motion.t[-1])
 
     def tips(at: Array) -> list[Array]:
-        places = np.zeros((len(at), 0)) if bases is None else _interpolate(motion.t, bases, at)
-        return sampler(places, motion.position.at(at))
+        """Return positions and z axes of the tip at times (K,). Shape (K, 3) each."""
+        base_path = np.zeros((len(at), 0)) if bases is None else interpolate(at, motion.t, bases)
+        if base_path.shape[1] == 7:
+            base_path[:, 3:] /= np.linalg.norm(base_path[:, 3:], axis=1)[:, None]
+        return sampler(base_path, motion.position.at(at))
 
     corners = path.positions
     tip_path, axes = tips(times)
@@ -232,30 +233,19 @@ def path_rows(
 
 
 def _row(name: str, value: float, limit: float, unit: str, time: float | None) -> Row:
-    """Return the table row for a value and its upper limit, which may be infinite."""
+    """Return the row, in the table of a check, of a value and its upper limit, which may be infinite."""
     bounded = bool(np.isfinite(limit))
     verdict = RowVerdict.of(value > limit) if bounded else RowVerdict.INFO
     return Row(name, value, limit if bounded else None, unit, time, verdict)
 
 
 def _axes(path: Waypoints, parameter: Array) -> Array:
-    """Return the required z axes of the tool, shape (K, 3), at points of the path, which are given by fractional
-    waypoint numbers (K,).
-    """
+    """Return the z axes (K, 3) that waypoints require of the tool at points, given as fractional numbers (K,)."""
     assert path.orientations is not None
     w, x, y, z = path.orientations.T
     at_waypoints = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    numbers = np.arange(len(at_waypoints))
-    axes = np.column_stack([np.interp(parameter, numbers, column) for column in at_waypoints.T])
+    axes = interpolate(parameter, np.arange(float(len(at_waypoints))), at_waypoints)
     return np.asarray(axes / np.maximum(np.linalg.norm(axes, axis=1), 1e-12)[:, None])
-
-
-def _interpolate(t: Array, values: Array, times: Array) -> Array:
-    """Interpolate base configurations linearly at times (K,), and normalise their quaternions. Shape (K, n)."""
-    interpolated = np.column_stack([np.interp(times, t, column) for column in values.T])
-    if values.shape[1] == 7:
-        interpolated[:, 3:] /= np.linalg.norm(interpolated[:, 3:], axis=1)[:, None]
-    return interpolated
 
 
 def _distances(points: Array, corners: Array) -> tuple[Array, Array]:
@@ -301,8 +291,7 @@ def doubtful_times(motion: Motion, velocity: Array) -> list[Fault]:
 
 
 def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool = True) -> list[Fault]:
-    """Return a suspicion if the columns of two joints seem exchanged, because swapping them makes the motion far
-    simpler.
+    """Return a suspicion if the columns of two joints seem exchanged: swapping them makes the motion far simpler.
 
     Either one joint is outside its limits most of the time, and all are inside after the exchange. Or the tip moves
     straight or at constant speed only after the exchange. The latter requires three joints that do not move in
@@ -356,7 +345,7 @@ def exchanged_joints(motion: Motion, robot: Robot, columns: Indices, tip: bool =
 
 
 def _exchange_fault(names: list[str], pair: tuple[int, int], evidence: str) -> Fault:
-    """Return the suspicion that two columns of the file are exchanged."""
+    """Return the suspicion that the columns of two joints, given by their indices, are exchanged in a file."""
     both = " and ".join(names[k] for k in pair)
     text = f"the columns of {both} look exchanged: then {evidence}, which is far from true as written"
     return Fault("suspicion", both, f"{text}; correct the names, or pass --names-confirmed")

@@ -18,8 +18,9 @@ from ocp.app.check.joint_limits import (
     Row,
     RowVerdict,
     effort_rows,
-    floating_base_rows,
+    integrate_base,
     limit_rows,
+    momentum_rows,
     rest_row,
     standing_rows,
     torque_rows,
@@ -38,18 +39,6 @@ from ocp.motion.tasks.goals import Scene
 from ocp.motion.tasks.limits import Limits, unknown_limits
 from ocp.tolerances import LIMIT_SHARE, ORIENTATION_TOLERANCE_RAD
 from ocp.tolerances import path_tolerance as default_tolerance
-
-__all__ = [
-    "Check",
-    "CheckTolerances",
-    "Fault",
-    "Interpretation",
-    "PlanVerdict",
-    "Row",
-    "audit_rows",
-    "check_trajectory",
-    "verdict_of",
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +80,13 @@ class Check:
         return not self.faults and not self.suspicions
 
     @property
+    def limited_rows(self) -> tuple[Row, ...]:
+        """Table rows of the checked quantities, except those that have no limit."""
+        return tuple(row for row in self.rows if row.verdict is not RowVerdict.UNLIMITED)
+
+    @property
     def sentence(self) -> str:
-        """Verdict on the trajectory in one sentence."""
+        """Verdict on the trajectory, as a sentence whose subject the caller adds: "meets all checked requirements"."""
         names = [row.name for row in self.rows if row.verdict is RowVerdict.UNDECIDED]
         but = f"; undetermined: {', '.join(names[:3])}{' ...' if len(names) > 3 else ''}" if names else ""
         unchecked = f"; not checked: {'; '.join(self.unchecked)}" if self.unchecked else ""
@@ -118,11 +112,10 @@ class Check:
         if self.faults:
             lines.append("faults:")
             lines += [f"  {fault}" for fault in self.faults]
-        limited = [row for row in self.rows if row.verdict is not RowVerdict.UNLIMITED]
-        if limited:
-            width = max(len(row.name) for row in limited)
+        if self.limited_rows:
+            width = max(len(row.name) for row in self.limited_rows)
             lines.append(f"  {'':<{width}}  {'worst':>11}  {'limit':>10}  {'unit':<8}{'at, s':>10}")
-            for row in limited:
+            for row in self.limited_rows:
                 limit = "" if row.limit is None else f"{row.limit:.4g}"
                 time = "" if row.time is None else f"{row.time:.5g}"
                 line = f"  {row.name:<{width}}  {row.value:>11.5g}  {limit:>10}  {row.unit:<8}{time:>10}  {row.verdict}"
@@ -135,7 +128,7 @@ class Check:
         return "\n".join([*lines, f"The trajectory {self.sentence}."])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as a dictionary for JSON, without the samples."""
+        """Return the result of the check as a dictionary for JSON, without the samples of the motion."""
         data = {name: getattr(self, name) for name in ("file", "robot", "joints", "samples", "duration", "rule")}
         data |= {"passed": self.passed, "verdict": self.sentence}
         data |= {name: [asdict(one) for one in getattr(self, name)] for name in ("faults", "suspicions", "rows")}
@@ -182,7 +175,7 @@ class Interpretation:
 
     @property
     def seconds(self) -> float:
-        """Duration of one unit of the file's times, s."""
+        """Duration, s, of one unit of the times in the trajectory file."""
         unit = self.time_unit
         return UNITS[unit] if isinstance(unit, str) else 1.0 if unit is None else float(unit)
 
@@ -295,8 +288,12 @@ def check_trajectory(
                     f"the file gives {cleaned.base.shape[1]} entries of the base, the machine has {machine.base_size}"
                 )
                 raise ProblemError(words, name="base", value=cleaned.base.shape[1], limit=machine.base_size)
-            bases, base_rows, base_faults = floating_base_rows(machine, motion, cleaned.base)
-            add((base_rows, base_faults))
+            if cleaned.base is None:
+                bases, base_rows = integrate_base(machine, motion)
+                rows += base_rows
+            else:
+                bases = cleaned.base
+                add(momentum_rows(machine, motion, bases))
         elif isinstance(machine, Standing):
             progress("ground")
             add(standing_rows(machine, motion, limits.friction))
@@ -394,7 +391,7 @@ class PlanVerdict:
 
     @property
     def sentence(self) -> str:
-        """Verdict on the plan in one sentence."""
+        """Verdict on the plan, as a sentence whose subject the caller adds: "must not be run: ..."."""
         if not self.audit.feasible or self.check.passed:
             return self.audit.sentence
         first, count = self.check.faults[0], len(self.check.faults)
@@ -453,7 +450,7 @@ def _check_samples(
 
 
 def _worst(checks: Sequence[Check]) -> Check:
-    """Merge the checks of several motions: keep all faults and, for each quantity, the worst table row."""
+    """Merge the checks of several motions into one with all faults and, for each quantity, the worst table row."""
     rows: dict[str, Row] = {}
     for row in (row for check in checks for row in check.rows):
         if row.name not in rows or _severity(row) > _severity(rows[row.name]):

@@ -32,16 +32,6 @@ from ocp.motion.plan import Plan
 from ocp.motion.schedule import JointTrajectory
 from ocp.storage import write_text, write_whole
 
-__all__ = [
-    "PROGRAM_UNITS",
-    "ROBOT_LANGUAGES",
-    "RobotLanguage",
-    "log_rerun",
-    "read_joint_messages",
-    "write_mcap",
-    "write_robot_program",
-]
-
 
 def _with_parts(fields: str, **parts: str) -> str:
     """Return the ROS 2 definition of a message type: its header, its fields, and the types that the fields use."""
@@ -429,7 +419,7 @@ def write_robot_program(
 
 
 def _axes(language: RobotLanguage, names: Sequence[str], linear: Sequence[bool]) -> list[str]:
-    """Return the axis of the controller for each joint; raise ProblemError if axes or joints are missing."""
+    """Return the axis of a robot controller for each joint; raise ProblemError if axes or joints are missing."""
     arm, external, axes = iter(language.arm), iter(language.external), list[str]()
     for name, is_linear in zip(names, linear, strict=True):
         axis = next(external if is_linear else chain(arm, external), None)
@@ -455,7 +445,7 @@ def _percents(velocities: Array, names: Sequence[str], limits: Array) -> list[in
 
 
 def _urscript(name: str, remarks: list[str], points: list[dict[str, str]], seconds: list[str]) -> Iterator[str]:
-    """Yield the lines of a program; see Universal Robots, *Script Manual*, `movej` and `servoj`."""
+    """Yield the lines of a URScript program; see Universal Robots, *Script Manual*, `movej` and `servoj`."""
     start, *others = (f"[{', '.join(point.values())}]" for point in points)
     yield from (f"def {name}():", *remarks, f"  movej({start}, a=0.5, v=0.25)")
     for point, duration in zip(others, seconds, strict=True):
@@ -464,7 +454,7 @@ def _urscript(name: str, remarks: list[str], points: list[dict[str, str]], secon
 
 
 def _krl(title: str, remarks: list[str], points: list[dict[str, str]], percents: list[int]) -> Iterator[str]:
-    """Yield the lines of a program; see KUKA, *Operating and Programming Instructions for System Integrators*."""
+    """Yield the lines of a KRL program; see KUKA, *Operating and Programming Instructions for System Integrators*."""
     name = title if title[:1].isalpha() and title.upper() not in KRL_WORDS else f"p{title}"
     yield from ("&ACCESS RVP", f"DEF {name[:24]}()", *remarks, "  $APO.CPTP=50")
     previous, last = 0, len(points) - 1
@@ -478,7 +468,7 @@ def _krl(title: str, remarks: list[str], points: list[dict[str, str]], percents:
 
 
 def _rapid(name: str, remarks: list[str], points: list[dict[str, str]], seconds: list[str]) -> Iterator[str]:
-    """Yield the lines of a module; see ABB, *RAPID Instructions, Functions and Data types*, `MoveAbsJ`."""
+    """Yield the lines of a RAPID module; see ABB, *RAPID Instructions, Functions and Data types*, `MoveAbsJ`."""
     language, last = ROBOT_LANGUAGES["rapid"], len(points) - 1
     yield from (f"MODULE {name}", *remarks, "  PROC main()")
     for number, point in enumerate(points):

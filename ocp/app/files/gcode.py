@@ -40,8 +40,6 @@ from ocp.app.files.program import Cut, Note, Pause, Program, Rapid, Section, che
 from ocp.app.files.safe_files import FileName, line_error, read_lines
 from ocp.errors import ProblemError, require
 
-__all__ = ["read_gcode"]
-
 UNITS = {"mm": 1e-3, "inch": 0.0254}
 DEFAULT_GAPS_M = {"mm": 2 * np.sqrt(2) * 1e-5, "inch": 2 * np.sqrt(2) * 2.54e-5}
 """Largest difference of an arc's two end radii that rounding to 0.01 mm or 0.001 inch explains, by unit, m."""
@@ -162,24 +160,26 @@ class _Reader:
         return Program(tuple(self.sections), self.start, notes)
 
     def _refuse(self, why: str, limit: Any = None) -> NoReturn:
-        """Raise a ProblemError about the current line."""
+        """Raise a ProblemError about the current line of the G-code file, with a reason."""
         raise line_error(self.file, self.block.number, self.block.text, why, limit=limit)
 
     def _note(self, text: str) -> None:
-        """Add a note about the current line."""
+        """Add a note about the current line of the G-code file to the notes of the program."""
         lines = self.note_lines.setdefault(text, [])
         if not lines or lines[-1] != self.block.number:
             lines.append(self.block.number)
 
     def _run(self) -> bool:
-        """Execute the current block and return whether it ends the program."""
+        """Execute the current line of G-code and return whether it ends the program."""
         words = dict(self.block.words)
         codes = {code for letter, code in self.block.codes if letter == "G"}
         self._check_groups(codes)
         unit_before = self.unit
         self._set_modes(codes, words)
         if "F" in words:
-            self._set_feed(words.pop("F"))
+            if (feed := words.pop("F")) < 0:
+                self._refuse("the feed F is negative")
+            self.feed = feed / 60 if self.inverse_time else feed * UNITS[self.unit] / 60  # 1/s or m/s
             if self.unit != unit_before:
                 self._note("F is in the units of its own line")
         for letter, text in IGNORED_LETTERS.items():
@@ -253,15 +253,6 @@ class _Reader:
             self._refuse(f"{code_name(code)}: {why}")
         self._note(f"{code_name(code)}: its zero is the zero of the program")
 
-    def _set_feed(self, value: float) -> None:
-        """Set the feed in m/s, or in 1/s in inverse time mode."""
-        if value < 0:
-            self._refuse("the feed F is negative")
-        if self.inverse_time:
-            self.feed = value / 60  # 1/s
-        else:
-            self.feed = value * UNITS[self.unit] / 60
-
     def _dwell(self, words: dict[str, float]) -> None:
         """Add the pause of a G4, which lasts P seconds."""
         if "P" not in words:
@@ -323,7 +314,7 @@ class _Reader:
         return target
 
     def _move(self, codes: set[int], words: dict[str, float]) -> None:
-        """Execute the motion of the current block."""
+        """Execute the motion of the current line of G-code, if it has coordinates."""
         if 800 in codes:
             self.motion = None
         for code in codes.intersection(MOTIONS):
@@ -398,7 +389,7 @@ class _Reader:
         self._add(arcs, target)
 
     def _add(self, segments: Sequence[Segment], reached: Array) -> None:
-        """Append path segments with the current feed."""
+        """Append segments to the current path, with the feed and the tolerance that apply to the current line."""
         if not self.feed:
             self._refuse("no feed is set; write F, or read with feed= in m/s")
         feed = self.feed * sum(segment.length for segment in segments) if self.inverse_time else self.feed

@@ -26,24 +26,6 @@ from models.spatial import FULL_TURN
 from ocp.app.files.safe_files import FileName, line_error
 from ocp.tolerances import STANDSTILL
 
-__all__ = [
-    "GROUPS",
-    "IGNORED_CODES",
-    "IGNORED_LETTERS",
-    "MACHINE_CODES",
-    "MOTIONS",
-    "M_WORDS",
-    "PLANES",
-    "REPOST",
-    "UNSUPPORTED_CODES",
-    "ArcError",
-    "Block",
-    "arcs_about_center",
-    "center_from_radius",
-    "code_name",
-    "read_blocks",
-]
-
 PLANES = {170: (0, 1, 2), 180: (2, 0, 1), 190: (1, 2, 0)}
 """First axis, second axis and normal of the planes G17, G18, G19: right-handed, so that G3 turns about the normal."""
 RADIUS_SHARE = 1e-3
@@ -51,7 +33,7 @@ RADIUS_SHARE = 1e-3
 
 
 class ArcError(Exception):
-    """Error raised when numbers do not describe an arc.
+    """Error raised when the numbers of a G-code line do not describe an arc.
 
     Attributes:
         why: Reason.
@@ -65,7 +47,7 @@ class ArcError(Exception):
 
 
 def center_from_radius(start: Array, end: Array, radius: float, *, clockwise: bool, gap: float) -> Array:
-    """Return the centre, shape (2,), m, of an arc of given radius; a negative radius selects the longer arc.
+    """Return the centre (2,), m, of an arc with given ends and radius; a negative radius selects the longer arc.
 
     Raises:
         ArcError: The radius is smaller than half the chord by more than `gap`, or the chord is zero.
@@ -85,7 +67,7 @@ def center_from_radius(start: Array, end: Array, radius: float, *, clockwise: bo
 def arcs_about_center(
     start: Array, end: Array, center: Array, *, clockwise: bool, turns: int, plane: tuple[int, int, int], gap: float
 ) -> list[Arc | Helix]:
-    """Return one arc or helix from start to end, or two halves if no single centre fits both ends.
+    """Return the arc or helix about a centre from start to end, or two halves of it if no centre fits both ends.
 
     Two are needed if a circle nearly closes but ends nearer to the centre than it starts.
 
@@ -243,7 +225,7 @@ class Block(NamedTuple):
 
 
 def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
-    """Yield a Block for each line that contains words, up to the second `%`.
+    """Yield a Block for each line of G-code that contains words, up to the line with `%` that ends the program.
 
     Raises:
         ProblemError: With the line: an invalid word, an unclosed comment, an expression, or a repeated letter.
@@ -291,7 +273,7 @@ def read_blocks(file: FileName, lines: Sequence[str]) -> Iterator[Block]:
 
 
 def _without_comments(file: FileName, number: int, text: str) -> str:
-    """Return a line without its comments."""
+    """Return a line of G-code without its comments; raise ProblemError if a comment is unclosed or nested."""
     line, semicolon, _ = text.partition(";") if "(" not in text.partition(";")[0] else (text, "", "")
     if not semicolon:
         line = COMMENT.sub(" ", text)
@@ -310,7 +292,7 @@ def _tenths(file: FileName, number: int, text: str, letter: str, value: str) -> 
 
 
 def _refuse(file: FileName, number: int, text: str, line: str) -> None:
-    """Raise ProblemError for a line that contains anything but words."""
+    """Raise the ProblemError about a line of G-code that contains something other than letters with numbers."""
     if CONTROL.match(line):
         raise line_error(file, number, text, NOT_RUN)
     if any(sign in line for sign in "#[]=<>"):

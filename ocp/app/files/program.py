@@ -15,20 +15,6 @@ from models.paths.path import NO_ROTATION, Reversal, fit_splines
 from ocp.errors import ProblemError, require, values_within
 from ocp.motion.schedule import LineLimits, Schedule, schedule
 
-__all__ = [
-    "DEFAULT_TOLERANCE_M",
-    "Cut",
-    "Note",
-    "Pause",
-    "Program",
-    "ProgramMotion",
-    "Rapid",
-    "Section",
-    "TimedProgram",
-    "checked_reversal",
-    "smooth_path",
-]
-
 DEFAULT_TOLERANCE_M = 5e-5
 """Default deviation of a rounded path, m, which is a usual contour tolerance of machine tools."""
 
@@ -76,7 +62,7 @@ class Cut:
         return self._fitted(tolerance, options)[0]
 
     def _fitted(self, tolerance: float | None, options: dict[str, Any]) -> tuple[SmoothPath, Array]:
-        """Return the smooth path of the cut, and the feed on each of its segments, m/s."""
+        """Return the path of the cut with rounded corners, and the programmed feed on each segment of it, m/s."""
         deviation = np.fmin(self.tolerances[:-1], self.tolerances[1:])
         if tolerance is not None:
             deviation = np.fmin(deviation, require.positive("tolerance", tolerance))
@@ -148,7 +134,7 @@ class Program:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Paths of the cuts of the program."""
+        """Paths of the cuts of the program, in their order."""
         return tuple(cut.path for cut in self.cuts)
 
     @property
@@ -253,7 +239,7 @@ def _count_text(number: int, noun: str) -> str:
 
 
 def _transform(points: Array, position: ArrayInput, orientation: ArrayInput) -> Array:
-    """Transform points (k, 3) by a pose."""
+    """Return points (k, 3) rotated by a unit quaternion (w, x, y, z) and then shifted by a position."""
     # lines from the origin along the axes check the pose and give its rotation
     frame = [Path.through([(0, 0, 0), axis]).placed(position, orientation).segments[0] for axis in np.eye(3)]
     origin = np.asarray(frame[0].start)

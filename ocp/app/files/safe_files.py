@@ -24,21 +24,6 @@ from models.files import INPUT_LIMITS, UnfitFile, open_regular, read_regular
 from ocp.errors import ProblemError
 from ocp.storage import read_arrays, table_joints
 
-__all__ = [
-    "MARK",
-    "SUFFIXES",
-    "FileName",
-    "checked_depth",
-    "checked_output",
-    "children_of",
-    "is_number",
-    "line_error",
-    "missing_package",
-    "read_lines",
-    "read_tree",
-    "split_cells",
-]
-
 FileName = str | PathLike[str]
 BEFORE_UNIT = re.compile(r"(?<!\s)\s+(?=[\[(])")
 QUOTED_CHARACTERS = 120
@@ -140,7 +125,10 @@ def read_tree(file: FileName, kind: str) -> Any:
     """
     text = "\n".join(read_lines(file, longest=None))
     try:
-        return _json(text) if kind == "json" else _yaml(text)
+        if kind != "json":
+            return _yaml(text)
+        _check_count(sum(text.count(sign) for sign in ",[{"))
+        return checked_depth(json.loads(text))
     except RecursionError as error:
         raise ProblemError(
             f"{file} is nested too deeply", name="file", value=str(file), limit=INPUT_LIMITS.nesting
@@ -151,12 +139,8 @@ def read_tree(file: FileName, kind: str) -> Any:
         raise ProblemError(f"{file} is not valid {kind.upper()}: {error}", name="file", value=str(file)) from error
 
 
-def _json(text: str) -> Any:
-    _check_count(sum(text.count(sign) for sign in ",[{"))
-    return checked_depth(json.loads(text))
-
-
 def _yaml(text: str) -> Any:
+    """Return the contents of the first document in a YAML text; raise ValueError if the text is invalid."""
     try:
         import yaml
     except ImportError as error:

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -31,11 +32,6 @@ from models.spatial import rotation_from_rpy
 from ocp.app.files.safe_files import FileName, checked_depth, line_error, read_lines, read_tree
 from ocp.errors import ProblemError, require
 from ocp.motion.tasks.limits import Limits
-
-__all__ = [
-    "REQUIRED", "TomlTable", "obstacles_of", "read_joint_limits", "read_obstacles", "read_shape",
-    "read_toml", "rotation_of",
-]  # fmt: skip
 
 TABLE = re.compile(r"(\[\[?)([^\[\]#]+)\]\]?\s*(?:#.*)?$")
 KEY = re.compile(r"""((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
@@ -97,15 +93,15 @@ class TomlTable:
         return value
 
     def text(self, name: str, expected: str = "a text", default: Any = None) -> Any:
-        """Return the entry of this name after checking that it is a non-empty text."""
+        """Return the entry `name` after checking that it is a non-empty text."""
         return self._read(name, default, expected, lambda value: isinstance(value, str) and value != "")
 
     def flag(self, name: str, default: bool = False) -> bool:
-        """Return the entry of this name after checking that it is true or false."""
+        """Return the entry `name` after checking that it is true or false."""
         return bool(self._read(name, default, "true or false", lambda value: isinstance(value, bool)))
 
     def choice(self, name: str, known: Iterable[str], default: Any = None) -> Any:
-        """Return the entry of this name after checking that it is one of the known words."""
+        """Return the entry `name` after checking that it is one of the known words."""
         words = tuple(known)
         expected = "one of " + ", ".join(f'"{word}"' for word in words)
         return self._read(name, default, expected, lambda value: isinstance(value, str) and value in words)
@@ -113,7 +109,7 @@ class TomlTable:
     def number(
         self, name: str, expected: str, default: Any = None, *, least: float = -np.inf, most: float = np.inf
     ) -> Any:
-        """Return the entry of this name after checking that it is a number above `least` and at most `most`."""
+        """Return the entry `name` after checking that it is a number above `least` and at most `most`."""
 
         def fits(value: Any) -> bool:
             return bool(np.isfinite(real(value)) and least < real(value) <= most)
@@ -122,7 +118,7 @@ class TomlTable:
         return value if value is None or value is default else float(value)
 
     def count(self, name: str, expected: str, default: Any = None) -> Any:
-        """Return the entry of this name after checking that it is an integer, 0 or more."""
+        """Return the entry `name` after checking that it is an integer, 0 or more."""
 
         def fits(value: Any) -> bool:
             return isinstance(value, int) and not isinstance(value, bool) and value >= 0
@@ -130,7 +126,7 @@ class TomlTable:
         return self._read(name, default, expected, fits)
 
     def vector(self, name: str, size: int | None, expected: str, default: Any = None) -> Any:
-        """Return the entry of this name as a vector of `size` numbers, or of any length if `size` is None."""
+        """Return the entry `name` as a vector of `size` numbers, or of any length if `size` is None."""
 
         def fits(value: Any) -> bool:
             try:
@@ -143,23 +139,24 @@ class TomlTable:
         return value if value is None or value is default else np.array(value, dtype=float)
 
     def numbers_by_name(self, name: str, expected: str) -> dict[str, float]:
-        """Return the entry of this name as a dictionary of numbers by name; empty if the entry is missing."""
+        """Return the entry `name` as a dictionary of numbers by name; empty if the entry is missing."""
         table = self.table(name, expected)
-        values = {} if table is None else table._values
-        for key, value in values.items():
-            if table is not None and not np.isfinite(real(value)):
+        if table is None:
+            return {}
+        for key, value in table._values.items():
+            if not np.isfinite(real(value)):
                 raise table.error(key, f"{key} must be a number, not {value!r}")
-        return {key: float(value) for key, value in values.items()}
+        return {key: float(value) for key, value in table._values.items()}
 
     def texts(self, name: str, expected: str) -> tuple[str, ...]:
-        """Return the entry of this name as a list of texts; empty if it is missing."""
+        """Return the entry `name` as a list of texts; empty if it is missing."""
         texts = self._read(
             name, [], expected, lambda value: isinstance(value, list) and all(isinstance(one, str) for one in value)
         )
         return tuple(texts)
 
     def pairs(self, name: str, expected: str) -> list[tuple[str, str]]:
-        """Return the entry of this name as a list of pairs of texts; empty if it is missing."""
+        """Return the entry `name` as a list of pairs of texts; empty if it is missing."""
 
         def fits(value: Any) -> bool:
             return isinstance(value, list) and all(
@@ -169,13 +166,21 @@ class TomlTable:
         return [(one, other) for one, other in self._read(name, [], expected, fits)]
 
     def raw(self, name: str, default: Any = None) -> Any:
-        """Return the entry of this name, which may be of any type, without a check."""
+        """Return the entry `name`, which may be of any type, without a check."""
         return self._read(name, default, "", lambda value: True)
 
-    def table(self, name: str, expected: str = "a table", default: Any = None) -> TomlTable | None:
-        """Return the nested table of this name, or None if it is missing."""
-        values = self._read(name, default, expected, lambda value: isinstance(value, dict))
-        return None if values is None else self._inner(values, name)
+    def table(self, name: str, expected: str = "a table") -> TomlTable | None:
+        """Return the nested table `name`, or None if it is missing."""
+        return self.required_table(name, expected) if name in self else None
+
+    def required_table(self, name: str, expected: str = "a table") -> TomlTable:
+        """Return the nested table `name`; raise ProblemError if it is missing."""
+        return self._inner(self._read(name, REQUIRED, expected, lambda value: isinstance(value, dict)), name)
+
+    def tables_by_name(self, name: str) -> dict[str, TomlTable]:
+        """Return all tables [name.KEY] that are nested in the required table `name`, by KEY."""
+        outer = self.required_table(name, f"tables, each headed [{'.'.join([*map(str, self.place), name])}.NAME]")
+        return {key: outer.required_table(key) for key in outer._values}
 
     def _inner(self, values: Any, *place: Any) -> TomlTable:
         """Return a nested table with its place in the file, so that its errors name the line."""
@@ -239,7 +244,7 @@ def read_toml(file: FileName) -> TomlTable:
 
 
 def _places(texts: Sequence[str]) -> dict[Place, int]:
-    """Return the line number of every table and entry of a file."""
+    """Return the line number of every table and entry of a TOML file, keyed by the names that lead to it."""
     lines: dict[Place, int] = {}
     counts: dict[Place, int] = {}
     table: Place = ()
@@ -262,6 +267,38 @@ def _places(texts: Sequence[str]) -> dict[Place, int]:
                 place = (*place, part.strip().strip("\"'"))
                 lines.setdefault(place, number)
     return lines
+
+
+@contextmanager
+def located_errors(entries: TomlTable, name: str | None = None) -> Iterator[None]:
+    """Add file, line and entry to errors raised in a `with` block: the given entry, or the one that the error names."""
+    try:
+        yield
+    except (ModelError, ProblemError) as error:
+        entry = error.name if name is None else name
+        located = entries.error(entry if entry is not None and entry in entries else None, str(error))
+        located.value, located.limit = error.value, error.limit
+        raise located from error
+
+
+def joint_values(
+    entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str, *, least: float | None = None
+) -> Any:
+    """Return an entry that gives numbers by joint as an array (n,); None if the entry is missing.
+
+    Joints without a number get `default`. If `least` is given, the entry may also be one number above `least` for all
+    joints, which is returned as it is.
+    """
+    if name not in entries:
+        return None
+    if least is not None and not isinstance(entries.raw(name), dict):
+        return entries.number(name, expected, least=least)
+    by_joint = entries.numbers_by_name(name, expected)
+    for joint in by_joint:
+        if joint not in names:
+            table = entries.required_table(name)
+            raise table.error(joint, f"the robot has no independent joint {joint!r}; it has {', '.join(names)}")
+    return np.array([by_joint.get(joint, default) for joint in names])
 
 
 # ---- joint limits ----------------------------------------------------------------------------------------------
@@ -292,27 +329,24 @@ def read_obstacles(file: FileName) -> tuple[Shape, ...]:
 
 
 def obstacles_of(entries: TomlTable, folder: Path) -> tuple[Shape, ...]:
-    """Return the shapes of the [[obstacle]] entries; paths of mesh files are relative to `folder`."""
+    """Return the shapes that the [[obstacle]] tables of a TOML file describe; mesh files are relative to `folder`."""
     shapes = []
     for table in entries.tables("obstacle"):
         shape = table.choice("shape", SHAPES, REQUIRED)
-        try:
+        with located_errors(table):
             shapes.append(read_shape(table, shape, folder))
-        except ModelError as error:
-            name = error.name if error.name is not None and error.name in table else None
-            raise table.error(name, str(error)) from error
         table.done()
     return tuple(shapes)
 
 
 def rotation_of(entries: TomlTable) -> Array:
-    """Return the rotation matrix of the entry `rpy` (roll, pitch, yaw); the identity if it is missing. Shape (3, 3)."""
+    """Return the rotation matrix (3, 3) of a table's entry `rpy` (roll, pitch, yaw, rad); the identity if missing."""
     angles = entries.vector("rpy", 3, "three angles, rad", (0.0, 0.0, 0.0))
     return np.array(rotation_from_rpy(*(float(angle) for angle in angles)), dtype=float)
 
 
 def read_shape(table: TomlTable, shape: str, folder: Path = Path()) -> Shape:
-    """Read a shape of a kind in SHAPES from a table; names of mesh files are relative to `folder`."""
+    """Return the shape, of a kind in SHAPES, that a table describes; names of mesh files are relative to `folder`."""
 
     def place(name: str = "position") -> Any:
         return table.vector(name, 3, "three numbers, m", REQUIRED)
@@ -395,7 +429,7 @@ def read_joint_limits(file: FileName, robot: Robot, *, scaling: bool = True) -> 
 
 
 def _joint_vector(robot: Robot, kind: str, limits: Mapping[str, float]) -> Array:
-    """Return one kind of limits of the independent joints, from the file's limits and the description. Shape (dof,)."""
+    """Return the limits (dof,) of independent joints, of one kind: those of a file, else of the robot description."""
     vector = np.full(robot.dof, np.inf)
     for name, (column, multiplier, _) in robot.couplings.items():
         joint = robot.joint(name)
@@ -406,7 +440,7 @@ def _joint_vector(robot: Robot, kind: str, limits: Mapping[str, float]) -> Array
 
 
 def _limit(file: FileName, joint: str, entry: Mapping[Any, Any], kind: str) -> float | None:
-    """Return a limit of a joint, infinite for no limit, or None if the entry does not give one."""
+    """Return a limit of a joint in joint_limits.yaml, infinite for no limit, or None if its entry gives none."""
     has, value = entry.get(f"has_{kind}_limits"), entry.get(f"max_{kind}")
     if has is not None and not isinstance(has, bool):
         words = f"{file}: joint {joint!r}: has_{kind}_limits must be true or false, not {repr(has)[:80]}"
@@ -422,7 +456,7 @@ def _limit(file: FileName, joint: str, entry: Mapping[Any, Any], kind: str) -> f
 
 
 def _factor(file: FileName, tree: Mapping[Any, Any], kind: str) -> float:
-    """Return the default scaling factor of the velocities or accelerations in a file."""
+    """Return the default scaling factor of velocities or accelerations that joint_limits.yaml states, else 1."""
     key = f"default_{kind}_scaling_factor"
     if not 0 < real(tree.get(key, 1.0)) <= 1:
         words = f"{file}: {key} must be a number above 0, at most 1, not {repr(tree[key])[:80]}"
@@ -431,7 +465,7 @@ def _factor(file: FileName, tree: Mapping[Any, Any], kind: str) -> float:
 
 
 def _unused_keys(entry: Mapping[Any, Any]) -> list[str]:
-    """Return the keys of a joint that are not used, misspelt keys with a suggestion."""
+    """Return the unused keys in a joint's entry of joint_limits.yaml, with a suggestion for each misspelt key."""
     used = [key for key, kind in UNUSED_KEYS.items() if key in entry and entry.get(f"has_{kind}_limits") is not False]
     unknown = [str(key) for key in entry if key not in LIMIT_KEYS and key not in OTHER_KEYS]
     similar = {key: get_close_matches(key[:80], LIMIT_KEYS, 1, 0.8) for key in unknown}

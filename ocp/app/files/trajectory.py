@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -36,8 +36,6 @@ from ocp.errors import ProblemError, require
 from ocp.storage import joint_name, table_joints
 
 Indices: TypeAlias = NDArray[np.intp]
-
-__all__ = ["KINDS", "RawTrajectory", "read_trajectory"]
 
 KINDS = ("positions", "velocities", "accelerations", "efforts")
 WORDS = {
@@ -170,20 +168,20 @@ def _read_table(
         raise ProblemError(words, name="time", value=tuple(head))
     t = np.asarray(np.arange(len(rows)) * (period or 0.0) if time is None else table[:, time[0]] * time[1], dtype=float)
     names = tuple(dict.fromkeys(name for name, _ in columns_of_values))
-    values: dict[str, Array] = {}
+    values: dict[str, Any] = dict.fromkeys(KINDS)
     for (name, quantity), (column, scale) in columns_of_values.items():
-        array = values.setdefault(quantity, np.full((len(rows), len(names)), np.nan))
-        array[:, names.index(name)] = table[:, column] * scale
-    if "positions" not in values:
+        if values[quantity] is None:
+            values[quantity] = np.full((len(rows), len(names)), np.nan)
+        values[quantity][:, names.index(name)] = table[:, column] * scale
+    if values["positions"] is None:
         words = f"{file}: no column is a position among {', '.join(map(repr, head))}; name the columns like the joints"
         raise ProblemError(words, name="positions", value=tuple(head))
-    v, a, efforts = (values.get(quantity) for quantity in KINDS[1:])
-    lines = np.array(numbers)
-    return RawTrajectory(names, t, values["positions"], v, a, efforts, lines, False, tuple(notes), str(file))
+    places: dict[str, Any] = {"lines": np.array(numbers), "notes": tuple(notes), "file": str(file)}
+    return RawTrajectory(names, t, **values, names_are_joints=False, **places)
 
 
 def _numbers(file: FileName, rows: list[str], numbers: list[int], delimiter: str, width: int) -> Array:
-    """Return the numbers of a table; empty cells become nan. Shape (M, width)."""
+    """Return the numbers in the rows of a table as an array (M, width), with nan for empty cells."""
     split = [split_cells(row, delimiter) for row in rows]
     for row, number, cells in zip(rows, numbers, split, strict=True):
         if len(cells) != width:
@@ -290,13 +288,12 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
         )
     t = np.array([_seconds(file, number, point) for number, point in enumerate(points, 1)])
     notes: list[str] = []
-    values: dict[str, Array | None] = {}
+    values: dict[str, Any] = dict.fromkeys(KINDS)
     for kind in KINDS:
         word = "effort" if kind == "efforts" else kind
         rows = [point.get(word) or [] for point in points]
         missing = [number for number, row in enumerate(rows, 1) if not row]
         if len(missing) == len(rows) and kind != "positions":
-            values[kind] = None
             continue
         if missing and kind == "positions":
             raise ProblemError(f"{file}: point {missing[0]} has no positions", name=f"point {missing[0]}")
@@ -304,14 +301,10 @@ def _from_points(file: FileName, tree: Any) -> RawTrajectory:
             notes.append(
                 f"{len(missing)} of {len(rows)} points have no {kind}, first point {missing[0]}: all are ignored"
             )
-            values[kind] = None
-            continue
-        values[kind] = _rows(file, word, rows, len(names))
-    position = values["positions"]
-    assert position is not None
-    lines = np.arange(1, len(points) + 1)
-    v, a, efforts = (values[kind] for kind in KINDS[1:])
-    return RawTrajectory(tuple(names), t, position, v, a, efforts, lines, True, tuple(notes), str(file))
+        else:
+            values[kind] = _rows(file, word, rows, len(names))
+    places: dict[str, Any] = {"lines": np.arange(1, len(points) + 1), "notes": tuple(notes), "file": str(file)}
+    return RawTrajectory(tuple(names), t, **values, names_are_joints=True, **places)
 
 
 def _rows(file: FileName, word: str, points: list[Any], width: int) -> Array:
@@ -357,7 +350,7 @@ def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) 
         if len(messages) > 1:
             notes.append(f"{topic} has {len(messages)} trajectories; only the first is read")
         trajectory = _from_points(file, first)
-        return RawTrajectory(**{**vars(trajectory), "notes": (*trajectory.notes, *notes)})
+        return replace(trajectory, notes=(*trajectory.notes, *notes))
     counts: dict[frozenset[str], int] = {}
     for _, state in messages:
         counts[frozenset(state["name"])] = counts.get(frozenset(state["name"]), 0) + 1
@@ -371,22 +364,17 @@ def _from_messages(file: FileName, topic: str, messages: list[tuple[int, Any]]) 
     if len(set(names)) != len(names) or not names:
         raise ProblemError(f"{file}: the joints {names} on {topic} must be distinct names", name="name", value=names)
     orders = [[state["name"].index(name) for name in names] for _, state in states]
-    values: dict[str, Array | None] = {}
+    values: dict[str, Any] = dict.fromkeys(KINDS)
     for kind, word in zip(KINDS, ("position", "velocity", "", "effort"), strict=True):
         rows = [state.get(word, ()) for _, state in states]
         if any(len(joints) != len(names) for joints in rows):
             if kind == "positions":
                 raise ProblemError(f"{file}: a joint state on {topic} has no positions", name="position")
-            values[kind] = None
             continue
         values[kind] = np.array([[joints[k] for k in order] for joints, order in zip(rows, orders, strict=True)])
     stamps = np.array([stamp for stamp, _ in states])
-    position = values["positions"]
-    assert position is not None
-    t = (stamps - stamps[0]) / 1e9
-    v, a, efforts = (values[kind] for kind in KINDS[1:])
-    lines = np.arange(1, len(states) + 1)
-    return RawTrajectory(names, t, position, v, a, efforts, lines, True, tuple(notes), str(file))
+    places: dict[str, Any] = {"lines": np.arange(1, len(states) + 1), "notes": tuple(notes), "file": str(file)}
+    return RawTrajectory(names, (stamps - stamps[0]) / 1e9, **values, names_are_joints=True, **places)
 
 
 # ---- programs of industrial robots -------------------------------------------------------------------------------
@@ -436,7 +424,7 @@ def _read_program(file: FileName, language: RobotLanguage, period: float | None)
 def _name_axis(
     language: RobotLanguage, joints: dict[str, tuple[str, float]], remark: re.Match[str], late: bool
 ) -> None:
-    """Store the joint and the unit of an axis that a comment states; raise ValueError if it is invalid."""
+    """Store the joint and the unit of a robot axis that a comment of a program states; raise ValueError if invalid."""
     axis, column, unit = remark.groups()
     if axis not in (*language.arm, *language.external):
         return  # any other comment
@@ -449,7 +437,7 @@ def _name_axis(
 
 
 def _axis_positions(language: RobotLanguage, text: str, joints: dict[str, tuple[str, float]]) -> list[float]:
-    """Return the positions of the joints, rad or m, from the numbers of a statement; raise ValueError if invalid."""
+    """Return the joint positions, rad or m, in a statement of a robot program; raise ValueError if they are invalid."""
     items = text.split(",")
     if language is ROBOT_LANGUAGES["krl"]:
         pairs = [(item[:2].upper(), item[2:].strip()) for item in items]

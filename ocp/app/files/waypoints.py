@@ -34,8 +34,6 @@ from ocp.app.files.program import DEFAULT_TOLERANCE_M, checked_reversal, smooth_
 from ocp.app.files.safe_files import FileName, is_number, line_error, read_lines, split_cells
 from ocp.errors import ProblemError, require
 
-__all__ = ["Waypoints", "read_waypoints"]
-
 POSITION, QUATERNION, VECTOR = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
 AXIS = ("ax", "ay", "az")
 KINDS = (POSITION, QUATERNION, VECTOR, AXIS, ("time",))
@@ -206,7 +204,9 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
         why = f"the time {times[i]:g} s is not after {times[i - 1]:g} s; sort the rows"
         raise line_error(file, int(lines[i]), row_texts[i], why)
     positions = parts[POSITION]
-    if unit is None and not any(_unit(cell) for cell, name in zip(head, names, strict=True) if name in POSITION):
+    if unit is None and not any(
+        _name_and_unit(cell)[1] for cell, name in zip(head, names, strict=True) if name in POSITION
+    ):
         extent = np.ptp(positions, axis=0).max()
         warn_of_millimetres(f"{file!s}: an extent of the waypoints of", extent, "unit")
     axes = _axes(file, parts[AXIS], lines, row_texts) if AXIS in parts else None
@@ -225,7 +225,7 @@ def read_waypoints(file: FileName, *, unit: str | None = None, columns: Sequence
 
 
 def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
-    """Return line number, text and cells of each row of a table; a comment that names the columns is the first row."""
+    """Return line number, text and cells of each row of a table; a comment that names its columns becomes row 0."""
     rows: list[tuple[int, str, list[str]]] = []
     delimiter: str | None = None
     last_comment = (0, "")
@@ -240,16 +240,16 @@ def _rows(file: FileName) -> list[tuple[int, str, list[str]]]:
     if not rows or delimiter is None:
         raise ProblemError(f"{file}: the file has only comments", name="file", value=str(file))
     comment_cells = split_cells(last_comment[1].strip(" "), delimiter)  # as numpy.savetxt writes a head
-    if len(comment_cells) == len(rows[0][2]) and set(POSITION) <= {_name(cell) for cell in comment_cells}:
+    if len(comment_cells) == len(rows[0][2]) and set(POSITION) <= {_name_and_unit(cell)[0] for cell in comment_cells}:
         rows.insert(0, (*last_comment, comment_cells))
     return rows
 
 
-def _name(cell: str) -> str:
-    """Return the standard name of a column from its cell in the header, or "" if the cell is no valid name."""
+def _name_and_unit(cell: str) -> tuple[str, str | None]:
+    """Return the standard name of a column, "" if it is invalid, and the unit that its header cell states, or None."""
     match = HEAD.match(" ".join(cell.lower().split()))
     name = match[1].removeprefix("pose.") if match else ""
-    return OTHER_NAMES.get(name, name)
+    return OTHER_NAMES.get(name, name), match[2] if match else None
 
 
 def _head(
@@ -274,19 +274,13 @@ def _head(
     return list(POSITION), 0
 
 
-def _unit(cell: str) -> str | None:
-    """Return the unit that the header cell of a column states, or None."""
-    match = HEAD.match(" ".join(cell.lower().split()))
-    return match[2] if match else None
-
-
 def _columns(file: FileName, head: Sequence[str], unit: str | None) -> tuple[list[str], list[float], tuple[str, ...]]:
     """Return standard name ("" if ignored) and factor to SI units of each column, and the names of ignored columns."""
     names: list[str] = []
     scales: list[float] = []
     ignored: list[str] = []
     for cell in head:
-        name, unit_name = _name(cell), _unit(cell)
+        name, unit_name = _name_and_unit(cell)
         kind = next((kind for kind in KINDS if name in kind), None)
         scale = 1.0
         if kind is None:
@@ -355,7 +349,7 @@ def _quaternions(file: FileName, values: Array, lines: NDArray[np.intp], texts: 
 
 
 def _axes(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequence[str]) -> Array:
-    """Return tool axes as unit vectors; raise ProblemError if an axis is zero."""
+    """Return the tool axes (M, 3) of a table as unit vectors; raise ProblemError, with the line, if one is zero."""
     norm = np.linalg.norm(values, axis=1)
     if not (norm > 0).all():
         i = int((norm > 0).argmin())
@@ -364,7 +358,7 @@ def _axes(file: FileName, values: Array, lines: NDArray[np.intp], texts: Sequenc
 
 
 def _from_vectors(vectors: Array) -> Array:
-    """Convert rotation vectors to quaternions."""
+    """Convert rotation vectors (M, 3), rad, to unit quaternions (M, 4)."""
     angle = np.linalg.norm(vectors, axis=1)[:, None]
     return np.concatenate([np.cos(angle / 2), np.sinc(angle / 2 / np.pi) / 2 * vectors], axis=1)
 

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from models import FreeFloating, Machine, Standing, inverse_dynamics, simplify
+from models import FreeFloating, Machine, Standing
 from models.checks import Array
 from models.machines.standing import center_of_pressure
-from models.robot.dynamics import GRAVITY
 from ocp.app.check.data_checks import clean_trajectory
-from ocp.app.check.joint_limits import Row, floating_torques, integrate_base
+from ocp.app.check.interpolation import interpolate
+from ocp.app.check.joint_limits import Row, integrate_base, torque_expression
 from ocp.app.check.verdict import PlanVerdict, audit_rows, verdict_of
 from ocp.app.files import RawTrajectory
 from ocp.app.view.appearance import Obstacle, obstacles_of, obstacles_of_plan
@@ -31,12 +31,6 @@ from ocp.motion.tasks.targets import Target
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import Sampler
 from ocp.solution import Solution, match_order
-
-__all__ = [
-    "PAGE_SETTINGS", "Animation", "ClosestPairs", "Curve", "GroundContact", "MotionSamples", "PageSettings",
-    "animate_plan", "animate_solution", "animate_trajectory", "cumulative_integral", "ground_contact",
-    "joint_curves", "machine_curves",
-]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,12 +110,7 @@ def _torques(machine: Machine, samples: MotionSamples) -> Array | None:
     if samples.accelerations is None or robot.total_mass == 0:
         return None
     q, v, a = (ca.SX.sym(name, robot.dof) for name in ("q", "v", "a"))
-    if isinstance(machine, FreeFloating):
-        torque = floating_torques(machine, q, v, a)
-    else:
-        gravity = getattr(machine, "gravity_in_world", GRAVITY)
-        frame = machine.world_from_base(())
-        torque = inverse_dynamics(simplify(robot), q, v, a, wrenches=(), gravity=gravity, world_from_base=frame)
+    torque = torque_expression(machine, q, v, a)
     torques: Array = Sampler([q, v, a], [torque])(samples.joints, samples.rates, samples.accelerations)[0]
     return torques
 
@@ -375,15 +364,10 @@ def animate_trajectory(raw: RawTrajectory, machine: Machine, name: str = "") -> 
             assert isinstance(machine, FreeFloating)
             base_path = integrate_base(machine, motion)[0]  # by conservation of momentum
         else:
-            base_rates = _interpolate(begin + times, motion.t, np.gradient(base_path, motion.t, axis=0))
-        base = _interpolate(begin + times, motion.t, base_path)
+            base_rates = interpolate(begin + times, motion.t, np.gradient(base_path, motion.t, axis=0))
+        base = interpolate(begin + times, motion.t, base_path)
     samples = MotionSamples(times, joints, rates, accelerations, base, base_rates)
     return _animation(name or raw.file, machine, samples, [])
-
-
-def _interpolate(times: Array, t: Array, values: Array) -> Array:
-    """Interpolate `values`, given at times `t`, linearly at other times (K,). Shape (K, n)."""
-    return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def _animation(

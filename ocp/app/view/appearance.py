@@ -30,30 +30,6 @@ from ocp.problem.problem import Problem
 from ocp.problem.values import Sampler
 from ocp.solution import Solution
 
-__all__ = [
-    "COMPARED",
-    "FAULT",
-    "LIMIT",
-    "PLAN",
-    "SCENE",
-    "SURFACE_STYLE",
-    "TIP",
-    "TIP_FRAME",
-    "Appearance",
-    "Frames",
-    "Obstacle",
-    "Part",
-    "Solid",
-    "SurfaceStyle",
-    "appearance_of",
-    "frames_along",
-    "obstacles_of",
-    "obstacles_of_plan",
-    "obstacles_of_shapes",
-    "part_of",
-    "rod",
-]
-
 
 @dataclass(frozen=True)
 class SurfaceStyle:
@@ -139,7 +115,7 @@ def appearance_of(
         surfaces += [(link.name, triangles) for triangles in triangles_of_link]
     shown = {name for name, _ in surfaces}
     surfaces += [(name, triangles) for name, triangles in _rods(robot, shown)]
-    return Appearance(tuple(_parts(_few(surfaces, most))), missing)
+    return Appearance(tuple(_parts(_limit_faces(surfaces, most))), missing)
 
 
 def _triangulate(
@@ -149,7 +125,7 @@ def _triangulate(
     missing: dict[str, str],
     default: tuple[float, ...] = SURFACE_STYLE.grey,
 ) -> list[Triangles]:
-    """Convert the shapes of a link to triangles in the frame of the link."""
+    """Convert the shapes of a link to coloured triangles in its frame; record missing meshes in `missing`."""
     triangles = []
     for shape in shapes:
         if shape.kind == "mesh" and not meshes:
@@ -236,17 +212,17 @@ def _rods(robot: Robot, shown: set[str]) -> list[tuple[str, Triangles]]:
     return rods
 
 
-def _few(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
+def _limit_faces(surfaces: list[tuple[str, Triangles]], most: int) -> list[tuple[str, Triangles]]:
     """Merge nearby vertices of surfaces until the surfaces have at most `most` faces in total."""
     size = SURFACE_STYLE.min_cell
     coarse = surfaces
     while sum(len(mesh.faces) for _, mesh in coarse) > most and size < 1.0:
-        coarse = [(link, _coarser(mesh, size)) for link, mesh in surfaces]
+        coarse = [(link, _merge_corners(mesh, size)) for link, mesh in surfaces]
         size *= 2
     return coarse
 
 
-def _coarser(mesh: Triangles, size: float) -> Triangles:
+def _merge_corners(mesh: Triangles, size: float) -> Triangles:
     """Merge the vertices of a mesh that lie in one grid cell into their mean, and remove degenerate faces."""
     cells = np.floor(mesh.vertices / size).astype(np.int64)
     _, cell = distinct_rows(cells)

@@ -34,8 +34,6 @@ from ocp.app.view.animation import PAGE_SETTINGS, Animation
 from ocp.app.view.appearance import TIP_FRAME, Appearance, Frames, appearance_of, frames_along, part_of
 from ocp.errors import ProblemError
 
-__all__ = ["Buffers", "Page", "PageServer", "build_page"]
-
 SCRIPTS = ("scene.js", "curves.js", "player.js")
 
 
@@ -47,7 +45,7 @@ class Buffers:
         self.size = 0
 
     def put(self, values: Any, kind: str) -> dict[str, Any]:
-        """Store an array as numbers of one kind, "f4", "u2", "i1" or "u4", and return a reference to it."""
+        """Append an array to the data of the page, as the NumPy type `kind` such as "f4"; return a reference to it."""
         array = np.ascontiguousarray(values, dtype=f"<{kind}" if kind != "i1" else kind)
         data = array.tobytes()
         reference = {"at": self.size, "kind": kind, "shape": list(array.shape)}
@@ -96,7 +94,7 @@ def build_page(
     motions, missing = [], dict[str, str]()
     for motion in shown:
         robot = motion.machine.robot
-        number = next((k for k, (known, _) in enumerate(robots) if _alike(known, robot)), None)
+        number = next((k for k, (known, _) in enumerate(robots) if _look_alike(known, robot)), None)
         if number is None:
             appearance = appearance_of(robot, folders, meshes=meshes)
             missing |= appearance.missing
@@ -129,7 +127,7 @@ def _fill_template(title: str, first: Animation, data: str) -> str:
     return re.sub(f"@({'|'.join(fields)})@", lambda match: fields[match[1]], text)
 
 
-def _alike(a: Robot, b: Robot) -> bool:
+def _look_alike(a: Robot, b: Robot) -> bool:
     """Return whether two robots look the same, so that they can share one set of surfaces."""
     if a is b:
         return True
@@ -144,9 +142,7 @@ def _alike(a: Robot, b: Robot) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, tuple[str, Array, Array]]:
-    """Return, for each link, the moving link (or root) that carries the link, and the link's pose relative to the
-    carrier.
-    """
+    """Return for each link the moving link, or the root, that carries it, and its rotation and position there."""
     carriers = {robot.root: (robot.root, np.eye(3), np.zeros(3))}
     for joint in robot.joints:
         if joint.moves:
@@ -163,7 +159,7 @@ def _movers(robot: Robot) -> list[str]:
 
 
 def _robot(robot: Robot, appearance: Appearance, buffers: Buffers) -> dict[str, Any]:
-    """Return the description of a robot for the page: its surfaces in the frames of its moving links."""
+    """Return the description of a robot for the page: its surfaces, in the frames of its moving links, with colours."""
     carriers, movers = _carriers(robot), _movers(robot)
     parts = []
     for part in appearance.parts:
@@ -208,7 +204,7 @@ def _poses(frames: Frames, names: Sequence[str]) -> Array:
 
 
 def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
-    """Return the description of one motion for the page."""
+    """Return the description of a motion for the page as data for JSON; its arrays are appended to the buffers."""
     rows = np.unique(np.linspace(0, len(motion.t) - 1, min(len(motion.t), PAGE_SETTINGS.poses)).round().astype(int))
     frames = frames_along(motion.machine, motion.joints[rows], motion.base[rows])
     tip = motion.machine.robot.tip is not None
@@ -279,7 +275,7 @@ def _motion(motion: Animation, buffers: Buffers) -> dict[str, Any]:
 
 
 def _solid(vertices: Array, faces: NDArray[np.intp], buffers: Buffers) -> dict[str, Any]:
-    """Return the description of a solid obstacle for the page."""
+    """Return the description of an obstacle's surface for the page; its arrays are appended to the buffers."""
     part = part_of("", vertices, faces, (0.0, 0.0, 0.0, 1.0))
     return _surface(part.vertices, part.normals, part.faces, buffers)
 
@@ -295,14 +291,14 @@ HOST = "127.0.0.1"
 
 
 class PageServer:
-    """HTTP server of one page on this machine, as a context manager.
+    """Context manager that serves one page by HTTP to browsers on this machine.
 
     Attributes:
         address: Address to open in a browser.
     """
 
     def __init__(self, text: str, port: int = 0) -> None:
-        """Listen on the given port or the next free port; port 0 selects any free port.
+        """Prepare to serve the HTML text of a page on a port or the next free one; port 0 selects any free port.
 
         Raises:
             ProblemError: No port is free, or the number is invalid.

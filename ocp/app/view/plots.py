@@ -11,13 +11,16 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from models.checks import Array
 from ocp.app.check.interpolation import Motion
-from ocp.app.view.appearance import COMPARED, FAULT, LIMIT, PLAN
+from ocp.app.view.appearance import COMPARED, LIMIT, PLAN
 from ocp.app.view.rendering import PICTURE_STYLE
+from ocp.app.view.report import KINDS, bounds_of, curve_samples, limits_in_view
 from ocp.errors import ProblemError, require
 from ocp.motion.local.accelerations import AccelerationSolution
 from ocp.motion.local.rates import LocalSolution
@@ -28,21 +31,6 @@ from ocp.problem.formulation import Formulation
 from ocp.solution import Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "STYLE",
-    "Picture",
-    "add_legend",
-    "as_svg",
-    "draw_curves",
-    "draw_joints",
-    "draw_limits",
-    "html_of_plan",
-    "html_of_solution",
-    "line_style",
-    "plot_plan",
-    "plot_solution",
-]
-
 STYLE: Any = {"font.size": 7.5, "axes.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False}
 """Settings of matplotlib for all figures."""
 STYLE |= {"text.parse_math": False}  # a joint's name may contain a dollar
@@ -50,49 +38,21 @@ DASHES: tuple[Any, ...] = ((0, (1, 1)), (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)))
 """Line styles of the motions compared with a plan, so that colour is not the only distinction."""
 
 
-def draw_curves(
-    motion: Motion, bounds: JointBounds, *, names: Sequence[str], units: Sequence[str], faults: Sequence[Any] = ()
-) -> str:
-    """Return an SVG with position, velocity and acceleration of every joint over time, with their limits and faults."""
-    from matplotlib.figure import Figure
-
-    width, height = PICTURE_STYLE.width, 0.4 + 1.15 * len(names)
-    figure = Figure(figsize=(width, height))
-    # margins in inches, wide enough for the labels; a constrained layout takes as long as all else
-    figure.subplots_adjust(0.85 / width, 0.45 / height, 1 - 0.08 / width, 1 - 0.3 / height, wspace=0.5, hspace=0.22)
-    draw_joints(figure, {"": motion}, bounds, names=names, units=units, faults=faults)
-    return as_svg(figure)
-
-
 def draw_joints(
-    figure: Any,
-    motions: Mapping[str, Motion],
-    bounds: JointBounds,
-    *,
-    names: Sequence[str],
-    units: Sequence[str],
-    faults: Sequence[Any] = (),
+    figure: Any, motions: Mapping[str, Motion], bounds: JointBounds, *, names: Sequence[str], units: Sequence[str]
 ) -> None:
-    """Draw position, velocity and acceleration of every joint over time into an empty figure, with limits and faults.
+    """Draw position, velocity and acceleration of every joint over time into an empty figure, with their limits.
 
     The first of several motions is the plan; the others are compared with it.
     """
-    import matplotlib
-
-    kinds = [("position", ""), ("velocity", "/s"), ("acceleration", "/s²")]
     with matplotlib.rc_context(STYLE):
         grid: Any = figure.subplots(len(names), 3, squeeze=False, sharex=True)
-        for column, (kind, per) in enumerate(kinds):
-            samples = []
-            for number, motion in reversed([*enumerate(motions.values())]):  # the plan last, on top
-                own_times = motion.t[:: len(motion.t) // PICTURE_STYLE.curve_points + 1]
-                times = np.unique(
-                    np.concatenate([np.linspace(motion.t[0], motion.t[-1], PICTURE_STYLE.curve_points), own_times])
-                )
-                quantity = motion.quantity(kind)
-                samples.append((number, times, None if quantity is None else quantity.pieces.at(times)))
-            limit = getattr(bounds, kind, None)
-            lower, upper = (bounds.lower, bounds.upper) if limit is None else (-limit, limit)
+        for column, (kind, per) in enumerate(KINDS.items()):
+            samples = [
+                (number, *curve_samples(motion, kind))
+                for number, motion in reversed([*enumerate(motions.values())])  # the plan last, on top
+            ]
+            lower, upper = bounds_of(bounds, kind)
             min_range = PICTURE_STYLE.flat * max(
                 (np.abs(values).max() for _, _, values in samples if values is not None), default=1.0
             )
@@ -103,9 +63,6 @@ def draw_joints(
                     if values is not None:
                         ax.plot(times, values[:, row], **line_style(number))
                 draw_limits(ax, lower[row], upper[row], min_range)
-                for fault in faults:
-                    if fault.name == name and fault.kind == kind and fault.time is not None:
-                        ax.axvline(fault.time, color=FAULT, lw=1.6)
                 ax.set_ylabel(f"{name if column == 0 else ''}\n{units[row]}{per}", fontsize=7)
                 ax.margins(x=0.01)
         for ax in grid[-1]:
@@ -119,24 +76,13 @@ def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
 
     Curves with a range smaller than `min_range` are drawn as constant.
     """
-    low, high = ax.dataLim.y0, ax.dataLim.y1
-    if not np.isfinite([low, high]).all():
-        low = high = 0.0
-    span = max(high - low, min_range) or 1.0
-    distant = []
-    for limit in (lower, upper):
-        if low - PICTURE_STYLE.limit_distance * span <= limit <= high + PICTURE_STYLE.limit_distance * span:
-            ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
-            low, high = min(low, limit), max(high, limit)
-        elif np.isfinite(limit):
-            distant.append(f"{limit:.3g}")
-    if distant:
-        words = f"limit{'s' if len(distant) > 1 else ''} {', '.join(distant)}"
-        place, side = (0.03, "bottom") if high == upper else (0.97, "top")  # not on the line of the upper limit
-        ax.annotate(words, (0.99, place), xycoords="axes fraction", ha="right", va=side, color=LIMIT, fontsize=6)
-    margin = max(0.06 * (high - low), 0.55 * (span - (high - low)))
-    space = 0.1 * span if distant else 0.0
-    ax.set_ylim(low - margin - space * (high == upper), high + margin + space * (high != upper))
+    view = limits_in_view(ax.dataLim.y0, ax.dataLim.y1, lower, upper, min_range)
+    for limit in view.lines:
+        ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
+    if view.text:
+        place, side = (0.03, "bottom") if view.text_below else (0.97, "top")
+        ax.annotate(view.text, (0.99, place), xycoords="axes fraction", ha="right", va=side, color=LIMIT, fontsize=6)
+    ax.set_ylim(view.low, view.high)
 
 
 def line_style(number: int) -> dict[str, Any]:
@@ -146,16 +92,12 @@ def line_style(number: int) -> dict[str, Any]:
 
 def add_legend(figure: Any, names: Sequence[str]) -> None:
     """Add a legend below a figure, with the names of the plan and of the motions compared with the plan."""
-    from matplotlib.lines import Line2D
-
     lines = [Line2D([], [], **line_style(number)) for number in range(len(names))]
     figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=8)
 
 
 def as_svg(figure: Any) -> str:
     """Return a figure as an `svg` element for a page."""
-    import matplotlib
-
     stream = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "selfmotion"}):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
@@ -211,13 +153,13 @@ def html_of_plan(plan: Plan) -> str:
 
 
 def _motion_of(plan: Plan) -> Motion:
-    """Return samples of a plan, dense enough for curves, as a Motion."""
+    """Return samples of a plan, dense enough for smooth curves, as a joint motion."""
     sample = plan.sample(plan.horizon / PICTURE_STYLE.curve_points)
     return Motion(sample.t, sample.joints, sample.rates, sample.accelerations)
 
 
 def _comparison(name: str, other: Any, names: tuple[str, ...]) -> tuple[Motion, float | None]:
-    """Return, as a Motion, what is plotted for comparison with a plan, and its cost (None if unknown)."""
+    """Return the joint motion of an object that is plotted for comparison with a plan, and its cost or None."""
     cost: float | None = None
     if isinstance(other, Plan):
         joints, motion, cost = other.names, _motion_of(other), other.cost
@@ -262,9 +204,9 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
         ProblemError: A motion cannot be compared, or has other states and controls.
     """
     others = _motions_by_name(against)
-    own_widths = _widths(solution)
+    own_widths = _widths(solution.name, solution)
     for name, other in others.items():
-        widths = _widths(other) if isinstance(other, Solution) else _local_widths(name, other)
+        widths = _widths(name, other)
         expected = {name: own_widths.get(name) for name in (widths if isinstance(other, LocalSolution) else own_widths)}
         if widths != expected:
             words = f"plot: {name!r} has {widths}, the solution has {own_widths}"
@@ -274,13 +216,11 @@ def plot_solution(solution: Solution, against: Any = None, figure: Any = None) -
     bounds, units = _bounds(solution)
     rows = -(-len(entries) // PICTURE_STYLE.columns)
     target = _figure(figure, (PICTURE_STYLE.width, 0.9 + 1.35 * rows))
-    import matplotlib
-
     with matplotlib.rc_context(STYLE):
         grid: Any = target.subplots(rows, min(PICTURE_STYLE.columns, len(entries)), squeeze=False, sharex=True)
         for ax in grid.ravel()[len(entries) :]:
             ax.remove()
-        curves = [_along(one) for one in (solution, *others.values())]
+        curves = [_curves_over_time(one) for one in (solution, *others.values())]
         for ax, (name, k) in zip(grid.ravel(), entries, strict=False):
             for number, curve in reversed([*enumerate(curves)]):
                 if name in curve:
@@ -311,20 +251,19 @@ def html_of_solution(solution: Solution) -> str:
     return f'<div style="max-width: 56rem"><p><b>{escape(head)}</b></p>{as_svg(plot_solution(solution))}{table}</div>'
 
 
-def _widths(solution: Solution) -> dict[str, int]:
-    """Return the number of entries of each state and control of a solution by name."""
-    return {name: values.shape[1] for name, values in {**solution.states, **solution.controls}.items()}
-
-
-def _local_widths(name: str, other: Any) -> dict[str, int]:
-    """Return how many curves base, joints and rates of a local motion (a result of `resolve`) have, by name."""
-    if not isinstance(other, LocalSolution):
+def _widths(name: str, motion: Any) -> dict[str, int]:
+    """Return the number of entries of each state and control of a solution, or of base, joints and rates of a result of
+    `resolve`, by name; raise ProblemError for any other object, which `name` denotes.
+    """
+    if isinstance(motion, LocalSolution):
+        return {entry: values.shape[1] for entry, values in _local(motion).items()}
+    if not isinstance(motion, Solution):
         words = (
-            f"plot: {name!r} is a {type(other).__name__}; a solution can be compared with a solution or a result of "
+            f"plot: {name!r} is a {type(motion).__name__}; a solution can be compared with a solution or a result of "
             "resolve"
         )
-        raise ProblemError(words, name="against", value=other)
-    return {entry: values.shape[1] for entry, values in _local(other).items()}
+        raise ProblemError(words, name="against", value=motion)
+    return {entry: values.shape[1] for entry, values in {**motion.states, **motion.controls}.items()}
 
 
 def _local(other: LocalSolution) -> dict[str, Array]:
@@ -333,7 +272,7 @@ def _local(other: LocalSolution) -> dict[str, Array]:
     return {name: values for name, values in samples.items() if values.shape[1]}
 
 
-def _along(motion: Any) -> dict[str, tuple[Array, Array]]:
+def _curves_over_time(motion: Any) -> dict[str, tuple[Array, Array]]:
     """Return times (s) and values of a motion's states and controls by name, including both one-sided values at nodes.
 
     States and controls of a phase are given over the interval of that phase.
@@ -380,7 +319,7 @@ def _motions_by_name(against: Any) -> dict[str, Any]:
 
 
 def _figure(figure: Any, size: tuple[float, float]) -> Any:
-    """Return a new figure, or the given figure if it is empty; raise ProblemError if it is invalid."""
+    """Return a new matplotlib figure, or a given figure after checking that it is empty, of a size in inches."""
     if figure is None:
         return Picture(figsize=size, layout="constrained")
     require.instance("plot: figure", figure, Figure)

@@ -7,6 +7,8 @@ Each pixel is the mean of several samples.
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -18,8 +20,6 @@ from models.checks import Array
 from ocp.app.view.appearance import Appearance, Frames, Part
 from ocp.errors import ProblemError
 
-__all__ = ["PICTURE_STYLE", "Camera", "Floor", "Layer", "PictureStyle", "parts_in_world", "render", "tube"]
-
 
 @dataclass(frozen=True)
 class PictureStyle:
@@ -30,7 +30,7 @@ class PictureStyle:
         max_pixels: Largest number of pixels.
         half_field_of_view: Half of the vertical field of view, rad.
         side_samples: Samples along each side of a pixel.
-        batch_size: Samples that are processed together, to limit memory.
+        batch_size: Samples that are processed together: their arrays fit into the cache of a processor.
         fading: Fraction of the smaller side of a picture within which the floor fades towards the edge.
         sun: Azimuth to the left of the camera's, and elevation, rad.
         shadow_map: Samples along each side of the shadow map, relative to the pixels along the longer side of the
@@ -54,7 +54,7 @@ class PictureStyle:
     max_pixels: int = 2**24
     half_field_of_view: float = 0.22
     side_samples: int = 2
-    batch_size: int = 1_000_000
+    batch_size: int = 2**16
     fading: float = 0.1
     sun: tuple[float, float] = (np.deg2rad(38.0), np.deg2rad(52.0))
     shadow_map: float = 1.25
@@ -168,7 +168,7 @@ class Floor(NamedTuple):
 
 
 def parts_in_world(appearance: Appearance, frames: Frames, k: int) -> list[Part]:
-    """Return the surfaces of a robot in the world frame at sample k of a motion."""
+    """Return the surfaces of a robot in the world frame at the sample of index `k` of a motion."""
     parts = []
     for part in appearance.parts:
         rotation, position = frames.rotations[part.link][k], frames.positions[part.link][k]
@@ -227,24 +227,36 @@ def render(
     picture = np.ones((fine.size[0] * fine.size[1], 3), dtype=np.float32)
     nearness, faces = _nearest(*_project(fine, solid), fine.size)
     if floor is not None:
-        _lay(picture, floor, fine, sun, np.flatnonzero(faces < 0))
+        for cells in _blocks(np.flatnonzero(faces < 0)):
+            _draw_floor(picture, floor, fine, sun, cells)
     first = sum(len(part.faces) for part in layers[0].parts if part.color[3] >= 1) if layers else 0
-    nearness = np.where((faces >= 0) & (faces < first), np.inf, nearness)
     cells = np.flatnonzero(faces >= 0)
-    picture[cells] = _shade(solid, faces[cells], fine.rays(cells), fine, sun)
+    _shade(picture, solid, faces, cells, fine, sun=sun)
+    nearness[cells[faces[cells] < first]] = np.inf
     for layer in layers:
         for opacity in sorted({part.color[3] for part in layer.parts}, reverse=True):
             if opacity >= 1 and layer.opacity >= 1:
                 continue
             veil = _Mesh.of([part for part in layer.parts if part.color[3] == opacity], layer.tint)
             near, faces = _nearest(*_project(fine, veil), fine.size)
-            cells = np.flatnonzero((faces >= 0) & (near > (1 + PICTURE_STYLE.behind) * nearness))
-            alpha = np.float32(layer.opacity * opacity)
-            lit = _shade(veil, faces[cells], fine.rays(cells), fine, None)
-            picture[cells] = (1 - alpha) * picture[cells] + alpha * lit
+            cells = np.flatnonzero(faces >= 0)
+            cells = cells[near[cells] > (1 + PICTURE_STYLE.behind) * nearness[cells]]
+            _shade(picture, veil, faces, cells, fine, alpha=layer.opacity * opacity)
     samples, sides = picture.reshape(height, side_samples, width, side_samples, 3), range(side_samples)
-    pixels = np.sum([samples[:, i, :, j] for i in sides for j in sides], axis=0) / side_samples**2
+    pixels = sum(samples[:, i, :, j] for i in sides for j in sides) / np.float32(side_samples**2)
     return np.asarray(np.round(255 * np.clip(pixels, 0.0, 1.0)), dtype=np.uint8)
+
+
+def encode_png(picture: NDArray[np.uint8]) -> bytes:
+    """Return a picture (height, width, 3) as a PNG file, whose rows are stored as differences from the row above."""
+    height, width, _ = picture.shape
+    rows = np.full((height, 1 + 3 * width), 2, dtype=np.uint8)  # the filter "up" of the PNG specification
+    rows[:, 1:] = np.diff(picture.reshape(height, -1), axis=0, prepend=np.zeros((1, 3 * width), dtype=np.uint8))
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, red green blue
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), 6)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,28 +305,31 @@ def _nearest(places: Array, near: Array, size: tuple[int, int]) -> tuple[Array, 
     # gradients of the barycentric coordinates of the second and third corners
     second = np.column_stack([two[:, 1], -two[:, 0]]) / area[valid, None]
     third = np.column_stack([-one[:, 1], one[:, 0]]) / area[valid, None]
+    fourth = -(second + third)[:, 0]
     slope = (near[valid, 1] - near[valid, 0])[:, None] * second + (near[valid, 2] - near[valid, 0])[:, None] * third
-    which, step = _repeat_numbers(rows)
-    row = top[valid][which] + step
-    dy = row + 0.5 - start[which, 1]
-    least, most = np.full(len(which), -0.5), np.full(len(which), width - 0.5)
-    b, c = second[which, 1] * dy, third[which, 1] * dy  # in each row, at the x of the first corner
-    for value, rise in ((b, second[which, 0]), (c, third[which, 0]), (1 - b - c, -(second + third)[which, 0])):
-        with np.errstate(divide="ignore", invalid="ignore"):  # barycentric coordinates are not negative
-            end = start[which, 0] - value / rise - 0.5
-        least = np.where(rise > 0, np.maximum(least, end), least)
-        most = np.where(rise < 0, np.minimum(most, end), np.where((rise == 0) & (value < 0), -1.0, most))
-    first = np.ceil(least).astype(np.int64)
-    lengths = np.maximum(np.floor(most).astype(np.int64) - first + 1, 0)
-    value = near[valid[which], 0] + slope[which, 1] * dy + slope[which, 0] * (first + 0.5 - start[which, 0])
-    rise, cell, which = slope[which, 0], row * width + first, valid[which]
-    for begin, end in _batches(lengths):
-        own, step = _repeat_numbers(lengths[begin:end])
-        own += begin
-        cells, values = cell[own] + step, value[own] + rise[own] * step
-        np.maximum.at(depth, cells, values)
-        best = np.flatnonzero(values == depth[cells])
-        number[cells[best]] = which[own[best]]
+    for first_face, last_face in _batches(rows):
+        which, step = _repeat_numbers(rows[first_face:last_face])
+        which += first_face
+        row = top[valid[which]] + step
+        dy = row + 0.5 - start[which, 1]
+        least, most = np.full(len(which), -0.5), np.full(len(which), width - 0.5)
+        b, c = second[which, 1] * dy, third[which, 1] * dy  # in each row, at the x of the first corner
+        for value, rise in ((b, second[which, 0]), (c, third[which, 0]), (1 - b - c, fourth[which])):
+            with np.errstate(divide="ignore", invalid="ignore"):  # barycentric coordinates are not negative
+                end = start[which, 0] - value / rise - 0.5
+            least = np.where(rise > 0, np.maximum(least, end), least)
+            most = np.where(rise < 0, np.minimum(most, end), np.where((rise == 0) & (value < 0), -1.0, most))
+        first = np.ceil(least).astype(np.int64)
+        lengths = np.maximum(np.floor(most).astype(np.int64) - first + 1, 0)
+        value = near[valid[which], 0] + slope[which, 1] * dy + slope[which, 0] * (first + 0.5 - start[which, 0])
+        rise, cell, which = slope[which, 0], row * width + first, valid[which]
+        for begin, end in _batches(lengths):
+            own, step = _repeat_numbers(lengths[begin:end])
+            own += begin
+            cells, values = cell[own] + step, value[own] + rise[own] * step
+            np.maximum.at(depth, cells, values)
+            best = np.flatnonzero(values == depth[cells])
+            number[cells[best]] = which[own[best]]
     return depth, number
 
 
@@ -325,13 +340,19 @@ def _repeat_numbers(counts: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArra
 
 
 def _batches(counts: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Yield ranges of consecutive items whose counts sum to about `batch_size`, to limit memory."""
+    """Yield ranges (first, last + 1) of consecutive items whose counts sum to about `batch_size`."""
     ends = np.cumsum(counts)
     begin = 0
     while begin < len(counts):
         end = min(int(np.searchsorted(ends, ends[begin] - counts[begin] + PICTURE_STYLE.batch_size)) + 1, len(counts))
         yield begin, end
         begin = end
+
+
+def _blocks(cells: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
+    """Yield the given numbers of picture samples in blocks of at most `batch_size`."""
+    size = PICTURE_STYLE.batch_size
+    return (cells[begin : begin + size] for begin in range(0, len(cells), size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,7 +368,7 @@ class _Sun:
 
     @classmethod
     def on(cls, mesh: _Mesh, camera: Camera) -> _Sun:
-        """Return the light source of a scene, in a direction relative to the camera, with its depth map for shadows."""
+        """Return the sun of a scene, whose direction is relative to the camera, with the depth map for its shadows."""
         back = camera.axes[2]
         azimuth, elevation = np.arctan2(back[1], back[0]) - PICTURE_STYLE.sun[0], PICTURE_STYLE.sun[1]
         to_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
@@ -376,8 +397,10 @@ class _Sun:
         return np.asarray(share / np.float32(len(blur) ** 2))
 
 
-def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None, bare: NDArray[np.intp]) -> None:
-    """Draw the floor, and the shadows on it, into the pixels `bare` of an empty picture, which no surface covers."""
+def _draw_floor(
+    picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun | None, bare: NDArray[np.intp]
+) -> None:
+    """Draw the floor, and the shadows on it, into the samples `bare` of an empty picture, which no surface covers."""
     ray, eye = camera.rays(bare), camera.eye.astype(np.float32)
     depth = np.float32(floor.height - camera.eye[2]) / ray[:, 2]
     x, y = (eye[k] + depth * ray[:, k] for k in range(2))
@@ -398,41 +421,61 @@ def _lay(picture: NDArray[np.float32], floor: Floor, camera: Camera, sun: _Sun |
     picture[cells] = (1 - fade * (1 - tone))[:, None]
 
 
-def _shade(mesh: _Mesh, faces: NDArray[np.intp], ray: Array, camera: Camera, sun: _Sun | None) -> Array:
-    """Return the colours at the points where rays (k, 3) from the camera hit given triangles (k,). Shape (k, 3)."""
+def _shade(
+    picture: NDArray[np.float32],
+    mesh: _Mesh,
+    faces: NDArray[np.intp],
+    cells: NDArray[np.intp],
+    camera: Camera,
+    *,
+    sun: _Sun | None = None,
+    alpha: float = 1.0,
+) -> None:
+    """Blend the colours of the triangles that are nearest at given samples into a picture.
+
+    Args:
+        picture: Red, green and blue of all samples. Shape (M, 3).
+        mesh: The triangles.
+        faces: Index of the nearest triangle at each sample. Shape (M,).
+        cells: Numbers of the samples to draw.
+        camera: The camera.
+        sun: The sun; None: the light comes from the camera and there are no shadows.
+        alpha: Opacity of the triangles.
+    """
     a, b, c = (mesh.corners[mesh.faces[:, k]] for k in range(3))
     sides = b - a, c - a, camera.eye - a
     one, two, to, origin = (each.astype(np.float32) for each in (*sides, a))
     # barycentric coordinates of the second and third corners (Moeller, Trumbore 1997)
-    across, beside, normal = np.cross(to, one), np.cross(two, to), np.cross(one, two)
-    whole = _dot(ray, normal[faces])
-    whole = -np.where(np.abs(whole) > 1e-30, whole, 1e-30)
-    u, v = _dot(ray, beside[faces]) / whole, _dot(ray, across[faces]) / whole
-    u, v = np.clip(u, 0, 1)[:, None], np.clip(v, 0, 1)[:, None]
-    place = origin[faces] + u * one[faces] + v * two[faces]
-    first, second, third = (mesh.normals.astype(np.float32)[mesh.faces[faces, k]] for k in range(3))
-    normal = first + u * (second - first) + v * (third - first)
-    normal /= np.maximum(np.sqrt(_dot(normal, normal)), 1e-12)[:, None]
-    back = -ray / np.sqrt(_dot(ray, ray))[:, None]
-    facing = _dot(normal, back)
-    normal *= np.where(facing < 0, -1.0, 1.0)[:, None]
+    across, beside, flat_normals = np.cross(to, one), np.cross(two, to), np.cross(one, two)
+    normals, colors = mesh.normals.astype(np.float32), mesh.colors.astype(np.float32)
     to_light = (camera.axes[2] if sun is None else sun.to_sun).astype(np.float32)
-    reaches = (
-        1.0
-        if sun is None
-        else sun.lit(
-            place + np.float32(PICTURE_STYLE.shadow_bias * sun.step) * np.sign(normal @ to_light)[:, None] * normal
-        )
-    )
-    key = np.maximum(normal @ to_light, 0.0)
-    gloss = np.maximum(2 * key * np.abs(facing) - back @ to_light, 0.0)
-    gloss **= 2
-    gloss **= 2
-    gloss **= 2  # squares take a tenth of the time of other powers
-    light = 0.44 + 0.1 * normal[:, 2] + 0.44 * key * reaches + 0.12 * np.abs(facing)
-    return np.asarray(
-        mesh.colors.astype(np.float32)[faces] * light[:, None] + (0.12 * reaches * gloss * gloss**2)[:, None]
-    )
+    opacity = np.float32(alpha)
+    for block in _blocks(cells):
+        face, ray = faces[block], camera.rays(block)
+        whole = _dot(ray, flat_normals[face])
+        whole = -np.where(np.abs(whole) > 1e-30, whole, 1e-30)
+        u, v = _dot(ray, beside[face]) / whole, _dot(ray, across[face]) / whole
+        u, v = np.clip(u, 0, 1)[:, None], np.clip(v, 0, 1)[:, None]
+        first, second, third = (normals[mesh.faces[face, k]] for k in range(3))
+        normal = first + u * (second - first) + v * (third - first)
+        normal /= np.maximum(np.sqrt(_dot(normal, normal)), 1e-12)[:, None]
+        back = -ray / np.sqrt(_dot(ray, ray))[:, None]
+        facing = _dot(normal, back)
+        normal *= np.where(facing < 0, -1.0, 1.0)[:, None]
+        incidence = normal @ to_light
+        reaches: Any = 1.0
+        if sun is not None:
+            place = origin[face] + u * one[face] + v * two[face]
+            bias = np.float32(PICTURE_STYLE.shadow_bias * sun.step)
+            reaches = sun.lit(place + bias * np.sign(incidence)[:, None] * normal)
+        key = np.maximum(incidence, 0.0)
+        gloss = np.maximum(2 * key * np.abs(facing) - back @ to_light, 0.0)
+        gloss **= 2
+        gloss **= 2
+        gloss **= 2  # squares take a tenth of the time of other powers
+        light = 0.44 + 0.1 * normal[:, 2] + 0.44 * key * reaches + 0.12 * np.abs(facing)
+        lit = colors[face] * light[:, None] + (0.12 * reaches * gloss * gloss**2)[:, None]
+        picture[block] = (1 - opacity) * picture[block] + opacity * lit if alpha < 1 else lit
 
 
 def _dot(first: Any, second: Any) -> Any:

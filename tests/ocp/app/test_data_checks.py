@@ -17,7 +17,7 @@ from ocp import Plan
 from ocp.app import Check, check_trajectory
 from ocp.app.check.data_checks import BASES
 from ocp.app.check.interpolation import Motion, PiecewisePolynomial, polynomial_maxima
-from ocp.app.check.joint_limits import floating_torques, integrate_base
+from ocp.app.check.joint_limits import integrate_base, torque_expression
 from ocp.app.check.kinematic_checks import prove_clearance, with_wide_limits
 from ocp.app.files import read_trajectory
 from ocp.errors import ProblemError
@@ -239,7 +239,7 @@ def test_torques_of_a_floating_arm_are_the_power_that_goes_into_its_motion(plana
     twist = machine.base_twist(base, q, v)
     energy = (ca.bilin(held, v, v) + ca.bilin(inertia, twist, twist)) / 2 + ca.dot(twist, ca.mtimes(joints, v))
     power = ca.jtimes(energy, ca.vertcat(q, v), ca.vertcat(v, a))
-    options = ca.dot(floating_torques(machine, q, v, a), v)
+    options = ca.dot(torque_expression(machine, q, v, a), v)
     function = ca.Function("power", [q, v, a], [power, options])
     rng = np.random.default_rng(3)
     for _ in range(5):

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import Box, ModelWarning, Sphere
-from ocp import Goal, Plan, ProblemError, TipTask, Waypoints
+from models import Box, Foothold, ModelWarning, Sphere, rectangle
+from ocp import FreeTime, Goal, Plan, ProblemError, Steps, StepWeights, TipTask, Waypoints, plan_problem
 from ocp.__main__ import main
 from ocp.app.files.task_file import Task, read_task
+from scripts.robots.steps import planar_biped
 from tests.ocp.app.motions import NAMES, write_robot
 
 START = "start = { shoulder = 0.3, elbow = 0.8, wrist = -0.5, slide = 0.15 }"
@@ -144,7 +145,7 @@ def test_points_in_millimetres_are_suspected(tmp_path: Path) -> None:
 
 
 def test_a_file_without_a_motion_says_which_tables_describe_one(tmp_path: Path) -> None:
-    with pytest.raises(ProblemError, match=r"give one table \[path\], \[goal\] or \[waypoints\]") as caught:
+    with pytest.raises(ProblemError, match=r"give one table \[path\], \[goal\], \[waypoints\] or \[walk\]") as caught:
         read(tmp_path, "[search]\nseed = 1\n")
     assert caught.value.name == "path"
 
@@ -158,3 +159,104 @@ def test_a_goal_is_planned_by_the_command(tmp_path: Path, capsys: Any) -> None:
     np.testing.assert_allclose(ends[0], [0.3, 0.8, -0.5, 0.15], atol=1e-9)
     assert ends[1, NAMES.index("elbow")] == pytest.approx(1.2)
     assert plan.audit().feasible
+
+
+WALK = """[walk]
+shift = 0.5
+swing = { least = 0.3, most = 2.0, guess = 0.6 }
+margin = 0.01
+[walk.feet.left]
+link = "left_foot"
+position = [0, 0, -0.08]
+sole = [-0.08, 0.14, -0.05, 0.05]
+at = [0.0, 0.0, 0.0, 0.0]
+[walk.feet.right]
+link = "right_foot"
+position = [0, 0, -0.08]
+sole = [-0.08, 0.14, -0.05, 0.05]
+at = [0.0, 0.0, 0.0, 0.0]
+[[walk.step]]
+foot = "right"
+at = [0.25, 0.0, 0.0, 0.0]
+[[walk.step]]
+foot = "left"
+at = [0.5, 0.0, 0.1, 0.02]
+[search]
+start = { left_hip = -0.4, left_knee = 0.8, left_ankle = -0.4, right_hip = -0.4, right_knee = 0.8, right_ankle = -0.4 }
+[cost]
+torque = 1e-4
+[limits]
+friction = 0.6
+"""
+
+
+CROUCHED_LEG = {"hip": -0.4, "knee": 0.8, "ankle": -0.4}
+
+
+def read_walk(folder: Path, text: str) -> Task:
+    planar_biped().to_urdf(folder / "biped.urdf")
+    (folder / "walk.toml").write_text(f'[robot]\nurdf = "biped.urdf"\n{text}')
+    return read_task(folder / "walk.toml")
+
+
+def test_a_walk_has_the_feet_the_footholds_and_the_durations_of_its_table(tmp_path: Path) -> None:
+    task = read_walk(tmp_path, WALK)
+    steps = task.tasks
+    assert isinstance(steps, Steps)
+    assert [set(phase.footholds) for phase in steps.phases] == [
+        {"left", "right"}, {"left"}, {"left", "right"}, {"right"}, {"left", "right"}
+    ]  # fmt: skip
+    assert [phase.duration for phase in steps.phases] == [0.5, FreeTime(0.3, 2.0, 0.6)] * 2 + [0.5]
+    assert (steps.margin, steps.clearance, steps.balance) == (0.01, Steps.clearance, "dynamic")
+    last, expected = steps.phases[-1].footholds["left"], Foothold.level(0.5, 0.0, 0.1, 0.02)
+    np.testing.assert_allclose(last.position, expected.position)
+    np.testing.assert_allclose(last.rotation, expected.rotation)
+    for side in ("left", "right"):
+        sole = steps.feet[side].sole
+        assert sole is not None
+        np.testing.assert_allclose(sole.vertices, rectangle((-0.08, 0.14), (-0.05, 0.05)).vertices)
+    start = dict(zip(task.machine.robot.joint_names, task.options["start"], strict=True))
+    assert start == {f"{side}_{name}": q for side in ("left", "right") for name, q in CROUCHED_LEG.items()}
+    assert task.options["cost"] == StepWeights(torque=1e-4)
+    assert task.options["limits"].friction == 0.6
+    problem = plan_problem(task.machine, steps, start=task.options["start"], cost=task.options["cost"])
+    assert len(problem.declared.phases) == 5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "expected"),
+    [
+        ("shift = 0.5", "shift = -0.5", 4, "must be a number above 0, s"),
+        ("shift = 0.5\n", "", 3, "'shift' is missing"),
+        ("most = 2.0", "most = 0.5", 5, "lower <= guess <= upper"),
+        ('link = "right_foot"', 'link = "foot"', 3, "foot"),
+        (
+            "sole = [-0.08, 0.14, -0.05, 0.05]\nat = [0.0, 0.0, 0.0, 0.0]\n[walk.f",
+            "at = [0, 0, 0]\n[walk.f",
+            10,
+            "four",
+        ),
+        ('foot = "right"', 'foot = "third"', 18, 'must be one of "left", "right"'),
+        ("margin = 0.01", 'balance = "some"', 6, "must be one of"),
+        ("[walk]", 'base = "floating"\n[walk]', 3, "remove base"),
+        ("[limits]", "[scene]\nclearance = 0.1\n[limits]", 27, "remove scene"),
+        ("torque = 1e-4", "effort = 1", 26, "unknown entry effort"),
+        ("left_hip = -0.4, ", "", 24, "start has no left_hip"),
+    ],
+)
+def test_a_mistake_in_a_walk_is_reported_with_its_line(
+    tmp_path: Path, old: str, new: str, line: int, expected: str
+) -> None:
+    assert WALK.count(old) >= 1
+    with pytest.raises(ProblemError) as caught:
+        read_walk(tmp_path, WALK.replace(old, new, 1))
+    assert f"line {line}," in str(caught.value)
+    assert expected in str(caught.value)
+
+
+@pytest.mark.long
+def test_the_command_plans_a_walk(tmp_path: Path, capsys: Any) -> None:
+    read_walk(tmp_path, WALK.replace("at = [0.5, 0.0, 0.1, 0.02]", "at = [0.5, 0.0, 0.0, 0.0]"))
+    file = tmp_path / "walk.npz"
+    assert main(["plan", str(tmp_path / "walk.toml"), "-o", str(file), "--quiet"]) == 0
+    assert Plan.load(file).horizon > 1.5 + 2 * 0.3

@@ -11,7 +11,7 @@ from models import Path, Scara, SmoothPath, scara_along, smooth
 from models.machines.scara import ScaraPath
 from ocp import Collocation, ProblemError, minimum_time_problem, solve
 from ocp.motion.builders.timing import FastestMotion, largest_demand, solve_minimum_time, table
-from ocp.motion.schedule import JointLimits, LineLimits, Schedule, joint_motion, peak_acceleration, schedule
+from ocp.motion.schedule import JointLimits, LineLimits, Schedule, ToolLimits, joint_motion, peak_acceleration, schedule
 from tests.models.paths.test_paths import example
 from tests.ocp.motion.schedule.test_schedule import line
 from tests.ocp.motion.schedule.test_schedule_joints import SLOW, BrokenJoints
@@ -241,3 +241,14 @@ def test_a_guess_of_another_path_and_too_few_intervals_are_refused() -> None:
         minimum_time_problem(line(1.0), limits, guess=schedule(line(2.0), limits))
     with pytest.raises(ProblemError, match="intervals"):
         minimum_time_problem(line(1.0), limits, intervals=5)
+
+
+def test_limits_that_a_minimum_time_problem_does_not_have_are_refused() -> None:
+    tool = LineLimits(1.0, 5.0, 200.0, tool=ToolLimits(velocity=1.0))
+    with pytest.raises(ProblemError, match="no constraints on the tool"):
+        minimum_time_problem(line(1.0), tool)
+    path = example("quintic")
+    along = scara_along(Scara(0.4, 0.4), path, "right")
+    torques = LineLimits(1.0, 5.0, 200.0, joints=JointLimits(velocity=1.0, torque=5.0))
+    with pytest.raises(ProblemError, match="torque"):
+        minimum_time_problem(path, torques, along)
