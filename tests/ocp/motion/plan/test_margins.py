@@ -29,6 +29,7 @@ from models.checks import Array
 from models.machines.standing import center_of_pressure
 from models.spatial import quaternion_from_rotation
 from ocp import Cost, Goal, Limits, Plan, ProblemError, Scene, Waypoints, joint_torques, plan
+from ocp.__main__ import main
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.result.margin import Margin
 from ocp.motion.result.segmented_plan import SequencePlan
@@ -298,3 +299,14 @@ def test_bad_uncertainties_are_refused_with_advice() -> None:
     with pytest.raises(ProblemError, match=r"Limits\(torque=...\)"):
         weak.margin({"payload": 1.0})
     assert weak.margin().sentence == "has no limits that payload, friction or misplacements can violate"
+
+
+def test_command_tells_whether_a_plan_covers_sizes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "plan.npz"
+    slow_swing().save(file)
+    assert main(["margin", str(file), "--size", "payload=3"]) == 0
+    assert "keeps all limits for payloads from 0 to 3.5 kg" in capsys.readouterr().out
+    assert main(["margin", str(file), "--size", "payload=4", "--size", "tool-offset=0.001", "--tolerance", "0.01"]) == 1
+    assert "does not cover payloads from 0 to 4 kg and a tool misplaced by up to 1 mm" in capsys.readouterr().out
+    assert main(["margin", str(file), "--size", "base-position=0.001"]) == 2
+    assert "--tolerance" in capsys.readouterr().err
