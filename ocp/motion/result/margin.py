@@ -41,7 +41,7 @@ from ocp.problem.hulls import WORLD
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["UNCERTAINTIES", "Margin", "Range", "checked_uncertainty", "margin_of_plan"]
+__all__ = ["LOADS", "UNCERTAINTIES", "Margin", "Range", "checked_uncertainty", "margin_of_plan", "tightened_torques"]
 
 PAYLOAD, FRICTION, BASE, OBSTACLE, TOOL = "payload", "friction", "base position", "obstacle position", "tool offset"
 PHRASES: dict[str, tuple[str, float, str]] = {
@@ -56,6 +56,8 @@ PHRASES: dict[str, tuple[str, float, str]] = {
            "collision shapes of the link that carries the tip"),
 }  # fmt: skip
 """Text about the size of each uncertainty, factor to the unit of the text, and what to do if no limit depends on it."""
+LOADS = (PAYLOAD, FRICTION)
+"""Names of the uncertainties that change torques; the others are misplacements."""
 UNCERTAINTIES = tuple(PHRASES)
 """Names of the uncertainties, see `ocp.motion.result.plan.Plan.margin`."""
 SAMPLES_PER_STEP = 8
@@ -66,6 +68,8 @@ INSIDE = 1e-9
 of the step."""
 DIGITS = 2
 """Number of significant digits of a margin in a sentence, rounded down."""
+TIGHTENING_SHARE = 0.01
+"""Share by which torque limits of robust plans are tightened more than estimated, so that few motions are planned."""
 PYRAMID_SIDES = 32
 """Number of sides of the pyramid in the cone of friction; at most 1 - cos(pi / 32), 0.5 % of the friction, is lost."""
 
@@ -78,12 +82,14 @@ class Requirements(NamedTuple):
         times: Times of the samples, s. Shape (M,).
         slack: Distance from the limit for a motion as modelled, in the unit of the limit. Shape (M,).
         coefficients: By uncertainty, the largest decrease of the slack for each unit of size, not negative. Shape (M,).
+        most: The limit.
     """
 
     name: str
     times: Array
     slack: Array
     coefficients: Mapping[str, Array]
+    most: float = 0.0
 
     def coefficient(self, uncertainty: str) -> Array:
         """Return the coefficients of an uncertainty, zero if the requirement does not depend on it. Shape (M,)."""
@@ -232,6 +238,24 @@ def checked_uncertainty(value: Any) -> dict[str, float | None]:
     return sizes
 
 
+def tightened_torques(plan: Plan, sizes: Mapping[str, float]) -> dict[str, float]:
+    """Return torque limits that leave room for uncertainties, for the joints that a plan leaves too little, by name.
+
+    The torque at the worst time is reduced in the ratio in which it would exceed its limit, and by TIGHTENING_SHARE
+    more, because payloads add torque roughly in proportion to the torque without them.
+    """
+    largest: dict[str, float] = {}
+    for row in _requirements(plan, None):
+        kind, _, joint = row.name.rpartition(": ")[2].partition(" of ")
+        if kind == "torque":
+            needed = np.sum([row.coefficient(name) * size for name, size in sizes.items()], axis=0)
+            torque = row.most - row.slack
+            short = (needed > row.slack) & (torque > 0)
+            targets = (1 - TIGHTENING_SHARE) * row.most * torque[short] / (torque + needed)[short]
+            largest[joint] = min(largest.get(joint, np.inf), float(targets.min(initial=np.inf)))
+    return {joint: torque for joint, torque in largest.items() if np.isfinite(torque)}
+
+
 def _requirements(plan: Plan, tolerance: float | None) -> list[Requirements]:
     """Return all requirements on a plan that an uncertainty can violate."""
     if isinstance(plan, ConsecutivePlans):
@@ -311,8 +335,9 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
     arguments: Mapping[str, Any] = {} if plan.request is None else plan.request.arguments
     limits = arguments.get("limits") or Limits()
     own = limits.bounds(hold_joints(machine, plan.held) if plan.held else machine)
-    own = own._replace(torque=np.asarray(arguments.get(RESERVE, {}).get("torque", own.torque)))
     bounds = JointBounds(*(all_joints(robot, dict.fromkeys(plan.held, np.inf), values) for values in own))
+    declared = arguments.get(RESERVE, {}).get("torque", bounds.torque)
+    bounds = bounds._replace(torque=np.where([name in plan.held for name in robot.joint_names], np.inf, declared))
     grid = plan.t[(plan.t >= part.begin) & (plan.t <= part.end)]
     grid = np.union1d(grid, [part.begin, part.end])
     count = max(SAMPLES_PER_STEP, -(-CHECKED_TIMES // len(grid)))
@@ -337,7 +362,7 @@ def _dynamic_requirements(plan: SolvedPlan, machine: Machine, part: Part) -> lis
             size = max(float(np.abs(value).max()), abs(most))
             growth = {PAYLOAD: bounded(change)} | ({} if friction is None else {FRICTION: friction})
             growth = {key: np.where(part > ROUNDING_SHARE * size, part, 0.0) for key, part in growth.items()}
-            rows.append(Requirements(name, sample.t, most - bounded(value), growth))
+            rows.append(Requirements(name, sample.t, most - bounded(value), growth, most))
 
     change, rates = loaded - nominal, motion[1]
     for joint, name in enumerate(robot.joint_names):

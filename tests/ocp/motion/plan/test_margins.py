@@ -26,13 +26,14 @@ from models import (
     with_load,
 )
 from models.checks import Array
-from models.machines.standing import center_of_pressure
+from models.machines.standing import center_of_pressure, wrenches_at
 from models.spatial import quaternion_from_rotation
-from ocp import Cost, Goal, Limits, Plan, ProblemError, Scene, Waypoints, joint_torques, plan
+from ocp import Cost, Goal, Limits, Plan, ProblemError, Scene, SolveError, Waypoints, joint_torques, plan, plan_problem
 from ocp.__main__ import main
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.result.margin import Margin
 from ocp.motion.result.segmented_plan import SequencePlan
+from ocp.motion.tasks.targets import tip_poses
 from ocp.problem.values import Sampler
 from tests.ocp.motion.plan.test_plans_to_stand import reached
 
@@ -66,41 +67,66 @@ def reaching(torque: float = 90.0, clearance: float = 0.005) -> Plan:
 # ---- independent evaluation ------------------------------------------------------------------------------------------
 
 
-def violates(result: Plan, sizes: dict[str, Any], tolerance: float = np.inf, samples: int = 400) -> bool:
+@cache
+def loads(result: Plan, payload: float, samples: int) -> tuple[Array, Array]:
+    """Joint torques with a payload, shape (M, n), and of a standing machine distances of its point from the edges."""
+    machine: Any = result.machine
+    request: Any = result.request  # type: ignore[attr-defined]
+    setup = None if request is None else request.arguments.get("setup")
+    robot = machine.robot
+    if payload:
+        machine = replace(machine, robot=with_load(robot, robot.tip_link, payload, robot.tip_translation))
+    sample = result.sampled(np.linspace(1e-9, result.horizon - 1e-9, samples))
+    base, q, v, a = (ca.SX.sym("v", size) for size in (machine.base_size, *[robot.dof] * 3))
+    time = ca.SX.sym("time")
+    bases = result.at(sample.t)["base"] if machine.base_size else np.zeros((samples, 0))
+    inside: Any = ca.SX(0, 1)
+    if isinstance(machine, Standing):
+        wrenches = wrenches_at(getattr(setup, "external", None), time, machine.tip_pose((), q).position)
+        torques = machine.joint_torques(q, v, a, wrenches)
+        inside = machine.support.margin(center_of_pressure(machine.ground_reaction(q, v, a, wrenches)))
+    else:
+        torques = joint_torques(machine, (base, q, v, a))
+    motion = bases, sample.joints, sample.rates, sample.accelerations, sample.t[:, None]
+    first, second = Sampler([base, q, v, a, time], [torques, inside])(*motion)
+    return first, second
+
+
+def violates(
+    result: Plan, sizes: dict[str, Any], tolerance: float = np.inf, *, samples: int = 400, torque: Any = None
+) -> bool:
     """Whether the motion breaks a limit if the machine and the obstacles are changed themselves, by Newton and Euler.
 
     Args:
-        result: A plan of an arm on a fixed base. sizes: Payload, shares of friction (n,), displacements (3,).
+        result: A plan. sizes: Payload, shares of friction (n,), displacements (3,).
+        tolerance: Of the tip, m. torque: Limits, if they are not those of the request.
     """
     machine: Any = result.machine
     request: Any = result.request  # type: ignore[attr-defined]
-    robot, limits = machine.robot, request.arguments.get("limits") or Limits()
+    arguments = {} if request is None else request.arguments
+    robot, limits = machine.robot, arguments.get("limits") or Limits()
     sample = result.sampled(np.linspace(1e-9, result.horizon - 1e-9, samples))
-    loaded = with_load(robot, robot.tip_link, sizes.get("payload", 0.0), robot.tip_translation)
-    q, v, a = (ca.SX.sym("q", robot.dof) for _ in range(3))
-    changed = replace(machine, robot=loaded)
-    torques = Sampler([q, v, a], [joint_torques(changed, ((), q, v, a))])(
-        sample.joints, sample.rates, sample.accelerations
-    )[0]
-    most = limits.bounds(machine).torque
+    torques, inside = loads(result, float(sizes.get("payload", 0.0)), samples)
+    most = limits.bounds(machine).torque if torque is None else np.full(robot.dof, torque)
+    most = np.where([name in result.held for name in robot.joint_names], np.inf, most)
     friction = np.where(np.isfinite(most), most, 0.0) * np.asarray(sizes.get("friction", np.zeros(robot.dof)))
-    if (np.abs(torques + friction) > most).any():
+    if (np.abs(torques + friction) > most).any() or (inside < 0).any():
         return True
-    nothing = np.zeros(3)
-    base, tool = sizes.get("base position", nothing), sizes.get("tool offset", nothing)
-    moved = replace(
-        machine,
-        robot=move_tip(robot, robot.tip_link, robot.tip_translation + tool),
-        translation=machine.translation + base,
-    )
-    tips = [np.array([np.array(ca.DM(each.tip_pose((), q).position)).ravel() for q in sample.joints[::20]])
-            for each in (machine, moved)]  # fmt: skip
-    if np.linalg.norm(tips[1] - tips[0], axis=1).max() > tolerance * (1 + 1e-9):
-        return True
-    apart = request.arguments.get("clearance_constraints") or getattr(
-        request.arguments.get("setup"), "clearance_constraints", None
-    )
-    if apart is None or not {"base position", "obstacle position", "tool offset"} & set(sizes):
+    displaced = {"base position", "obstacle position", "tool offset"} & set(sizes)
+    base, tool = (np.asarray(sizes.get(name, np.zeros(3))) for name in ("base position", "tool offset"))
+    moved = replace(machine, robot=move_tip(robot, robot.tip_link, robot.tip_translation + robot.tip_rotation @ tool))
+    bases = result.at(sample.t)["base"] if machine.base_size else np.zeros((samples, 0))
+    if machine.base_size == 7:
+        bases = bases + np.concatenate([base, np.zeros(4)])
+    elif not machine.base_size:
+        moved = replace(moved, translation=machine.translation + base)
+    if displaced:
+        own = result.at(sample.t)["base"] if machine.base_size else bases
+        tips = tip_poses(machine, own, sample.joints), tip_poses(moved, bases, sample.joints)
+        if np.linalg.norm((tips[1] - tips[0])[:, :3], axis=1).max() > tolerance * (1 + 1e-9):
+            return True
+    apart = getattr(arguments.get("setup"), "clearance_constraints", None)
+    if apart is None or not displaced or machine.base_size or isinstance(machine, Standing):
         return False
     shifts = sizes.get("obstacle position", np.zeros((len(apart.scene.obstacles), 3)))
     links = [
@@ -119,18 +145,18 @@ def violates(result: Plan, sizes: dict[str, Any], tolerance: float = np.inf, sam
 def draws(rng: np.random.Generator, sizes: dict[str, float], dof: int, obstacles: int, *, scale: float = 1.0) -> Any:
     """One random draw inside the sizes; half of all are on their boundary."""
     edge = rng.random() < 0.5
-    drawn: dict[str, Any] = {}
+    errors: dict[str, Any] = {}
     for name, size in sizes.items():
         most = scale * size * (1.0 if edge else rng.random())
         if name == "payload":
-            drawn[name] = most
+            errors[name] = scale * size * rng.integers(1, 21) / 20  # few values, since each is a machine
         elif name == "friction":
-            drawn[name] = most * rng.choice([-1.0, 1.0], dof)
+            errors[name] = most * rng.choice([-1.0, 1.0], dof)
         else:
             count = (obstacles, 3) if name == "obstacle position" else (3,)
             step = rng.normal(size=count)
-            drawn[name] = most * step / np.linalg.norm(step, axis=-1, keepdims=True)
-    return drawn
+            errors[name] = most * step / np.linalg.norm(step, axis=-1, keepdims=True)
+    return errors
 
 
 # ---- closed forms ----------------------------------------------------------------------------------------------------
@@ -199,8 +225,28 @@ def test_random_draws_inside_keep_all_limits(count: int) -> None:
     assert set(margin.alone) == {"payload", "friction", "base position", "obstacle position", "tool offset"}
     for k in range(count):
         sizes = dict(margin.together) if k % 2 else {name: margin[name].size for name in [[*margin.alone][k // 2 % 5]]}
-        drawn = draws(rng, sizes, result.machine.robot.dof, len(OBSTACLES))
-        assert not violates(result, drawn, 0.05, samples=100), drawn
+        errors = draws(rng, sizes, result.machine.robot.dof, len(OBSTACLES))
+        assert not violates(result, errors, 0.05, samples=100), errors
+
+
+GALLERY = [file.stem for file in sorted((Path(__file__).parents[4] / "results" / "gallery").glob("*.npz"))]
+OTHERS: dict[str, Any] = {"reached": reached, "reached briskly": lambda: reached((-0.12, 0.06)), "slow": slow_swing,
+          "fast": lambda: fast_swing(None)}  # fmt: skip
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [*GALLERY, *OTHERS])
+def test_random_draws_inside_the_margins_of_many_plans_keep_all_limits(name: str) -> None:
+    """Six of the gallery and four others, 1000 draws each; obstacles have a test of their own."""
+    file = Path(__file__).parents[4] / "results" / "gallery" / f"{name}.npz"
+    result = OTHERS[name]() if name in OTHERS else Plan.load(file)
+    margin, rng = result.margin(tolerance=0.003), np.random.default_rng(11)
+    for k in range(1000):
+        alone = [*margin.alone][k // 2 % len(margin.alone)]
+        sizes = dict(margin.together) if k % 2 else {alone: margin[alone].size}
+        errors = draws(rng, sizes, result.machine.robot.dof, 0)
+        errors.pop("obstacle position", None)
+        assert not violates(result, errors, 0.003, samples=300), errors
 
 
 @pytest.mark.parametrize("name", ["payload", "friction", pytest.param("base position", marks=pytest.mark.long)])
@@ -210,7 +256,11 @@ def test_margins_cover_most_of_the_true_range(name: str) -> None:
     margin = result.margin(dict.fromkeys(("payload", "friction", "base position")))
     directions = np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(1).normal(size=(6, 3))])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    worst = {"payload": [1.0], "friction": [np.ones(6), -np.ones(6)], "base position": [*directions]}
+    worst: dict[str, list[Any]] = {
+        "payload": [1.0],
+        "friction": [np.ones(6), -np.ones(6)],
+        "base position": [*directions],
+    }
     low, high = 0.0, 4 * margin[name].size
     for _ in range(7):
         middle = (low + high) / 2
@@ -240,6 +290,64 @@ def test_standing_machine_tips_over_beyond_the_payload() -> None:
 
     assert inside(size)
     assert not inside(size / 0.98)
+
+
+# ---- robust plans ----------------------------------------------------------------------------------------------------
+
+
+def fast_swing(robust: Any) -> Plan:
+    limits = Limits(torque=TORQUE, robust=robust)
+    machine = FixedBase(SWING, rotation=UPRIGHT)
+    return plan(machine, Goal(joints=[1.2]), 2.0, start=[0.0], limits=limits, scene=False, cost=Cost(velocity=1.0))
+
+
+def test_robust_plans_cover_payload_and_friction_at_a_higher_cost(tmp_path: Path) -> None:
+    sizes = {"payload": (0, 2.0), "friction": 0.05}
+    plain, robust = fast_swing(None), fast_swing(sizes)
+    assert not plain.margin(sizes).covers_stated
+    assert robust.margin(sizes).covers_stated
+    assert robust.audit().feasible
+    assert plain.cost < robust.cost < 1.1 * plain.cost
+    rng = np.random.default_rng(3)
+    for _ in range(30):
+        errors = draws(rng, {"payload": 2.0, "friction": 0.05}, 1, 0)
+        assert not violates(robust, {name: value * 0.999 for name, value in errors.items()}, torque=TORQUE), errors
+    robust.save(tmp_path / "robust.npz")
+    again = Plan.load(tmp_path / "robust.npz")
+    assert again.audit().feasible
+    assert again.margin(sizes).factor.size == pytest.approx(robust.margin(sizes).factor.size, rel=1e-6)
+    with pytest.raises(SolveError, match=r"leave room|no motion keeps all limits"):
+        fast_swing({"payload": 20.0})
+
+
+def test_robust_plans_keep_away_from_obstacles_that_may_be_misplaced() -> None:
+    """A ball beside the way: the robust plan makes a detour that leaves room for the misplacements of the real ball."""
+    ball = CollisionShape("sphere", (0.05,), translation=(0.3, 0.0, 0.0))
+    chain = planar_chain([0.3, 0.3], [1.0, 1.0])
+    links = tuple(replace(each, collisions=(ball,)) if each.name == "link2" else each for each in chain.links)
+    machine = FixedBase(replace(chain, links=links))
+    post = Sphere(0.05, (0.71, 0.0, 0.0))
+    goal, start, sizes = Goal(joints=[0.9, 0.0]), [-0.9, 0.0], {"base position": 0.01, "obstacle position": 0.005}
+    plain = plan(machine, goal, 2.0, start=start, scene=Scene(post))
+    robust = plan(machine, goal, 2.0, start=start, scene=Scene(post), limits=Limits(robust=sizes))
+    assert not plain.margin(sizes).covers_stated
+    margin = robust.margin(sizes)
+    assert margin.covers_stated
+    assert margin.factor.size < 1.5
+    assert plain.cost < robust.cost < 1.5 * plain.cost
+    sample = robust.sample(0.005)
+    distances = distances_along(CollisionScene(machine, [post]), np.zeros(0), sample.joints, sample.t)
+    assert distances.min() >= 0.015 - 1e-6
+
+
+def test_only_plan_takes_robust_limits() -> None:
+    limits = Limits(robust={"payload": 1.0})
+    with pytest.raises(ProblemError, match="taken by plan alone"):
+        plan_problem(FixedBase(SWING), Goal(joints=[0.2]), 1.0, start=[0.0], limits=limits)
+    with pytest.raises(ProblemError, match=r"Scene\(clearance=...\)"):
+        plan(FixedBase(SWING), Waypoints(np.zeros((2, 3)), np.eye(4)[:2]), limits=limits)
+    with pytest.raises(ProblemError, match="did you mean 'payload'"):
+        plan(FixedBase(SWING), Goal(joints=[0.2]), 1.0, start=[0.0], limits=Limits(robust={"payloads": 1.0}))
 
 
 # ---- kinds of plans, files and bad input -----------------------------------------------------------------------------
