@@ -28,7 +28,7 @@ endif
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help reproduce gallery benchmark site test long sweep crowded mbm redundancy global brute passages singular frauds fuzz fresh moving faults browser installed check format dev build clean anew
+.PHONY: help reproduce gallery benchmark site test long sweep crowded mbm redundancy suite global brute passages singular frauds fuzz fresh moving faults browser installed check format dev build clean anew
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s  %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -70,6 +70,10 @@ redundancy: $(VENV)/test.stamp ## plan and check six problems of a published ben
 
 mbm: $(VENV)/test.stamp ## plan 700 problems of MotionBenchMaker, 70 also in least time (DATA=FOLDER of robot and problems; ARGS="--only cage")
 	$(BIN)/python -W ignore -m tests.sweep.motion_bench_maker --data "$(DATA)" --out "$(OUT)/sweeps/motion_bench_maker.jsonl" $(ARGS)
+
+suite: $(VENV)/peers.stamp $(VENV)/test.stamp ## solve, audit and confirm the problems of three public suites (ARGS="--only chain --again")
+	$(BIN)/python -W ignore -m tests.conformance.suite --out "$(OUT)/suite" $(ARGS)
+	$(BIN)/python scripts/suite.py --out "$(OUT)"
 
 passages: $(VENV)/test.stamp ## plan 40 feasible paths of floating arms past singularities (ARGS="--only beyond": infeasible ones)
 	$(BIN)/python -W ignore -m tests.sweep.passages --out "$(OUT)/sweeps/passages.jsonl" $(ARGS)

@@ -12,7 +12,9 @@ if _Path(_file := getattr(_find_spec("models"), "origin", None) or "").parent !=
         path=_file,
     )
 
+from ocp.adaptive import AdaptiveCollocation
 from ocp.audit.audit import Audit, Finding
+from ocp.direct.controller import Controller, ControlStep
 from ocp.direct.discretisation import Collocation, MultipleShooting
 from ocp.errors import (
     AuditError,
@@ -48,6 +50,7 @@ from ocp.motion.tasks.limits import Anywhere, Following, IndexAtLeast, InFoot, L
 from ocp.motion.tasks.tip_task import TipTask
 from ocp.problem.phases import Phases
 from ocp.problem.problem import Problem
+from ocp.problem.tables import Table, table
 from ocp.refinement import RefinementSettings, refine
 from ocp.solution import Sensitivity, Solution
 from ocp.solution_data import register as _register
@@ -56,6 +59,7 @@ from ocp.tightening import tighten
 __version__ = "0.1.0"
 
 _register("audit", "ocp.audit.audit")
+_register("default_method", "ocp.adaptive")
 _register("sensitivity", "ocp.direct.sensitivity")
 _register("margin_of_plan", "ocp.motion.result.margin")
 _register("load_plan", "ocp.motion.plan.dispatch")
@@ -64,6 +68,7 @@ for _drawing in ("plot_solution", "html_of_solution", "plot_plan", "html_of_plan
 
 __all__ = [
     "AccelerationOptions",
+    "AdaptiveCollocation",
     "Anywhere",
     "Audit",
     "AuditError",
@@ -74,6 +79,8 @@ __all__ = [
     "ClearanceConstraints",
     "Collocation",
     "Cone",
+    "ControlStep",
+    "Controller",
     "Cost",
     "DeadEnd",
     "DynamicsSetup",
@@ -117,6 +124,7 @@ __all__ = [
     "Steps",
     "StepsMotion",
     "StorageWarning",
+    "Table",
     "TipTask",
     "ToolFreedom",
     "Unreachable",
@@ -148,6 +156,7 @@ __all__ = [
     "standing_problem",
     "steps_motion",
     "steps_problem",
+    "table",
     "tighten",
     "walk",
 ]

@@ -12,7 +12,9 @@ import numpy as np
 
 from ocp.audit.audit import Audit, Finding
 from ocp.audit.audit import audit as judge
+from ocp.audit.correction import SETTINGS as CORRECTION
 from ocp.console import TimeLimitReached, time_left, time_limited
+from ocp.direct.discretisation import Collocation
 from ocp.direct.prepared import DirectMethod
 from ocp.direct.transcription import check_meshed
 from ocp.errors import ProblemError, RefinementWarning, SolveError, SolverStatus, checked_time_limit, require
@@ -20,12 +22,15 @@ from ocp.methods import solve
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
 from ocp.solution import ByName, Guess, Refinement, Solution, stack
-from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
+from ocp.switching import WARM_START_OPTIONS, locate_switches, nodes_at_switches
+from ocp.tightening import tighten
+from ocp.tolerances import LIMIT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 __all__ = ["RefinementSettings", "refine", "refine_from", "split"]
 
 
 LIMITS = [name for name, entry in signature(judge).parameters.items() if entry.kind is Parameter.KEYWORD_ONLY]
+INTEGRATION = "integration error, relative"
 KINDS = ("integration", "equalities", "limits", "cost", "other")
 
 
@@ -38,12 +43,15 @@ class RefinementSettings:
             :func:`ocp.audit.audit.audit`: ``{"constraints": 1e-6}``. By default the audit's own.
         max_intervals: Maximum number of intervals.
         solver: As for :func:`ocp.methods.prepare`.
+        tighten: Whether limits that no mesh satisfies between its points are tightened in the end (see
+            :func:`ocp.tightening.tighten`), if the cost increases by less than the plan may lose.
         target: Value of a row, relative to its limit, at which splitting aims: half, as the order of an error is
             uncertain.
         max_parts: Maximum number of parts into which an interval is split at once.
         least_width: Smallest width of an interval, relative to the horizon: less is rounding.
         rounds: Maximum number of rounds. patience: Rounds without progress of any row before it stops.
         nearer: Largest ratio of a row to its best earlier value that counts as progress.
+        same_switch: Distance of a switch from a node, relative to the horizon, below which the node is at the switch.
 
     Raises:
         ProblemError: An unknown limit of the audit, or max_intervals is no positive integer.
@@ -52,12 +60,14 @@ class RefinementSettings:
     limits: Mapping[str, Any] = field(default_factory=dict)
     max_intervals: int = 400
     solver: str = "ipopt"
+    tighten: bool = True
     target: float = 0.5
     max_parts: int = 4
     least_width: float = ROUNDING_SHARE
     rounds: int = 12
     patience: int = 2
     nearer: float = 0.8
+    same_switch: float = 1e-6
 
     def __post_init__(self) -> None:
         for name in require.mapping("RefinementSettings: limits", self.limits):
@@ -84,6 +94,10 @@ def refine(
     width that the method determines, from which follows the number of parts of an interval. An error that cannot be
     attributed to intervals (end conditions) is reduced by splitting those with the largest other errors. Nodes are
     kept. Every round starts from the previous plan.
+
+    Collocation with controls at the points gets a node at each switch: where a control jumps from limit to limit,
+    enters or leaves a singular arc, or where a state reaches or leaves its limit. If in the end nothing but limits is
+    exceeded between the points, they are tightened; see `RefinementSettings.tighten`.
 
     Args:
         problem, parameters, options, guess: As for :func:`ocp.methods.solve`.
@@ -134,7 +148,7 @@ def refine_from(
     :func:`ocp.methods.solve`.
     """
     arguments = {"options": options, "check": check}
-    return _refine_mesh(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings())
+    return _refine_mesh(problem, method, plan, SOLVER_SHARE, arguments, RefinementSettings(tighten=False))
 
 
 def _refine_mesh(
@@ -153,6 +167,7 @@ def _refine_mesh(
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
     best: dict[str, float] = {}
     idle, late = 0, False
+    moving, placed = isinstance(method, Collocation) and method.control == "points", np.zeros(0)
     while True:
         rows = _rows(form, p, solution, audit, tolerance, method)
         beyond = [row for row in rows if not row.value <= 1.0]
@@ -162,11 +177,16 @@ def _refine_mesh(
         nearer = [row for row in beyond if row.value < settings.nearer * best.get(row.name, np.inf)]
         best |= {row.name: min(row.value, best.get(row.name, np.inf)) for row in rows}
         idle = 0 if nearer else idle + 1
-        finer = split(
-            method.fractions, *_parts_per_interval(beyond, rows, method.fractions, settings), settings.max_intervals
-        )
-        spent = idle == settings.patience or len(intervals) == settings.rounds
-        if not beyond or spent or len(finer) == method.intervals + 1:
+        at_switches = _mesh_at_switches(problem, method, solution, (beyond, rows), placed, settings) if moving else None
+        if at_switches is not None and idle > settings.patience:  # nodes that keep moving stay where they are
+            at_switches, moving, idle = None, False, 0
+        if at_switches is None:
+            parts = _parts_per_interval(beyond, rows, method.fractions, settings)
+            finer = split(method.fractions, *parts, settings.max_intervals)
+        else:
+            finer, placed = at_switches
+        spent = (at_switches is None and idle >= settings.patience) or len(intervals) == settings.rounds
+        if not beyond or spent or np.array_equal(finer, method.fractions):
             break
         method = method.with_mesh(finer)
         result = _next(problem, method, {**arguments, "guess": solution}, settings)
@@ -174,6 +194,13 @@ def _refine_mesh(
             late = True
             break
         solution, audit = result
+    if beyond and not late and (tightened := _tightened(problem, method, (solution, audit), arguments, settings)):
+        solution, audit = tightened
+        rows = _rows(form, p, solution, audit, tolerance, method)
+        beyond = [row for row in rows if not row.value <= 1.0]
+        intervals.append(method.intervals)
+        for kind, values in errors.items():
+            values.append(max((row.value for row in rows if row.kind == kind), default=0.0))
     stopped = f"refinement of {problem.name!r} stopped at {intervals[-1]} of at most {settings.max_intervals} intervals"
     idles = idle == settings.patience and not late
     if (warning := _shortfall(stopped, late, idles, beyond, audit, form)) is not None:
@@ -181,6 +208,42 @@ def _refine_mesh(
     history = {kind: tuple(values) for kind, values in errors.items()}
     refinement = Refinement(tuple(intervals), history, tolerance, audit.passed and not beyond)
     return replace(solution, refinement=refinement), audit
+
+
+def _tightened(
+    problem: Problem,
+    method: DirectMethod,
+    plan: tuple[Solution, Audit],
+    arguments: dict[str, Any],
+    settings: RefinementSettings,
+) -> tuple[Solution, Audit] | None:
+    """Return the plan under tightened limits and its audit; None unless it is feasible and loses hardly any cost.
+
+    It is tried where nothing but limits fails, such as bounds of a control near a singular arc.
+    """
+    solution, audit = plan
+    failures = [finding for finding in audit.failures if finding.verdict == "feasible"]
+    limited = {f"bounds of {name}" for name in (*solution.states, *solution.controls)}
+    limited |= set(Formulation.of(problem).path.names)
+    if not (settings.tighten and failures and {finding.name for finding in failures} <= limited):
+        return None
+    excess = min(finding.limit for finding in failures if finding.limit is not None) / 2
+    largest = solution.cost + LIMIT_SHARE * abs(solution.cost)
+    options = {**WARM_START_OPTIONS, **(arguments["options"] or {})}
+    try:
+        result = tighten(
+            problem,
+            method,
+            tolerance=excess,
+            parameters=solution.parameters,
+            options=options,
+            guess=solution,
+            max_cost=largest,
+        )
+        checked = judge(problem, result, **settings.limits)
+    except (SolveError, TimeLimitReached):
+        return None
+    return (result, checked) if checked.feasible and result.cost <= largest else None
 
 
 def _shortfall(
@@ -247,7 +310,7 @@ class _Row(NamedTuple):
     """An error that the audit reports: its value and each interval's contribution, relative to the error's limit.
 
     ``errors`` (N,) are the contributions, None if it cannot be attributed to intervals; ``order`` is the power of the
-    interval width with which it falls.
+    interval width with which it falls. ``grows`` tells that unstable dynamics amplify the errors of the intervals.
     """
 
     name: str
@@ -255,6 +318,7 @@ class _Row(NamedTuple):
     value: float
     errors: np.ndarray | None = None
     order: int = 1
+    grows: bool = False
 
 
 class _Parts(NamedTuple):
@@ -287,8 +351,11 @@ def _rows(
     order = method.control_order
     parts = {
         name: _Parts("integration", audit.local_errors, method.order)
-        for name in (requested.name, "integration error, relative", "integration error of one interval")
+        for name in (requested.name, INTEGRATION, "integration error of one interval")
     }
+    grows = audit.integration_error > CORRECTION.growth * float(audit.local_errors.sum())
+    if grows:
+        parts[INTEGRATION] = _Parts("integration", audit.local_errors, method.order, summed=True)
     parts["cost lost, relative"] = _Parts("cost", audit.lost, 2 * order, summed=True)
     costates = audit.optimality.adjoint
     parts["costate equation, relative"] = _Parts("other", costates.error, order, summed=True)
@@ -300,12 +367,15 @@ def _rows(
         if finding.limit is None or finding.name in form.separations:  # refinement does not separate bodies
             continue
         value = 0.0 if finding.value == 0 else finding.value / finding.limit if finding.limit > 0 else np.inf
+        if finding.name == INTEGRATION and finding.limit > 0 and grows:
+            # no mesh reduces the growth: the audit requires that the sum of the defects is below a share of the limit
+            value = CORRECTION.growth * float(audit.local_errors.sum()) / finding.limit
         value = np.inf if np.isnan(value) else float(value)
         part = parts.get(finding.name)
         if part is None or not part.values.any():
             rows.append(_Row(finding.name, "other", value))
         else:
-            rows.append(_Row(finding.name, part.kind, value, part.shares(value), part.order))
+            rows.append(_Row(finding.name, part.kind, value, part.shares(value), part.order, grows))
     return rows
 
 
@@ -331,6 +401,37 @@ def _violations(
     return violations
 
 
+def _mesh_at_switches(
+    problem: Problem,
+    method: DirectMethod,
+    solution: Solution,
+    errors: tuple[list[_Row], list[_Row]],
+    placed: np.ndarray,
+    settings: RefinementSettings,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the next mesh with nodes at the switches of a plan, and these nodes; None if every switch has its node.
+
+    Splitting does not reduce the errors of an interval with a switch, which vanish with a node there.
+
+    Args:
+        errors: The rows beyond their limits, and all rows.
+        placed: Nodes that were put at switches before, and move with them.
+    """
+    mesh, (beyond, rows) = method.fractions, errors
+    at, smeared = locate_switches(problem, solution)
+    if not beyond or not (np.abs(at[:, None] - mesh).min(axis=1, initial=np.inf) > settings.same_switch).any():
+        return None
+    finer = mesh
+    if any(row.errors is not None and (row.errors[~smeared] > 1.0).any() for row in beyond):
+        parts, error = _parts_per_interval(beyond, rows, mesh, settings)
+        parts[smeared] = 1
+        finer = split(mesh, parts, error, settings.max_intervals)
+    own = np.clip(np.searchsorted(mesh, placed), 1, method.intervals - 1)
+    replaced = ((mesh[own - 1, None] <= at) & (at <= mesh[own + 1, None])).any(axis=1)
+    finer = nodes_at_switches(finer[~np.isin(finer, placed[replaced])], at)
+    return finer, np.union1d(at, placed[~replaced])
+
+
 def _parts_per_interval(
     beyond: list[_Row], rows: list[_Row], mesh: np.ndarray, settings: RefinementSettings
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -340,6 +441,8 @@ def _parts_per_interval(
     """
     n = len(mesh) - 1
     parts, error = np.ones(n, int), np.zeros(n)
+    if growing := [row for row in beyond if row.name == INTEGRATION and row.grows]:
+        beyond = [row for row in beyond if row.kind == "integration"] or growing  # other rows judge diverged states
     for row in beyond:
         if row.errors is not None:
             with np.errstate(over="ignore"):

@@ -98,9 +98,9 @@ class Solution:
             tightened. None for a plan under the problem's own bounds. Shape (2, N, nx + nu + path rows).
         tightening_cost: Cost increase over the plan of the same mesh without tightening: an estimate of the excess over
             the optimum, not a bound.
-        start: Starting point of the successful solve: ``guess``, ``zeros``, ``roll-out`` (simulation of the dynamics
-            with the controls of the guess), ``elastic plan`` (of least constraint violation) or ``downhill`` (next to a
-            stationary plan that is not a minimum).
+        start: Starting point of the successful solve: ``guess``, ``displaced guess`` (by seeded random amounts),
+            ``zeros``, ``roll-out`` (simulation of the dynamics with the controls of the guess), ``elastic plan`` (of
+            least constraint violation) or ``downhill`` (next to a stationary plan that is not a minimum).
         regularised: Whether the solver found the cost not convex at the end: the plan may not be a minimum.
     """
 

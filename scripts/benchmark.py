@@ -28,6 +28,7 @@ PARTS = (
     "waypoints",
     "batch",
     "schedules",
+    "controllers",
     "cts",
     "blend",
     "robots",

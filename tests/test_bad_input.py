@@ -42,6 +42,8 @@ CREATED_BY_THE_PACKAGE = {
     "Batch",
     "Candidate",
     "Certificate",
+    "ControlStep",
+    "Controller",
     "Cut",
     "Dip",
     "Finding",

@@ -147,3 +147,10 @@ def test_source_distribution_contains_every_folder_and_page() -> None:
     pages = {file.name for file in ROOT.glob("*.md")} | {"CITATION.cff", "Makefile"}
     assert pages - automatic <= {part.lstrip("/") for part in parts}
     assert {f"/{name}" for name in ("docs", "models", "ocp", "results", "scripts", "tests")} <= set(parts)
+
+
+def test_importing_the_packages_loads_no_part_of_scipy_and_no_matplotlib() -> None:
+    heavy = ("scipy.interpolate", "scipy.optimize", "scipy.special", "scipy.stats", "matplotlib")
+    code = f"import sys, models, ocp, ocp.__main__; print([name for name in {heavy!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -24,8 +24,6 @@ from ocp.audit.sizes import share_sizes
 from ocp.problem.formulation import Formulation
 from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, MACHINE_SHARE, RESOLVED_SHARE, SOLVER_SHARE
 
-__all__ = ["AccessoryProblem", "end_conditions"]
-
 
 class AccessoryProblem:
     """Linear-quadratic problem of the second variation of the cost: dynamics, Hamiltonian and active constraints.
@@ -82,8 +80,11 @@ class AccessoryProblem:
         share_sizes(state, self.along.form.states, self.along.form.problem.declared.states, LIMIT_SHARE)
         self.unit = np.concatenate([state, horizon, *([state] if self.with_start else []), self.range])
 
-    def _into_z(self) -> tuple[list[int], list[int]]:
-        """Return the indices of states, controls and free horizon in the stacked vectors (x, T, u) and (z, u)."""
+    def _variation_indices(self) -> tuple[list[int], list[int]]:
+        """Return the indices of states, free horizon T and controls in the stacked vectors (x, T, u) and (z, u).
+
+        z consists of the states, T if free, and the start state if the problem ties both ends.
+        """
         nx = self.nx
         keep = [*range(nx), *([nx] if self.free else [])]
         inputs = range(nx + 1, nx + 1 + self.nu)
@@ -109,7 +110,7 @@ class AccessoryProblem:
         self.curved = hessian[:, self.nx + 1 :, self.nx + 1 :]
         self._curves = np.einsum("kii->ki", hessian)
         self._units()
-        used, z_of = self._into_z()
+        used, z_of = self._variation_indices()
         size, z_unit = self.nz + self.nu, self.unit[: self.nz]
         self.rate, self.hessian = np.zeros((m, self.nz, size)), np.zeros((m, size, size))
         self.rate[np.ix_(range(m), range(self.nx), z_of)] = along.rate_y[:, :, used]
@@ -163,7 +164,7 @@ class AccessoryProblem:
     def _constraints(self) -> None:
         """Find the strongly active limits, which have multipliers, and the weakly active limits, which have none."""
         along, m = self.along, len(self.along.s)
-        used, z_of = self._into_z()
+        used, z_of = self._variation_indices()
         size = self.nz + self.nu
         nu, nh = self.nu, self.nu + along.mixed.size
         normals = np.zeros((m, nh + len(along.state_limits.equal), size))

@@ -29,17 +29,6 @@ from ocp.problem.hulls import BodyPairs, Frames, Separation, frames_of
 from ocp.problem.problem import Problem
 from ocp.solution import Solution, check_variables_match, match_order
 
-__all__ = [
-    "Clearance",
-    "ClosestPair",
-    "Track",
-    "clearance",
-    "clearance_along",
-    "clearance_of_pairs",
-    "closest_pairs_along",
-    "separation_frames",
-]
-
 MAX_PRINTED = 4
 """Largest number of pairs that a text lists as left out of the proof by assumption; `Clearance.assumed` has all."""
 
@@ -326,7 +315,7 @@ class _Search:
         return f"the prescribed motion between {names} {cause} at {begin[k]:.6g} s"
 
     def at(self, time: float) -> list[ClosestPair]:
-        """Return the distance and the closest points of every pair of bodies at one time, s."""
+        """Return the distance and the closest points of every pair of bodies at one time of a plan, s."""
         self.best[:] = np.inf
         self._evaluate(np.full(len(self.apart), np.clip(time / self.track.horizon, 0.0, 1.0)))
         return self._closest(self.best)
@@ -363,7 +352,7 @@ class _Search:
         """Compute the distance of each pair at a separate time, given as a fraction of the horizon in ``when`` (n,)."""
         pair = np.arange(len(self.apart))
         _, gap, points = self.bodies.nearest(self.track.frames(when), pair, pair)
-        self._keep(pair, gap, when, points)
+        self._store_smallest(pair, gap, when, points)
 
     def _sufficient_bounds(self) -> np.ndarray:
         """Return for each pair the lower distance bound that suffices to stop halving its intervals. Shape (n,), m.
@@ -378,7 +367,7 @@ class _Search:
         return np.where(margin >= 0, self.apart.least + max(smallest - max(share * smallest, finest), 0.0), reduced)
 
     def _bounds(self, pair: np.ndarray, block: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower distance bounds on time intervals, and the sufficient bounds of all pairs. Shapes (K,), (n,), m.
+        """Return lower bounds of distances in time intervals (K,), and the sufficient bounds of all pairs (n,), m.
 
         Pairs that the bounding balls leave undecided are evaluated at the middle of the interval. The smallest
         distances are stored.
@@ -388,7 +377,7 @@ class _Search:
         times, index = np.unique(np.concatenate([begin, (begin + end) / 2, end]), return_inverse=True)
         first, middle, last = np.split(index, 3)
         frames = self.track.frames(times)
-        sway, bow = self._moves(pair, block, level, width)
+        sway, bow = self._largest_falls(pair, block, level, width)
         if self.track.prescribed is not None:
             more = self.track.prescribed.bounds(pair, begin * self.track.horizon, end * self.track.horizon)
             sway, bow = sway + more[0], bow + more[1]
@@ -398,7 +387,7 @@ class _Search:
         if not close.size:
             return bound, self._sufficient_bounds()
         facing, gap, points = self.bodies.nearest(frames, middle[close], pair[close])
-        self._keep(pair[close], gap, times[middle[close]], points)
+        self._store_smallest(pair[close], gap, times[middle[close]], points)
         bound[close] = np.maximum(bound[close], gap - sway[close])
         candidate = (bound[close] < sufficient[close]) & np.isfinite(bow[close])
         close, facing = close[candidate], facing.of(candidate)
@@ -416,12 +405,12 @@ class _Search:
         left, right = self.breaks[segment], self.breaks[np.minimum(segment + 1, self.pieces)]
         return np.asarray(left + share * (right - left))
 
-    def _moves(
+    def _largest_falls(
         self, pair: np.ndarray, block: np.ndarray, level: int, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far the distances of pairs can fall within time intervals of length ``width`` (s).
+        """Return how far the distances of pairs can fall below their values in the middle of time intervals, m.
 
-        This is below the value at the middle, and below the chord between the ends. Shape (K,) each, m.
+        Also return how far they can fall below the chord between their values at both ends. Shape (K,) each.
         """
         apart = self.apart
         rates, seconds = self.fastest[max(level, 0)]
@@ -433,7 +422,7 @@ class _Search:
             bends = np.where(levers > 0, seconds[segment] * levers, 0.0).sum(axis=1)
         return moves * width / 2, (bends + 2 * turns * moves) * width**2 / 8
 
-    def _keep(self, pair: np.ndarray, distance: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
+    def _store_smallest(self, pair: np.ndarray, distance: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
         """Store the smallest distance found so far for each pair, with its time and closest points."""
         order = np.lexsort((distance, pair))
         first = order[np.unique(pair[order], return_index=True)[1]]

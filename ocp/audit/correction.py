@@ -20,8 +20,6 @@ from ocp.audit.sizes import FineGrid, plan_at
 from ocp.console import check_time
 from ocp.curves import lagrange
 
-__all__ = ["SETTINGS", "IntegratedMotion", "corrected_motion"]
-
 
 @dataclass(frozen=True)
 class IntegrationSettings:
@@ -143,7 +141,7 @@ class _Newton:
         self.own = None if self.first is None else self._own_error(self.first, self.x)
 
     def _integral(self, x: np.ndarray) -> np.ndarray | None:
-        """Integrate dynamics and running cost along given states ``x`` from the start of each interval to every sample.
+        """Integrate state rates and running cost at given states ``x`` from the start of each interval to all samples.
 
         Shape (N, 2 cells + 1, nx + 1). None if the quadrature error exceeds the tolerance.
         """

@@ -22,8 +22,6 @@ from ocp.curves import lagrange
 from ocp.solution import stack
 from ocp.tolerances import COSTATE_SHARE, ROUNDING_SHARE
 
-__all__ = ["Adjoint", "EndLimits", "Ends", "adjoint", "end_limits", "interval_end_costates"]
-
 
 class Ends(NamedTuple):
     """Residuals and multipliers of the optimality conditions at start and end of a plan.
@@ -105,7 +103,7 @@ def adjoint(along: Linearisation, curved: np.ndarray | None, cost: float, shifts
         before = control_multipliers != 0
         back = BackwardIntegration(along, control_multipliers, across)
         for k in limited.tolist():
-            inside[k], atoms[k] = _forces(back, k, first[k], last[k], cost)
+            inside[k], atoms[k] = _state_limit_multipliers(back, k, first[k], last[k], cost)
         costate, start = back.integrate(last, inside, atoms)
         control_multipliers, across = find_control_multipliers(along, costate, curved)
         if not (limited.size or along.mixed.size) or (before == (control_multipliers != 0)).all():
@@ -236,10 +234,10 @@ class BackwardIntegration:
         return np.where(np.isfinite(total), total, np.inf)
 
 
-def _forces(
+def _state_limit_multipliers(
     back: BackwardIntegration, k: int, first: np.ndarray, last: np.ndarray, cost: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers of the state limits in interval ``k`` that best explain its reported costates.
+    """Return the multipliers of the state limits in mesh interval ``k`` that best explain the reported costates.
 
     Those at the Gauss points (q, m) are multiplied by quadrature weights; those at both ends (2, m) are impulses.
     """

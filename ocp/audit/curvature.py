@@ -15,11 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ocp.audit.accessory import AccessoryProblem, end_conditions
-from ocp.audit.principle import groups
+from ocp.audit.principle import describe_singular_arcs, groups, is_convex
 from ocp.problem.formulation import Formulation
 from ocp.tolerances import FLAT_SHARE, IMPLIED_SHARE, ROUNDING_SHARE, SOLVER_SHARE
-
-__all__ = ["Curvature", "curvature"]
 
 
 class RankTolerances(NamedTuple):
@@ -55,6 +53,7 @@ class Curvature:
         gain: Cost that the controls could save in each interval by the best variation, if active constraints stay
             active and the states respond. Shape (N,).
         start_slope: Remaining gradient of the cost with respect to start and horizon. Shape (nz,).
+        convex: Whether the problem is convex, so that an extremal is a global optimum whatever the sweep finds.
     """
 
     least: float
@@ -65,13 +64,14 @@ class Curvature:
     starts: tuple[np.ndarray, np.ndarray] | None = None
     gain: np.ndarray | None = None
     start_slope: np.ndarray | None = None
+    convex: bool = False
 
     @property
     def upwards(self) -> bool | None:
         """Whether the second variation is positive along all feasible variations; None if inconclusive."""
         if self.flat:
             return None
-        return bool(self.least > FLAT_SHARE)
+        return self.convex or bool(self.least > FLAT_SHARE)
 
     def lost(self, slope: np.ndarray) -> float:
         """Return the cost, to second order, that a change of start and horizon can save.
@@ -113,11 +113,16 @@ def curvature(accessory: AccessoryProblem) -> Curvature:
             if wider.least > FLAT_SHARE and not wider.flat:
                 result = wider
                 break
-    return Curvature(*result[:4], along.t, *result[4:7])
+    if result.flat and along.form.cached("convex", lambda: is_convex(along)):
+        return Curvature(result.least, result.time, "", None, along.t, *result[4:7], convex=True)
+    flat = result.flat
+    if flat:
+        flat += describe_singular_arcs(along, accessory.adjoint.costate, accessory.linear_controls, accessory.moved)
+    return Curvature(result.least, result.time, flat, result.direction, along.t, *result[4:7])
 
 
 class _Swept(NamedTuple):
-    """Result of one backward sweep, with the fields of `Curvature` except for ``t``.
+    """Result of one backward sweep of the second variation, with the fields of `Curvature` except for the times.
 
     ``dependent``: Whether it is inconclusive because constraints are nearly dependent.
     """

@@ -20,8 +20,6 @@ from ocp.problem.values import Sampler
 from ocp.solution import Solution, stack
 from ocp.tolerances import NEAR_LIMIT_SHARE, RESOLVED_SHARE, SOLVER_SHARE, TIGHTENED_SHARE
 
-__all__ = ["Limits", "Linearisation", "quadrature"]
-
 MIN_POINTS, MAX_POINTS, ENOUGH_POINTS = 3, 5, 150
 """Smallest and largest number of Gauss points in an interval, and a sufficient number in the whole plan."""
 MAX_DERIVATIVES = 3

@@ -9,20 +9,25 @@ limits, integrated over the plan.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from ocp.audit.linearisation import Linearisation
 from ocp.problem.formulation import Formulation
 from ocp.solution import Solution, stack
-from ocp.tolerances import FLAT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE
+from ocp.tolerances import FLAT_SHARE, LIMIT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE
 
 __all__ = [
     "Hamiltonian",
+    "clebsch",
     "control_loss",
+    "describe_singular_arcs",
     "find_control_multipliers",
     "groups",
     "hamiltonian",
+    "is_convex",
     "nnls",
     "pseudo_inverse_of",
     "reduced_slope",
@@ -60,6 +65,82 @@ def hamiltonian(form: Formulation, solution: Solution, p: np.ndarray) -> Hamilto
     running, products = form.sampled(lambda: [form.running, lam * form.f], *point, cache_as="Hamiltonian")
     scale = float(np.max(np.abs(running[:, 0]) + np.abs(products).sum(axis=1), initial=0.0))
     return Hamiltonian(solution.t, running[:, 0] + products.sum(axis=1), scale or 1.0)
+
+
+def is_convex(along: Linearisation) -> bool:
+    """Return whether the problem is convex, so that every extremal is a global optimum (Mangasarian 1966).
+
+    That is the case for a fixed horizon, dynamics and equalities that are affine in states and controls, convex
+    quadratic costs, and inequalities that bound convex quadratic expressions from above or concave ones from below; all
+    with coefficients that may depend on time.
+    """
+    form, (low, high) = along.form, along.bounds
+    if form.horizon_is_free:
+        return False
+    inside, ends = ca.vertcat(form.x, form.u), ca.vertcat(form.x, form.x0)
+
+    def of(kind: str) -> np.ndarray:
+        index = form.bounds.places[kind]
+        return np.where(low[index] == high[index], 0, np.isfinite(low[index]) * 1 + np.isfinite(high[index]) * 2)
+
+    parts = [(form.running, inside, 2), (form.terminal, ends, 2), *((rate, inside, 0) for rate in ca.vertsplit(form.f))]
+    for kind, variables in (("path", inside), ("start", ends), ("end", ends)):
+        rows = getattr(form, kind).expression
+        parts += [(rows[i], variables, side) for i, side in enumerate(of(kind).tolist())]
+    for expression, variables, side in parts:
+        hessian = ca.hessian(expression, variables)[0]
+        if hessian.nnz() == 0 or form.problem.symbols(hessian).is_zero():
+            continue
+        if side not in (1, 2) or ca.depends_on(hessian, ca.vertcat(inside, form.x0, form.u0)):
+            return False
+        n = variables.numel()
+        values = form.sampled([hessian], *along.point[:-1])[0].reshape(-1, n, n) * (1.0 if side == 2 else -1.0)
+        least = np.linalg.eigvalsh(values)[:, 0]
+        if not (least >= -ROUNDING_SHARE * np.abs(values).max(axis=(1, 2))).all():
+            return False
+    return True
+
+
+def clebsch(along: Linearisation, costate: np.ndarray, control: int) -> np.ndarray:
+    """Return the generalised Legendre-Clebsch term of a control that enters linearly, along a plan. Shape (M,).
+
+    It is -d/du of the second time derivative of H_u along the extremal, of one control. A minimum on a singular arc
+    requires that it is not negative (Kelley, Kopp, Moyer 1967).
+    """
+    form = along.form
+    lam = form.sym("lam", form.nx)
+    total = form.running + ca.dot(lam, form.f)
+
+    def outputs() -> list[Any]:
+        switching = ca.gradient(total, form.u)[control]
+        for _ in range(2):
+            change = ca.jtimes(switching, form.x, form.f) + ca.jacobian(switching, form.t)
+            switching = change - ca.jtimes(switching, lam, ca.gradient(total, form.x))
+        return [-ca.jacobian(switching, form.u)[control]]
+
+    return np.asarray(form.sampled(outputs, *along.point[:-1], (lam, costate), cache_as=f"clebsch {control}")[0][:, 0])
+
+
+def describe_singular_arcs(along: Linearisation, costate: np.ndarray, linear: np.ndarray, moved: np.ndarray) -> str:
+    """Return clauses on the generalised Legendre-Clebsch condition along singular arcs, "" if there are none.
+
+    Args:
+        linear: Which controls enter linearly. Shape (nu,). moved: In which intervals they switch. Shape (N, nu).
+    """
+    clauses, t = "", along.t
+    for i in np.flatnonzero(linear):
+        arc = ~along.control_limits.near[:, i] & ~np.repeat(moved[:, i], along.shape[1])
+        if not arc.any():
+            continue
+        values = clebsch(along, costate, int(i))[arc]
+        size, label = np.abs(values).max(), along.form.control_labels[i]
+        clauses += f"; control {label!r} is singular at times from {t[arc][0]:.4g} to {t[arc][-1]:.4g} s; there the "
+        clauses += "generalised Legendre-Clebsch condition of order 1 "
+        if not values.min() >= -LIMIT_SHARE * size:
+            clauses += f"is violated at {t[arc][np.argmin(values)]:.4g} s"
+        else:
+            clauses += "holds, but is only necessary" if values.min() > LIMIT_SHARE * size else "is degenerate"
+    return clauses
 
 
 def find_control_multipliers(

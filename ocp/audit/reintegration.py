@@ -27,8 +27,6 @@ from ocp.problem.formulation import Formulation
 from ocp.problem.values import evaluate_in_blocks
 from ocp.tolerances import LIMIT_SHARE, SOLVER_SHARE
 
-__all__ = ["Reintegration", "Violation", "reintegrate", "violations"]
-
 
 @dataclass(frozen=True)
 class Reintegration:

@@ -21,18 +21,6 @@ from ocp.problem.formulation import Bounds, Formulation, Rows
 from ocp.solution import Solution
 from ocp.tolerances import HELD_SHARE, LIMIT_SHARE, MACHINE_SHARE, ROUNDING_SHARE, SOLVER_SHARE, STANDSTILL
 
-__all__ = [
-    "FineGrid",
-    "Sizes",
-    "fine_grid",
-    "integral",
-    "plan_at",
-    "row_changes",
-    "share_sizes",
-    "sizes",
-    "sizes_along",
-]
-
 GRID_FACTOR = 10  # refinement of the fine grid over the points of the plan
 COSTS = ("running", "terminal")
 N_SAMPLES = 32  # number of samples at which the dependence of a constraint on its variables is evaluated
@@ -140,8 +128,8 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndar
     point = grid.states, grid.controls, grid.t, horizon, p, (form.x0, grid.states[0]), (form.u0, grid.controls[0])
     outputs = [form.running, form.path.expression, form.watch_reference_rate]
     running, rows, path_lengths = form.sampled(outputs, *point, cache_as="along a plan")
-    path = _rows_of(form, "path", grid, horizon, p, bounds, entries, rows)
-    start, end = (_rows_of(form, kind, grid, horizon, p, bounds, entries) for kind in ("start", "end"))
+    path = _constraint_sizes(form, "path", grid, horizon, p, bounds, entries, rows)
+    start, end = (_constraint_sizes(form, kind, grid, horizon, p, bounds, entries) for kind in ("start", "end"))
     absolute = np.where(np.isfinite(running), np.abs(running), 0.0)[:, 0]
     integral_of_cost = float(np.sum(np.diff(grid.t) * (absolute[:-1] + absolute[1:]) / 2))
     by_variables = [
@@ -150,7 +138,7 @@ def sizes_along(form: Formulation, grid: FineGrid, horizon: float, *, p: np.ndar
     ]
     watch = _watched_row_sizes(
         form,
-        _rows_of(form, "watch", grid, horizon, p, bounds, _alike(form, entries)),
+        _constraint_sizes(form, "watch", grid, horizon, p, bounds, _sizes_by_unit(form, entries)),
         horizon,
         integral(path_lengths, grid.t),
     )
@@ -182,7 +170,7 @@ def share_sizes(size: np.ndarray, places: Mapping[str, slice], declared: Mapping
 
 
 def _select(bounds: Bounds, index: np.ndarray) -> Bounds:
-    """Return the lower and upper bounds at given indices."""
+    """Return the lower and upper bounds of a problem at given indices of its bound table."""
     return bounds[0][index], bounds[1][index]
 
 
@@ -228,7 +216,7 @@ def _spread(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return high - low, np.maximum(np.abs(low), np.abs(high))
 
 
-def _rows_of(
+def _constraint_sizes(
     form: Formulation,
     kind: str,
     grid: FineGrid,
@@ -262,7 +250,7 @@ def _rows_of(
     return np.asarray(size)
 
 
-def _alike(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _sizes_by_unit(form: Formulation, entries: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the sizes of states and controls, with much smaller sizes raised to the largest size of the same unit.
 
     A watched row is judged by the change that its variables could cause. At a singular configuration the joints that

@@ -28,8 +28,6 @@ from ocp.direct.scaling import Scales
 from ocp.errors import SolverStatus
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["RESOLVED", "Conditions", "Newton", "active_sides", "conditions"]
-
 Sides: TypeAlias = dict[str, np.ndarray]
 """Active limit of each variable (x) and each constraint row (g) of a program: -1 lower, 1 upper, 0 none."""
 RESOLVED = 10 * SOLVER_RESIDUAL
@@ -209,7 +207,7 @@ class Newton:
             scales: Units in which residuals and multipliers are judged.
         """
         began, earlier, steps = time.monotonic(), list[Sides](), 0
-        while len(earlier) < SETTINGS.sets and not any(_same(sides, each) for each in earlier):
+        while len(earlier) < SETTINGS.sets and not any(_is_same_set(sides, each) for each in earlier):
             earlier.append(sides)
             root = self._root(start, sides, arguments, scales, SETTINGS.steps - steps)
             if root is None:
@@ -218,9 +216,11 @@ class Newton:
             next_sides = next_active_set(self._program, root, arguments, scales, sides=sides, tolerance=ROUNDING_SHARE)
             if next_sides is None:
                 return None
-            if _same(next_sides, sides):
+            if _is_same_set(next_sides, sides):
                 v, lam, p = root.variables, root.multipliers, arguments["p"]
-                if self._matrix(v, p, lam, _held(sides, arguments), scales, local=True) is None:  # a saddle point
+                if (
+                    self._matrix(v, p, lam, _fixed_entries(sides, arguments), scales, local=True) is None
+                ):  # a saddle point
                     return None
                 return replace(root, iterations=steps, seconds=time.monotonic() - began)
             sides = next_sides
@@ -231,7 +231,7 @@ class Newton:
     ) -> Outcome | None:
         """Return the result of at most ``max_steps`` Newton steps for a fixed active set; None without convergence."""
         a, b, c, p = scales.variables, scales.rows, scales.cost, arguments["p"]
-        fixed, held = _held(sides, arguments)
+        fixed, held = _fixed_entries(sides, arguments)
         target = np.where(sides["x"] > 0, arguments["ubx"], arguments["lbx"])
         row_target = np.where(sides["g"] > 0, arguments["ubg"], arguments["lbg"])
         v, lam = np.where(fixed, target, start.variables), np.where(held, start.multipliers, 0.0)
@@ -348,14 +348,14 @@ class _Matrix:
         return move[place], self.weight * multipliers
 
 
-def _held(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _fixed_entries(sides: Sides, arguments: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return which variables and constraints are fixed, by equal limits or by an active limit. Shapes (n,), (m,)."""
     fixed, held = ((arguments[f"lb{kind}"] == arguments[f"ub{kind}"]) | (sides[kind] != 0) for kind in "xg")
     return fixed, held
 
 
-def _same(sides: Sides, other_sides: Sides) -> bool:
-    """Return whether two active sets are the same."""
+def _is_same_set(sides: Sides, other_sides: Sides) -> bool:
+    """Return whether two active sets contain the same limits of variables and constraints."""
     return all(np.array_equal(side, other_sides[kind]) for kind, side in sides.items())
 
 
@@ -453,7 +453,7 @@ class Cholesky:
 
 
 def _border(row: np.ndarray, column: np.ndarray, distance: np.ndarray, size: int) -> np.ndarray:
-    """Choose the variables for the border of a banded matrix, so that its factorisation takes little work."""
+    """Choose the variables for the border of a banded matrix, so that the matrix is factorised with little work."""
     degree = np.bincount(row, minlength=size) + np.bincount(column, minlength=size)
     is_border, border, least_work, count = np.zeros(size, dtype=bool), list[int](), np.inf, 0
     for k in np.argsort(-distance, kind="stable"):

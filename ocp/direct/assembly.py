@@ -20,8 +20,6 @@ from ocp.console import check_time
 from ocp.curves import PiecewisePolynomial
 from ocp.problem.values import symbols_of
 
-__all__ = ["Block", "Derivatives", "Interpolants", "Program", "Stages", "Transcription", "assemble", "derivatives"]
-
 
 @dataclass(frozen=True)
 class Block:
@@ -394,9 +392,6 @@ def assemble(transcription: Transcription, parameters: int, functions: Sequence[
         running_gradient=ca.Function("inside", [x, p], [inside]),
         parametric=ca.Function("parametric", [x, p, lam], [slope]),
     )
-
-
-# ---- one block ---------------------------------------------------------------------------------------------------
 
 
 def derivatives(function: Any) -> Derivatives:

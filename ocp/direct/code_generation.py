@@ -50,9 +50,6 @@ from ocp.errors import ProblemError
 from ocp.problem.formulation import Formulation
 from ocp.storage import write_text
 
-__all__ = ["CompilerError", "Library", "block_derivatives", "build_library", "generate_c", "write_controller"]
-
-
 VERSION = "1"  # of the generated code
 FLAGS = ("-fPIC", "-shared", "-w", "-ffp-contract=off", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
 """Flags of the C compiler; undefined symbols are errors at link time, because otherwise a call would crash Python."""
@@ -85,9 +82,6 @@ class CodeSizes:
 
 
 CODE_SIZES = CodeSizes()
-
-
-# ---- libraries ---------------------------------------------------------------------------------------------------
 
 
 def generate_c(functions: Iterable[Any], name: str, *, header: bool = True) -> list[str]:
@@ -162,9 +156,6 @@ _OWN: dict[str, Path] = {}
 @lru_cache(1)
 def _own_folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="selfmotion-")
-
-
-# ---- the compiler ------------------------------------------------------------------------------------------------
 
 
 def compiler() -> tuple[str, str]:

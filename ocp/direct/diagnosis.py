@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from ocp.console import IterationMonitor, stop_requests_polled, time_left
 from ocp.direct.assembly import Program, Transcription, sparse
@@ -22,11 +23,10 @@ from ocp.direct.scaling import SCALING, Scales
 from ocp.errors import Interrupted, SolveError, SolverStatus
 from ocp.problem.formulation import Formulation
 from ocp.problem.problem import Problem
-from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
-
-__all__ = ["Elastic", "diagnosis", "elastic_plan", "variable_names"]
+from ocp.tolerances import IMPLIED_SHARE, MACHINE_SHARE, RESOLVED_SHARE, SOLVER_SHARE
 
 ELASTIC_IPOPT = {"tol": 1e-6, "max_iter": 300, "print_level": 0, "sb": "yes"}
+MISSED = 1e-8  # violation of a constraint above which it counts as missed: the tolerance of ipopt
 REMEDY = "leave scaling on, give ends, bounds and a guess of the right size, or choose units in which they are near 1"
 
 
@@ -38,11 +38,14 @@ class ElasticSettings:
         cost: Weight of the problem's own cost, which makes the plan unique.
         equality: Price of the violation of an equality relative to that of a limit.
         lines: Largest number of lines of one kind in the report.
+        inverse_iterations: Steps of the inverse iteration that finds dependent constraints: each amplifies what is
+            dependent by the inverse square of its smallest singular value.
     """
 
     cost: float = 1e-3
     equality: float = 10.0
     lines: int = 6
+    inverse_iterations: int = 4
 
 
 SETTINGS = ElasticSettings()
@@ -86,7 +89,7 @@ def diagnosis(
     conflicts = () if elastic is None or badly_scaled else elastic.conflicts
     if badly_scaled:
         message = f"{outcome.status}: badly scaled: {badly_scaled}; {REMEDY}"
-    elif elastic is not None and not conflicts:  # the constraints are not the reason
+    elif not conflicts and (elastic is not None or not np.any(violation > MISSED)):  # constraints are not the reason
         message = str(outcome.status)
     lines = [f"problem {built.problem.name!r}: {outcome.solver} ended with {message}"]
     if conflicts:
@@ -109,7 +112,7 @@ def diagnosis(
         worst.append({"name": labels[i], "value": float(value[i]), "time": float(fractions[i] * horizon)})
     reported: set[str] = set()
     for i in np.argsort(-np.where(np.isfinite(violation), violation, -np.inf)):
-        if len(reported) == SETTINGS.lines or not violation[i] > 1e-8:
+        if len(reported) == SETTINGS.lines or not violation[i] > MISSED:
             break
         if labels[i] not in reported:
             reported.add(labels[i])
@@ -118,8 +121,44 @@ def diagnosis(
             worst.append({"name": labels[i], "value": float(violation[i]), "limit": 0.0, "time": time})
     lines += at_bounds(built, outcome.variables, arguments, horizon)
     if not reported and not undefined.size:
+        dependent = dependent_rows(built, outcome.variables, arguments)
         lines.append("  all constraints are met; the plan is feasible but not optimal")
+        if dependent:
+            worst.append({"name": dependent[0]})
+            lines.append(f"  these constraints depend on each other, drop one of them: {', '.join(dependent)}")
     return SolveError("\n".join(lines), solution, conflicts, **(worst[0] if worst else {}))
+
+
+def dependent_rows(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray]) -> list[str]:
+    """Return labels of declared constraints whose gradients are linearly dependent, with the time, the largest first.
+
+    They are the constraints with large entries in a vector y with J^T y = 0, found by inverse iteration with J J^T; J
+    is the Jacobian of the equations, with rows of length 1, in the variables that are not fixed.
+    """
+    form, transcription = built.formulation, built.transcription
+    try:
+        jacobian = built.program.numbers.first(values, arguments["p"])[1].tocsr()
+    except RuntimeError:  # an integrator fails
+        return []
+    free = np.flatnonzero(arguments["lbx"] < arguments["ubx"])
+    equal = np.flatnonzero(arguments["lbg"] == arguments["ubg"])
+    matrix = jacobian[equal][:, free]
+    lengths = scipy.sparse.linalg.norm(matrix, axis=1)
+    if not (np.isfinite(matrix.data).all() and equal.size):
+        return []
+    matrix = scipy.sparse.diags(1 / np.where(lengths > 0, lengths, 1.0)) @ matrix
+    solve = scipy.sparse.linalg.splu((matrix @ matrix.T + MACHINE_SHARE * scipy.sparse.eye(equal.size)).tocsc())
+    y = np.random.default_rng(0).normal(size=equal.size)
+    for _ in range(SETTINGS.inverse_iterations):
+        y = solve.solve(y)
+        y /= np.linalg.norm(y)
+    if not np.linalg.norm(matrix.T @ y) < SOLVER_SHARE:
+        return []
+    declared = np.concatenate([form.bounds.places[kind] for kind in ("path", "start", "end")])
+    chosen = equal[np.isin(transcription.row_bounds[equal], declared) & (np.abs(y) > IMPLIED_SHARE * np.abs(y).max())]
+    size = dict(zip(equal.tolist(), np.abs(y).tolist(), strict=True))
+    order = sorted(chosen.tolist(), key=lambda i: -size[i])
+    return list(dict.fromkeys(transcription.row_labels[i] for i in order))[: SETTINGS.lines]
 
 
 def at_bounds(built: Built, values: np.ndarray, arguments: dict[str, np.ndarray], horizon: float) -> list[str]:

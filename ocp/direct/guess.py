@@ -1,6 +1,6 @@
 """Initial points of a solver: guesses evaluated for the variables of a transcription, and alternative initial points.
 
-If the solver fails from the guess, it may start from zeros or from a roll-out of the dynamics.
+If the solver fails from the guess, it may start from a displaced guess, from zeros or from a roll-out of the dynamics.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ocp.problem.values import numeric, table
 from ocp.solution import Guess, Solution
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["STARTS", "Samples", "alternative_starts", "guessed_names", "initial_point", "shifted_indices"]
+__all__ = ["STARTS", "Samples", "alternative_starts", "displace", "guessed_names", "initial_point", "shifted_indices"]
 
 Trajectory = Callable[[np.ndarray], np.ndarray]  # fractions of the horizon (M,) -> values (M, n)
 
@@ -234,10 +234,13 @@ class StartSettings:
     Attributes:
         horizon: Factor on the guess of a free horizon when starting from zeros: a long horizon contains a feasible
             plan, one that is too short does not.
+        displacement: Displacement of the guess from itself, relative to the size of each state and control: enough to
+            leave a symmetry of the problem, or a point at which a derivative does not exist.
         iterations: Largest number of iterations from each start.
     """
 
     horizon: float = 4.0
+    displacement: float = 0.1
     iterations: int = 200
 
 
@@ -251,16 +254,30 @@ def alternative_starts(
     p: np.ndarray,
     *,
     bounds: tuple[np.ndarray, np.ndarray],
+    sizes: np.ndarray,
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the name and the variables of each alternative initial point of the solver, computed on demand.
 
     Args:
         point: Values of the variables at the guess.
         bounds: Bounds of the variables, to which the starts are clipped.
+        sizes: Typical sizes of the variables.
     """
+    yield "displaced guess", np.clip(displace(transcription, point, sizes), *bounds)
     zeros = np.where(transcription.variable_role == "horizon", STARTS.horizon * point, 0.0)
     yield "zeros", np.clip(zeros, *bounds)
     yield "roll-out", np.clip(roll_out(form, transcription, point, p), *bounds)
+
+
+def displace(transcription: Transcription, point: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return a guess displaced by a seeded random share, constant in time, of the size of each state and control."""
+    result, random = point.copy(), np.random.default_rng(0)
+    for role in ("state", "control"):
+        chosen = np.flatnonzero(transcription.variable_role == role)
+        entries = transcription.variable_entry[chosen]
+        direction = random.choice([-1.0, 1.0], entries.max(initial=-1) + 1)
+        result[chosen] += STARTS.displacement * direction[entries] * sizes[chosen]
+    return result
 
 
 def roll_out(form: Formulation, transcription: Transcription, point: np.ndarray, p: np.ndarray) -> np.ndarray:

@@ -18,8 +18,9 @@ from ocp.console import TimeLimitReached, check_time, interruptible, time_limite
 from ocp.direct.active_set import Newton, active_sides
 from ocp.direct.assembly import Program, assemble
 from ocp.direct.code_generation import block_derivatives, write_controller
+from ocp.direct.controller import Controller, ControllerSettings
 from ocp.direct.diagnosis import Elastic, diagnosis, elastic_plan
-from ocp.direct.guess import STARTS, alternative_starts, guessed_names, initial_point, shifted_indices
+from ocp.direct.guess import STARTS, alternative_starts, displace, guessed_names, initial_point, shifted_indices
 from ocp.direct.nlp import (
     SOLVERS,
     Outcome,
@@ -113,7 +114,7 @@ class Prepared:
         self._pattern = Pattern(self.formulation, self.transcription, self.program)
         self._known = PredeterminedVariables(self.formulation, self.transcription, self.program)
         self._max_iterations = iteration_limit(self.solver_name, own)
-        self._arguments, self._compiled = (problem, method, solver, options), compiled
+        self._arguments, self.compiled = (problem, method, solver, options), compiled
         self._lock = threading.RLock()  # casadi functions are not reentrant
         self.seconds = time.monotonic() - began
 
@@ -130,7 +131,7 @@ class Prepared:
 
     def __reduce__(self) -> Any:
         """Represent the object for pickling and copying by its arguments, from which it is prepared again."""
-        return partial(type(self), compiled=self._compiled, scaling=self._scaling), self._arguments
+        return partial(type(self), compiled=self.compiled, scaling=self._scaling), self._arguments
 
     @interruptible
     def solve(
@@ -142,6 +143,7 @@ class Prepared:
         tighter: Mapping[str, np.ndarray] | None = None,
         time_limit: float | None = None,
         shift: int = 0,
+        start: str = "guess",
     ) -> Solution:
         """Solve the prepared problem with given parameters from a given guess; see :func:`ocp.methods.solve`.
 
@@ -158,17 +160,19 @@ class Prepared:
             shift: Number of intervals by which a receding horizon has advanced since the guess, a plan on equal
                 intervals. Each interval starts from the values, limits and multipliers of the plan so many intervals
                 later; the last ones from their own.
+            start: ``guess``, or ``displaced guess``: displaced by seeded random shares of the sizes of the variables.
 
         Raises:
             ProblemError: Wrong arguments.
             SolveError: No plan was found, with the reasons.
         """
         ahead = require.count("solve: shift", shift, least=0, most=self.method.intervals - 1)
-        if ahead and not (self._is_own_plan(guess) and self.method.mesh is None):
+        if ahead and not (self.is_own_plan(guess) and self.method.mesh is None):
             words = "solve: shift requires as guess a plan of this problem, method and mesh, with equal intervals"
             raise ProblemError(words, name="shift", value=shift)
         with time_limited(checked_time_limit(time_limit)), self._lock:
-            return self._solve(parameters, guess, check, tighter, ahead)
+            require.choice("solve: start", start, ("guess", "displaced guess"))
+            return self._solve(parameters, guess, check, tighter, ahead, start)
 
     @interruptible
     def to_c(self, folder: str | os.PathLike[str], parameters: ByName = None, guess: Guess = None) -> Path:
@@ -194,8 +198,47 @@ class Prepared:
                 point = guess.variables if guess.variables.size == point.size else point
             return write_controller(form, transcription, point, place)
 
+    def controller(
+        self,
+        plan: Solution,
+        *,
+        iterations: int = 5,
+        qp_iterations: int = 100,
+        hessian: str = "gauss-newton",
+        tolerance: float = 1e-6,
+        shift: int = 1,
+    ) -> Controller:
+        """Return a controller with a receding horizon, whose steps take a bounded number of iterations.
+
+        ``controller.step(parameters)`` solves the problem for the measured state and other parameters from the result
+        of the last step, and returns the control to apply, the prediction, and what is known of its feasibility.
+
+        Args:
+            plan: Solution of this prepared problem, from which the first step starts.
+            iterations: Largest number of iterations of sequential quadratic programming in an attempt. A step has one
+                attempt, or two if the result of the first one violates dynamics or limits by more than the tolerance.
+            qp_iterations: Largest number of changes of the active set in a quadratic program.
+            hessian: ``gauss-newton`` (linear convergence, also far from the optimum) or ``exact`` (quadratic
+                convergence near an optimum).
+            tolerance: Largest violation and residual of a converged step, in the units of the problem.
+            shift: Number of mesh intervals by which the horizon advances from step to step. 0 if the period of control
+                is not that of the mesh.
+
+        Raises:
+            ProblemError: Wrong arguments.
+        """
+        settings = ControllerSettings(iterations, qp_iterations, hessian, tolerance, shift)
+        with self._lock:
+            return Controller(self, plan, settings)
+
     def _solve(
-        self, parameters: ByName, guess: Guess, check: bool, tighter: Mapping[str, np.ndarray] | None, shift: int
+        self,
+        parameters: ByName,
+        guess: Guess,
+        check: bool,
+        tighter: Mapping[str, np.ndarray] | None,
+        shift: int,
+        start: str,
     ) -> Solution:
         """Solve by Newton steps near a known plan, else from the guess, other points or a relaxed problem."""
         form, transcription = self.formulation, self.transcription
@@ -211,7 +254,9 @@ class Prepared:
         if shift and isinstance(guess, Solution):
             point = guess.variables[shifted_indices(transcription, shift)[0]]
         names = guessed_names(form, guess)
-        first = self._attempt("guess", point, names, arguments, bounds)
+        if start != "guess":
+            point = displace(transcription, point, self._sizes(point, names, bounds, p))
+        first = self._attempt(start, point, names, arguments, bounds)
         if first.solution is not None and (first.outcome.success or not check):
             return first.solution
         attempts: list[Attempt] = [first, *(self._alternative_attempts(first, arguments, bounds) if check else ())]
@@ -220,8 +265,8 @@ class Prepared:
         elastic = None if attempts[-1].is_final else self._elastic(first)
         remaining = self._max_iterations - sum(attempt.outcome.iterations for attempt in attempts[1:])
         if elastic is not None and check and remaining > 0:
-            start = "elastic plan", elastic.plan, self._variable_names
-            attempts.append(self._attempt(*start, arguments, bounds, self._short_solver))
+            relaxed = "elastic plan", elastic.plan, self._variable_names
+            attempts.append(self._attempt(*relaxed, arguments, bounds, self._short_solver))
             if attempts[-1].plan is not None:
                 return attempts[-1].plan
         decisive = attempts[-1] if attempts[-1].is_final else first
@@ -247,12 +292,13 @@ class Prepared:
         attempts, remaining, x0 = list[Attempt](), self._max_iterations, first.arguments["x0"]
         if first.is_final:
             return attempts
-        limits = arguments["lbx"], arguments["ubx"]
-        for start, point in alternative_starts(self.formulation, self.transcription, x0, arguments["p"], bounds=limits):
+        limits, p = (arguments["lbx"], arguments["ubx"]), arguments["p"]
+        sizes = sizes_along(self._pattern, x0, first.names, bounds=bounds, p=p).of_variables(self.transcription)
+        for start, point in alternative_starts(self.formulation, self.transcription, x0, p, bounds=limits, sizes=sizes):
             if remaining <= 0 or np.array_equal(point, x0):
                 continue
             attempts.append(self._attempt(start, point, first.names, arguments, bounds, self._short_solver))
-            if attempts[-1].is_final or all(attempt.is_broken for attempt in (first, *attempts)):
+            if attempts[-1].is_final:
                 break
             remaining -= attempts[-1].outcome.iterations
         return attempts
@@ -268,7 +314,7 @@ class Prepared:
         except Interrupted as error:
             raise Interrupted(str(error), first.solution) from error
 
-    def _is_own_plan(self, guess: Guess) -> bool:
+    def is_own_plan(self, guess: Guess) -> bool:
         """Return whether a guess is a plan of this nonlinear program: same method, mesh, sizes and parameters."""
         if not isinstance(guess, Solution) or guess.method != self.method.settings:
             return False
@@ -278,7 +324,7 @@ class Prepared:
     def _nearby(self, guess: Guess, arguments: dict[str, np.ndarray], bounds: Bounds, shift: int) -> Solution | None:
         """Return the optimum near a guess that is a plan, shifted by ``shift`` mesh intervals; None if not found."""
         form = self.formulation
-        if not isinstance(guess, Solution) or not self._is_own_plan(guess) or self.solver_name != "ipopt":
+        if not isinstance(guess, Solution) or not self.is_own_plan(guess) or self.solver_name != "ipopt":
             return None
         if guess.regularised or not guess.success:
             return None
@@ -299,7 +345,7 @@ class Prepared:
                 outcome = self._known.checked(outcome, arguments, scales)
             if outcome is None or not outcome.success:
                 return None
-            return self._solution(outcome, arguments["p"], "guess")
+            return self.solution_from(outcome, arguments["p"], "guess")
         except (ProblemError, RuntimeError):  # parameters that this problem rejects; an integrator that fails
             return None
 
@@ -336,7 +382,7 @@ class Prepared:
         outcome = scales.unscale(outcome)
         outcome = self._known.checked(outcome, arguments, scales)
         try:
-            solution = self._solution(outcome, p, start)
+            solution = self.solution_from(outcome, p, start)
         except RuntimeError as error:  # an integrator fails at the last iterate, which is no plan
             if outcome.status is SolverStatus.INTERRUPTED:
                 raise Interrupted(f"problem {self.problem.name!r}: interrupted") from error
@@ -356,12 +402,16 @@ class Prepared:
             return dataclasses.replace(scales, cost=max(scales.cost, 1.0))
         return scales
 
+    def _sizes(self, point: np.ndarray, names: set[str], bounds: Bounds, p: np.ndarray) -> np.ndarray:
+        """Return the typical size of each variable at a guess; ``names`` are variables with meaningful values."""
+        return sizes_along(self._pattern, point, names, bounds=bounds, p=p).of_variables(self.transcription)
+
     @property
     def _variable_names(self) -> set[str]:
         """Names of all states and controls, and "horizon"."""
         return {*self.formulation.states, *self.formulation.controls, "horizon"}
 
-    def _solution(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:
+    def solution_from(self, outcome: Outcome, p: np.ndarray, start: str) -> Solution:
         """Convert a solver's result to a solution; ``start`` is the name of the initial point."""
         seconds = {"build": self.seconds, "solve": outcome.seconds}
         fields = {"method": self.method.settings, "seconds": seconds, "start": start}

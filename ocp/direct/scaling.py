@@ -27,18 +27,7 @@ from ocp.direct.assembly import Program, Transcription
 from ocp.direct.nlp import SOLVER_RESIDUAL, Outcome
 from ocp.errors import SolverStatus
 from ocp.problem.formulation import Bounds, Formulation
-
-__all__ = [
-    "SCALING",
-    "Pattern",
-    "PredeterminedVariables",
-    "Scales",
-    "compute_scales",
-    "scaled_program",
-    "scaling_fault",
-    "sizes_along",
-    "unit_scales",
-]
+from ocp.tolerances import ROUNDING_SHARE
 
 SIDES = ("lbx", "ubx", "lbg", "ubg")
 
@@ -53,11 +42,14 @@ class ScalingSettings:
             guess.
         weak: Weight of the bounds relative to the dynamics in the least-squares fit, and of the size 1 relative to the
             bounds.
+        beside: Displacement from the guess at which derivatives that vanish there are evaluated, as a share of the
+            range of each state and control.
     """
 
     usual: float = 1e3
     rounding: float = 1e-13
     weak: float = 1e-3
+    beside: float = 0.1
 
     @property
     def bad(self) -> float:
@@ -173,9 +165,6 @@ def scaled_program(program: Program) -> Program:
     )
 
 
-# ---- sizes -------------------------------------------------------------------------------------------------------
-
-
 def sizes_along(
     pattern: Pattern, point: np.ndarray, intended: Collection[str], *, bounds: Bounds, p: np.ndarray
 ) -> Sizes:
@@ -214,6 +203,8 @@ def sizes_along(
 
     # log s_i = log a_ij + log s_j + log T / T_0 of every coupling a_ij at the horizon T_0
     coupling = couplings(pattern, point, p)
+    beside = couplings(pattern, _displaced(pattern, point, largest, (low[index], high[index])), p)
+    coupling = np.where(coupling < ROUNDING_SHARE * beside, beside, coupling)
     to, source = np.nonzero(coupling)
     equations = np.zeros((len(to), len(largest)))
     equations[np.arange(len(to)), to] += 1.0
@@ -228,6 +219,26 @@ def sizes_along(
     logs[~known] = np.linalg.lstsq(rows, values, rcond=None)[0]
     sizes = np.exp(logs)
     return Sizes(sizes[:nx], sizes[nx:-1], float(sizes[-1]))
+
+
+def _displaced(pattern: Pattern, point: np.ndarray, sizes: np.ndarray, ends: Bounds) -> np.ndarray:
+    """Return the point with states and controls displaced by a constant share of their range, their size, or 1.
+
+    A derivative such as the cosine of a right angle may vanish at the guess, but does so nowhere near it.
+
+    Args:
+        sizes: Known sizes of states, controls and horizon, 0 if unknown. ends: Their bounds.
+    """
+    width = ends[1] - ends[0]
+    unit = np.where(sizes > 0, sizes, np.where(np.isfinite(width), width, 1.0))
+    share = SCALING.beside * np.random.default_rng(0).uniform(0.5, 1.0, len(unit))
+    result = point.copy()
+    for role, offset in (("state", 0), ("control", pattern.form.nx)):
+        chosen = pattern.transcription.variable_role == role
+        entry = offset + pattern.transcription.variable_entry[chosen]
+        moved = point[chosen] + (share * unit)[entry]
+        result[chosen] = np.where(moved > ends[1][entry], 2 * point[chosen] - moved, moved)
+    return result
 
 
 def couplings(pattern: Pattern, point: np.ndarray, p: np.ndarray) -> np.ndarray:

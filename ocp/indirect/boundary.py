@@ -20,8 +20,6 @@ from ocp.indirect.seed import ControlArcs
 from ocp.problem.formulation import Formulation
 from ocp.problem.values import symbols_of
 
-__all__ = ["LOBATTO", "BoundaryProblem", "NewtonResult", "newton"]
-
 LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(10) / 9)  # Chebyshev-Lobatto nodes of a reported segment, 0..1
 
 
@@ -53,17 +51,17 @@ class BoundaryProblem:
         """
         key = tuple(arcs.segments)
         if key not in self._systems:
-            build = self._backward if self.backward else self._multiple
+            build = self._backward_shooting if self.backward else self._multiple_shooting
             z, data, residual = build(arcs)
             jacobian = ca.jacobian(residual, z)
             named = (("residual", residual), ("jacobian", jacobian))
             self._systems[key] = tuple(ca.Function(name, [z, data], [value]) for name, value in named)
         return self._systems[key]
 
-    def _multiple(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
+    def _multiple_shooting(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
         """Return unknowns, data and equations of multiple shooting: continuity, switching and end conditions."""
         form = self.form
-        at, of = self.layout(arcs), self._data(arcs)
+        at, of = self.layout(arcs), self._data_layout(arcs)
         z, data = ca.MX.sym("z", at["end"].stop), ca.MX.sym("data", of["guess"].stop)
         total = sum(arcs.segments)
         y = ca.reshape(z[at["y"]], 2 * form.nx, total + 1)
@@ -84,33 +82,29 @@ class BoundaryProblem:
             residuals.append(values[2] + by_horizon + ca.sum2(quads[1, :]))
         return z, data, ca.vertcat(*residuals)
 
-    def _backward(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
+    def _backward_shooting(self, arcs: ControlArcs) -> tuple[Any, Any, Any]:
         """Return unknowns, data and equations of backward shooting from an unknown end state to the given start."""
-        form = self.form
-        of = self._data(arcs)
-        total = sum(arcs.segments)
-        z, data = ca.MX.sym("z", form.nx), ca.MX.sym("data", of["guess"].stop)
-        _, y_start = self._chain(z, data, arcs, total)
-        return z, data, y_start[: form.nx, :] - data[of["ends"]][form.nx : 2 * form.nx]
+        nx, of = self.form.nx, self._data_layout(arcs)
+        z, data = ca.MX.sym("z", nx), ca.MX.sym("data", of["guess"].stop)
+        return z, data, self._integrate_backwards(z, data, arcs)[-1][:nx, :] - data[of["ends"]][nx : 2 * nx]
 
-    def _chain(self, state: Any, data: Any, arcs: ControlArcs, total: int) -> tuple[list[Any], Any]:
+    def _integrate_backwards(self, state: Any, data: Any, arcs: ControlArcs) -> list[Any]:
         """Integrate states and costates backwards from an end state; return them at all nodes, last node first."""
-        form, of = self.form, self._data(arcs)
+        form, of = self.form, self._data_layout(arcs)
         horizon = data[of["horizon"]]
         gradient = ca.gradient(form.terminal, form.x)
         terminal = ca.Function("terminal", [form.x, form.t, form.T, form.p], [gradient])
         y = ca.vertcat(state, terminal(state, horizon, horizon, data[of["p"]]))
         inputs = self._segment_data(ca.MX(0, 1), horizon, data, arcs)
         nodes = [y]
-        for k in reversed(range(total)):
+        for k in reversed(range(sum(arcs.segments))):
             q = ca.vertcat(inputs[0, k] + inputs[1, k], -inputs[1, k], inputs[2:, k])
-            y = self.step(y, q)[0]
-            nodes.append(y)
-        return nodes, y
+            nodes.append(self.step(nodes[-1], q)[0])
+        return nodes
 
     def _segment_data(self, switches: Any, horizon: Any, data: Any, arcs: ControlArcs) -> Any:
         """Return the integrator's data vectors q of all shooting segments as the columns of a matrix."""
-        of, total = self._data(arcs), sum(arcs.segments)
+        of, total = self._data_layout(arcs), sum(arcs.segments)
         knots = ca.vertcat(0, switches, horizon)
         begins, lengths = [], []
         for a, count in enumerate(arcs.segments):
@@ -127,7 +121,10 @@ class BoundaryProblem:
         )
 
     def arguments(self, y: Any, at: Any, horizon: Any, q: Any) -> list[Any]:
-        """Return states, costates, times ``at`` and data as arguments of the Hamiltonian system's functions."""
+        """Split states and costates ``y`` and data ``q`` into arguments of the Hamiltonian system's functions.
+
+        ``at`` are the times, s.
+        """
         sizes = self.ham.sizes
         cuts = np.cumsum([3, *sizes[4:]])
         tail = [q[int(a) : int(b)] for a, b in itertools.pairwise(cuts)]
@@ -136,18 +133,12 @@ class BoundaryProblem:
     def layout(self, arcs: ControlArcs) -> dict[str, slice]:
         """Return, by name, the slice of every part of the vector of unknowns, such as the switch times."""
         form = self.form
-        total = sum(arcs.segments)
-        sizes = {
-            "y": 2 * form.nx * (total + 1),
-            "switches": len(arcs.switches),
-            "horizon": int(form.horizon_is_free),
-            "start": len(form.start),
-            "end": len(form.end),
-        }
-        return side_by_side(sizes)
+        sizes = {"y": 2 * form.nx * (sum(arcs.segments) + 1), "switches": len(arcs.switches)}
+        ends = {"start": len(form.start), "end": len(form.end)}
+        return side_by_side({**sizes, "horizon": int(form.horizon_is_free), **ends})
 
-    def _data(self, arcs: ControlArcs) -> dict[str, slice]:
-        """Return the slice of every part of the data vector (parameters, fixed values and guesses), by name."""
+    def _data_layout(self, arcs: ControlArcs) -> dict[str, slice]:
+        """Return, by name, the slice of every part of the data vector, such as parameters, fixed values and guesses."""
         sizes = self.ham.sizes
         total = sum(arcs.segments)
         parts = {"horizon": 1, "p": sizes[4], "ends": 4 * sizes[0], "bang": sizes[5] * total, "guess": sizes[6] * total}
@@ -184,13 +175,6 @@ class BoundaryProblem:
         except RuntimeError:
             return np.full(segment.size_out(0), np.nan), np.full(2, np.nan)
 
-    def end_multipliers(self, z: np.ndarray, arcs: ControlArcs) -> tuple[np.ndarray, np.ndarray]:
-        """Return the multipliers of the start constraints and of the end constraints."""
-        if self.backward:
-            return np.zeros(0), np.zeros(0)
-        at = self.layout(arcs)
-        return z[at["start"]], z[at["end"]]
-
     def advance(self, y: np.ndarray, q: np.ndarray, place: float) -> np.ndarray:
         """Return states and costates at a position 0..1 of a segment that begins with ``y``. Shape (2 nx,)."""
         if place == 0.0:
@@ -205,8 +189,7 @@ class BoundaryProblem:
         horizon, switches = float(data[0]), np.zeros(0)
         if self.backward:
             symbols = ca.MX.sym("z", form.nx), ca.MX.sym("data", data.size)
-            nodes, _ = self._chain(*symbols, arcs, total)
-            chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(nodes))])
+            chain = ca.Function("chain", symbols, [ca.horzcat(*reversed(self._integrate_backwards(*symbols, arcs)))])
             try:
                 with casadi_silenced():
                     y = np.asarray(chain(z, data).full())
@@ -294,7 +277,7 @@ class NewtonSettings:
 
 @dataclass(frozen=True)
 class NewtonResult:
-    """Last iterate and status of Newton's method."""
+    """Last iterate of Newton's method, its residual, the number of steps, and the status with a message."""
 
     unknowns: np.ndarray
     residual: float
@@ -356,10 +339,9 @@ def newton(
             if not np.all(np.isfinite(step)):
                 word = "Newton's matrix is singular: the plan is not unique"
                 if polished:
-                    return NewtonResult(
-                        z, size, steps, SolverStatus.SOLVED, f"Converged in {steps} Newton steps; {word}"
-                    )
-                return NewtonResult(z, size, steps, SolverStatus.STEP_FAILED, word)
+                    word = f"Converged in {steps} Newton steps; {word}"
+                status = SolverStatus.SOLVED if polished else SolverStatus.STEP_FAILED
+                return NewtonResult(z, size, steps, status, word)
             length = 1.0
             for _ in range(settings.halvings):
                 trial = z + length * step

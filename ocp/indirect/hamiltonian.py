@@ -18,8 +18,6 @@ from ocp.problem.formulation import Bounds, Formulation
 from ocp.problem.values import symbols_of
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["Extremal", "Hamiltonian", "cost_gradient"]
-
 
 @dataclass(frozen=True)
 class Hamiltonian:
@@ -33,7 +31,7 @@ class Hamiltonian:
         smooth, linear: Indices of the controls in which H is curved, and of those in which it is linear.
         unknowns: Function (x, lam, t, T, p, bang, guess) -> w = [smooth controls; mu] that minimises H. ``bang`` are
             the values of the linear controls, each at one of its bounds; ``guess`` starts an iteration for w.
-        how: ``quadratic`` (solved symbolically), ``projected`` (then projected on its bounds) or ``iterated``.
+        solved: ``quadratic`` (symbolically), ``projected`` (then projected on the bounds) or ``iterated`` (by Newton).
     """
 
     form: Formulation
@@ -44,11 +42,11 @@ class Hamiltonian:
     smooth: tuple[int, ...]
     linear: tuple[int, ...]
     unknowns: Any
-    how: str
+    solved: str
 
     @classmethod
     def of(cls, form: Formulation) -> Hamiltonian:
-        """Derive the Hamiltonian system of a problem.
+        """Derive the Hamiltonian system of an optimal control problem, with the controls that minimise H.
 
         Raises:
             ProblemError: An unsupported constraint, a control without bounds in which H is linear, or a control that H
@@ -61,13 +59,12 @@ class Hamiltonian:
         lam, mu = sym("lam", form.nx), sym("mu", len(form.path))
         value = form.running + ca.dot(lam, form.f) + ca.dot(mu, rows)
         symbols = [form.x, form.u, lam, mu, form.t, form.T, form.p]
-        curved = used_columns(nonzeros(ca.hessian(value, form.u)[0], symbols))
-        in_path = used_columns(ca.jacobian_sparsity(rows, form.u))
-        smooth = [i for i in range(form.nu) if curved[i] or in_path[i]]
-        linear = [i for i in range(form.nu) if i not in smooth]
+        patterns = nonzero_pattern(ca.hessian(value, form.u)[0], symbols), ca.jacobian_sparsity(rows, form.u)
+        curved = {column for pattern in patterns for column in pattern.get_col()}
+        smooth, linear = ([i for i in range(form.nu) if (i in curved) == kind] for kind in (True, False))
         system = cls(form, lam, mu, rows, value, tuple(smooth), tuple(linear), None, "")
-        unknowns, how = system._solve()
-        return replace(system, unknowns=unknowns, how=how)
+        unknowns, solved = system._solve()
+        return replace(system, unknowns=unknowns, solved=solved)
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -129,8 +126,6 @@ class Hamiltonian:
         results = inner.call([*arguments[:-1], self.unknowns.call(arguments)[0]])
         return ca.Function(name, arguments, results, {"cse": True})
 
-    # ---- the equations that make H stationary in the smooth controls, and their solution ----------------------
-
     def _solve(self) -> tuple[Any, str]:
         """Return the function that computes optimal controls and multipliers, and the name of the solution method.
 
@@ -141,14 +136,17 @@ class Hamiltonian:
         self._check_linear()
         w, bang, guess = sym("w", n + m), sym("bang", len(self.linear)), sym("guess", n + m)
         known = [form.x, self.lam, form.t, form.T, form.p, bang]
-        residual = self._residual(w, bang)
+        gradient = ca.gradient(self.value, form.u)[list(self.smooth)] if n else form.problem.symbols(0, 1)
+        control = _assemble_control(form, self.smooth, self.linear, w, bang)
+        stationarity = ca.densify(ca.vertcat(gradient, self.rows))
+        residual = ca.substitute([stationarity], [form.u, self.mu], [control, w[n:, :]])[0]
         matrix = ca.jacobian(residual, w) if n + m else self.form.problem.symbols(0, 0)
-        pattern = nonzeros(matrix, [*known, w])
+        pattern = nonzero_pattern(matrix, [*known, w])
         if isinstance(matrix, ca.SX):
             matrix = ca.sparsify(matrix)
         self._check_regular(matrix, [*known, w])
-        bounded = self._has_bounds()
         index = form.bounds.places["control"][list(self.smooth)].tolist()
+        bounded = bool(np.isfinite([bound[index] for bound in numeric_bounds(form)]).any())
         low, high = (bound[index] for bound in form.bounds.function(form.p))
         separate = m == 0 and pattern.is_diag()
         if not ca.depends_on(matrix, w) and (not bounded or separate):
@@ -166,20 +164,8 @@ class Hamiltonian:
         symbols = [ca.MX.sym(f"a{i}", s.numel()) for i, s in enumerate([*known, guess])]
         return ca.Function("unknowns", symbols, [finder(symbols[-1], ca.vertcat(*symbols[:-1]))]), "iterated"
 
-    def _residual(self, w: Any, bang: Any) -> Any:
-        """Return the Hamiltonian's gradient in the smooth controls, stacked on path equalities. Shape (n + m, 1)."""
-        n = len(self.smooth)
-        gradient = ca.gradient(self.value, self.form.u)[list(self.smooth)] if n else self.form.problem.symbols(0, 1)
-        stacked = ca.densify(ca.vertcat(gradient, self.rows))
-        control = _assemble_control(self.form, self.smooth, self.linear, w, bang)
-        return ca.substitute([stacked], [self.form.u, self.mu], [control, w[n:, :]])[0]
-
-    def _has_bounds(self) -> bool:
-        low, high = numeric_bounds(self.form)
-        index = self.form.bounds.places["control"][list(self.smooth)]
-        return bool(np.any(np.isfinite(low[index]) | np.isfinite(high[index])))
-
     def _check_linear(self) -> None:
+        """Raise ProblemError if a control in which the Hamiltonian is linear is not bounded on both sides."""
         low, high = numeric_bounds(self.form)
         for i in self.linear:
             at = self.form.bounds.places["control"][i]
@@ -196,7 +182,7 @@ class Hamiltonian:
         if 0 in matrix.shape:
             return
         rng = np.random.default_rng(0)
-        sample = numbers(matrix, symbols, rng)
+        sample = random_values(matrix, symbols, rng)
         singular = np.linalg.svd(sample, compute_uv=False) if np.all(np.isfinite(sample)) else np.ones(1)
         if singular[-1] < ROUNDING_SHARE * singular[0]:
             raise ProblemError(
@@ -215,7 +201,7 @@ def _assemble_control(form: Formulation, smooth: Any, linear: Any, w: Any, bang:
 
 
 def check_constraints(form: Formulation) -> None:
-    """Raise ProblemError, naming the constraint, for a constraint that the indirect method does not support."""
+    """Raise ProblemError if the indirect method does not support a constraint of the problem, by its name."""
     for name, place in form.states.items():
         index = form.bounds.places["state"][place]
         low, high = (bound[index] for bound in numeric_bounds(form))
@@ -246,12 +232,11 @@ def check_constraints(form: Formulation) -> None:
                 if not equality:
                     raise ProblemError(f"the indirect method does not support the {kind} inequality {label!r}")
                 if form.nu and ca.depends_on(rows.expression[i], controls):
-                    raise ProblemError(
-                        f"the indirect method does not support {kind} constraint {label!r} on the control"
-                    )
+                    words = f"the indirect method does not support {kind} constraint {label!r} on the control"
+                    raise ProblemError(words)
 
 
-def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
+def nonzero_pattern(matrix: Any, symbols: list[Any]) -> Any:
     """Return the sparsity pattern of the entries of a matrix that are not identically zero.
 
     Of an MX expression these are the entries that are nonzero at one of three random points.
@@ -259,14 +244,8 @@ def nonzeros(matrix: Any, symbols: list[Any]) -> Any:
     if isinstance(matrix, ca.SX):
         return ca.sparsify(matrix).sparsity()
     rng = np.random.default_rng(0)
-    size = np.abs([numbers(matrix, symbols, rng) for _ in range(3)]).max(axis=0)  # nan counts as nonzero
+    size = np.abs([random_values(matrix, symbols, rng) for _ in range(3)]).max(axis=0)  # nan counts as nonzero
     return ca.sparsify(ca.DM(np.where(size == 0, 0.0, 1.0))).sparsity()
-
-
-def used_columns(pattern: Any) -> list[bool]:
-    """Return which columns of a sparsity pattern contain an entry."""
-    starts = pattern.colind()
-    return [starts[i + 1] > starts[i] for i in range(pattern.size2())]
 
 
 def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
@@ -275,7 +254,7 @@ def numeric_bounds(form: Formulation) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def numbers(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
+def random_values(matrix: Any, symbols: list[Any], rng: np.random.Generator) -> np.ndarray:
     """Return the value of a matrix expression at random values of its symbols between 0.1 and 1."""
     function = ca.Function("matrix", symbols, [ca.densify(matrix)])
     return np.asarray(function.call([ca.DM(rng.uniform(0.1, 1.0, s.numel())) for s in symbols])[0].full())
@@ -289,7 +268,8 @@ def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
     if not isinstance(matrix, ca.SX):
         return ca.solve(matrix, rhs)
     curvature, constraint = matrix[:n, :n], matrix[n:, :n]
-    if not positive(curvature):
+    values = np.linalg.eigvalsh(random_values(curvature, ca.symvar(curvature), np.random.default_rng(0)))
+    if not (np.isfinite(values).all() and values[0] > ROUNDING_SHARE * values[-1]):  # not positive definite
         return ca.solve(ca.densify(matrix), rhs)
     factor = ca.ldl(curvature)
     first = ca.ldl_solve(rhs[:n], *factor)
@@ -299,13 +279,6 @@ def symmetric_solve(matrix: Any, rhs: Any, n: int) -> Any:
     schur = ca.mtimes(constraint, through)
     multiplier = ca.ldl_solve(ca.mtimes(constraint, first) - rhs[n:], *ca.ldl(schur))
     return ca.vertcat(first - ca.mtimes(through, multiplier), multiplier)
-
-
-def positive(matrix: Any) -> bool:
-    """Return whether a symmetric matrix is positive definite at a random point."""
-    sample = numbers(matrix, ca.symvar(matrix), np.random.default_rng(0))
-    values = np.linalg.eigvalsh(sample)
-    return bool(np.all(np.isfinite(values)) and values[0] > ROUNDING_SHARE * values[-1])
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,12 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from ocp.console import interruptible, time_limited
 from ocp.curves import PiecewisePolynomial
@@ -35,8 +34,6 @@ from ocp.problem.problem import Problem
 from ocp.problem.values import evaluate_at_samples
 from ocp.solution import ByName, Guess, Solution, check_variables_match
 from ocp.tolerances import FLAT_SHARE, ROUNDING_SHARE, SOLVER_SHARE
-
-__all__ = ["Indirect", "PreparedIndirect", "hamiltonian_defect"]
 
 
 def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: Bounds) -> str:
@@ -77,13 +74,11 @@ def hamiltonian_defect(ham: Hamiltonian, path: Extremal, p: np.ndarray, bounds: 
     free = ~(at_low | at_high)
     for k in np.flatnonzero(free.any(axis=1)):
         inside = curvature[k][np.ix_(free[k], free[k])]
-        tangent = null_space(by_control[k][:, free[k]])
+        tangent = scipy.linalg.null_space(by_control[k][:, free[k]], rcond=1e-12)
         least = np.min(np.linalg.eigvalsh(tangent.T @ inside @ tangent), initial=0.0)
         # an extremal is accurate to rounding, unlike a direct plan, for which FLAT_SHARE is meant
         if least < -0.1 * FLAT_SHARE * np.max(np.abs(curvature[k])):
-            names = ", ".join(
-                repr(label) for label, is_free in zip(form.control_labels, free[k], strict=True) if is_free
-            )
+            names = ", ".join(repr(form.control_labels[i]) for i in np.flatnonzero(free[k]))
             return f"the Hamiltonian is stationary but not minimal in control {names} at {path.t.ravel()[k]:.4g} s"
     return ""
 
@@ -95,30 +90,18 @@ def control_derivatives(ham: Hamiltonian, path: Extremal, p: np.ndarray) -> list
     and their Jacobian (K, m, nu).
     """
     form = ham.form
-    by_control = ca.jacobian(ham.rows, form.u)
-    parts = ca.fabs(ca.gradient(form.running, form.u)) + ca.mtimes(
-        ca.fabs(ca.jacobian(form.f, form.u)).T, ca.fabs(ham.lam)
-    )
+    by_state_rates = ca.mtimes(ca.fabs(ca.jacobian(form.f, form.u)).T, ca.fabs(ham.lam))
     hessian, slope = ca.hessian(ham.value, form.u)
-    outputs = [slope, parts, hessian, ham.rows, by_control]
-    first, size, second, rows, jacobian = path.sampled(ham, outputs, p)
-    count = path.t.size
-    square = second.reshape(count, form.nu, form.nu)
-    return [first, size, square, rows, jacobian.reshape(count, form.nu, len(form.path)).transpose(0, 2, 1)]
-
-
-def null_space(rows: np.ndarray) -> Any:
-    """Return an orthonormal basis of the null space of a matrix with n columns. Shape (n, k)."""
-    if rows.shape[0] == 0:
-        return np.eye(rows.shape[1])
-    _, sizes, directions = np.linalg.svd(rows)
-    rank = int(np.sum(sizes > 1e-12 * max(1.0, float(np.max(sizes, initial=0.0)))))
-    return directions[rank:].T
+    terms = ca.fabs(ca.gradient(form.running, form.u)) + by_state_rates
+    outputs = [slope, terms, hessian, ham.rows, ca.jacobian(ham.rows, form.u)]
+    slopes, sizes, hessians, rows, jacobians = path.sampled(ham, outputs, p)
+    shapes = (-1, form.nu, form.nu), (len(rows), form.nu, len(form.path))
+    return [slopes, sizes, hessians.reshape(shapes[0]), rows, jacobians.reshape(shapes[1]).transpose(0, 2, 1)]
 
 
 @dataclass(frozen=True)
 class Indirect:
-    """Indirect method: the equations of the minimum principle, solved by multiple or backward shooting.
+    """Indirect method: the equations of Pontryagin's minimum principle, solved by multiple or backward shooting.
 
     Attributes:
         segments: Number of segments, distributed over the arcs between switches of bang-bang controls.
@@ -143,9 +126,8 @@ class Indirect:
         for name in ("tolerance", "residual"):
             require.positive(f"Indirect: {name}", getattr(self, name), below=1.0)
         if not isinstance(self.seed, Collocation):
-            raise ProblemError(
-                f"Indirect: seed must be a Collocation(...), not {self.seed!r}", name="seed", value=self.seed
-            )
+            words = f"Indirect: seed must be a Collocation(...), not {self.seed!r}"
+            raise ProblemError(words, name="seed", value=self.seed)
 
     @interruptible
     def prepare(
@@ -157,22 +139,18 @@ class Indirect:
         compiled: bool = False,
         scaling: bool = True,
     ) -> PreparedIndirect:
-        """Derive the Hamiltonian system of a problem once; see :func:`ocp.methods.prepare`.
+        """Derive the Hamiltonian system of a problem once, for repeated solves; see :func:`ocp.methods.prepare`.
 
         ``solver``, ``options``, ``compiled`` and ``scaling`` apply to the direct solution that is its initial guess.
         """
         require.choice("solver", solver, SOLVERS)
-        how = {
-            "solver": solver,
-            "options": require.mapping("options", options),
-            "compiled": compiled,
-            "scaling": scaling,
-        }
-        return PreparedIndirect(problem, self, how)
+        options = require.mapping("options", options)
+        seeding = {"solver": solver, "options": options, "compiled": compiled, "scaling": scaling}
+        return PreparedIndirect(problem, self, seeding)
 
 
 class PreparedIndirect:
-    """A problem with its Hamiltonian system, derived once for repeated solves.
+    """A problem with its Hamiltonian system, derived once for repeated solves by the indirect method.
 
     Attributes:
         formulation, hamiltonian, boundary: The derived system. seconds: Wall time of the derivation.
@@ -192,7 +170,7 @@ class PreparedIndirect:
         self.seconds = time.monotonic() - began
 
     def __reduce__(self) -> Any:
-        """Represent the object for pickling and copying by its arguments, from which it is prepared again."""
+        """Return the class and the arguments from which pickle and copy prepare the problem again."""
         return type(self), (self.problem, self.method, self._seeding)
 
     @interruptible
@@ -229,15 +207,14 @@ class PreparedIndirect:
             try:
                 seed = direct.prepare(self.problem, **self._seeding).solve(parameters, guess)
             except SolveError as error:
-                return self._no_seed("the direct solution for its seed failed: ", error, error.solution, check)
+                return self._reject_seed("the direct solution for its seed failed: ", error, error.solution, check)
             note = f"; seeded by its own direct solution ({seed.method['type']}, {direct.intervals} intervals)"
         began = time.monotonic()
         try:
-            arcs = read_arcs(
-                self.hamiltonian, self.boundary.outputs, seed, p, bounds=bounds, segments=self.method.segments
-            )
+            count = self.method.segments
+            arcs = read_arcs(self.hamiltonian, self.boundary.outputs, seed, p, bounds=bounds, segments=count)
         except SolveError as error:
-            return self._no_seed("", error, seed, check)
+            return self._reject_seed("", error, seed, check)
         system = self.boundary.system(arcs)
         start, data = read_unknowns(self.hamiltonian, seed, arcs, p, bounds=bounds, backward=self.boundary.backward)
         root = newton(system, start, data, scale=float(max(1.0, np.max(np.abs(start)))), tolerance=self.method.residual)
@@ -258,7 +235,7 @@ class PreparedIndirect:
             )
         return solution
 
-    def _no_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
+    def _reject_seed(self, why: str, error: SolveError, seed: Solution | None, check: bool) -> Solution:
         """Raise SolveError about an unusable seed or, if ``check`` is false, return the seed as a failed solution."""
         if check or seed is None:
             words = f"problem {self.problem.name!r}: the indirect method failed: {why}{error}"
@@ -266,8 +243,6 @@ class PreparedIndirect:
             raise SolveError(words, seed, error.conflicts, **details) from error
         status = seed.status if not seed.success else SolverStatus.REJECTED
         return dataclasses.replace(seed, success=False, status=status, message=f"{why}{error}")
-
-    # ---- check and report of the result ----------------------------------------------------------------------
 
     def _check_order(self, root: NewtonResult, arcs: ControlArcs, bounds: Bounds) -> NewtonResult:
         """Reject a result whose bang-bang switches are out of order, or whose horizon is outside its bounds."""
@@ -303,6 +278,7 @@ class PreparedIndirect:
         note: str,
         seconds: float,
     ) -> Solution:
+        """Return the solution of the problem from the last Newton iterate; reject it if H is not minimal along it."""
         form, ham = self.formulation, self.hamiltonian
         y, inputs, switches, horizon = self.boundary.unpack(root.unknowns, arcs, data)
         segments = self._segments(y, inputs, bounds)
@@ -323,7 +299,10 @@ class PreparedIndirect:
         cost += form.terminal_cost(*ends, horizon=horizon, p=p)
 
         shape = (len(segments), len(LOBATTO))
-        nu_start, nu_end = self.boundary.end_multipliers(root.unknowns, arcs)
+        at = self.boundary.layout(arcs)
+        nu_start, nu_end = (
+            np.zeros(0) if self.boundary.backward else root.unknowns[at[end]] for end in ("start", "end")
+        )
         x, lam = samples_y[..., : form.nx], samples_y[..., form.nx :]
         u, mu = control.reshape(*shape, form.nu), multiplier.reshape(*shape, len(form.path))
         extremal = Extremal(LOBATTO, q[1], times, x, lam, u, mu, horizon, nu_start, nu_end)
@@ -342,7 +321,7 @@ class PreparedIndirect:
         settings = dataclasses.asdict(self.method)
         return Solution(
             name=form.name,
-            method={"type": "Indirect", **settings, "control": ham.how, "switches": switches.tolist()},
+            method={"type": "Indirect", **settings, "control": ham.solved, "switches": switches.tolist()},
             solver="newton",
             success=root.success and bool(np.isfinite(cost)),
             status=root.status,
@@ -366,24 +345,27 @@ class PreparedIndirect:
         )
 
     def _segments(self, y: np.ndarray, inputs: np.ndarray, bounds: Bounds) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return initial values and data of reported segments: shooting segments split where controls reach bounds."""
+        """Return initial values and data of all shooting segments, each split where a control reaches a bound."""
         index = self.formulation.bounds.places["control"]
         low, high = bounds[0][index], bounds[1][index]
 
-        def at_bound(first: np.ndarray, q: np.ndarray, position: float) -> np.ndarray:
+        def at_bound(position: float, first: np.ndarray, q: np.ndarray) -> np.ndarray:
             y = self.boundary.advance(first, q, position)
             arguments = self.boundary.arguments(y, q[0] + position * q[1], q[2], q)
             u = np.asarray(self.boundary.outputs(*arguments)[0].full()).reshape(-1)
             return np.asarray((u <= low) | (u >= high))
 
+        def change(position: float, first: np.ndarray, q: np.ndarray, before: np.ndarray) -> float:
+            return 0.5 - np.array_equal(at_bound(position, first, q), before)
+
         segments: list[tuple[np.ndarray, np.ndarray]] = []
         for first, q in zip(y.T[:-1], inputs.T, strict=True):
             splits = [0.0]
-            if self.hamiltonian.how != "quadratic":
-                at_bounds = [at_bound(first, q, position) for position in LOBATTO]
+            if self.hamiltonian.solved != "quadratic":
+                at_bounds = [at_bound(position, first, q) for position in LOBATTO]
                 for a, b, before, after in zip(LOBATTO, LOBATTO[1:], at_bounds, at_bounds[1:], strict=False):
                     if np.any(before != after):
-                        splits.append(bisect(partial(at_bound, first, q), a, b, before))
+                        splits.append(scipy.optimize.bisect(change, a, b, args=(first, q, before), xtol=1e-13))
             splits = [split for split in splits if split < 1.0 - 1e-9]
             if abs(q[1]) <= ROUNDING_SHARE * (abs(q[0]) + abs(q[1])):
                 continue  # an empty arc between simultaneous switches
@@ -391,14 +373,3 @@ class PreparedIndirect:
                 segment = np.concatenate([[q[0] + a * q[1], (b - a) * q[1]], q[2:]])
                 segments.append((self.boundary.advance(first, q, a), segment))
         return segments
-
-
-def bisect(marks: Callable[[float], np.ndarray], low: float, high: float, before: np.ndarray) -> float:
-    """Return, by bisection, where in low..high the function ``marks`` ceases to return the values ``before``."""
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        if np.array_equal(marks(middle), before):
-            low = middle
-        else:
-            high = middle
-    return high

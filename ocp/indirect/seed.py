@@ -18,8 +18,6 @@ from ocp.problem.values import evaluate_at_samples
 from ocp.solution import Solution
 from ocp.tolerances import RESOLVED_SHARE, SOLVER_SHARE
 
-__all__ = ["ControlArcs", "read_arcs", "read_unknowns"]
-
 
 @dataclass(frozen=True)
 class SeedSettings:
@@ -126,7 +124,7 @@ def seed_bounds(form: Formulation, seed: Solution, bounds: Bounds) -> tuple[np.n
 
 
 def signs(slope: np.ndarray) -> np.ndarray:
-    """Return the signs of sampled switching functions (M, n); samples near zero take the next clear sign.
+    """Return the signs of sampled switching functions (M, n); samples near zero take that of the next that is not.
 
     After the last significant sample its sign continues. A switching function that vanishes at an end, for example at a
     free state, would have the sign of the seed's noise there.

@@ -27,10 +27,17 @@ import numpy as np
 
 from ocp.errors import ProblemError
 from ocp.problem.hulls import WORLD, CoveredPairs, Separation
-from ocp.problem.intervals import RULES, Interval, check_instructions, constant, decided_masks, evaluate, multiple_of
+from ocp.problem.intervals import (
+    RULES,
+    Interval,
+    check_instructions,
+    constant,
+    decided_masks,
+    evaluate,
+    interpret,
+    multiple_of,
+)
 from ocp.problem.values import identity
-
-__all__ = ["Enclosure", "Enclosures", "PrescribedMotion"]
 
 
 class Enclosure(NamedTuple):
@@ -48,7 +55,7 @@ class Enclosure(NamedTuple):
 
 
 class Enclosures:
-    """Evaluator of bounds of expressions of one scalar symbol over intervals of that symbol.
+    """Evaluator of bounds of the values and slopes of expressions of one scalar symbol over intervals of the symbol.
 
     The bounds hold wherever an entry and all its subexpressions are defined: the square root of a function that becomes
     negative counts where it is real.
@@ -67,31 +74,16 @@ class Enclosures:
         check_instructions(what, self._function)
 
     def __call__(self, low: np.ndarray, high: np.ndarray) -> Enclosure:
-        """Return bounds of the expressions over M intervals of the symbol.
+        """Return bounds of the expressions over M intervals of the symbol, from ``low`` (M,) to ``high`` (M,)."""
 
-        The intervals reach from ``low`` to ``high``. Shape (M,) each.
-        """
-        jets = self._jets(_Jet(Interval(low, high), constant(1.0, low)))
-        return Enclosure(*(np.column_stack([side(jet) for jet in jets]) for side in _SIDES))
+        def apply(code: int, *operands: _Jet) -> _Jet:
+            return _KINKED[code](code, *operands) if code in _KINKED else _smooth(code, *operands)
 
-    def _jets(self, time: _Jet) -> list[_Jet]:
-        function, slots, outputs = self._function, dict[int, _Jet](), dict[int, _Jet]()
-        zero = constant(0.0, time.value.low)
+        symbol, zero = _Jet(Interval(low, high), constant(1.0, low)), constant(0.0, low)
         with np.errstate(all="ignore"):
-            for k in range(function.n_instructions()):
-                code, inputs = function.instruction_id(k), function.instruction_input(k)
-                if code == ca.OP_OUTPUT:
-                    outputs[function.instruction_output(k)[1]] = slots[inputs[0]]
-                    continue
-                if code == ca.OP_INPUT:
-                    jet = time
-                elif code == ca.OP_CONST:
-                    jet = _Jet(constant(function.instruction_constant(k), zero.low), zero)
-                else:
-                    rule: Callable[..., _Jet] = _KINKED.get(code, _smooth)
-                    jet = rule(code, *(slots[slot] for slot in inputs))
-                slots[function.instruction_output(k)[0]] = jet
-        return [outputs[k] for k in range(len(outputs))]
+            jets = interpret(self._function, [symbol], lambda value: _Jet(constant(value, low), zero), apply)
+        sides = zip(*((*jet.value[:2], *jet.slope[:2]) for jet in jets), strict=True)
+        return Enclosure(*(np.column_stack(side) for side in sides))
 
 
 class _Jet(NamedTuple):
@@ -101,19 +93,10 @@ class _Jet(NamedTuple):
     slope: Interval
 
 
-_SIDES: tuple[Callable[[_Jet], np.ndarray], ...] = (
-    lambda jet: jet.value.low,
-    lambda jet: jet.value.high,
-    lambda jet: jet.slope.low,
-    lambda jet: jet.slope.high,
-)
 ADD, MULTIPLY, SUBTRACT = (RULES[code] for code in (ca.OP_ADD, ca.OP_MUL, ca.OP_SUB))
 
 
-# ---- rules ----------------------------------------------------------------------------------------------------------
-
-
-def _where(valid: Any, slope: Interval) -> Interval:
+def _slope_where(valid: Any, slope: Interval) -> Interval:
     """Return the given slope bounds in intervals that a mask marks as valid, and infinite bounds in the others."""
     return Interval(np.where(valid, slope.low, -np.inf), np.where(valid, slope.high, np.inf))
 
@@ -121,14 +104,16 @@ def _where(valid: Any, slope: Interval) -> Interval:
 def _smooth(code: int, *jets: _Jet) -> _Jet:
     """Return bounds of the value and slope of a smooth operation, by the mean value theorem."""
     value = RULES[code](*(jet.value for jet in jets))
-    is_power = code in (ca.OP_POW, ca.OP_CONSTPOW)
-    exponent = _number(jets[1].value) if is_power else None
+    exponent = None
+    if code in (ca.OP_POW, ca.OP_CONSTPOW):
+        low, high = jets[1].value[:2]
+        exponent = float(low[0]) if (low == low[0]).all() and (high == low[0]).all() else None
     slope = constant(0.0, value.low)
     inputs = [jet.value for jet in jets[: 1 if exponent is not None else None]]
     for partial, jet in zip(evaluate(_partials(code, len(jets), exponent), inputs), jets, strict=False):
         if jet.slope.low.any() or jet.slope.high.any():
             slope = ADD(slope, MULTIPLY(partial, jet.slope))
-    return _Jet(value, _where(np.isfinite(value.low) & np.isfinite(value.high), slope))
+    return _Jet(value, _slope_where(np.isfinite(value.low) & np.isfinite(value.high), slope))
 
 
 @lru_cache(maxsize=4096)
@@ -143,16 +128,10 @@ def _partials(code: int, count: int, exponent: float | None) -> Any:
     return ca.Function("partials", [x, y], [ca.densify(ca.gradient(ca.SX.binary(code, x, y), both))])
 
 
-def _number(x: Interval) -> float | None:
-    """Return the number if all intervals consist of one and the same number; else None."""
-    first = float(x.low[0])
-    return first if bool((x.low == first).all() and (x.high == first).all()) else None
-
-
-def _steps(code: int, *jets: _Jet) -> _Jet:
+def _piecewise_constant(code: int, *jets: _Jet) -> _Jet:
     """Return bounds of the value and slope of a piecewise constant operation: floor, ceil, sign, comparisons."""
     value = RULES[code](*(jet.value for jet in jets))
-    return _Jet(value, _where(value.low == value.high, constant(0.0, value.low)))
+    return _Jet(value, _slope_where(value.low == value.high, constant(0.0, value.low)))
 
 
 def _absolute(code: int, x: _Jet) -> _Jet:
@@ -162,7 +141,7 @@ def _absolute(code: int, x: _Jet) -> _Jet:
 
 
 def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
-    """Return bounds of the value and slope of fmin or fmax; both slopes count where the selection is unknown."""
+    """Return bounds of the value and slope of fmin or fmax, from both operands where either may be the extreme one."""
     low, high = (x, y) if code == ca.OP_FMIN else (y, x)
     first, second = low.value.high <= high.value.low, high.value.high <= low.value.low
     ends = [
@@ -177,27 +156,27 @@ def _extreme(code: int, x: _Jet, y: _Jet) -> _Jet:
 def _if_else_zero(code: int, test: _Jet, x: _Jet) -> _Jet:
     holds, fails = decided_masks(test.value)
     slope = Interval(np.where(holds, x.slope.low, 0.0), np.where(holds, x.slope.high, 0.0))
-    return _Jet(RULES[code](test.value, x.value), _where(holds | fails, slope))
+    return _Jet(RULES[code](test.value, x.value), _slope_where(holds | fails, slope))
 
 
 def _modulo(code: int, x: _Jet, y: _Jet) -> _Jet:
     multiple, known = multiple_of(x.value, y.value, np.trunc if code == ca.OP_FMOD else np.rint)
     slope = SUBTRACT(x.slope, MULTIPLY(Interval(multiple, multiple), y.slope))
-    return _Jet(RULES[code](x.value, y.value), _where(known, slope))
+    return _Jet(RULES[code](x.value, y.value), _slope_where(known, slope))
 
 
 def _copysign(code: int, x: _Jet, y: _Jet) -> _Jet:
     size = _absolute(ca.OP_FABS, x).slope
     down = y.value.high < 0
     slope = Interval(np.where(down, -size.high, size.low), np.where(down, -size.low, size.high))
-    return _Jet(RULES[code](x.value, y.value), _where(down | (y.value.low > 0), slope))
+    return _Jet(RULES[code](x.value, y.value), _slope_where(down | (y.value.low > 0), slope))
 
 
 def _angle(code: int, y: _Jet, x: _Jet) -> _Jet:
-    """Return bounds of the value and slope of atan2, which jumps by a full turn on a half-line."""
+    """Return bounds of the value and slope of atan2, which jumps by a full turn on the negative x axis."""
     smooth = _smooth(code, y, x)
     continuous = (x.value.low > 0) | (y.value.low > 0) | (y.value.high < 0)
-    return _Jet(smooth.value, _where(continuous, smooth.slope))
+    return _Jet(smooth.value, _slope_where(continuous, smooth.slope))
 
 
 _KINKED: dict[int, Callable[..., _Jet]] = {
@@ -210,7 +189,7 @@ _KINKED: dict[int, Callable[..., _Jet]] = {
     ca.OP_COPYSIGN: _copysign,
     ca.OP_ATAN2: _angle,
     **{
-        getattr(ca, f"OP_{name}"): _steps
+        getattr(ca, f"OP_{name}"): _piecewise_constant
         for name in ("FLOOR", "CEIL", "SIGN", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR")
     },
 }

@@ -28,8 +28,6 @@ from models.shapes.hull import gap_along, is_box, nearest_directions
 from ocp.errors import ProblemError, require
 from ocp.problem.values import check_finite, table
 
-__all__ = ["Separation", "index_rows", "stack_motion_bounds"]
-
 
 @dataclass(frozen=True, eq=False)
 class Hull:
@@ -109,21 +107,21 @@ class HullPairs:
         self.has = np.zeros(len(pairs), dtype=bool)
         self.has[members] = True
         self.row = np.cumsum(self.has) - 1
-        self._cores = [
-            np.array([_pad_points(pair[side].core, kind or 8) for pair in chosen]) for side, kind in enumerate(kinds)
-        ]
+        self._cores = []
+        for side, kind in enumerate(kinds):
+            cores, index = [pair[side].core for pair in chosen], np.arange(kind or 8)
+            self._cores.append(np.array([core[np.minimum(index, len(core) - 1)] for core in cores]))  # of one length
         self._boxes = kinds[0] == 0, kinds[1] == 0
         self._frames = [np.array([pair[side].frame for pair in chosen]) for side in (0, 1)]
         self._observer = pairs[members, 2]
         self.radii = np.array([first.radius + second.radius for first, second in chosen])
-        self.flat = np.array([bool(first.normal.size or second.normal.size) for first, second in chosen])
         self.normals = np.array([_normal(*pair) for pair in chosen])
+        self.flat = np.asarray(self.normals.any(axis=1))
         self._box_side = None if set(kinds) not in ({0, 1}, {1}) or self.flat.any() else kinds.index(min(kinds))
         if self._box_side is not None:
             corners = self._cores[self._box_side]
-            edges = (
-                corners[:, [4, 2, 1]] - corners[:, :1] if kinds[self._box_side] == 0 else np.zeros((len(corners), 3, 3))
-            )
+            has_edges = kinds[self._box_side] == 0
+            edges = corners[:, [4, 2, 1]] - corners[:, :1] if has_edges else np.zeros((len(corners), 3, 3))
             lengths = np.linalg.norm(edges, axis=2)
             self._halves, self._centres = lengths / 2, corners.mean(axis=1)
             self._axes = np.where(lengths[:, :, None] > 0, edges / np.maximum(lengths, 1e-300)[:, :, None], np.eye(3))
@@ -231,7 +229,7 @@ class SeparatingDirections(NamedTuple):
     along: np.ndarray
 
     def of(self, selected: np.ndarray) -> SeparatingDirections:
-        """Return the directions of the pairs that a boolean mask of shape (K,) selects."""
+        """Return the separating directions of the pairs of bodies that a boolean mask of shape (K,) selects."""
         keep = selected[self.place]
         return SeparatingDirections((np.cumsum(selected) - 1)[self.place[keep]], self.row[keep], self.along[keep])
 
@@ -247,18 +245,20 @@ class BodyPairs:
         self._middles = np.array([hull.middle for hull in hulls]).reshape(-1, 3)
         sizes = np.array([hull.size + hull.radius for hull in hulls])
         self._reach = sizes[self._first] + sizes[self._second]
-        bodies = [(hulls[first], hulls[second]) for first, second in pairs[:, :2]]
-        self._flat = np.array([bool(first.normal.size or second.normal.size) for first, second in bodies], dtype=bool)
-        self._normals = np.array([_normal(*pair) for pair in bodies]).reshape(-1, 3)
+        normals = [_normal(hulls[first], hulls[second]) for first, second in pairs[:, :2]]
+        self._normals = np.array(normals).reshape(-1, 3)
+        self._flat = np.asarray(self._normals.any(axis=1))
 
     def balls(self, frames: Frames, at: np.ndarray, pair: np.ndarray) -> np.ndarray:
         """Return the gap between the bounding balls of the two bodies of each pair at a given sample. Shape (K,), m."""
         bodies = self._first[pair], self._second[pair]
         first, second = (self._in_world(frames, at, self._middles[k], self._frames[k]) for k in bodies)
-        return self._ball_distance(second - first, pair)
+        offset = second - first
+        along_normal = (offset * self._normals[pair]).sum(axis=-1)
+        return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
 
     def distances(self, frames: Frames, near: float = np.inf, pairs: Sequence[int] | None = None) -> np.ndarray:
-        """Return the distances of all pairs at all samples, or lower bounds of distances above `near`. Shape (M, n), m.
+        """Return the distances of all pairs of bodies at all samples, or lower bounds above `near`. Shape (M, n), m.
 
         With `pairs`, the indices of the only pairs that count, the distances of all others are infinite.
         """
@@ -283,7 +283,7 @@ class BodyPairs:
         return np.asarray(np.where(self._flat, along_normal, np.sqrt(square)) - self._reach)
 
     def gaps(self, frames: Frames, at: np.ndarray, pair: np.ndarray, near: float | np.ndarray = np.inf) -> np.ndarray:
-        """Return distances of given pairs at given samples, or lower bounds of those above `near`. Shape (K,), m."""
+        """Return the distances of pairs of bodies at given samples, or lower bounds above `near`. Shape (K,), m."""
         place, row = self._covered.of(pair)
         gap, count = np.full(len(row), -np.inf), len(pair)
 
@@ -299,7 +299,7 @@ class BodyPairs:
     def nearest(
         self, frames: Frames, at: np.ndarray, pair: np.ndarray
     ) -> tuple[SeparatingDirections, np.ndarray, np.ndarray]:
-        """Return directions, distances (K,), m, and nearest points before inflation (K, 2, 3), m, of pairs."""
+        """Return separating directions, distances (K,), m, and nearest points of the cores (K, 2, 3), m, of pairs."""
         place, rows = self._covered.of(pair)
         along, gap, points = np.empty((len(rows), 3)), np.empty(len(rows)), np.empty((len(rows), 2, 3))
         for kind, chosen, row in self._by_kind(rows):
@@ -308,7 +308,7 @@ class BodyPairs:
         return SeparatingDirections(place, rows, along), gap[decisive], points[decisive]
 
     def chords(self, facing: SeparatingDirections, frames: Frames, ends: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the smaller of each pair's gaps along a direction at start and end of an interval. Shape (K,), m.
+        """Return the smaller of two bodies' gaps along a direction at start and end of an interval. Shape (K,), m.
 
         The same row must separate the bodies at both ends; otherwise nothing follows for the times between.
         """
@@ -323,13 +323,8 @@ class BodyPairs:
         """Transform points that are fixed in moving frames to world coordinates at given samples."""
         return np.asarray((frames.rotations[at, frame] @ points[..., None])[..., 0] + frames.positions[at, frame])
 
-    def _ball_distance(self, offset: np.ndarray, pair: np.ndarray) -> np.ndarray:
-        """Return the gap between the two bounding balls of each pair, whose centres differ by `offset`."""
-        along_normal = (offset * self._normals[pair]).sum(axis=-1)
-        return np.asarray(np.where(self._flat[pair], along_normal, np.linalg.norm(offset, axis=-1)) - self._reach[pair])
-
     def _by_kind(self, rows: np.ndarray) -> Iterator[tuple[HullPairs, np.ndarray, np.ndarray]]:
-        """Split pairs by the kinds of their hulls; yield each group, its places in `rows`, and indices in the group."""
+        """Split pairs by the kinds of their hulls; yield each group, the places in `rows`, and indices in the group."""
         for kind in self._kinds:
             chosen = np.flatnonzero(kind.has[rows])
             if chosen.size:
@@ -344,13 +339,11 @@ def group_pairs(hulls: Sequence[Hull], pairs: np.ndarray) -> list[HullPairs]:
     return [HullPairs(hulls, pairs, members, kind) for kind, members in kinds.items()]
 
 
-def _pad_points(core: np.ndarray, count: int) -> np.ndarray:
-    """Return the points of a hull, with the last point repeated until there are `count` points."""
-    return np.concatenate([core, np.repeat(core[-1:], count - len(core), axis=0)])
-
-
 def frames_of(placements: np.ndarray) -> Frames:
-    """Return poses from samples of rotation matrices, by columns, and positions (M, 12 F); the world is added last."""
+    """Return the poses of F frames from M samples of rotation matrices, by columns, and positions. Shape (M, 12 F).
+
+    The world is added as the last frame.
+    """
     count = len(placements)
     world = np.broadcast_to(np.vstack([np.eye(3), np.zeros(3)]), (count, 1, 4, 3))
     values = np.concatenate([placements.reshape(count, placements.shape[1] // 12, 4, 3), world], axis=1)
@@ -358,7 +351,7 @@ def frames_of(placements: np.ndarray) -> Frames:
 
 
 def _normal(first: Hull, second: Hull) -> np.ndarray:
-    """Return the half-space normal of a pair, directed from first to second body; zero if no body is a half-space."""
+    """Return the half-space normal of a pair, directed from first to second body; zero if neither is a half-space."""
     return first.normal if first.normal.size else -second.normal if second.normal.size else np.zeros(3)
 
 
@@ -368,7 +361,7 @@ WORLD = -1
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Declaration of minimum distances between pairs of bodies.
+    """Declaration of minimum distances between pairs of bodies, which the audit proves along the whole motion.
 
     Attributes:
         name: Unique among the constraints of a problem.
@@ -447,7 +440,7 @@ class Separation:
         return tuple((names[first], names[second]) for first, second, _ in self.pairs)
 
     def of(self, pairs: Sequence[int]) -> Separation:
-        """Return the separation constraint of a subset of the pairs."""
+        """Return the separation constraint of a subset of the pairs of bodies, given by their indices."""
         keep = list(pairs)
         parts = {label: getattr(self, label)[keep] for label in ("pairs", "least", "levers", "turns")}
         covers = {row: self.covers[pair] for row, pair in enumerate(keep) if pair in self.covers}
@@ -491,7 +484,9 @@ def index_rows(what: str, label: str, values: Any, count: int) -> np.ndarray:
 
 
 def stack_motion_bounds(what: str, bounds: Mapping[str, Any], movers: Mapping[str, int], count: int) -> np.ndarray:
-    """Stack bounds of the displacement of the bodies of pairs per unit change of each state; 0 for a state without one.
+    """Return bounds of the relative displacement of pairs of bodies per unit change of each state. Shape (n, k).
+
+    A state for which `bounds` has no entry has the bound 0.
 
     Args:
         movers: Size of each state that moves a body. count: Number of pairs.

@@ -10,16 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import product
 from math import tau
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
 
 from ocp.errors import ProblemError
 
-__all__ = ["NAMES", "RULES", "Interval", "check_instructions", "constant", "decided_masks", "evaluate", "multiple_of"]
-
 Array: TypeAlias = np.ndarray
+Value = TypeVar("Value")
 
 
 class Interval(NamedTuple):
@@ -44,20 +43,34 @@ def evaluate(function: Any, inputs: Sequence[Interval]) -> list[Interval]:
         function: Function of scalars whose instructions are those of `RULES`, see `check_instructions`.
         inputs: The range of each input, over the same M intervals.
     """
-    slots: dict[int, Interval] = {}
-    outputs: dict[int, Interval] = {}
+    return interpret(
+        function, inputs, lambda value: constant(value, inputs[0].low), lambda code, *operands: RULES[code](*operands)
+    )
+
+
+def interpret(
+    function: Any, inputs: Sequence[Value], constant: Callable[[float], Value], apply: Callable[..., Value]
+) -> list[Value]:
+    """Return the entries of the single output of an SX function, evaluated in another arithmetic.
+
+    Args:
+        function: Function of scalars.
+        inputs: The value of each input in that arithmetic.
+        constant: Function that converts a number to that arithmetic.
+        apply: Function (instruction code, operands) that evaluates an operation.
+    """
+    slots: dict[int, Value] = {}
+    outputs: dict[int, Value] = {}
     for k in range(function.n_instructions()):
         code, operands = function.instruction_id(k), function.instruction_input(k)
         if code == ca.OP_OUTPUT:
             outputs[function.instruction_output(k)[1]] = slots[operands[0]]
+        elif code == ca.OP_INPUT:
+            slots[function.instruction_output(k)[0]] = inputs[operands[0]]
+        elif code == ca.OP_CONST:
+            slots[function.instruction_output(k)[0]] = constant(function.instruction_constant(k))
         else:
-            slots[function.instruction_output(k)[0]] = (
-                inputs[operands[0]]
-                if code == ca.OP_INPUT
-                else constant(function.instruction_constant(k), inputs[0].low)
-                if code == ca.OP_CONST
-                else RULES[code](*(slots[slot] for slot in operands))
-            )
+            slots[function.instruction_output(k)[0]] = apply(code, *(slots[slot] for slot in operands))
     return [outputs[k] for k in range(len(outputs))]
 
 
@@ -71,10 +84,7 @@ def check_instructions(what: str, function: Any) -> None:
             raise ProblemError(words, name=name, value=code)
 
 
-# ---- rules ----------------------------------------------------------------------------------------------------------
-
-
-def _out(low: Any, high: Any) -> Interval:
+def _widen(low: Any, high: Any) -> Interval:
     """Return an interval that is widened by possible rounding errors; a bound that is nan becomes infinite."""
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     # the functions of a C library are accurate to four units in the last place
@@ -89,9 +99,9 @@ def constant(value: float, like: Array) -> Interval:
 
 
 def _range_of(corners: list[Array]) -> Interval:
-    """Return the interval from the smallest to the largest value of an operation at the corners of its inputs."""
+    """Return the interval from the smallest to the largest of given values, widened by possible rounding errors."""
     stacked = np.array(corners)
-    return _out(stacked.min(axis=0), stacked.max(axis=0))
+    return _widen(stacked.min(axis=0), stacked.max(axis=0))
 
 
 def _without_warnings(rule: Callable[..., Interval]) -> Callable[..., Interval]:
@@ -105,13 +115,12 @@ def _without_warnings(rule: Callable[..., Interval]) -> Callable[..., Interval]:
 
 
 def _add(x: Interval, y: Interval) -> Interval:
-    if x.part is not None and y.part is not None and _opposite(x.part[0], y.part[0]):
-        return _either(x.part[0], x.part[1], y.part[1])
-    return _out(x.low + y.low, x.high + y.high)
-
-
-def _opposite(first: Interval, second: Interval) -> bool:
-    return first.negates is second or second.negates is first
+    """Return the range of a sum, or that of an if_else, which casadi writes as a sum of both branches."""
+    if x.part is not None and y.part is not None:
+        (test, yes), (opposite, no) = x.part, y.part
+        if test.negates is opposite or opposite.negates is test:
+            return _either(test, yes, no)
+    return _widen(x.low + y.low, x.high + y.high)
 
 
 def _either(test: Interval, yes: Interval, no: Interval) -> Interval:
@@ -133,7 +142,7 @@ def _if_else_zero(test: Interval, value: Interval) -> Interval:
 
 
 def _subtract(x: Interval, y: Interval) -> Interval:
-    return _out(x.low - y.high, x.high - y.low)
+    return _widen(x.low - y.high, x.high - y.low)
 
 
 def _multiply(x: Interval, y: Interval) -> Interval:
@@ -145,18 +154,12 @@ def _multiply(x: Interval, y: Interval) -> Interval:
 
 def _inverse(x: Interval) -> Interval:
     about_zero = (x.low <= 0) & (x.high >= 0)
-    return _out(np.where(about_zero, -np.inf, 1 / x.high), np.where(about_zero, np.inf, 1 / x.low))
-
-
-def _divide(x: Interval, y: Interval) -> Interval:
-    return _multiply(x, _inverse(y))
+    return _widen(np.where(about_zero, -np.inf, 1 / x.high), np.where(about_zero, np.inf, 1 / x.low))
 
 
 def _square(x: Interval) -> Interval:
-    largest = np.maximum(np.abs(x.low), np.abs(x.high))
-    smallest = np.maximum(0.0, np.maximum(x.low, -x.high))
-    squares = _out(smallest * smallest, largest * largest)
-    return Interval(np.maximum(squares.low, 0.0), squares.high)
+    size = _absolute(x)
+    return _clamp(_widen(size.low * size.low, size.high * size.high), low=0.0)
 
 
 def _power(x: Interval, y: Interval) -> Interval:
@@ -167,8 +170,8 @@ def _power(x: Interval, y: Interval) -> Interval:
             return _inverse(_power(x, constant(-exponent, x.low)))
         if exponent % 2 == 0:
             base = _absolute(x)
-            return _clamp(_out(base.low**exponent, base.high**exponent), low=0.0)
-        return _out(x.low**exponent, x.high**exponent)
+            return _clamp(_widen(base.low**exponent, base.high**exponent), low=0.0)
+        return _widen(x.low**exponent, x.high**exponent)
     base = _clamp(x, low=0.0)
     powers = _range_of([a**b for a, b in product((base.low, base.high), (y.low, y.high))])
     unknown = (x.high < 0) | ((x.low < 0) & ~fixed)  # y may contain an integer exponent
@@ -190,18 +193,11 @@ def _increasing_rule(
 
     def rule(x: Interval) -> Interval:
         inside = _clamp(x, low, high)
-        result = _out(function(inside.low), function(inside.high))
+        result = _widen(function(inside.low), function(inside.high))
         undefined = (x.high < low) | (x.low > high)
         return Interval(np.where(undefined, -np.inf, result.low), np.where(undefined, np.inf, result.high))
 
     return rule
-
-
-def _decreasing_rule(function: Callable[[Any], Any], low: float, high: float) -> Callable[..., Interval]:
-    """Return the interval rule of a decreasing function with the domain from `low` to `high`."""
-    rising = _increasing_rule(lambda x: -function(x), low, high)
-
-    return lambda x: _negative(rising(x))
 
 
 def _negative(x: Interval) -> Interval:
@@ -220,7 +216,7 @@ def _sinusoid_rule(function: Callable[[Any], Any], crest: float) -> Callable[...
 
     def rule(x: Interval) -> Interval:
         ends = function(x.low), function(x.high)
-        result = _out(np.minimum(*ends), np.maximum(*ends))
+        result = _widen(np.minimum(*ends), np.maximum(*ends))
         high = np.where(_contains_multiple(x, crest, tau), 1.0, np.minimum(result.high, 1.0))
         low = np.where(_contains_multiple(x, crest + tau / 2, tau), -1.0, np.maximum(result.low, -1.0))
         unbounded = ~(np.isfinite(x.low) & np.isfinite(x.high))
@@ -231,12 +227,12 @@ def _sinusoid_rule(function: Callable[[Any], Any], crest: float) -> Callable[...
 
 def _tangent(x: Interval) -> Interval:
     pole = _contains_multiple(x, tau / 4, tau / 2) | ~(np.isfinite(x.low) & np.isfinite(x.high))
-    result = _out(np.tan(x.low), np.tan(x.high))
+    result = _widen(np.tan(x.low), np.tan(x.high))
     return Interval(np.where(pole, -np.inf, result.low), np.where(pole, np.inf, result.high))
 
 
 def _angle(y: Interval, x: Interval) -> Interval:
-    """Return the range of atan2 over rectangles: from the corner values, or a full turn if the branch cut is met."""
+    """Return the range of atan2(y, x): from its values at the ends of both intervals, or a full turn at its jump."""
     result = _range_of([np.arctan2(a, b) for a, b in product((y.low, y.high), (x.low, x.high))])
     crosses_cut = ~((x.low > 0) | (y.low > 0) | (y.high < 0))
     half = float(np.nextafter(np.pi, 4))
@@ -245,7 +241,7 @@ def _angle(y: Interval, x: Interval) -> Interval:
 
 def _hypot(x: Interval, y: Interval) -> Interval:
     first, second = _absolute(x), _absolute(y)
-    return _clamp(_out(np.hypot(first.low, second.low), np.hypot(first.high, second.high)), low=0.0)
+    return _clamp(_widen(np.hypot(first.low, second.low), np.hypot(first.high, second.high)), low=0.0)
 
 
 def _copysign(x: Interval, y: Interval) -> Interval:
@@ -257,7 +253,7 @@ def _copysign(x: Interval, y: Interval) -> Interval:
 
 def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tuple[Any, Any]:
     """Return the rounded quotient x / y, and a mask of the intervals in which the rounded quotient is constant."""
-    quotient = _divide(x, y)
+    quotient = _multiply(x, _inverse(y))
     multiple = rounded(quotient.low)
     known = np.isfinite(multiple) & (multiple == rounded(quotient.high))
     return np.where(known, multiple, 0.0), known
@@ -265,22 +261,22 @@ def multiple_of(x: Interval, y: Interval, rounded: Callable[[Any], Any]) -> tupl
 
 def _modulo(x: Interval, y: Interval) -> Interval:
     """Return the range of fmod: x minus a multiple of y, with the sign of x."""
-    multiple, known = multiple_of(x, y, np.trunc)
-    result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     largest = np.minimum(_absolute(y).high, _absolute(x).high)
-    low, high = np.where(x.low < 0, -largest, 0.0), np.where(x.high > 0, largest, 0.0)
-    return Interval(
-        np.where(known, np.maximum(result.low, low), low), np.where(known, np.minimum(result.high, high), high)
-    )
+    return _reduce(x, y, np.trunc, np.where(x.low < 0, -largest, 0.0), np.where(x.high > 0, largest, 0.0))
 
 
 def _remainder(x: Interval, y: Interval) -> Interval:
     """Return the range of the remainder: x minus the nearest integer multiple of y."""
-    multiple, known = multiple_of(x, y, np.rint)
-    result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     half = np.minimum(_absolute(y).high / 2, _absolute(x).high)
+    return _reduce(x, y, np.rint, -half, half)
+
+
+def _reduce(x: Interval, y: Interval, rounded: Callable[[Any], Any], low: Array, high: Array) -> Interval:
+    """Return the range of x minus y times the rounded quotient x / y, which lies between `low` and `high` (M,)."""
+    multiple, known = multiple_of(x, y, rounded)
+    result = _subtract(x, _multiply(Interval(multiple, multiple), y))
     return Interval(
-        np.where(known, np.maximum(result.low, -half), -half), np.where(known, np.minimum(result.high, half), half)
+        np.where(known, np.maximum(result.low, low), low), np.where(known, np.minimum(result.high, high), high)
     )
 
 
@@ -307,12 +303,7 @@ def _and(x: Interval, y: Interval) -> Interval:
     return Interval(np.where(first & second, 1.0, 0.0), np.where(first_fails | second_fails, 0.0, 1.0))
 
 
-def _or(x: Interval, y: Interval) -> Interval:
-    (first, first_fails), (second, second_fails) = decided_masks(x), decided_masks(y)
-    return Interval(np.where(first | second, 1.0, 0.0), np.where(first_fails & second_fails, 0.0, 1.0))
-
-
-def _step(function: Callable[[Any], Any]) -> Callable[..., Interval]:
+def _step_rule(function: Callable[[Any], Any]) -> Callable[..., Interval]:
     """Return the interval rule of an increasing step function, whose integer values need no widening for rounding."""
     return lambda x: Interval(function(x.low), function(x.high))
 
@@ -322,10 +313,10 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "ADD": _add,
     "SUB": _subtract,
     "MUL": _multiply,
-    "DIV": _divide,
+    "DIV": lambda x, y: _multiply(x, _inverse(y)),
     "NEG": _negative,
     "INV": _inverse,
-    "TWICE": lambda x: _out(2 * x.low, 2 * x.high),
+    "TWICE": lambda x: _widen(2 * x.low, 2 * x.high),
     "SQ": _square,
     "SQRT": _increasing_rule(np.sqrt, low=0.0),
     "POW": _power,
@@ -338,7 +329,7 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "COS": _sinusoid_rule(np.cos, 0.0),
     "TAN": _tangent,
     "ASIN": _increasing_rule(np.arcsin, -1.0, 1.0),
-    "ACOS": _decreasing_rule(np.arccos, -1.0, 1.0),
+    "ACOS": lambda x: _negative(_increasing_rule(lambda a: -np.arccos(a), -1.0, 1.0)(x)),
     "ATAN": _increasing_rule(np.arctan),
     "ATAN2": _angle,
     "SINH": _increasing_rule(np.sinh),
@@ -354,16 +345,16 @@ _BY_NAME: dict[str, Callable[..., Interval]] = {
     "FMOD": _modulo,
     "REMAINDER": _remainder,
     "COPYSIGN": _copysign,
-    "FLOOR": _step(np.floor),
-    "CEIL": _step(np.ceil),
-    "SIGN": _step(np.sign),
+    "FLOOR": _step_rule(np.floor),
+    "CEIL": _step_rule(np.ceil),
+    "SIGN": _step_rule(np.sign),
     "LT": lambda x, y: _below(x, y, strict=True),
     "LE": lambda x, y: _below(x, y, strict=False),
     "EQ": _equal,
     "NE": lambda x, y: _not(_equal(x, y))._replace(negates=None),
     "NOT": _not,
     "AND": _and,
-    "OR": _or,
+    "OR": lambda x, y: _not(_and(_not(x), _not(y)))._replace(negates=None),
     "IF_ELSE_ZERO": _if_else_zero,
 }
 RULES = {getattr(ca, f"OP_{name}"): _without_warnings(rule) for name, rule in _BY_NAME.items()}

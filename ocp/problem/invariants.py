@@ -1,7 +1,8 @@
 """First integrals: quantities that the dynamics conserve for all controls, such as the length of a quaternion.
 
 An end condition that follows from the start and from first integrals is redundant, and its multiplier grows without
-bound as the error of the method falls. It is dropped from the solve, and the audit checks it like any other.
+bound as the error of the method falls. So is a condition on a control at an end that follows from path equalities and
+from the other conditions there. It is dropped from the solve, and the audit checks it like any other.
 
 The first integrals sought are polynomials of the states: I is one if grad I(x) . f(x, u, t) = 0, which is linear in its
 coefficients, at random samples of x, u and t.
@@ -20,8 +21,6 @@ import scipy
 from ocp.problem.formulation import Bounds, Formulation, is_free
 from ocp.tolerances import ROUNDING_SHARE, SOLVER_SHARE
 
-__all__ = ["bounds_to_solve"]
-
 MAX_DEGREE = 3  # of the polynomials
 
 
@@ -35,12 +34,15 @@ class InvariantSettings:
         contradiction: Residual, relative to its terms, by which a condition may contradict a first integral:
             quaternions are given with few digits.
         leeway: Violation allowed of a dropped condition, relative to its terms: it excludes -q, which is as long as q.
+        control_weight: Weight of conditions on controls where one of several is dropped. The multiplier of a condition
+            on a control at one time is an impulse of those of the path equalities, so conditions on states stay.
     """
 
     monomials: int = 300
     steps: int = 20
     contradiction: float = 1e-3
     leeway: float = 0.5
+    control_weight: float = 1e-3
 
 
 SETTINGS = InvariantSettings()
@@ -103,7 +105,7 @@ def coupled_parts(form: Formulation) -> list[np.ndarray]:
 
 
 def monomials(part: np.ndarray) -> np.ndarray:
-    """Return all monomials of given states up to the highest allowed degree; see `FirstIntegrals`. Shape (m, 3)."""
+    """Return all monomials of given states up to the highest allowed degree, as indices of 3 factors. Shape (m, 3)."""
     degree = max(d for d in range(MAX_DEGREE + 1) if comb(len(part) + d, d) <= SETTINGS.monomials + 1)
     rows = combinations_with_replacement([0, *(part + 1)], degree)
     return np.array([(0,) * (MAX_DEGREE - degree) + row for row in rows if any(row)], int).reshape(-1, MAX_DEGREE)
@@ -117,7 +119,7 @@ def factor_derivatives(monomials: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def sample_rates(form: Formulation, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most ``count`` random states with finite time derivatives, and the derivatives. Shapes (K, nx)."""
+    """Return at most ``count`` random states whose time derivatives are finite, and these. Shape (K, nx) each."""
     rng = np.random.default_rng(0)
     x, u, t = (rng.normal(size=(count, n)) for n in (form.nx, form.nu, 1))
     horizon, p = 1.0, np.exp(0.3 * rng.normal(size=form.np))
@@ -136,7 +138,7 @@ def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
     """
     lower, upper = form.bound_values(p)
     integrals = form.cached("first integrals", lambda: FirstIntegrals(form))
-    if not len(integrals.factors):
+    if not len(integrals.factors) and not path_equalities(form).any():
         return lower, upper
     low, high = lower.copy(), upper.copy()
     for index, leeway in implied_conditions(form, integrals, (lower, upper), p):
@@ -147,24 +149,31 @@ def bounds_to_solve(form: Formulation, p: np.ndarray) -> Bounds:
 def implied_conditions(
     form: Formulation, integrals: FirstIntegrals, bounds: Bounds, p: np.ndarray
 ) -> list[tuple[int, float]]:
-    """Return the end conditions that first integrals imply: indices in the bound table, and allowed violations."""
-    nx, places = form.nx, form.bounds.places
+    """Return the indices of start and end conditions that first integrals or path equalities imply, with leeways.
+
+    The indices are those of the bound table, the leeways the allowed violations.
+    """
+    nx, n, places = form.nx, form.nx + form.nu, form.bounds.places
     index = np.concatenate([places[kind] for kind in ("initial", "start", "terminal", "end")])
     low, high = (side[index] for side in bounds)
-    equal, last = low == high, nx + len(form.start)
-    if not equal[last:].any():
+    equal, first = low == high, nx if path_equalities(form).any() else nx + len(form.start)
+    if not equal[first:].any():
         return []
     rows = form.cached("rows of both ends", lambda: rows_of_ends(form))
+    on_path = bounds[0][places["path"][path_equalities(form)]]
     # find a point that meets all conditions, by Newton's method from a random one
-    z = np.random.default_rng(0).normal(size=2 * nx + 1)
+    z = np.random.default_rng(0).normal(size=2 * n + 1)
     z[-1] = 1.0 if form.horizon_is_free else float(form.horizon_at(p))
     for _ in range(SETTINGS.steps):
         values, slope = (np.array(part) for part in rows(z, p))
         slope[:, -1] *= form.horizon_is_free
-        (before, before_x), (after, after_x) = integrals.at(z[:nx]), integrals.at(z[nx:-1])
-        invariance = np.hstack([-before_x, after_x, np.zeros((len(before), 1))])
-        conditions = slope[equal]
-        residuals = np.concatenate([(values.ravel() - low)[equal], after - before])
+        (before, before_x), (after, after_x) = integrals.at(z[:nx]), integrals.at(z[n : n + nx])
+        of_controls = np.zeros((len(before), form.nu))
+        conserved = np.hstack([-before_x, of_controls, after_x, of_controls, np.zeros((len(before), 1))])
+        invariance = np.vstack([conserved, slope[len(index) :]])
+        conditions, on_rows = slope[: len(index)][equal], values.ravel()
+        path_gap = on_rows[len(index) :] - np.tile(on_path, 2)
+        residuals = np.concatenate([(on_rows[: len(index)] - low)[equal], after - before, path_gap])
         jacobian = np.vstack([conditions, invariance])
         if not (np.isfinite(jacobian).all() and np.isfinite(residuals).all()):
             return []
@@ -177,12 +186,14 @@ def implied_conditions(
         return []  # the conditions contradict each other: the solver reports it
     # only end conditions on states that all conditions together determine may be relaxed
     undetermined = np.diag(null_projector(jacobian)) > ROUNDING_SHARE
-    own = (np.flatnonzero(equal) >= last) & ~conditions[:, undetermined].any(axis=1)
+    own = (np.flatnonzero(equal) >= first) & ~conditions[:, undetermined].any(axis=1)
     others, ends = conditions[~own], conditions[own]
     if not own.any():
         return []
     independent = (ends @ null_projector(np.vstack([others, invariance]))).T
-    triangle, order = scipy.linalg.qr(independent, mode="r", pivoting=True)
+    of_controls = np.concatenate([np.arange(nx, n), np.arange(n + nx, 2 * n)])
+    weight = np.where((ends[:, of_controls] != 0).any(axis=1), SETTINGS.control_weight, 1.0)
+    triangle, order = scipy.linalg.qr(independent * weight, mode="r", pivoting=True)
     threshold = SOLVER_SHARE * np.abs(ends).max()
     rank = int((np.abs(np.diag(triangle)) > threshold).sum())
     if rank == np.linalg.matrix_rank(ends @ null_projector(others), tol=threshold):
@@ -196,19 +207,28 @@ def null_projector(rows: np.ndarray) -> np.ndarray:
     return np.asarray(np.eye(rows.shape[1]) - np.linalg.pinv(rows, rcond=ROUNDING_SHARE) @ rows)
 
 
-def rows_of_ends(form: Formulation) -> ca.Function:
-    """Return the casadi Function that evaluates all conditions on the start and end states, and their Jacobian.
+def path_equalities(form: Formulation) -> np.ndarray:
+    """Return which path equalities may imply conditions on controls at the ends; none if there are no such conditions.
 
-    Its arguments are the start state, end state and horizon in one column, and the parameters.
+    Shape (rows,), bool.
     """
-    z = form.sym("z", 2 * form.nx + 1)
-    x0, x1, horizon = z[: form.nx], z[form.nx : -1], z[-1]
-    zero = form.problem.symbols(ca.DM.zeros(form.nu))
-    begin = ca.substitute([form.start.expression], [form.x, form.u, form.t, form.T], [x0, zero, 0, horizon])[0]
-    end = ca.substitute(
-        [form.end.expression],
-        [form.x, form.x0, form.u, form.u0, form.t, form.T],
-        [x1, x0, zero, zero, horizon, horizon],
-    )[0]
-    rows = ca.vertcat(x0, begin, x1, end)
+    ends = ca.vertcat(form.start.expression, form.end.expression)
+    uses_control = not form.signals and form.nu > 0 and ca.depends_on(ends, ca.vertcat(form.u, form.u0))
+    return np.asarray(form.path.equality & bool(uses_control))
+
+
+def rows_of_ends(form: Formulation) -> ca.Function:
+    """Return the casadi Function that evaluates all conditions on the start and end, and their Jacobian.
+
+    Its arguments are start state and control, end state and control, and horizon in one column, and the parameters. The
+    path equalities at the start and at the end come last.
+    """
+    n, nx = form.nx + form.nu, form.nx
+    z = form.sym("z", 2 * n + 1)
+    x0, u0, x1, u1, horizon = z[:nx], z[nx:n], z[n : n + nx], z[n + nx : -1], z[-1]
+    path = form.path.select(path_equalities(form)).expression
+    symbols = [form.x, form.u, form.x0, form.u0, form.t, form.T]
+    begin = ca.substitute([form.start.expression, path], symbols, [x0, u0, x0, u0, 0, horizon])
+    end = ca.substitute([form.end.expression, path], symbols, [x1, u1, x0, u0, horizon, horizon])
+    rows = ca.vertcat(x0, begin[0], x1, end[0], begin[1], end[1])
     return ca.Function("rows", [z, form.p], [ca.densify(rows), ca.densify(ca.jacobian(rows, z))])

@@ -15,21 +15,17 @@ import numpy as np
 from ocp.errors import ProblemError, error_names, require
 from ocp.problem.declarations import (
     ENDS,
+    RECORD_KINDS,
     Constraint,
     Declarations,
-    ExpressionReader,
     Guess,
     Horizon,
-    PhaseTimes,
     Signal,
     Value,
     Variable,
-    check_guess,
-    number_of_entries,
-    read_scale,
-    signal_function,
 )
 from ocp.problem.enclosures import PrescribedMotion
+from ocp.problem.expressions import ExpressionReader, check_guess, number_of_entries, read_scale, signal_function
 from ocp.problem.hulls import Hull, Separation, index_rows, stack_motion_bounds
 from ocp.problem.record_reader import from_record
 from ocp.problem.record_writer import to_record
@@ -102,16 +98,13 @@ class Problem:
         self.formulated: Any = None  # see ocp.problem.formulation.Formulation.of
         self.origin: Any = None  # the builder that declared it and its arguments, see `remembers_request`
 
-    # ---- copies and files ------------------------------------------------------------------------------------
-
     def __getstate__(self) -> dict[str, Any]:
         """Return the problem as plain data, without those guesses that are functions; see `to_record`."""
         return to_record(self.name, self.symbols, self.time, self.declared)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the problem, with new symbols, from data of :meth:`__getstate__`; raise ProblemError if damaged."""
-        kinds = (Variable, Signal, Constraint, Horizon, PhaseTimes, Declarations, Separation, Hull)
-        self.name, self.symbols, self.time, self.declared = from_record(state, kinds)
+        self.name, self.symbols, self.time, self.declared = from_record(state, RECORD_KINDS)
         self.declared.check(self.symbols)
         self.formulated = self.origin = None
 
@@ -133,8 +126,6 @@ class Problem:
     def __deepcopy__(self, memo: Any) -> Problem:
         """Return a copy with the same symbols, which are immutable."""
         return self.__copy__()
-
-    # ---- variables -------------------------------------------------------------------------------------------
 
     @_about_its_name
     def state(
@@ -158,7 +149,7 @@ class Problem:
             initial, terminal: Values at both ends; nan frees an entry, None frees all. A scalar applies to every entry.
                 Expressions of parameters are allowed.
             lower, upper: Bounds at all times; expressions of parameters are allowed.
-            guess: A value, or a function ``time -> value``.
+            guess: A value, a function ``time -> value``, or samples (M, n) evenly over the horizon.
             unit: Shown beside the values, "rad" or "m/s"; for mixed entries all units, "rad, m".
             scale: Typical size of the entries, by which the solver divides them; nan for an entry, None for all,
                 derives it. Give it if entries of one vector differ by orders of magnitude, as rotor and arm speeds do.
@@ -183,9 +174,19 @@ class Problem:
         guess: Guess = None,
         unit: str = "",
         scale: Value = None,
+        rate: Value = None,
     ) -> Any:
-        """Declare a control and return its symbol. Shape (n, 1). Arguments as for :meth:`state`."""
+        """Declare a control and return its symbol. Shape (n, 1). Arguments as for :meth:`state`.
+
+        With ``rate``, the largest absolute rate of change, it is a state, and the control is its rate, ``NAME rate``.
+        """
         bounds = {"lower": lower, "upper": upper}
+        if rate is not None:
+            n = number_of_entries(f"control {name!r}", size, {**bounds, "guess": guess, "rate": rate})
+            symbol = self.state(name, n, **bounds, guess=guess, unit=unit, scale=scale)
+            change = self._reader.column(f"control {name!r}: rate", rate, n, np.nan)
+            self.dynamics(symbol, self.control(f"{name} rate", n, lower=-change, upper=change))
+            return symbol
         self.declared.controls[name] = self._variable("control", name, size, bounds, guess, unit, scale)
         return self.declared.controls[name].symbol
 
@@ -279,8 +280,6 @@ class Problem:
             self.declared.at_start[declared.name] = self.symbols.sym(f"{declared.name}_at_start", declared.size)
         return self.declared.at_start[declared.name]
 
-    # ---- equations -------------------------------------------------------------------------------------------
-
     def dynamics(self, state: Any, derivative: Value) -> None:
         """Declare ``d state / dt = derivative``, shape (n, 1), in states, controls, parameters, time and horizon."""
         variable = self._find(self.declared.states, state, "dynamics")
@@ -301,16 +300,21 @@ class Problem:
         lower: Value = None,
         upper: Value = None,
         *,
+        during: Value = None,
         unit: str = "",
         tolerance: Value = None,
     ) -> None:
         """Declare ``lower <= expression <= upper`` at all times; equal bounds make an equality.
 
         Args:
+            lower, upper: Bounds; expressions of parameters and of the time are allowed.
+            during: First and last time (s) of the window in which an inequality holds; None: always. Give the mesh
+                nodes there: ``method.with_nodes_at(fractions)``.
             tolerance: Largest violation that the audit accepts, in the unit of the expression, if it is smaller than
                 the relative tolerance of the constraint; positive, one number for all rows or for each.
         """
-        self.declared.path[name] = self._constraint("path", name, expression, (lower, upper), unit, tolerance)
+        constraint = self._constraint("path", name, expression, (lower, upper), unit, tolerance, during=during)
+        self.declared.path[name] = constraint
 
     @_about_its_name
     def start(self, name: str, expression: Value, lower: Value = None, upper: Value = None, *, unit: str = "") -> None:
@@ -408,7 +412,7 @@ class Problem:
         if self.declared.running is not None:
             raise ProblemError(f"problem {self.name!r}: the cost is declared twice")
         ends = [v.symbol for v in (*self.declared.states.values(), *self.declared.parameters.values())]
-        ends += [*self.declared.at_start.values(), self.time, *self._horizon_symbol()]
+        ends += [*self.declared.at_start.values(), *self._times()]
         costs = {}
         for label, cost, known in (("running", running, self._inner()), ("terminal", terminal, ends)):
             with error_names(label):
@@ -435,8 +439,6 @@ class Problem:
         d = self.declared
         return f"<Problem {self.name!r}: {len(d.states)} states, {len(d.controls)} controls>"
 
-    # ---- checks ----------------------------------------------------------------------------------------------
-
     def _variable(
         self, kind: str, name: str, size: int | None, values: dict[str, Value], guess: Guess, unit: str, scale: Value
     ) -> Variable:
@@ -451,16 +453,16 @@ class Problem:
     @property
     def _reader(self) -> ExpressionReader:
         """Reader that converts user values to expressions of this problem and of the parameters declared so far."""
-        return ExpressionReader(self.symbols, tuple(v.symbol for v in self.declared.parameters.values()))
+        return ExpressionReader(self.symbols, self.time, tuple(v.symbol for v in self.declared.parameters.values()))
 
-    def _horizon_symbol(self) -> list[Any]:
-        return [] if self.declared.horizon is None else [self.declared.horizon.symbol]
+    def _times(self) -> list[Any]:
+        return [self.time, *([] if self.declared.horizon is None else [self.declared.horizon.symbol])]
 
     def _inner(self) -> list[Any]:
         """Return the symbols allowed in path constraints: states, controls, parameters, signals, time and horizon."""
         d = self.declared
         pools = (d.states, d.controls, d.parameters, d.signals)
-        return [v.symbol for pool in pools for v in pool.values()] + [self.time, *self._horizon_symbol()]
+        return [v.symbol for pool in pools for v in pool.values()] + self._times()
 
     def _symbol(self, kind: str, name: str, size: int) -> Any:
         self.declared.check_new_variable(kind, name)
@@ -489,9 +491,9 @@ class Problem:
         unit: str,
         tolerance: Value = None,
         known: Sequence[Any] = (),
+        during: Value = None,
     ) -> Constraint:
         """Return a new constraint; its expression may contain what path constraints may, and the ``known`` symbols."""
         self.declared.check_new_constraint(f"{kind} constraint", name)
-        return self._reader.constraint(
-            kind, name, expression, [*self._inner(), *known], bounds=bounds, unit=unit, tolerance=tolerance
-        )
+        symbols, options = [*self._inner(), *known], {"unit": unit, "tolerance": tolerance, "during": during}
+        return self._reader.constraint(kind, name, expression, symbols, bounds=bounds, **options)

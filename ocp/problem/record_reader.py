@@ -17,8 +17,6 @@ import numpy as np
 
 from ocp.errors import ProblemError
 
-__all__ = ["ARRAY_NAMES", "RECORD_ERRORS", "FunctionReader", "from_record", "unpack_record"]
-
 UNARY = (
     "NEG", "EXP", "LOG", "SQRT", "SQ", "TWICE", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "NOT", "FLOOR", "CEIL",
     "FABS", "SIGN", "ERF", "INV", "SINH", "COSH", "TANH", "ASINH", "ACOSH", "ATANH", "ERFINV", "LOG1P", "EXPM1",
@@ -110,19 +108,19 @@ class FunctionReader:
         values: list[Any] = []  # a scalar of each row; for a call the list of its results
 
         def operand(row: int) -> Any:
-            value = values[_place(row, len(values), "operand")]
+            value = values[_check_index(row, len(values), "operand")]
             if isinstance(value, list):
                 raise ProblemError(f"operand {row} is a call, not a number", name="rows", value=row)
             return value
 
         for operation, first, second in rows:
             if operation == INPUT:
-                entries = input_entries[_place(first, len(input_entries), "input")]
-                values.append(entries[_place(second, len(entries), "entry")])
+                entries = input_entries[_check_index(first, len(input_entries), "input")]
+                values.append(entries[_check_index(second, len(entries), "entry")])
             elif operation == CONSTANT:
-                values.append(kind(constants[_place(first, len(constants), "constant")]))
+                values.append(kind(constants[_check_index(first, len(constants), "constant")]))
             elif operation == CALL:
-                callee = self.functions[_place(first, len(self.functions), "function")]
+                callee = self.functions[_check_index(first, len(self.functions), "function")]
                 work += self._work[first]
                 self._passed += _entries(callee)
                 if self._passed > MAX_OPERATIONS:
@@ -130,10 +128,10 @@ class FunctionReader:
                     raise ProblemError(words, name="arguments", limit=MAX_OPERATIONS)
                 values.append(_call(callee, [operand(row) for row in arguments[max(second, 0) :][: _entries(callee)]]))
             elif operation == RESULT:
-                results = values[_place(first, len(values), "call")]
+                results = values[_check_index(first, len(values), "call")]
                 if not isinstance(results, list):
                     raise ProblemError(f"row {first} is not a call", name="rows", value=first)
-                values.append(results[_place(second, len(results), "result")])
+                values.append(results[_check_index(second, len(results), "result")])
             elif CALL < operation < FIRST_BINARY:
                 values.append(kind.unary(CODES[operation - len(STRUCTURAL)], operand(first)))
             elif operation < len(OPERATIONS) and operation > 0:
@@ -143,13 +141,8 @@ class FunctionReader:
                 raise ProblemError(words, name="operation", value=operation, limit=len(OPERATIONS) - 1)
         patterns = [_read_pattern(shape) for shape in record["outputs"]]
         results = _integers(record["results"], (sum(pattern.nnz() for pattern in patterns),)).tolist()
-        outputs, begin = [], 0
-        for pattern in patterns:
-            outputs.append(
-                from_entries(pattern, [operand(row) for row in results[begin : begin + pattern.nnz()]], kind)
-            )
-            begin += pattern.nnz()
-        return ca.Function(name, inputs, outputs), work
+        entries = [operand(row) for row in results]
+        return ca.Function(name, inputs, matrices_from(patterns, entries, kind)), work
 
 
 def from_entries(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any:
@@ -157,7 +150,14 @@ def from_entries(pattern: Any, entries: Sequence[Any], kind: Any = ca.SX) -> Any
     return kind(pattern, ca.vertcat(*entries) if entries else kind(0, 1))
 
 
+def matrices_from(patterns: Sequence[Any], entries: Sequence[Any], kind: Any) -> list[Any]:
+    """Return matrices with given sparsity patterns from the nonzero entries of all of them, one after the other."""
+    ends = np.cumsum([0, *(pattern.nnz() for pattern in patterns)]).tolist()
+    return [from_entries(pattern, entries[a:b], kind) for pattern, (a, b) in zip(patterns, pairwise(ends), strict=True)]
+
+
 def _nonzeros(matrix: Any) -> list[Any]:
+    """Return the nonzero entries of an SX or MX matrix as scalar expressions, column by column."""
     return matrix.nonzeros() if isinstance(matrix, ca.SX) else [matrix.nz[k] for k in range(matrix.nnz())]
 
 
@@ -170,6 +170,7 @@ def _declared_entries(record: Mapping[str, Any]) -> int:
 
 
 def _entries(function: Any) -> int:
+    """Return the number of nonzero entries of all arguments of a function."""
     return sum(function.nnz_in(k) for k in range(function.n_in()))
 
 
@@ -177,20 +178,19 @@ def _call(callee: Any, entries: list[Any]) -> list[Any]:
     """Call a function with the entries of all its arguments; return the entries of all its results."""
     if len(entries) != _entries(callee):
         raise ProblemError(f"a call has {len(entries)} arguments, not {_entries(callee)}", name="arguments")
-    arguments, begin = [], 0
-    for k in range(callee.n_in()):
-        arguments.append(from_entries(callee.sparsity_in(k), entries[begin : begin + callee.nnz_in(k)], ca.MX))
-        begin += callee.nnz_in(k)
+    arguments = matrices_from([callee.sparsity_in(k) for k in range(callee.n_in())], entries, ca.MX)
     return [entry for result in callee.call(arguments, False, True) for entry in _nonzeros(result)]
 
 
-def _place(place: int, count: int, what: str) -> int:
+def _check_index(place: int, count: int, what: str) -> int:
+    """Return an index into `count` items, such as "operand"s; raise ProblemError if there is no such item."""
     if not 0 <= place < count:
         raise ProblemError(f"{what} {place} does not exist, there are {count}", name=what, value=place, limit=count)
     return place
 
 
-def _whole(value: Any, what: str, least: int, most: int) -> int:
+def _check_integer(value: Any, what: str, least: int, most: int) -> int:
+    """Return a value of untrusted data; raise ProblemError unless it is an integer from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         words = f"{what} {value!r} is not an integer from {least} to {most}"
         raise ProblemError(words, name=what, value=value, limit=(least, most))
@@ -198,6 +198,7 @@ def _whole(value: Any, what: str, least: int, most: int) -> int:
 
 
 def _integers(values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Return untrusted values as an array of integers; raise ProblemError if a size differs from `shape`."""
     array = np.asarray(values)
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
     if not fits or (array.dtype.kind not in "iu" and array.size):
@@ -206,6 +207,7 @@ def _integers(values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
 
 
 def _floats(values: Any, *, finite: bool = False) -> np.ndarray:
+    """Return untrusted values as an array (n,) of floats; raise ProblemError if this is impossible."""
     array = np.asarray(values)
     if array.ndim != 1 or (array.dtype.kind not in "fiu" and array.size) or (finite and not np.isfinite(array).all()):
         raise ProblemError(f"a list of {'finite ' if finite else ''}numbers is expected", name="constants")
@@ -216,7 +218,7 @@ def _read_pattern(shape: Any) -> Any:
     """Return the sparsity pattern of a stored shape: row count, column count and, if sparse, entry positions."""
     if not isinstance(shape, list) or len(shape) not in (2, 3):
         raise ProblemError(f"a shape is expected, not {shape!r:.80}", name="shape")
-    rows, columns = (_whole(size, "size", 0, MAX_ENTRIES) for size in shape[:2])
+    rows, columns = (_check_integer(size, "size", 0, MAX_ENTRIES) for size in shape[:2])
     if rows * columns > MAX_ENTRIES:
         raise ProblemError(f"{rows} x {columns} entries, at most {MAX_ENTRIES}", name="shape", limit=MAX_ENTRIES)
     if len(shape) == 2:
@@ -227,36 +229,33 @@ def _read_pattern(shape: Any) -> Any:
     return ca.Sparsity.nonzeros(rows, columns, places.tolist())
 
 
-# ---- functions that are not scalar arithmetic ------------------------------------------------------------------------
-
-
-def _low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_low(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild CasADi's function `low` from its record: the index of the table interval that contains a number."""
     table, modes = _floats(record["table"], finite=True), ("linear", "exact", "binary")
-    count, mode = _whole(record["count"], "count", 0, MAX_ENTRIES), _whole(record["mode"], "mode", 0, 2)
+    count, mode = _check_integer(record["count"], "count", 0, MAX_ENTRIES), _check_integer(record["mode"], "mode", 0, 2)
     if len(table) < 2 or (np.diff(table) < 0).any():
         raise ProblemError("the grid of a table does not increase", name="table")
     x = ca.MX.sym("x", count)
     return ca.Function("low", [x], [ca.low(ca.DM(table), x, {"lookup_mode": modes[mode]})], OPAQUE)
 
 
-def _gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_gather(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild from its record a function that looks up table entries at computed positions; nan outside the table."""
-    table, x = _floats(record["table"]), ca.MX.sym("x", _whole(record["count"], "count", 0, MAX_ENTRIES))
+    table, x = _floats(record["table"]), ca.MX.sym("x", _check_integer(record["count"], "count", 0, MAX_ENTRIES))
     if not len(table):
         raise ProblemError("a table is empty", name="table")
     return ca.Function("gather", [x], [ca.MX(ca.DM(table)).get_nz(False, x)], OPAQUE)
 
 
-def _solve(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_solve(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild from its record a function that solves a system of linear equations."""
-    size, columns = (_whole(record[what], what, 1, 1024) for what in ("size", "columns"))
+    size, columns = (_check_integer(record[what], what, 1, 1024) for what in ("size", "columns"))
     matrix, right = ca.MX.sym("A", size, size), ca.MX.sym("b", size, columns)
     return ca.Function("solve", [matrix, right], [ca.solve(matrix, right)], OPAQUE)
 
 
 def _grids(record: Mapping[str, Any], what: str) -> list[list[float]]:
-    """Return the stored grid of a table along each dimension, after checks."""
+    """Return the grid of a stored table along each dimension; raise ProblemError if it does not increase."""
     places, offsets = _floats(record[what], finite=True), _integers(record["offsets"], (None,)).tolist()
     if not 2 <= len(offsets) <= MAX_DIMENSIONS + 1 or offsets[0] != 0 or offsets[-1] != len(places):
         raise ProblemError(f"the offsets of a grid of {len(offsets) - 1} dimensions are inconsistent", name="offsets")
@@ -266,12 +265,12 @@ def _grids(record: Mapping[str, Any], what: str) -> list[list[float]]:
     return [grid.tolist() for grid in grids]
 
 
-def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild from its record a B-spline of one or several variables."""
     knots, coefficients = _grids(record, "knots"), _floats(record["coefficients"])
-    degrees = [_whole(degree, "degree", 0, MAX_DEGREE) for degree in record["degrees"]]
-    modes = [("linear", "exact", "binary")[_whole(mode, "mode", 0, 2)] for mode in record["modes"]]
-    size, count = (_whole(record[what], what, 1, MAX_ENTRIES) for what in ("size", "count"))
+    degrees = [_check_integer(degree, "degree", 0, MAX_DEGREE) for degree in record["degrees"]]
+    modes = [("linear", "exact", "binary")[_check_integer(mode, "mode", 0, 2)] for mode in record["modes"]]
+    size, count = (_check_integer(record[what], what, 1, MAX_ENTRIES) for what in ("size", "count"))
     if len(degrees) != len(knots) or len(modes) != len(knots):
         raise ProblemError(f"{len(degrees)} degrees for {len(knots)} dimensions", name="degrees")
     lengths = [len(grid) - degree - 1 for grid, degree in zip(knots, degrees, strict=True)]
@@ -284,7 +283,7 @@ def _bspline(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     return ca.Function("bspline", [x], [value], OPAQUE)
 
 
-def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
+def _build_interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     """Rebuild from its record a linear interpolant of a table, or the derivative of such an interpolant."""
     grids, values = _grids(record, "grid"), _floats(record["values"])
     cells = int(np.prod([len(grid) for grid in grids], dtype=object))
@@ -294,9 +293,10 @@ def _interpolant(record: Mapping[str, Any], _: Sequence[Any]) -> Any:
     return function.jacobian() if record["derivative"] is True else function
 
 
-def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
+def _build_integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
     """Rebuild from its record an integrator, whose differential equations are another stored function."""
-    equations = functions[_place(_whole(record["equations"], "equations", 0, MAX_ENTRIES), len(functions), "equations")]
+    number = _check_integer(record["equations"], "equations", 0, MAX_ENTRIES)
+    equations = functions[_check_index(number, len(functions), "equations")]
     if record["plugin"] not in INTEGRATORS.values():
         raise ProblemError(f"integrator {record['plugin']!r} is unknown", name="plugin", value=record["plugin"])
     begin, times = float(record["begin"]), _floats(record["times"], finite=True)
@@ -306,7 +306,7 @@ def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
     for option, value in options.items():
         kind = INTEGRATOR_OPTIONS[option][1]
         if kind is int:
-            _whole(value, option, 0, 9 if option == "interpolation_order" else 100_000)
+            _check_integer(value, option, 0, 9 if option == "interpolation_order" else 100_000)
         elif not (isinstance(value, float) and 0 < value < 1):
             raise ProblemError(f"{option} {value!r} is not a tolerance", name=option, value=value)
     names = [("t", "x", "z", "p", "u"), ("ode", "alg", "quad", "zero")]
@@ -318,16 +318,14 @@ def _integrator(record: Mapping[str, Any], functions: Sequence[Any]) -> Any:
 
 
 BUILDERS: dict[str, Callable[[Mapping[str, Any], Sequence[Any]], Any]] = {
-    "low": _low,
-    "gather": _gather,
-    "solve": _solve,
-    "bspline": _bspline,
-    "interpolant": _interpolant,
-    "integrator": _integrator,
+    "low": _build_low,
+    "gather": _build_gather,
+    "solve": _build_solve,
+    "bspline": _build_bspline,
+    "interpolant": _build_interpolant,
+    "integrator": _build_integrator,
 }
 
-
-# ---- records of problems and of other data ---------------------------------------------------------------------------
 
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
 RECORD_ERRORS = (
@@ -356,6 +354,7 @@ def from_record(record: Mapping[str, Any], kinds: Sequence[type]) -> tuple[str, 
 
 
 def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[str, Any, Any, Any]:
+    """Rebuild a problem from its record like `from_record`, but raise various errors if the record is damaged."""
     symbols, functions = SYMBOLS[record["symbols"]], FunctionReader(record["functions"]).functions
     expressions = functions[record["expressions"]]
     time = symbols.sym("time")
@@ -365,9 +364,8 @@ def _from_record(record: Mapping[str, Any], kinds: Mapping[str, type]) -> tuple[
             raise ValueError(f"symbol {symbol['input']} occurs twice")
         size = expressions.size_in(symbol["input"])
         if size != (symbol["size"], 1):
-            raise ValueError(
-                f"symbol {symbol['name']!r} has {symbol['size']} entries, the input of the function {size}"
-            )
+            words = f"symbol {symbol['name']!r} has {symbol['size']} entries, the input of the function {size}"
+            raise ValueError(words)
         inputs[symbol["input"]] = symbols.sym(symbol["name"], size[0])
     outputs = expressions.call(inputs, True, False)
 

@@ -27,8 +27,6 @@ from ocp.problem.record_reader import (
     from_entries,
 )
 
-__all__ = ["FunctionWriter", "pack_record", "to_record"]
-
 
 class FunctionWriter:
     """Writer of CasADi functions as records; each function is written once, after the functions that it calls.
@@ -68,12 +66,13 @@ class FunctionWriter:
             record = self._operations(self._as_scalars(function))
             if (callee := self._forwarded_to(record)) is not None:
                 return self._register(key, callee)
-        return self._append(key, record, function)
+        return self._append(record, function)
 
-    def _append(self, key: int, record: dict[str, Any], function: Any) -> int:
+    def _append(self, record: dict[str, Any], function: Any) -> int:
+        """Append the record of a function, and return the number of the record."""
         self.records.append(record)
         self._written.append(function)
-        return self._register(key, len(self.records) - 1)
+        return self._register(function.__hash__(), len(self.records) - 1)
 
     def _forwarded_to(self, record: dict[str, Any]) -> int | None:
         """Return the number of the function that a recorded function merely calls with its own arguments, or None.
@@ -94,6 +93,7 @@ class FunctionWriter:
         return int(rows[count, 1]) if passes and (patterns, results) == (record["inputs"], record["outputs"]) else None
 
     def _register(self, key: int, number: int) -> int:
+        """Store the number of the record of a function with a given hash, and return the number."""
         self._numbers[key] = number
         return number
 
@@ -101,7 +101,7 @@ class FunctionWriter:
         """Store the record of a function, such as a table look-up, and return the function rebuilt from the record."""
         function = BUILDERS[record["kind"]](record, ())
         self._alive.append(function)
-        self._append(function.__hash__(), record, function)
+        self._append(record, function)
         return function
 
     def _call_leaf(self, record: dict[str, Any], entries: Sequence[Any], pattern: Any) -> Any:
@@ -159,9 +159,8 @@ class FunctionWriter:
                 record = {"kind": "low", "table": _numbers(table), "count": at.nnz(), "mode": mode}
                 return [self._call_leaf(record, at.nonzeros(), node.sparsity())]
             inner = table.nonzeros()[1:-1]
-            return [
-                from_entries(node.sparsity(), [sum((x >= edge for edge in inner), ca.SX(0)) for x in at.nonzeros()])
-            ]
+            indices = [sum((x >= edge for edge in inner), ca.SX(0)) for x in at.nonzeros()]
+            return [from_entries(node.sparsity(), indices)]
         if code == ca.OP_GETNONZEROS_PARAM:
             return [self._gather(node, arguments)]
         if code == ca.OP_BSPLINE and node.n_dep() == 1:
@@ -280,7 +279,7 @@ def _numbers(matrix: Any) -> np.ndarray:
 
 
 def _fields(function: Any, kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Return internal fields of a CasADi function, read from CasADi's debugging output, by name.
+    """Return the values of internal fields of a CasADi function by name, read from CasADi's debugging output.
 
     ``kinds`` gives the type of each field: `int`, `float`, or a list of one of them for an array. The text comes from a
     function of this process, never from a file.
@@ -313,20 +312,21 @@ def _fields(function: Any, kinds: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _spline_fields(step: Any) -> dict[str, Any]:
+    """Return the numbers that define a casadi B-spline: knots, degrees, look-up modes and coefficients."""
     prefix = "BSplineCommon::"
-    kinds = {f"{prefix}{name}": [int] for name in ("offset", "degree", "lookup_mode")}
+    lists = {"offsets": "offset", "degrees": "degree", "modes": "lookup_mode"}
+    kinds = {f"{prefix}{name}": [int] for name in lists.values()}
     numbers = _fields(step, {f"{prefix}knots": [float], "BSpline::coeffs": [float], f"{prefix}m": int, **kinds})
     return {
         "knots": numbers[f"{prefix}knots"],
-        "offsets": numbers[f"{prefix}offset"].tolist(),
-        "degrees": numbers[f"{prefix}degree"].tolist(),
-        "modes": numbers[f"{prefix}lookup_mode"].tolist(),
+        **{key: numbers[f"{prefix}{name}"].tolist() for key, name in lists.items()},
         "coefficients": numbers["BSpline::coeffs"],
         "size": numbers[f"{prefix}m"],
     }
 
 
 def _interpolant_record(function: Any, kind: str) -> dict[str, Any]:
+    """Return the record of a linear interpolant of casadi, or of its derivative."""
     prefix = "Interpolant::"
     kinds = {f"{prefix}{name}": [float] for name in ("grid", "values")}
     numbers = _fields(function, {**kinds, f"{prefix}offset": [int], f"{prefix}batch_x": int})
@@ -342,6 +342,7 @@ def _interpolant_record(function: Any, kind: str) -> dict[str, Any]:
 
 
 def _integrator_record(function: Any, oracle: int) -> dict[str, Any]:
+    """Return the record of a casadi integrator, whose differential equations are the function number `oracle`."""
     kinds = dict(INTEGRATOR_OPTIONS.values())
     names = {"Integrator::t0": float, "Integrator::tout": [float], "Integrator::nfwd": int, "Integrator::nadj": int}
     numbers = _fields(function, {**kinds, **names})
@@ -357,9 +358,6 @@ def _integrator_record(function: Any, oracle: int) -> dict[str, Any]:
         "times": numbers["Integrator::tout"],
         "options": {option: numbers[name] for option, (name, _) in INTEGRATOR_OPTIONS.items() if name in numbers},
     }
-
-
-# ---- records of problems and of other data ---------------------------------------------------------------------------
 
 
 def to_record(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, Any]:
@@ -380,7 +378,9 @@ def to_record(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, An
     def put(value: Any, is_symbol: bool = False) -> Any:
         if is_symbol:
             inputs.append(value)
-            return {"input": len(inputs) - 1, "size": value.numel(), "name": symbol_name(value)}
+            label = str(ca.symvar(value)[0].name())  # entries of an SX column have numbered names
+            label = label.rpartition("_")[0] if isinstance(value, ca.SX) and value.numel() > 1 else label
+            return {"input": len(inputs) - 1, "size": value.numel(), "name": label}
         if isinstance(value, ca.SX | ca.MX):
             outputs.append(value)
             return {"output": len(outputs) - 1}
@@ -394,9 +394,8 @@ def to_record(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, An
             parts = {f.name: getattr(value, f.name) for f in fields(value)}
             inside = {key: put(part, is_symbol=key == "symbol") for key, part in parts.items() if key != "at_start"}
             if "at_start" in parts:
-                inside["at_start"] = {
-                    "pool": [[key, put(item, is_symbol=True)] for key, item in parts["at_start"].items()]
-                }
+                pool = [[key, put(item, is_symbol=True)] for key, item in parts["at_start"].items()]
+                inside["at_start"] = {"pool": pool}
             return {"kind": type(value).__name__, "fields": inside}
         if isinstance(value, str | bool | int | float):
             return value
@@ -409,12 +408,6 @@ def to_record(name: str, symbols: Any, time: Any, declared: Any) -> dict[str, An
         words = f"problem {name!r} cannot be written: {str(error).strip().splitlines()[-1]}"
         raise ProblemError(words, name=name) from error
     return {**record, "functions": writer.records}
-
-
-def symbol_name(symbol: Any) -> str:
-    """Return the name with which a symbol was created."""
-    first = str(ca.symvar(symbol)[0].name())
-    return first.rpartition("_")[0] if isinstance(symbol, ca.SX) and symbol.numel() > 1 else first
 
 
 def pack_record(record: Any) -> tuple[Any, dict[str, np.ndarray]]:

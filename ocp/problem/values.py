@@ -122,7 +122,7 @@ class Sampler:
         self._maps: dict[int, Any] = {}
 
     def __call__(self, *columns: Any) -> list[np.ndarray]:
-        """Return the outputs of the function at M samples. Shape (M, n) each.
+        """Return the outputs of the function at M samples of its arguments. Shape (M, n) each.
 
         Args:
             columns: The arguments: an array (M, n) that varies over the samples, or (n,) or a number that does not.
@@ -173,6 +173,6 @@ def evaluate_in_blocks(
 
 
 def evaluate_at_samples(function: Any, *columns: Any) -> list[np.ndarray]:
-    """Return the outputs of a casadi function of dense columns at given samples, see :class:`Sampler`."""
+    """Return the outputs of a casadi function of dense columns at M samples of its arguments. Shape (M, n) each."""
     symbols = [ca.MX.sym(f"input{i}", function.numel_in(i)) for i in range(function.n_in())]
     return Sampler(symbols, list(function.call(symbols)))(*columns)

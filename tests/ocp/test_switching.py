@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ocp import Collocation, Problem, solve
-from ocp.tightening import solve_at_switches, switches
+from ocp.switching import solve_at_switches, switches
 
 
 def pushed(push: float = 1.0, brake: float = 3.0) -> Problem:

@@ -19,6 +19,7 @@ OPTIONS = {
     "gallery": ["--out", "--only", "space_arm", "panda", "ur5", "posture_set", "mobile_manipulator", "pushing"],
     "benchmark": ["--out", "--only", "--repeats", "costate_rate"],
     "reproduce": ["--out", "--only", "free_floating"],
+    "suite": ["--out", "--problems"],
 }
 """What each of them tells of its options."""
 

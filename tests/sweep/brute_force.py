@@ -19,8 +19,9 @@ from ocp import TipTask, inverse_kinematics
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
+from ocp.motion.search.lengths import PathLength
 from ocp.motion.search.search import AtlasSearch
-from ocp.motion.search.steps import PathLength, SquaredRates, StepCost, Steps
+from ocp.motion.search.steps import SquaredRates, StepCost, Steps
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.search.test_charts import planar
 from tests.ocp.motion.search.test_values import SECONDS, TIME_SAMPLES, reached

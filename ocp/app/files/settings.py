@@ -282,7 +282,7 @@ def located_errors(entries: TomlTable, name: str | None = None) -> Iterator[None
 
 
 def joint_values(
-    entries: TomlTable, name: str, names: tuple[str, ...], default: float, expected: str, *, least: float | None = None
+    entries: TomlTable, name: str, names: tuple[str, ...], *, default: float, expected: str, least: float | None = None
 ) -> Any:
     """Return an entry that gives numbers by joint as an array (n,); None if the entry is missing.
 

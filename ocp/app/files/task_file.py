@@ -269,7 +269,7 @@ def _goal(entries: TomlTable, names: tuple[str, ...]) -> Goal:
         "within": entries.number("within", "largest angle between tool axis and direction, rad", least=0.0),
         "tip": entries.text("tip", "the name of a link"),
         "duration": entries.number("duration", "a number above 0, s", least=0.0),
-        "joints": joint_values(entries, "joints", names, np.nan, BY_JOINT),
+        "joints": joint_values(entries, "joints", names, default=np.nan, expected=BY_JOINT),
     }
     if "rpy" in entries:
         if values["orientation"] is not None:
@@ -278,7 +278,7 @@ def _goal(entries: TomlTable, names: tuple[str, ...]) -> Goal:
     if isinstance(entries.raw("velocity"), str):
         values["velocity"] = entries.choice("velocity", ("rest", "free"))
     else:
-        values["velocity"] = joint_values(entries, "velocity", names, np.nan, BY_JOINT)
+        values["velocity"] = joint_values(entries, "velocity", names, default=np.nan, expected=BY_JOINT)
     if (region := entries.table("region", "a box or a sphere")) is not None:
         values["region"] = read_shape(region, region.choice("shape", ("box", "sphere"), REQUIRED))
         region.done()
@@ -333,7 +333,7 @@ def _waypoints(entries: TomlTable, folder: Path, names: tuple[str, ...]) -> Wayp
         raise entries.error("file", words)
     rule = entries.choice("reconfigurations", ("forbidden", "counted"), "forbidden")
     expected = "a number above 0, rad or m, or { joint = number }"
-    step = joint_values(entries, "step", names, np.inf, expected, least=0.0)
+    step = joint_values(entries, "step", names, default=np.inf, expected=expected, least=0.0)
     return Waypoints(poses.positions, poses.orientations, np.inf if step is None else step, rule)
 
 
@@ -414,7 +414,7 @@ def _limits(entries: TomlTable, names: tuple[str, ...]) -> dict[str, Any]:
     for quantity, unit in LIMIT_UNITS.items():
         expected = f"a number above 0, {unit}, or {{ joint = number }}"
         with located_errors(entries, quantity):
-            limits[quantity] = joint_values(entries, quantity, names, np.inf, expected, least=0.0)
+            limits[quantity] = joint_values(entries, quantity, names, default=np.inf, expected=expected, least=0.0)
             Limits(**{quantity: limits[quantity]})
     friction = entries.number("friction", "a number above 0: the friction coefficient of the ground", np.inf, least=0.0)
     return {"limits": Limits(**limits, joints=entries.flag("positions", True), friction=friction)}
@@ -423,10 +423,12 @@ def _limits(entries: TomlTable, names: tuple[str, ...]) -> dict[str, Any]:
 def _cost(entries: TomlTable, names: tuple[str, ...]) -> dict[str, Any]:
     """Read the table [cost] of a task file and return the cost as an option of the planner."""
     expected = "a number of 0 or more, or { joint = number }"
-    weights = joint_values(entries, "weights", names, 1.0, "numbers above 0 by joint: { elbow = 4 }", least=0.0)
+    weights = joint_values(
+        entries, "weights", names, default=1.0, expected="numbers above 0 by joint: { elbow = 4 }", least=0.0
+    )
     values: dict[str, Any] = {"weights": weights}
     for name in ("effort", "acceleration"):
-        values[name] = joint_values(entries, name, names, 0.0, expected, least=-1e-300)
+        values[name] = joint_values(entries, name, names, default=0.0, expected=expected, least=-1e-300)
     for name in ("velocity", "time", "length", "energy", "jerk", "turning"):
         values[name] = entries.number(name, "a number of 0 or more: the weight of this term", least=-1e-300)
     with located_errors(entries):
@@ -453,7 +455,7 @@ def _read_search(entries: TomlTable, names: tuple[str, ...]) -> dict[str, Any]:
         raise entries.error("cyclic", 'kind = "segments" does not support cyclic; remove it')
     options["seed"] = entries.count("seed", "a whole number, 0 or more", 0)
     options["time_limit"] = entries.number("time_limit", "a number above 0, s", least=0.0)
-    start = joint_values(entries, "start", names, np.nan, BY_JOINT)
+    start = joint_values(entries, "start", names, default=np.nan, expected=BY_JOINT)
     if start is not None:
         if missing := [joint for joint, position in zip(names, start, strict=True) if np.isnan(position)]:
             raise entries.error("start", f"start has no {', '.join(missing)}; give every joint, rad or m")

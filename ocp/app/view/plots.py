@@ -76,7 +76,7 @@ def draw_limits(ax: Any, lower: float, upper: float, min_range: float) -> None:
 
     Curves with a range smaller than `min_range` are drawn as constant.
     """
-    view = limits_in_view(ax.dataLim.y0, ax.dataLim.y1, lower, upper, min_range)
+    view = limits_in_view(ax.dataLim.y0, ax.dataLim.y1, lower, upper, min_range=min_range)
     for limit in view.lines:
         ax.axhline(limit, color=LIMIT, lw=0.9, ls=(0, (5, 2)))
     if view.text:

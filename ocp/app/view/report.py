@@ -226,7 +226,7 @@ class LimitView(NamedTuple):
     text_below: bool
 
 
-def limits_in_view(low: float, high: float, lower: float, upper: float, min_range: float) -> LimitView:
+def limits_in_view(low: float, high: float, lower: float, upper: float, *, min_range: float) -> LimitView:
     """Return how a diagram shows the limits of curves with values from `low` to `high`.
 
     Limits near the curves are drawn as lines, limits far away are given as text, to keep the shape of the curves
@@ -285,7 +285,7 @@ def draw_curves(
         for row, name in enumerate(names):
             curve = np.full(1, np.nan) if values is None else values[:, row]
             view = limits_in_view(
-                float(curve.min()), float(curve.max()), float(lower[row]), float(upper[row]), min_range
+                float(curve.min()), float(curve.max()), float(lower[row]), float(upper[row]), min_range=min_range
             )
             scale = height / (view.high - view.low)
             parts.append(f'<g transform="translate({left + column * (width + gap):g} {top + row * pitch:g})">')

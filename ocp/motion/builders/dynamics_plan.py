@@ -39,7 +39,8 @@ from ocp.problem.phases import DURATION, Phases
 from ocp.problem.problem import Problem, remembers_request
 from ocp.refinement import split
 from ocp.solution import Guess, Solution
-from ocp.tightening import WARM_START_OPTIONS, largest_excess, solve_at_switches, tighten
+from ocp.switching import WARM_START_OPTIONS, solve_at_switches
+from ocp.tightening import largest_excess, tighten
 
 
 @remembers_request("dynamics phases")

@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from models import CollisionScene, Machine
 from models.checks import Array
 from ocp.errors import ProblemError, require
-from ocp.problem.hulls import BodyPairs, Hull, frames_of
+from ocp.problem.hulls import BodyPairs, Frames, Hull, frames_of
 from ocp.problem.values import Sampler
 from ocp.tolerances import STANDSTILL
 
@@ -82,6 +83,40 @@ def distances_along(
     placements, bodies = prepared_pairs(scene)
     bases = np.broadcast_to(base, (count, scene.machine.base_size))
     return bodies.distances(frames_of(placements(bases, joints, np.reshape(times, (-1, 1)))[0]), cutoff, pairs)
+
+
+def near_pairs(
+    scene: CollisionScene, joints: Array, reach: float, gradients: bool = True
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+    """Return the pairs of bodies, among fixed obstacles, that are closer than the clearance plus `reach`, m.
+
+    Args:
+        scene: Collision scene of a machine on a fixed base.
+        joints: Configurations. Shape (M, n).
+        reach: Largest distance beyond the clearance, m.
+        gradients: Whether gradients are computed, by finite differences; they are 0 otherwise.
+
+    Returns:
+        Configuration and pair of each, their distance beyond the clearance, m, shape (K,) each, and its gradient, shape
+        (K, n).
+    """
+    (placements, bodies), n, near = prepared_pairs(scene), joints.shape[1], scene.clearance + reach
+
+    def frames_at(configurations: Array) -> Frames:
+        count = len(configurations)
+        return frames_of(placements(np.zeros((count, 0)), configurations, np.zeros((count, 1)))[0])
+
+    frames = frames_at(joints)
+    at, pair = np.nonzero(bodies.all_balls(frames) < near)
+    gap = bodies.gaps(frames, at, pair, near)
+    at, pair, gap = at[gap < near], pair[gap < near], gap[gap < near]
+    gradient = np.zeros((len(at), n))
+    if gradients and len(at):
+        rows, index = np.unique(at, return_inverse=True)
+        moved = frames_at((joints[rows, None] + SLIDING.difference * np.eye(n)).reshape(-1, n))
+        places = (n * index[:, None] + np.arange(n)).ravel()
+        gradient = (bodies.gaps(moved, places, np.repeat(pair, n)).reshape(-1, n) - gap[:, None]) / SLIDING.difference
+    return at, pair, gap - scene.clearance, gradient
 
 
 def find_collisions(scene: CollisionScene, base: Array, joints: Array, times: Array) -> list[Collision]:

@@ -200,24 +200,42 @@ def _search_globally(queue: CandidateQueue, solver: CandidateSolver, search: Tas
     """Solve candidates from the promising motions of a global search; if none passes, from all of its motions.
 
     A free start and a coarse mesh may lead away from a nearly optimal motion. Motions of the search that promise a
-    lower cost than the plan are therefore also solved with their start fixed, until the plan is close to its bound.
+    lower cost than the plan are therefore solved in other ways as well, and then motions of a search at twice as many
+    times, until the plan is close to its bound. Classes of motions that were not solved are listed as candidates.
     """
-    settings = solver.settings
     _check_dead_end(search)
-    for include_costlier in (False, True):
-        motions = search.local_motions(include_costlier)
-        if motions[0].cost.size:
-            queue.run(candidates_from(solver, motions))
-            fixed = solver.request.start is None
-            for seed in candidates_from(solver, motions, direct=True, fixed=fixed):
-                near_bound = queue.cost <= settings.near_bound * search.bound
-                if near_bound or seed.cost >= (1 - settings.gain) * queue.cost:
-                    break
-                queue.run([seed])
-        if queue.passed:
-            return
-    while search.refine_samples():
+    for finer in (False, True):
+        if finer and not (queue.passed and search.refine_samples(everywhere=True)):
+            break
+        for include_costlier in (False, True):
+            if _solve_classes(queue, solver, search, include_costlier):
+                return
+    if queue.passed:
+        for bound, time, joints in search.unresolved(queue.cost):
+            words = f"motions near this configuration at {time:.4g} s may cost {bound:.6g}; the search found no path"
+            reason = Reason(Rejection.NOT_TRIED, words, "bound", bound, queue.cost, time)
+            queue.candidates.append(Candidate(joints, reason=reason))
+    while not queue.passed and search.refine_samples():
         _check_dead_end(search)
+
+
+def _solve_classes(queue: CandidateQueue, solver: CandidateSolver, search: TaskSearch, include_costlier: bool) -> bool:
+    """Solve the motions of the search; return whether a plan is so good that none of them promises a lower cost.
+
+    Where the solver fails, the motion of the search is the guess on the fine mesh, with its start fixed, then with a
+    free start and, at last, with relaxed tasks.
+    """
+    motions, gain = search.local_motions(include_costlier), solver.settings.gain
+    if not motions[0].cost.size:
+        return False
+    queue.run(candidates_from(solver, motions))
+    for options in ({"fixed": solver.request.start is None}, {"thorough": True}):
+        for seed in candidates_from(solver, motions, direct=True, **options):
+            if queue.cost <= search.near_cost or seed.cost >= (1 - gain) * queue.cost:
+                return queue.passed
+            if queue.passed or "fixed" in options:
+                queue.run([seed])
+    return False
 
 
 def _check_dead_end(search: TaskSearch) -> None:

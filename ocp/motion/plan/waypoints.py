@@ -26,14 +26,16 @@ from ocp.motion.local.ik_solver import idle_positions
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.plan.planner import PlanOptions, clearance_for
 from ocp.motion.result.candidate import Candidate, Reason, Rejection, Stage
-from ocp.motion.result.path_plan import PathPlan, PathPoses
+from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.dead_end import RelaxationKind, dead_end
-from ocp.motion.search.joint_space import TOLERANCE, JointSpace, TasksWithFixedJoints
+from ocp.motion.search.joint_space import TOLERANCE
+from ocp.motion.search.lengths import Homogeneous, LargestMotion, PathLength
 from ocp.motion.search.reconfigurations import SectionSearch, SectionSettings, Segment, fewest_segments, section_values
 from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings, checked_bound
-from ocp.motion.search.steps import Homogeneous, LargestMotion, PathLength, Steps
-from ocp.motion.search.value import shorten_path
+from ocp.motion.search.shortening import PathPoses, PathProblem, optimise_path, shorten_path
+from ocp.motion.search.steps import Steps
+from ocp.motion.search.task_search import TOO_MANY_CHARTS, lower_bound_along
 from ocp.motion.tasks.equations import bind
 from ocp.motion.tasks.goals import Cost, Scene, Waypoints
 from ocp.motion.tasks.limits import Limits
@@ -42,8 +44,6 @@ from ocp.motion.tasks.tip_task import TipTask
 __all__ = ["plan_path"]
 
 WAYPOINT = "waypoint {:g}"
-TOO_MANY_CHARTS = "configurations"
-"""Value of the field `name` in the error of a search that needs too many charts of the self-motion manifold."""
 NO_PATH = "no path through the waypoints keeps all limits"
 
 
@@ -56,9 +56,12 @@ class WaypointSettings:
             next if no path found goes through all.
         first_steps: With two redundant joints, number of steps of a first search, which finds short paths.
         steps, strides: Approximate number of steps of the next two searches, and their least strides.
+        sample_loss: With two redundant joints, share of the cost of the best path that straight steps between the
+            waypoints of the lower bound may lose.
         max_paths: Largest number of paths of a search that are shortened, the lowest cost first.
-        widths: Initial and final spacing of the configurations of `shorten_path`, rad or m.
-        pose_tolerance: Largest pose error, m and rad, which the last width leaves.
+        widths: Initial and final spacing of the configurations of `shorten_path`, rad or m, before the path is brought
+            to a local optimum.
+        pose_tolerance: Largest pose error, m and rad.
         search, sections: Settings of the searches with at most one redundant joint, and with two.
     """
 
@@ -66,8 +69,9 @@ class WaypointSettings:
     first_steps: int = 6
     steps: int = 20
     strides: tuple[int, int] = (10, 5)
+    sample_loss: float = 0.01
     max_paths: int = 2
-    widths: tuple[float, float] = (0.06, 1e-6)
+    widths: tuple[float, float] = (0.06, 2e-3)
     pose_tolerance: float = 1e-6
     search: SearchSettings = field(default_factory=SearchSettings)
     sections: SectionSettings = field(default_factory=SectionSettings)
@@ -91,7 +95,7 @@ def plan_path(
     Args:
         machine: An arm on a fixed base with at most two redundant joints for the poses of its tip. If it has two,
             paths are searched on sections in which the joint nearest to the base has one of several values (see
-            `ocp.motion.search.reconfigurations`), and no bound is known.
+            `ocp.motion.search.reconfigurations`), and the bound on the whole manifolds.
         waypoints: Poses of the tip.
         options: Cost, limits, and seed of inverse kinematics. The cost is the `length`, the sum of all joint
             displacements with the `weights` of the joints, which is the default, or the `time`, s, by the velocity
@@ -158,15 +162,12 @@ class _WaypointPlanner:
         self.positions, self.rotations, self.step = self.poses
         self.scene = None if self.constraints is None else self.constraints.scene
         self.lower, self.upper = bounds.lower, bounds.upper
-        self.space = JointSpace(machine, bounds.lower, bounds.upper, np.ones(machine.joint_size))
         pose = bind(machine, self._task(0))
-        equations = TasksWithFixedJoints(machine, pose.bound, tuple(np.flatnonzero(pose.idle).tolist()))
-        stationary = idle_positions(self.lower, self.upper)
-        targets = np.zeros((len(self.positions), 18))
-        targets[:, :3] = self.positions
-        targets[:, 6:15] = self.rotations.transpose(0, 2, 1).reshape(-1, 9)
-        targets = np.column_stack([targets, np.tile(stationary[pose.idle], (len(targets), 1))])
-        self.manifolds = SelfMotionManifolds(self.space, equations, targets)
+        idle = idle_positions(self.lower, self.upper)
+        options: dict[str, Any] = {"bounds": bounds, "idle": idle, "scene": self.scene}
+        self.problem = PathProblem.through_poses(machine, self.poses, self.cost, **options)
+        self.manifolds = self.problem.samples[0].manifolds
+        self.space = self.manifolds.space
         self._seed_cache = dict[int, Array]()
         if not 0 <= self.manifolds.size <= MAX_FREE_DIRECTIONS:
             words = f"{machine.robot.name}: {int((~pose.idle).sum())} joints for the {pose.size} rows of a pose"
@@ -228,7 +229,11 @@ class _WaypointPlanner:
         if not paths or paths[0].failure:
             reasons = "; ".join(dict.fromkeys(path.failure for path in paths))
             raise SolveError(f"{NO_PATH}{reasons and ': '}{reasons}", name="waypoints")
-        best, lower_bound = paths[0], checked_bound(bound, paths[0].cost)
+        best = paths[0]
+        if self._section_joint is not None:
+            loss, settings = self.settings.sample_loss, self.settings.search
+            bound = lower_bound_along(self.problem, best.joints, loss, seeds=self._seeds, settings=settings)
+        lower_bound = checked_bound(bound, best.cost)
         candidates = [Candidate(best.joints[0], best.cost, None, Stage.FINE)]
         for path in paths[1:]:
             reason = Reason(Rejection.INFEASIBLE, path.failure) if path.failure else Reason(Rejection.COSTLIER)
@@ -243,6 +248,7 @@ class _WaypointPlanner:
             tuple(candidates),
             lower_bound or None,
             best.breaks,
+            self.cost,
         )
 
     # ---- searched waypoints ------------------------------------------------------------------------------------------
@@ -350,12 +356,10 @@ class _WaypointPlanner:
             return _Path(np.inf, failure, np.concatenate(distant), joints, break_numbers)
         paths = []
         for segment in chain:
-            rows = slice(int(chosen[segment.first]), int(chosen[segment.last]) + 1)
-            samples = [TimeSample(self.manifolds, k) for k in range(len(self.positions))[rows]]
-            limits, bounds = np.full_like(joints[rows][1:], self.step), (self.lower, self.upper)
-            times = np.arange(len(self.positions), dtype=float)[rows]
-            options: dict[str, Any] = {"bounds": bounds, "scene": self.scene, "widths": self.settings.widths}
-            paths.append(shorten_path(joints[rows], samples, Steps(times, self.cost, limits), **options))
+            first, last = int(chosen[segment.first]), int(chosen[segment.last])
+            problem = self.problem.restrict(first, last)
+            shortened = shorten_path(joints[first : last + 1], problem, self.settings.widths)
+            paths.append(optimise_path(shortened, problem))
         joints = np.concatenate(paths)
         steps = np.delete(self.cost.evaluate(np.diff(joints, axis=0), 1.0), list(break_numbers))
         return _Path(float(steps.sum()), *self._check_path(joints, break_numbers), joints, break_numbers)

@@ -41,8 +41,6 @@ from ocp.problem.hulls import WORLD
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["LOADS", "UNCERTAINTIES", "Margin", "Range", "checked_uncertainty", "margin_of_plan", "tightened_torques"]
-
 PAYLOAD, FRICTION, BASE, OBSTACLE, TOOL = "payload", "friction", "base position", "obstacle position", "tool offset"
 PHRASES: dict[str, tuple[str, float, str]] = {
     PAYLOAD: ("payloads from 0 to {} kg", 1.0, "the motion has no torque limits: give Limits(torque=...), or efforts "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy
@@ -19,11 +19,13 @@ from ocp.motion.builders.clearance import ClearanceConstraints, clearance_of
 from ocp.motion.result.candidate import Candidate
 from ocp.motion.result.plan import Plan, read_record, reading_plan, record_arrays
 from ocp.motion.result.request import restored_request, stored_request
+from ocp.motion.search.lengths import Homogeneous, LargestMotion, PathLength
+from ocp.motion.search.shortening import PathPoses, PathProblem, optimality_of
 from ocp.motion.tasks.limits import Limits
 from ocp.motion.tasks.speed_profile import segment_index
 from ocp.motion.tasks.targets import Target, tip_poses
 from ocp.solution import Solution
-from ocp.tolerances import CLEARANCE_TOLERANCE_M
+from ocp.tolerances import CLEARANCE_TOLERANCE_M, RESOLVED_SHARE
 
 __all__ = ["PathPlan", "PathPoses"]
 
@@ -33,20 +35,8 @@ STEP_TOLERANCE = 1e-6
 """Largest excess over a joint limit or over the largest step between waypoints, rad or m."""
 UNLIMITED_RATE = 1.0
 """Rate that is assumed for joints without velocity limits when a path is timed, rad/s or m/s."""
-UNDECIDED = "a path through waypoints is compared with its lower bound, not with its neighbours"
-
-
-class PathPoses(NamedTuple):
-    """Tool poses that a path must reach at its waypoints, and the largest joint displacement between waypoints.
-
-    Attributes:
-        positions, rotations: Poses of the tip at the waypoints, in world. Shapes (N, 3), m, and (N, 3, 3).
-        step: Largest displacement of each joint between waypoints. Shape (n,), rad or m.
-    """
-
-    positions: Array
-    rotations: Array
-    step: Array
+SAVED = "cost that displacements would save"
+"""Name of the finding about the first-order conditions: what small displacements would save, relative to the cost."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,6 +54,7 @@ class PathPlan(Plan):
         constraints: Collision scene; None without a collision check.
         poses: Poses of the tip at the waypoints and largest displacements of the joints between them, or None.
         candidates, bound: As in `Plan`; the bound is that of any path with at most as many segments.
+        step_cost: Cost of the steps between waypoints; None if it is unknown.
         reconfigurations: Waypoints from which the arm moves to the next one in another configuration, by a motion that
             is not planned.
     """
@@ -77,6 +68,7 @@ class PathPlan(Plan):
     candidates: tuple[Candidate, ...] = ()
     bound: float | None = None
     reconfigurations: tuple[int, ...] = ()
+    step_cost: Homogeneous | None = None
     _audits: dict[str, Any] = field(default_factory=dict, repr=False)
 
     # ---- values ------------------------------------------------------------------------------------------------------
@@ -170,8 +162,26 @@ class PathPlan(Plan):
         clearance = self.clearance()
         findings += [] if clearance is None else [clearance_finding(clearance, CLEARANCE_TOLERANCE_M)]
         clearances = {} if clearance is None else {clearance.name: clearance}
-        undecided = UNDECIDED if self.gap is None else f"{UNDECIDED}; it may cost {self.gap:.2g} too much"
-        return Audit("path through waypoints", tuple(findings), undecided, clearances=clearances)
+        optimality, undecided = self._optimality()
+        remarks = () if self.gap is None else (f"it may cost {self.gap:.2g} too much",)
+        options: dict[str, Any] = {"clearances": clearances, "remarks": remarks}
+        return Audit("path through waypoints", tuple(findings + optimality), undecided, **options)
+
+    def _optimality(self) -> tuple[list[Finding], str]:
+        """Return the finding about the first-order conditions, and why a local minimum is undetermined, or ""."""
+        if self.poses is None or self.step_cost is None:
+            return [], "the cost of its steps is unknown"
+        scene = None if self.constraints is None else self.constraints.scene
+        options: dict[str, Any] = {"bounds": self.limits.bounds(self.machine), "idle": self.joints[0], "scene": scene}
+        problem = PathProblem.through_poses(self.machine, self.poses, self.step_cost, **options)
+        firsts, lasts = [0, *(k + 1 for k in self.reconfigurations)], [*self.reconfigurations, len(self.joints) - 1]
+        parts = [
+            optimality_of(self.joints[first : last + 1], problem.restrict(first, last))
+            for first, last in zip(firsts, lasts, strict=True)
+        ]
+        saved = sum(part[0] for part in parts) / max(self.path_cost, np.finfo(float).tiny)
+        undecided = "its cost may decrease to second order" if any(part[1] for part in parts) else ""
+        return [Finding(SAVED, saved, RESOLVED_SHARE, verdict="optimal", note="relative, to first order")], undecided
 
     @property
     def _counts(self) -> str:
@@ -213,6 +223,8 @@ class PathPlan(Plan):
             "candidates": [candidate.record() for candidate in self.candidates],
             "joints": self.joints,
             "poses": None if self.poses is None else self.poses._asdict(),
+            "weights": None if self.step_cost is None else self.step_cost.weights,
+            "timed": isinstance(self.step_cost, LargestMotion),
         }
         return record_arrays("path", record)
 
@@ -233,6 +245,8 @@ class PathPlan(Plan):
             breaks = tuple(int(number) for number in head["reconfigurations"])
             if not all(0 <= number < count - 1 for number in breaks):
                 raise ValueError(f"it reconfigures at waypoints that it has not: {breaks}")
+            weights = values.pop("weights", None)
+            kind = LargestMotion if head["timed"] is True else PathLength
             candidates = tuple(Candidate.of_record(record, None) for record in head["candidates"])
             return cls(
                 machine=machine,
@@ -244,6 +258,7 @@ class PathPlan(Plan):
                 candidates=candidates,
                 bound=None if head["bound"] is None else float(head["bound"]),
                 reconfigurations=breaks,
+                step_cost=None if weights is None else kind(weights),
             )
 
 
@@ -252,6 +267,8 @@ def _checked_values(head: Mapping[str, Any], size: int) -> dict[str, Array]:
     count = len(head["joints"])
     shapes: dict[str, tuple[int, ...]] = {"joints": (count, size)}
     written = {"joints": head["joints"]}
+    if head["weights"] is not None:
+        shapes["weights"], written["weights"] = (size,), head["weights"]
     if head["poses"] is not None:
         shapes |= {"positions": (count, 3), "rotations": (count, 3, 3), "step": (size,)}
         written |= {name: head["poses"][name] for name in PathPoses._fields}

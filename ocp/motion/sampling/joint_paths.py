@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from models import CollisionScene
 from models.checks import Array
 from ocp.console import check_time
-from ocp.motion.local.collisions import Collision, find_collisions, prepared_pairs
+from ocp.motion.local.collisions import Collision, find_collisions, near_pairs, prepared_pairs
 from ocp.problem.hulls import Frames, frames_of
 from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
@@ -63,7 +63,6 @@ class StraightMotionSettings:
             is decided.
         tolerance: Distance by which the clearance may be missed, m: half of what the audit allows, so that motions may
             begin and end at the clearance itself.
-        difference: Step of finite differences, rad or m: the root of the rounding error of distances, 1e-10 m.
         block: Largest number of pairs of bodies, over all configurations, that are evaluated at once.
     """
 
@@ -71,7 +70,6 @@ class StraightMotionSettings:
     uneven: float = 0.05
     first: float = 0.4
     tolerance: float = CLEARANCE_TOLERANCE_M / 2
-    difference: float = 1e-5
     block: int = 1_000_000
 
 
@@ -106,18 +104,9 @@ class StraightMotions:
             Configuration and pair of each, their distance beyond the clearance, m, shape (K,) each, and its gradient,
             shape (K, n).
         """
-        n = joints.shape[1]
         if self.scene is None:
-            return np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, n))
-        near, step = self.scene.clearance + reach, PROOF.difference
-        frames = self._frames(joints)
-        at, pair = np.nonzero(self._bodies.all_balls(frames) < near)
-        gap = self._bodies.gaps(frames, at, pair, near)
-        at, pair, gap = at[gap < near], pair[gap < near], gap[gap < near]
-        moved = self._frames((joints[:, None] + step * np.eye(n)).reshape(-1, n))
-        places = (n * at[:, None] + np.arange(n)).ravel()
-        gradient = (self._bodies.gaps(moved, places, np.repeat(pair, n)).reshape(-1, n) - gap[:, None]) / step
-        return at, pair, gap - self.scene.clearance, gradient
+            return np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, joints.shape[1]))
+        return near_pairs(self.scene, joints, reach)
 
     def are_clear(self, starts: Array, ends: Array) -> NDArray[np.bool_]:
         """Return which straight motions are proven collision-free. Shape (M,).

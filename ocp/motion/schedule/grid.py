@@ -29,8 +29,6 @@ from ocp.motion.schedule.limits import (
 from ocp.motion.tasks.speed_profile import Array, segment_index
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["GAUSS", "Grid", "coarse_grid", "make_grid", "reachable_bounds"]
-
 
 @dataclass(frozen=True)
 class GridSettings:
@@ -117,7 +115,7 @@ class Grid:
         s = np.sort(np.concatenate([self.distance, (self.distance[:-1] + self.distance[1:]) / 2]))
         return replace(self, distance=s, requested=np.repeat(self.requested, 2), jumps=2 * self.jumps)
 
-    def parts(self) -> list[tuple[int, int]]:
+    def blocks(self) -> list[tuple[int, int]]:
         """Divide the grid into consecutive blocks of bounded size; return the first and last node of each block."""
         ends = [*range(0, len(self.requested), BLOCK_SIZE), len(self.requested)]
         return list(pairwise(ends))
@@ -127,7 +125,7 @@ class _Cells(NamedTuple):
     """Intervals of a path, short enough to resolve the limits, and bounds of speed and acceleration in each interval.
 
     Attributes:
-        begin: Distances at which the intervals begin. Shape (N,), m, as of the others.
+        begin: Distances at which the intervals begin. Shape (N,) like all others, m.
         top: Fastest steady speeds, m/s.
         rates: Upper bounds of the acceleration of any motion, m/s^2.
         acceleration, jerk: Largest acceleration and jerk along the path at rest, m/s^2 and m/s^3.
@@ -174,12 +172,9 @@ def make_grid(path: PathLike, limits: LineLimits, joints: JointPath | None) -> G
 def _halve_intervals(
     path: PathLike, limits: LineLimits, joints: JointPath | None, s: Array, requested: tuple[Array, Array]
 ) -> _Cells:
-    """Halve the intervals of a path until the coefficients of all limits vary almost linearly in each interval.
+    """Halve the intervals between distances `s` along a path until all limits vary almost linearly in each interval.
 
-    Args:
-        path, limits, joints: As for `make_grid`.
-        s: Distances of the positions. Shape (M + 1,), m.
-        requested: Bounds of the segments of the path, and the requested speed in each segment.
+    `requested` contains the bounds of the segments of the path, and the requested speed in each segment.
     """
     rows = limit_rows(path, limits, joints, s)
     _check_rest(rows, s, limit_names(limits, joints))
@@ -205,7 +200,7 @@ def _halve_intervals(
     with np.errstate(divide="ignore"):
         jerk = 1 / np.maximum(np.abs(left.jerk[:, :, 0]), np.abs(right.jerk[:, :, 0])).max(axis=1, initial=0.0)
     acceleration = 1 / np.maximum(np.abs(left.acceleration[:, :, 0]), np.abs(right.acceleration[:, :, 0])).max(axis=1)
-    return _Cells(s[:-1], top, _acceleration_bounds(left, right, top**2, top**2), acceleration, jerk)
+    return _Cells(s[:-1], top, acceleration_bounds(left, right, top**2, top**2), acceleration, jerk)
 
 
 def coarse_grid(path: PathLike, limits: LineLimits) -> Grid:
@@ -231,8 +226,7 @@ def _separate(places: Array, nodes: Array) -> Array:
     s = np.unique(places)
     for _ in range(3):
         gap = np.diff(s)
-        longer_gap = np.maximum(np.append(gap, 0.0), np.insert(gap, 0, 0.0))
-        close = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf)) < SETTINGS.closest * longer_gap
+        close = node_minimum(gap) < SETTINGS.closest * np.maximum(np.append(gap, 0.0), np.insert(gap, 0, 0.0))
         close &= ~np.isin(s, nodes)
         close[1:] &= ~close[:-1]  # of two close positions, keep one
         if not close.any():
@@ -251,10 +245,8 @@ def _steady_speeds(rows: Rows, s: Array, bounds: Array, requested: Array) -> Arr
 def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Array) -> NDArray[np.bool_]:
     """Return in which intervals a limit varies too nonlinearly with distance for linear interpolation. Shape (N,).
 
-    Args:
-        places: Limit rows at the beginning, at a fraction of the length, and at the end of each interval. Shape (N,).
-        fraction: That fraction.
-        top: Fastest steady speeds. Shape (N,), m/s.
+    `places` contains the limits at the beginning, at a fraction of the length, and at the end of each interval. `top`
+    are the fastest steady speeds (N,), m/s.
     """
     kinds = (
         # by the squared speed, as the rows of speed are in the program
@@ -269,23 +261,11 @@ def _uneven_intervals(places: tuple[Rows, Rows, Rows], fraction: float, top: Arr
     return uneven
 
 
-def reachable_bounds(
-    distance: Array, caps: Array, *, left: Rows, right: Rows, at_rest: tuple[bool, bool]
-) -> tuple[Array, Array]:
-    """Return bounds that no motion exceeds: of squared speeds at nodes (N + 1,) and accelerations in intervals (N,).
+def acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> Array:
+    """Return upper bounds of the acceleration in each interval from the squared speeds at both ends. Shape (N,).
 
-    Args:
-        distance: Distances of the nodes. Shape (N + 1,), m.
-        caps: Greatest permitted squared speed at each node. Shape (N + 1,).
-        left, right: Limit rows at both ends of each interval. Shape (N,).
-        at_rest: Whether the motion begins and ends at rest.
+    `left` and `right` are the limits at both ends of each interval.
     """
-    rates = _acceleration_bounds(left, right, caps[:-1], caps[1:])
-    return _reachable_squares(distance, caps, rates, at_rest), rates
-
-
-def _acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> Array:
-    """Return upper bounds of the acceleration in each interval from the squared speeds at both ends. Shape (N,)."""
     rates = np.full(len(first), np.inf)
     for side, most in ((left, first), (right, last)):
         rows = np.abs(side.acceleration)
@@ -295,22 +275,34 @@ def _acceleration_bounds(left: Rows, right: Rows, first: Array, last: Array) -> 
     return rates
 
 
-def _reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
-    """Return the highest squared speeds that can be reached at nodes under speed caps and acceleration bounds."""
+def reachable_squares(distance: Array, caps: Array, rates: Array, at_rest: tuple[bool, bool]) -> Array:
+    """Return squared speeds at nodes (N + 1,) that no motion exceeds under speed caps and acceleration bounds.
+
+    `caps` are the greatest permitted squared speeds at the nodes, `rates` bound the accelerations in the intervals, and
+    `at_rest` tells whether the motion begins and ends at rest.
+    """
     gain = np.concatenate([[0.0], np.cumsum(2 * rates * np.diff(distance))])
     squares = caps.copy()
     squares[[i for i, rest in zip((0, -1), at_rest, strict=True) if rest]] = 0.0
-    squares = np.minimum.accumulate(squares - gain) + gain
-    squares = np.minimum.accumulate((squares + gain)[::-1])[::-1] - gain
-    return np.asarray(np.maximum(squares, 0.0))
+    return np.maximum(limit_slope(squares, gain), 0.0)
+
+
+def limit_slope(values: Array, gain: Array) -> Array:
+    """Return the greatest values (N,), at most the given ones, that change by at most the change of `gain` (N,)."""
+    lowered = np.minimum.accumulate(values - gain) + gain
+    return np.asarray(np.minimum.accumulate((lowered + gain)[::-1])[::-1] - gain)
+
+
+def node_minimum(of_intervals: Array) -> Array:
+    """Return the smaller of the values of the two intervals that meet at each node. Shape (N + 1,)."""
+    return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
 
 
 def _time_nodes(cells: _Cells, length: float) -> Array:
     """Return grid nodes such that the motion passes every interval in a short time, refined towards the path's ends."""
     _, top, rates, acceleration, jerk = cells
     s = np.append(cells.begin, length)
-    caps = np.minimum(np.append(top, np.inf), np.insert(top, 0, np.inf)) ** 2
-    squares = _reachable_squares(s, caps, rates, (True, True))
+    squares = reachable_squares(s, node_minimum(top) ** 2, rates, (True, True))
     ramp = top / acceleration
     with np.errstate(invalid="ignore"):
         build_up = np.minimum(acceleration / jerk, np.sqrt(top / jerk))
@@ -320,7 +312,8 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
     longest = np.minimum(speed * duration, length)
     # ceil with a margin for rounding: the unit of length must not change the nodes
     parts = np.clip(np.ceil(np.diff(s) / longest * (1 - ROUNDING_SHARE)), 1, SETTINGS.parts).astype(np.intp)
-    nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * _group_indices(parts), length)
+    index = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    nodes = np.append(np.repeat(s[:-1], parts) + np.repeat(np.diff(s) / parts, parts) * index, length)
     near: list[Array] = [np.zeros(0), np.zeros(0)]
     for end in (0, -1):
         away = nodes if end == 0 else length - nodes
@@ -333,13 +326,6 @@ def _time_nodes(cells: _Cells, length: float) -> Array:
         count = max(int(np.ceil(np.log(geometric_range / first) / np.log(SETTINGS.growth))), 1)
         near[end] = np.asarray(first * SETTINGS.growth ** np.arange(count + 1), dtype=float)
         # finer nodes, which resolve a limit such as a bend near the end, are kept
-        gap = np.diff(nodes)
-        finest = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf))
-        finer = finest < away * (1 - 1 / SETTINGS.growth)
+        finer = node_minimum(np.diff(nodes)) < away * (1 - 1 / SETTINGS.growth)
         nodes = nodes[(away == 0) | finer | (away >= near[end][-1] * (1 + (SETTINGS.growth - 1) / 2))]
     return np.unique(np.concatenate([nodes, near[0], length - near[1]]))
-
-
-def _group_indices(sizes: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return, for consecutive groups of elements of the given sizes, the index of each element within its group."""
-    return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)

@@ -24,12 +24,6 @@ from ocp.errors import ProblemError, require
 from ocp.motion.tasks.speed_profile import Array, LineMotion
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "BLOCK_SIZE", "JointLimits", "JointPath", "JointRates", "LineLimits", "PathLike", "Rows", "ToolLimits",
-    "TorqueRates", "check_joints", "check_line", "check_smooth", "curvature_along", "limit_names", "limit_rows",
-    "rates_along", "tool_along", "torque_rows", "torques_along",
-]  # fmt: skip
-
 BLOCK_SIZE = 20_000
 """Largest number of points of a path whose limits are evaluated at once, to bound the memory for a long path."""
 
@@ -191,10 +185,9 @@ class LineLimits:
 
 
 def _check(name: str, value: ArrayLike, finite: bool, dimensions: int = 1, *, zero: bool = False) -> None:
-    """Raise ProblemError unless a limit is positive, has at most `dimensions` array dimensions, and is finite if
-    required.
+    """Raise ProblemError unless a limit is positive, or 0 if `zero`, and finite if `finite`.
 
-    With `zero` it may also be 0.
+    It may have at most `dimensions` array dimensions.
     """
     try:
         array = floats(value)
@@ -251,9 +244,8 @@ def _check_still(path: PathLike, limits: LineLimits, joints: JointPath) -> None:
         if moves.any():
             column = int(moves.argmax())
             joint, fastest = joints.names[column], int(slopes[:, column].argmax())
-            words = (
-                f"joint {joint!r} moves along the path, at {places[fastest]:.4g} m, but the limit of its {name} is 0"
-            )
+            where = f"moves along the path, at {places[fastest]:.4g} m"
+            words = f"joint {joint!r} {where}, but the limit of its {name} is 0"
             raise ProblemError(words, name=joint, value=float(slopes[fastest, column]), limit=0.0)
 
 
@@ -369,7 +361,7 @@ class Rows(NamedTuple):
     jerk: Array
 
     def take(self, places: NDArray[Any] | slice) -> Rows:
-        """Return the coefficients at a subset of the points."""
+        """Return the coefficients of all limits at a subset of the points of the path."""
         return Rows(self.speed[places], self.acceleration[places], self.jerk[places])
 
     def steady(self) -> tuple[Array, NDArray[np.intp]]:
@@ -398,7 +390,7 @@ class Rows(NamedTuple):
         return sum(kind.shape[1] for kind in self)
 
     def usage(self, motion: LineMotion) -> Array:
-        """Return the signed ratio of each limited quantity to its limit in a motion. Shape (S, K + L + P)."""
+        """Return the ratio, with sign, of each limited quantity of a motion to its limit. Shape (S, K + L + P)."""
         v, a, j = (value[:, None] for value in (motion.speed, motion.acceleration, motion.jerk))
         acceleration, jerk = self.acceleration, self.jerk
         return np.concatenate(
@@ -412,7 +404,7 @@ class Rows(NamedTuple):
 
 
 def limit_names(limits: LineLimits, joints: JointPath | None) -> tuple[str, ...]:
-    """Return the names of the limits in the order of the columns of `Rows.usage`."""
+    """Return the names of all limits of a motion: those of speed, then of acceleration, then of jerk, as in `Rows`."""
     return tuple(name for kind in _names_by_kind(limits, joints) for name in kind)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.console import interruptible
 from ocp.errors import ProblemError, require, sample_times
-from ocp.motion.schedule.grid import Grid, coarse_grid, make_grid
+from ocp.motion.schedule.grid import Grid, coarse_grid, limit_slope, make_grid, node_minimum
 from ocp.motion.schedule.limits import (
     BLOCK_SIZE,
     JointPath,
@@ -33,8 +33,6 @@ from ocp.motion.schedule.stretch import ACTIVE_SHARE, fastest_profile
 from ocp.motion.schedule.window import Stretch
 from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, join_profiles, ramp_distance, segment_index
 from ocp.tolerances import ROUNDING_SHARE
-
-__all__ = ["Dip", "Schedule", "plan_below_velocity_curve", "schedule"]
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ def plan_below_velocity_curve(path: PathLike, limits: LineLimits) -> SpeedProfil
 
 
 def _velocity_curve(path: PathLike, limits: LineLimits) -> tuple[Array, Array, Array]:
-    """Return distances and speeds (G,) on a path's maximum velocity curve, and requested speeds in between (G - 1,)."""
+    """Return G distances and speeds on a path's maximum velocity curve, and the G - 1 requested speeds between them."""
     of_pieces, bounds = path.by_piece(limits.speed), np.asarray(path.bounds, dtype=float)
     first = np.unique(np.concatenate([path.sample_distances(8, 2), bounds]))
     parts = []
@@ -134,14 +132,12 @@ def _refine_distances(
 def _unresolved_intervals(
     length: float, s: Array, permitted: Array, requested: Array, acceleration: float
 ) -> NDArray[np.bool_]:
-    """Return which intervals are too long to resolve the permitted speed, where the permitted speed limits the motion.
+    """Return which intervals of a velocity curve are too long where its speed, the permitted speed, limits the motion.
 
     It limits the motion where it is near or below the requested speed and the acceleration suffices to get near it.
     """
     low = np.minimum(permitted[:-1], permitted[1:])
-    gain = 2 * acceleration * (s - s[0])
-    reachable = np.minimum.accumulate(permitted**2 - gain) + gain
-    reachable = np.minimum.accumulate((reachable + gain)[::-1])[::-1] - gain
+    reachable = limit_slope(permitted**2, 2 * acceleration * (s - s[0]))
     reachable = np.sqrt(np.maximum(reachable[:-1], reachable[1:]))
     matters = (low < 1.1 * np.minimum(requested, reachable)) & (np.diff(s) > ROUNDING_SHARE * length)
     value = np.log(np.minimum(permitted, 2 * requested.max()))
@@ -316,7 +312,10 @@ def schedule(path: PathLike, limits: LineLimits, *, joints: JointPath | None = N
 
 
 def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> SpeedProfile:
-    """Return a speed profile within all limits: plan `line_profile` again at violations, or wholly if it is None."""
+    """Return a speed profile within all limits: `line_profile`, planned again where it violates a limit.
+
+    If it is None, the whole path is planned.
+    """
     count = len(grid.requested)
     if line_profile is None:
         return fastest_profile(Stretch(grid, 0, count))
@@ -325,7 +324,7 @@ def _constrained_profile(grid: Grid, line_profile: SpeedProfile | None) -> Speed
         return line_profile
     s, extent = grid.distance, 1.0
     while True:
-        stretches = _stretches(grid, line_profile, violated, extent)
+        stretches = _violated_stretches(grid, line_profile, violated, extent)
         motions = []
         for first, last in stretches:
             ends = [(0.0 if k in (0, count) else float(grid.requested[k]) ** 2, 0.0) for k in (first, last)]
@@ -361,7 +360,7 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
         np.concatenate([profile.t, np.maximum(profile.t[1:] - 1e-12 * profile.duration, 0.0), profile.peaks().t])
     )
     at = segment_index(grid.distance, peaks.distance)
-    for first, last in grid.parts():
+    for first, last in grid.blocks():
         at_nodes, inside = profile.at_distance(grid.distance[first : last + 1]), (at >= first) & (at < last)
         turn = LineMotion(*(value[inside] for value in peaks))
         for rows, ends in zip(grid.ends(first, last), (slice(-1), slice(1, None)), strict=True):
@@ -372,7 +371,9 @@ def _violated_intervals(grid: Grid, profile: SpeedProfile) -> NDArray[np.bool_]:
     return violated
 
 
-def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float) -> list[tuple[int, int]]:
+def _violated_stretches(
+    grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], extent: float
+) -> list[tuple[int, int]]:
     """Return first and last node of each part of a path that must be planned again because a limit is violated there.
 
     They end at steady speeds or path ends, beyond the violated intervals by `extent` times the length of a ramp to
@@ -381,7 +382,7 @@ def _stretches(grid: Grid, profile: SpeedProfile, violated: NDArray[np.bool_], e
     count, s, limits = len(violated), grid.distance, grid.limits
     motion = profile.at_distance(s)
     steady = (np.abs(motion.acceleration) <= ROUNDING_SHARE * limits.acceleration) & (motion.jerk == 0)
-    requested = np.minimum(np.append(grid.requested, np.inf), np.insert(grid.requested, 0, np.inf))
+    requested = node_minimum(grid.requested)
     steady &= np.abs(motion.speed - requested) <= ROUNDING_SHARE * requested
     steady[[0, -1]] = True
     steady_nodes = np.flatnonzero(steady)
@@ -432,7 +433,7 @@ def _find_dips(grid: Grid, profile: SpeedProfile, names: tuple[str, ...]) -> tup
     line_rows = [k for k, name in enumerate(names) if name.startswith("line ")]
     cause, steady = np.zeros(len(grid.requested), dtype=np.intp), np.zeros(len(grid.requested))
     binding = middle.speed < grid.requested * (1 - SETTINGS.reached)
-    for first, last in grid.parts():
+    for first, last in grid.blocks():
         part, sides = slice(first, last), grid.ends(first, last)
         motion = LineMotion(*(value[part] for value in middle))
         usage = np.maximum(*(np.abs(rows.usage(motion)) for rows in sides))

@@ -35,8 +35,6 @@ from ocp.errors import SolveError
 from ocp.motion.tasks.speed_profile import Array
 from ocp.tolerances import SOLVER_SHARE
 
-__all__ = ["INTERIOR", "Program", "ProgramSettings", "Spline", "SplineRows", "least_time"]
-
 
 @dataclass(frozen=True)
 class ProgramSettings:
@@ -49,29 +47,29 @@ class ProgramSettings:
         more_steps: Further steps after an accepted one, where rounding stops progress.
         accepted: Complementarity at which a solution is accepted, and the stationarity residual by the logarithm of the
             coefficients, over the time.
-        missed: Largest violation of a row in an accepted solution, or `missed_by_accuracy` times the squared accuracy
-            if that is larger.
+        violation: Largest violation of a row in an accepted solution, unless `violation_by_accuracy` times the squared
+            accuracy is larger.
         diverged: Complementarity above which the program counts as infeasible.
         to_boundary: Largest share of the step to the nearest bound.
-        lost: Largest share of a coefficient that a step removes: a motion close to rest may be a trap.
+        reduction: Largest share of a coefficient that a step removes: a motion close to rest may be a trap.
         block: Intervals of a block; step lengths are interpolated between the middles of blocks.
-        firm: Relative regularisations of the diagonal, tried in order until the equations are positive definite.
-        astray: Largest growth of the worst violation in a step.
-        no_matter: Violation below which any growth is accepted.
+        regularisations: Relative additions to the diagonal, tried in order until the equations are positive definite.
+        growth: Largest growth of the worst violation in a step.
+        negligible: Violation below which any growth is accepted.
     """
 
     steps: int = 200
     more_steps: int = 10
     accepted: float = 1e-3
-    missed: float = SOLVER_SHARE
-    missed_by_accuracy: float = 100.0
+    violation: float = SOLVER_SHARE
+    violation_by_accuracy: float = 100.0
     diverged: float = 1e12
     to_boundary: float = 0.995
-    lost: float = 0.7
+    reduction: float = 0.7
     block: int = 10
-    firm: tuple[float, ...] = (0.0, 1e-14, 1e-12, 1e-10)
-    astray: float = 2.0
-    no_matter: float = 1e-2
+    regularisations: tuple[float, ...] = (0.0, 1e-14, 1e-12, 1e-10)
+    growth: float = 2.0
+    negligible: float = 1e-2
 
 
 INTERIOR = ProgramSettings()
@@ -124,7 +122,7 @@ class Spline:
         return np.append(x - self.share * self.width * slope / 2, x[-1])
 
     def basis(self, interval: NDArray[np.intp], fraction: Array) -> Array:
-        """Return the map from spline coefficients to squared speed and its derivatives at points. Shape (3, 3, M)."""
+        """Return matrices from 3 coefficients to squared speed and its 2 derivatives at M points. Shape (3, 3, M)."""
         h, share = self.h[interval], self.share[interval]
         inside = fraction * h
         first, last = 2 / self.width[interval], 2 / self.width[interval + 1]
@@ -183,7 +181,7 @@ class Program(NamedTuple):
 
 
 class _EndConditions:
-    """End conditions as equations for spline coefficients: fixed values or, for rest, a ratio of the outermost two."""
+    """End conditions of a spline of the squared speed: fixed coefficients or, at rest, a ratio of the outermost two."""
 
     def __init__(self, program: Program) -> None:
         n, h, (first, last) = len(program.upper), program.spline.h, program.rest
@@ -191,26 +189,26 @@ class _EndConditions:
         self.sides += [(n - 1, n - 2, 1 / (1 + 2 * h[-1] / (3 * last)))] if last else []
         self.fixed = np.union1d(program.fixed, np.array([outer for outer, *_ in self.sides], dtype=np.intp))
 
-    def start(self, b: Array) -> Array:
+    def impose(self, b: Array) -> Array:
         """Return a copy of the spline coefficients ``b`` that satisfies the end conditions."""
         b = b.copy()
         for outer, inner, ratio in self.sides:
             b[outer] = ratio * b[inner]
         return b
 
-    def follow(self, change: Array) -> None:
+    def adapt_step(self, change: Array) -> None:
         """Adapt a change of the coefficients, in place, to the end conditions, so that they stay satisfied."""
         change[self.fixed] = 0.0
         for outer, inner, ratio in self.sides:
             change[outer] = ratio * change[inner]
 
-    def reduce(self, slope: Array) -> None:
+    def reduce_gradient(self, slope: Array) -> None:
         """Replace a gradient, in place, by the gradient with respect to the free coefficients."""
         for outer, inner, ratio in self.sides:
             slope[inner] += ratio * slope[outer]
         slope[self.fixed] = 0.0
 
-    def band(self, main: Array, first: Array, second: Array) -> Array:
+    def reduce_hessian(self, main: Array, first: Array, second: Array) -> Array:
         """Return the diagonals of a Hessian with respect to the free coefficients, as input of `_BandSolver`.
 
         Args:
@@ -239,10 +237,10 @@ class _BandSolver:
     """
 
     def __init__(self, band: Array) -> None:
-        for firm in INTERIOR.firm:
-            firmer = band.copy(order="F")
-            firmer[0] *= 1 + firm
-            self.factors, failed = scipy.linalg.lapack.dpbtrf(firmer, lower=1, overwrite_ab=1)
+        for share in INTERIOR.regularisations:
+            regularised = band.copy(order="F")
+            regularised[0] *= 1 + share
+            self.factors, failed = scipy.linalg.lapack.dpbtrf(regularised, lower=1, overwrite_ab=1)
             if not failed:
                 return
         raise np.linalg.LinAlgError("the equations of a step are not positive definite")
@@ -312,13 +310,13 @@ class _Constraints:
         return self._all_values(change, _weighted_sum(self.gradients, self._coefficients(change)))
 
     def weighted_gradients(self, values: Array) -> Array:
-        """Return the weighted sum of the gradients of all constraints, for given weights. Shape (N + 2,)."""
+        """Return the sum of the gradients of all constraints, each multiplied by its weight. Shape (N + 2,)."""
         out = self._spread(self.gradients * values[self.alone :])
         out[1:-1] -= values[: self.count]
         out[self.bounded] += values[self.count : self.alone]
         return out
 
-    def squares(self, values: Array) -> tuple[Array, Array, Array]:
+    def outer_products(self, values: Array) -> tuple[Array, Array, Array]:
         """Return three diagonals (N + 2,), (N + 1,), (N,) of the weighted sum of outer products of gradients."""
         g = self.gradients
         pulled = g * values[self.alone :]
@@ -336,7 +334,7 @@ class _Constraints:
         return np.concatenate([-b[1:-1], b[self.bounded], rows])
 
     def _spread(self, values: Iterable[Array]) -> Array:
-        """Sum values over the limits in each interval; return the sums added to the spline coefficients they belong to.
+        """Sum values of limits over each interval, and add the k-th sum to the k-th spline coefficient of the interval.
 
         Shapes (M - `alone`,) each to (N + number of values - 1,).
         """
@@ -346,7 +344,7 @@ class _Constraints:
             out[k : self.count + k] += own
         return out
 
-    def longest(self, rates: Array, share: float, of_positive: float) -> Array:
+    def step_lengths(self, rates: Array, share: float, of_positive: float) -> Array:
         """Return a Newton step length of at most 1 for each interval; it varies slowly along the path. Shape (N,).
 
         Args:
@@ -390,7 +388,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
     cost_weights = spline.width / 2
     cost_weights[0] += 3 * rest[0]
     cost_weights[-1] += 3 * rest[1]
-    b = ends.start(start)
+    b = ends.impose(start)
     gap, size = constraints.evaluate(b)
     slack = np.maximum(-gap, 0.1 * size)
     slack[:count] = b[1:-1]
@@ -398,9 +396,9 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
     def solve(right: Array) -> Array:
         """Return the Newton step of the coefficients."""
-        ends.reduce(right)
+        ends.reduce_gradient(right)
         change = equations.solve(right)
-        ends.follow(change)
+        ends.adapt_step(change)
         return change
 
     accepted: Array | None = None
@@ -409,7 +407,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
     for number in range(INTERIOR.steps):
         np.maximum(slack, -gap, out=slack)
         violation = _violations(gap, slack, size, count)
-        if before and not uniform and not violation.max() < max(INTERIOR.astray * worst, INTERIOR.no_matter):
+        if before and not uniform and not violation.max() < max(INTERIOR.growth * worst, INTERIOR.negligible):
             uniform = True
             b, slack, multiplier = (value + step * change for value, step, change in before)
             gap, size = constraints.evaluate(b)
@@ -420,9 +418,9 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         if not np.isfinite(mean + worst) or mean * len(gap) > INTERIOR.diverged * time:
             break
         complementary = mean * len(gap) < max(INTERIOR.accepted, accuracy) * time
-        if complementary and worst < max(INTERIOR.missed, INTERIOR.missed_by_accuracy * accuracy**2):
+        if complementary and worst < max(INTERIOR.violation, INTERIOR.violation_by_accuracy * accuracy**2):
             stationarity = slope + constraints.weighted_gradients(multiplier)
-            ends.reduce(stationarity)
+            ends.reduce_gradient(stationarity)
             if float(np.abs(stationarity * b).sum()) < max(INTERIOR.accepted, accuracy) * time:
                 accepted = b
         if accepted is not None and (mean * len(gap) < accuracy * time or number > latest):
@@ -432,9 +430,11 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
 
         per_slack, residual = 1 / slack, gap + slack
         weight = multiplier * per_slack
-        squares = constraints.squares(weight)
+        squares = constraints.outer_products(weight)
         try:
-            equations = _BandSolver(ends.band(*(own + more for own, more in zip(curvature, squares, strict=True))))
+            equations = _BandSolver(
+                ends.reduce_hessian(*(own + more for own, more in zip(curvature, squares, strict=True)))
+            )
         except np.linalg.LinAlgError:
             break
         gradient = slope + constraints.weighted_gradients(weight * residual)
@@ -442,7 +442,7 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         # the relative rates of the multipliers are those of the slacks, mirrored about -1/2
         change = solve(-gradient)
         rates = -(residual + constraints.change_of(change)) * per_slack
-        reached = constraints.longest(np.minimum(rates, -1 - rates), 1.0, 1.0)
+        reached = constraints.step_lengths(np.minimum(rates, -1 - rates), 1.0, 1.0)
         affine, product = reached.take(constraints.interval), slack * multiplier
         after = float((product * (1 + affine * rates)) @ (1 - affine - affine * rates)) / len(gap)
         remaining = 1 - reached
@@ -453,8 +453,8 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
         slack_change = -(residual + constraints.change_of(change))
         multiplier_change = target_multiplier - multiplier - weight * slack_change
         lengths = [
-            constraints.longest(slack_change * per_slack, INTERIOR.to_boundary, INTERIOR.lost),
-            constraints.longest(multiplier_change / multiplier, INTERIOR.to_boundary, INTERIOR.to_boundary),
+            constraints.step_lengths(slack_change * per_slack, INTERIOR.to_boundary, INTERIOR.reduction),
+            constraints.step_lengths(multiplier_change / multiplier, INTERIOR.to_boundary, INTERIOR.to_boundary),
         ]
         shortest = [each.min() for each in lengths]
         if uniform:
@@ -474,11 +474,11 @@ def least_time(program: Program, start: Array, *, accuracy: float, center: float
     row = int(violation.argmax())
     place = float(spline.nodes[constraints.interval[row]])
     message = f"no motion keeps the limits near {place:g} m: they conflict by {worst:.2g}"
-    raise SolveError(message, name="limits", value=worst, limit=INTERIOR.missed, time=place)
+    raise SolveError(message, name="limits", value=worst, limit=INTERIOR.violation, time=place)
 
 
 def _violations(gap: Array, slack: Array, size: Array, count: int) -> Array:
-    """Return relative residuals of constraints with slacks; 0 for the first `count` constraints, which always hold."""
+    """Return relative residuals of constraints with slack variables; 0 for the first `count`, which always hold."""
     violation = (gap + slack) / size
     violation[:count] = 0.0
     return np.asarray(violation)

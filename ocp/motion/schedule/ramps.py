@@ -32,10 +32,6 @@ from ocp.motion.tasks.speed_profile import (
 )
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = [
-    "Memory", "Zones", "fastest_motion", "peak_acceleration", "plan_zones", "reachability_passes",
-]  # fmt: skip
-
 Memory = MutableMapping[tuple[float, ...], Phases]
 """Cache of computed motions, keyed by distance, end speeds and limits."""
 
@@ -169,17 +165,15 @@ def plan_zones(zones: Zones, cache: Memory) -> SpeedProfile:
     motions: list[Phases] = []
     for largest, length, first, last in zip(limits, lengths, ends[:-1], ends[1:], strict=True):
         key = (length, first, last, *largest)
-        if first == last == largest[0]:
-            motions.append(((length / first, 0.0),))
-        else:
-            motions.append(
-                cache[key] if key in cache else cache.setdefault(key, fastest_motion(length, first, last, largest))
-            )
-    return _profile(zones, np.array(ends), motions)
+        if key not in cache:
+            steady = first == last == largest[0]
+            cache[key] = ((length / first, 0.0),) if steady else fastest_motion(length, first, last, largest)
+        motions.append(cache[key])
+    return _join_motions(zones, np.array(ends), motions)
 
 
-def _profile(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
-    """Join the motions through consecutive parts of a path to one speed profile; their end speeds are given, m/s."""
+def _join_motions(zones: Zones, ends: Array, motions: list[Phases]) -> SpeedProfile:
+    """Join motions through consecutive parts of a path, with given speeds at the ends, m/s, to one speed profile."""
     counts = np.array([len(phases) for phases in motions])
     durations, jerks = np.array([phase for phases in motions for phase in phases]).reshape(-1, 2).T
     if not durations.size or not np.isfinite(durations).all():
@@ -206,7 +200,7 @@ def _limit_speed(speed: float, other_end: float, length: float, limits: tuple[fl
 
 
 class _Bounds(NamedTuple):
-    """Bounds low + slope x <= u <= high + slope x of the acceleration u at squared speed x. Shape (N, R) each."""
+    """Bounds of the acceleration u at squared speed x: low + slope x <= u <= high + slope x. Shape (N, R) each."""
 
     slope: Array
     low: Array
@@ -214,7 +208,10 @@ class _Bounds(NamedTuple):
 
     @classmethod
     def build(cls, rows: Array) -> _Bounds:
-        """Return the bounds that rows (p, q, r) set, -1 <= p u + q x + r <= 1. Shape (N, R, 3)."""
+        """Return the bounds of acceleration u at squared speed x that -1 <= p u + q x + r <= 1 sets for rows (p, q, r).
+
+        Shape (N, R, 3).
+        """
         p, q, r = np.moveaxis(rows, 2, 0)
         size = np.abs(p)
         free = size <= NO_INERTIA * size.max(axis=1, keepdims=True)
@@ -223,14 +220,14 @@ class _Bounds(NamedTuple):
         return cls(np.where(free, 0.0, -q * inverse), middle - reach, middle + reach)
 
     def at(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return the greatest lower and the least upper bound at squared speeds (N,), and their difference's slope."""
+        """Return the greatest lower and least upper bound of u at squared speeds x, and the slope of their gap."""
         change, each = self.slope * x[:, None], np.arange(len(x))
         below, above = change + self.low, change + self.high
         low, high = below.argmax(axis=1), above.argmin(axis=1)
         return below[each, low], above[each, high], self.slope[each, high] - self.slope[each, low]
 
     def feasible(self, caps: Array) -> Array:
-        """Return the greatest squared speeds, at most `caps` (N,), at which the bounds leave an acceleration."""
+        """Return the greatest squared speeds, at most `caps` (N,), at which an acceleration satisfies all bounds."""
         x, at = caps.copy(), np.flatnonzero(caps > 0)
         while at.size:  # Newton's method on a concave function, from above its root
             low, high, slope = _Bounds(*(kind[at] for kind in self)).at(x[at])
@@ -292,7 +289,7 @@ def reachability_passes(distance: Array, caps: Array, left: Array, right: Array)
 
 
 def _greatest_squares(caps: Array, near: tuple[Array, Array], far: tuple[Array, Array]) -> Array:
-    """Return the greatest x (N + 1,) within caps with max(a x[k + 1] + b) <= min(c x[k] + d), from the first on.
+    """Return the greatest squared speeds x <= `caps` at N + 1 nodes with max(a x[k + 1] + b) <= min(c x[k] + d).
 
     Howard's policy iteration: all nodes are solved with the lines that are active at the last solution, until these are
     the active ones.

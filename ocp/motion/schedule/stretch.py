@@ -16,12 +16,12 @@ import scipy
 from numpy.typing import NDArray
 
 from ocp.errors import ProblemError, SolveError
-from ocp.motion.schedule.grid import GAUSS, Grid, reachable_bounds
+from ocp.motion.schedule.grid import GAUSS, Grid, acceleration_bounds, limit_slope, node_minimum, reachable_squares
 from ocp.motion.schedule.limits import Rows, limit_rows
 from ocp.motion.schedule.program import Program, Spline, SplineRows, least_time
 from ocp.motion.schedule.ramps import reachability_passes
 from ocp.motion.schedule.window import (
-    HELD,
+    ENFORCED_AT,
     INSIDE,
     Ends,
     EnforcedRows,
@@ -31,12 +31,11 @@ from ocp.motion.schedule.window import (
     Window,
     limit_usage,
     motion_profile,
+    parabola_peak,
 )
 from ocp.motion.schedule.window import SETTINGS as WINDOW_SETTINGS
 from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, join_profiles, profile_between
 from ocp.tolerances import ROUNDING_SHARE
-
-__all__ = ["ACTIVE_SHARE", "fastest_profile"]
 
 ACTIVE_SHARE = 0.98
 """Fraction of a limit above which it counts as active; limits that no motion can activate are left out at first."""
@@ -93,7 +92,7 @@ def fastest_profile(stretch: Stretch) -> SpeedProfile:
         ProblemError: No motion keeps the limits, with the distance at fault.
     """
     if not stretch.grid.sharp:
-        return _without_jerk(stretch.grid)  # a path without jerk limits is one stretch
+        return _solve_without_jerk(stretch.grid)  # a path without jerk limits is one stretch
     parts: list[SpeedProfile] = []
     begin, state, behind = stretch.first, stretch.ends[0], None
     while True:
@@ -114,21 +113,16 @@ def _solve_window(
 ) -> tuple[SpeedProfile, tuple[float, float], EnforcedRows]:
     """Return the fastest motion in a window (intervals of a path solved at once), up to the start of the next window.
 
-    Args:
-        window: The window.
-        seam: Node at which the next window begins, or the last node.
-        before: Limit rows enforced in the previous window beyond its seam.
-
-    Returns:
-        The motion, squared speed and slope at the seam, and the limit rows enforced beyond it.
+    Also return the squared speed and its slope at that node, `seam`, and the limits enforced beyond it; `before` are
+    those that the previous window enforced beyond its own seam.
     """
     enforced = EnforcedRows.build(window)
     if before is not None:
         for margin, previous in zip(enforced.margins, before.margins, strict=True):
             margin[: len(previous)] = previous
-        enforced.held[:, :, : before.held.shape[2]] = before.held
-        enforced.speeds[:, : before.held.shape[2]] = before.speeds
-        enforced.inherited = before.held.shape[2]
+        enforced.mask[:, :, : before.mask.shape[2]] = before.mask
+        enforced.speeds[:, : before.mask.shape[2]] = before.speeds
+        enforced.inherited = before.mask.shape[2]
     to_seam, checked = seam - window.first, min(seam + SETTINGS.overlap // 2, window.last) - window.first
     x, slope = _tighten(window, enforced, seam, checked)
     state = float(x[to_seam]), float(slope[to_seam])
@@ -138,19 +132,15 @@ def _solve_window(
 def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) -> Motion:
     """Tighten the enforced limits until the computed motion satisfies the original limits; return the motion.
 
-    If few intervals still violate limits, these are planned again with their neighbours, between fixed motions.
-
-    Args:
-        window, seam: As for `_solve_window`.
-        enforced: Enforced limit rows and margins, changed in place.
-        checked: Number of intervals, from the first, that must keep the limits.
+    If few intervals still violate limits, these are planned again with their neighbours, between fixed motions. The
+    first `checked` intervals must keep the limits.
     """
     every = np.arange(window.last - window.first)
     accuracies, start, free = SETTINGS.accuracies, None, every
     for number in range(SETTINGS.rounds):
         accuracy = accuracies[min(number, len(accuracies) - 1)]
         try:
-            x, slope = _with_jerk(window, enforced, seam, start, accuracy, free)
+            x, slope = _solve_with_jerk(window, enforced, seam, start, accuracy, free)
         except ProblemError:
             if len(free) == len(every):
                 raise
@@ -159,7 +149,7 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
         used, values = limit_usage(window, motion_profile(window, x, slope), free, start is not None)
         used /= _seam_shares(window, seam)[:, None]
         if start is None:
-            enforced.hold_near(used, values, window.rows[1].jerk[:, :, 0])
+            enforced.enforce_near(used, values, window.rows[1].jerk[:, :, 0])
             start = x, slope
             continue
         violated = used > 1 + ROUNDING_SHARE
@@ -168,7 +158,7 @@ def _tighten(window: Window, enforced: EnforcedRows, seam: int, checked: int) ->
             return x, slope
         if number == 1:
             enforced.release(values, window.rows[1].jerk[:, :, 0], seam - window.first)
-        enforced.lower(used, enforced.hold(violated, values), window.rows[0], seam - window.first)
+        enforced.lower(used, enforced.enforce(violated, values), window.rows[0], seam - window.first)
         start = x, slope
         near = np.flatnonzero(scipy.ndimage.maximum_filter1d(affected, 2 * SETTINGS.around + 1))
         free = near if accuracy == accuracies[-1] and len(near) < SETTINGS.few * len(every) else every
@@ -183,7 +173,7 @@ def _seam_shares(window: Window, seam: int) -> Array:
     return np.where(np.arange(window.first, window.last) < seam, 1.0, SETTINGS.seam)
 
 
-def _without_jerk(grid: Grid) -> SpeedProfile:
+def _solve_without_jerk(grid: Grid) -> SpeedProfile:
     """Return the fastest motion along a path for unlimited jerk, by two passes on a grid that is refined in rounds.
 
     An interval is halved while a limit is violated inside it, and in the first rounds where a limit is active at both
@@ -196,7 +186,7 @@ def _without_jerk(grid: Grid) -> SpeedProfile:
     sides = grid.ends(0, len(requested))
     middle = limit_rows(grid.path, grid.limits, grid.joints, (s[:-1] + s[1:]) / 2)
     for _ in range(SETTINGS.rounds):
-        caps = np.minimum(_node_minimum(requested) ** 2, _row_speed_caps(*sides))
+        caps = np.minimum(node_minimum(requested) ** 2, _row_speed_caps(*sides))
         caps[[0, -1]] = 0.0
         x, *rates = reachability_passes(s, caps, *(side.acceleration for side in sides))
         profile = profile_between(s, np.sqrt(x), (rates[0], rates[1]))
@@ -234,7 +224,7 @@ def _without_jerk(grid: Grid) -> SpeedProfile:
 
 
 def _usage_without_jerk(profile: SpeedProfile, rows: tuple[Rows, ...], requested: Array) -> tuple[Array, Array]:
-    """Return the largest usage of any limit at beginning, middle and end of each interval (3, N), and between (N,).
+    """Return the largest usage of any limit at start, middle and end of each interval, (3, N), and inside it, (N,).
 
     Each row is interpolated by a parabola through the three places.
     """
@@ -245,10 +235,7 @@ def _usage_without_jerk(profile: SpeedProfile, rows: tuple[Rows, ...], requested
     last = LineMotion(profile.t[1:], profile.distance[1:], profile.speed[1:], end, profile.jerk)
     motions = first, inside, last
     values = np.stack([each.usage(motion) for each, motion in zip(rows, motions, strict=True)])
-    begin, half, final = values
-    slope, bend = final - begin, begin + final - 2 * half
-    vertex = np.where(np.abs(slope) < 2 * np.abs(bend), half - slope**2 / np.where(bend == 0, np.inf, 8 * bend), 0.0)
-    peak = np.maximum(np.abs(values).max(axis=(0, 2)), np.abs(vertex).max(axis=1))
+    peak = np.maximum(np.abs(values).max(axis=(0, 2)), np.abs(parabola_peak(values, (0.0, 0.5, 1.0))).max(axis=1))
     used = np.maximum(np.abs(values).max(axis=2), [motion.speed / requested for motion in motions])
     return used, np.maximum(peak, used.max(axis=0))
 
@@ -260,12 +247,7 @@ def _row_speed_caps(left: Rows, right: Rows) -> Array:
         return np.asarray(np.maximum(np.append(left, 0.0), np.insert(right, 0, 0.0)) ** -2.0)
 
 
-def _node_minimum(of_intervals: Array) -> Array:
-    """Return the smaller of the values of the two intervals that meet at each node."""
-    return np.asarray(np.minimum(np.append(of_intervals, np.inf), np.insert(of_intervals, 0, np.inf)))
-
-
-def _with_jerk(
+def _solve_with_jerk(
     window: Window, enforced: EnforcedRows, seam: int, known: Motion | None, accuracy: float, free: NDArray[np.intp]
 ) -> Motion:
     """Return squared speeds and their derivatives at the nodes of a window for the fastest motion under jerk limits."""
@@ -275,8 +257,9 @@ def _with_jerk(
     seam_shares = _seam_shares(window, seam)
     shares = enforced.margins.times(seam_shares)
     requested = grid.requested[begin:end] ** 2 * seam_shares**2
-    caps = np.minimum(_node_minimum(requested), _row_speed_caps(left, right) * _node_minimum(shares.speed) ** 2)
-    reachable, rates = reachable_bounds(nodes, caps, left=left, right=right, at_rest=at_rest)
+    caps = np.minimum(node_minimum(requested), _row_speed_caps(left, right) * node_minimum(shares.speed) ** 2)
+    rates = acceleration_bounds(left, right, caps[:-1], caps[1:])
+    reachable = reachable_squares(nodes, caps, rates, at_rest)
     # an interval next to rest has constant jerk and is not part of the program
     low, high = int(at_rest[0]), len(nodes) - int(at_rest[1])
     rest = [0.0, 0.0]
@@ -292,12 +275,12 @@ def _with_jerk(
     with np.errstate(divide="ignore"):
         between = (middle.speed.max(axis=1, initial=0.0) / shares.speed) ** -2.0
     upper = np.concatenate([caps[inner][:1], np.minimum(requested, between)[cells], caps[inner][-1:]])
-    held = enforced.held
+    mask = enforced.mask
     if known is None:
-        held = held.copy()
+        mask = mask.copy()
         start = _initial_squares(nodes, np.minimum(reachable, caps), left, right, ends)[inner]
         b = np.concatenate([start[:1], np.minimum(start[:-1], start[1:]), start[-1:]])
-        held[1] |= _reachable_rows(window.rows[1], np.maximum(reachable[1:], reachable[:-1]), rates, shares)
+        mask[1] |= _reachable_rows(window.rows[1], np.maximum(reachable[1:], reachable[:-1]), rates, shares)
     else:
         b = spline.through(known[0][inner], known[1][inner])
         b = np.maximum(b, 1e-9 * b.max())
@@ -317,7 +300,7 @@ def _with_jerk(
     with np.errstate(invalid="ignore"):
         implied = (1 - spline.share) * upper[:-1] + spline.share * upper[1:]
     rows = _spline_rows(
-        places, held[:, :, cells], caps[inner], implied, own_shares, enforced.speeds[:, cells], in_motion
+        places, mask[:, :, cells], caps[inner], implied, own_shares, enforced.speeds[:, cells], in_motion
     )
     program = Program(spline, rows, upper, (rest[0], rest[1]), np.array(fixed, dtype=np.intp))
     try:
@@ -356,13 +339,12 @@ def _initial_squares(nodes: Array, most: Array, left: Rows, right: Rows, ends: E
     motion may slow down likewise.
     """
     steady = np.minimum(left.steady()[0], right.steady()[0])
-    y = (SETTINGS.start * np.minimum(most, _node_minimum(steady) ** 2)) ** 0.75
+    y = (SETTINGS.start * np.minimum(most, node_minimum(steady) ** 2)) ** 0.75
     with np.errstate(divide="ignore"):
         sharp = 1 / np.maximum(*(np.abs(rows.jerk[:, :, 0]).max(axis=1) for rows in (left, right)))
     away = np.concatenate([[0.0], np.cumsum(np.sqrt(4.5 * sharp) * np.diff(nodes))])
     y[0], y[-1] = (x**0.75 for x, _ in ends)
-    y = np.minimum.accumulate(y - away) + away
-    y = np.minimum.accumulate((y + away)[::-1])[::-1] - away
+    y = limit_slope(y, away)
     start = np.maximum(y, np.maximum(ends[0][0] ** 0.75 - away, ends[1][0] ** 0.75 - (away[-1] - away))) ** (4 / 3)
     return np.asarray(np.maximum(start, 1e-9 * start.max()))
 
@@ -380,7 +362,7 @@ def _rest_jerk(left: Rows, right: Rows, width: float, side: int, shares: Array) 
 
 def _spline_rows(
     places: tuple[Rows, ...],
-    held: NDArray[np.bool_],
+    mask: NDArray[np.bool_],
     caps: Array,
     implied: Array,
     shares: Margins,
@@ -391,10 +373,10 @@ def _spline_rows(
 
     Args:
         places: Limit rows where intervals begin, inside them, and where they end. Shape (N,) each.
-        held: Which of them are enforced, at the `HELD` positions. Shape (4, 2, N, K + L + P).
+        mask: Which of them are enforced, at the `ENFORCED_AT` positions. Shape (4, 2, N, K + L + P).
         caps, implied: Greatest squared speed at nodes by the speed limits, and by coefficient bounds. Shape (N + 1,).
         shares: Shares of the limits that each interval may use.
-        speeds: Speed ratios at the `HELD` positions, see `EnforcedRows`. Shape (4, N).
+        speeds: Speed ratios at the `ENFORCED_AT` positions, see `EnforcedRows`. Shape (4, N).
         in_motion: Whether the program begins and ends with a known motion, whose own rows are left out.
     """
     count, first = len(caps) - 1, places[0].speed.shape[1]
@@ -406,7 +388,7 @@ def _spline_rows(
     for inside, rows in zip(INSIDE, places[1:-1], strict=True):
         most = (rows.speed[slow].max(axis=1, initial=0.0) / shares.speed[slow]) ** 2
         parts.append(_speed_rows(slow, np.full(len(slow), inside), most))
-    for which, at_place, speed in zip(held, HELD, speeds, strict=True):
+    for which, at_place, speed in zip(mask, ENFORCED_AT, speeds, strict=True):
         inside, rows, active = (0.0, *INSIDE, 1.0)[at_place], places[at_place], which[:, :, first:second].copy()
         if inside in (0.0, 1.0) and in_motion[int(inside)]:
             active[:, -int(inside)] = False
@@ -436,7 +418,7 @@ def _jerk_place(inside: float) -> float:
 
 
 def _speed_ratios(spline: Spline, b: Array) -> Array:
-    """Return the speeds at which limits are enforced, divided by those at the points of `_jerk_place`. Shape (4, N)."""
+    """Return the speeds at the points where limits are enforced over those at the points of `_jerk_place`."""
     x, slope = spline.at_nodes(b)
     second = np.diff(slope) / spline.h
 
@@ -444,7 +426,7 @@ def _speed_ratios(spline: Spline, b: Array) -> Array:
         distance = inside * spline.h
         return np.asarray(np.maximum(x[:-1] + distance * (slope[:-1] + distance * second / 2), SETTINGS.dive * x[:-1]))
 
-    places = [(0.0, *INSIDE, 1.0)[k] for k in HELD]
+    places = [(0.0, *INSIDE, 1.0)[k] for k in ENFORCED_AT]
     return np.sqrt([at(inside) / at(_jerk_place(inside)) for inside in places])
 
 
@@ -457,11 +439,7 @@ def _speed_rows(interval: NDArray[np.intp], fraction: Array, of: Array) -> Splin
 def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -> NDArray[np.bool_]:
     """Return which acceleration and jerk limits some motion can reach in each interval. Shape (N, K + L + P).
 
-    Args:
-        rows: Limit rows in N intervals.
-        squares: Greatest squared speed of any motion. Shape (N,).
-        rates: Greatest acceleration. Shape (N,).
-        shares: Shares of the limits that each interval may use.
+    `squares` and `rates` are the greatest squared speed and acceleration of any motion. Shape (N,) each.
     """
     a, j, top = np.abs(rows.acceleration), np.abs(rows.jerk), np.sqrt(squares)
     acceleration = a[:, :, 0] * rates[:, None] + a[:, :, 1] * squares[:, None] + a[:, :, 2]
@@ -469,6 +447,5 @@ def _reachable_rows(rows: Rows, squares: Array, rates: Array, shares: Margins) -
     with np.errstate(divide="ignore", invalid="ignore"):
         sharp = np.where(j[:, :, 0] > 0, (1 + without_jerk) / j[:, :, 0], np.inf).min(axis=1, initial=np.inf)
         jerk = np.where(j[:, :, 0] > 0, j[:, :, 0] * sharp[:, None], 0.0) + without_jerk
-    none = np.zeros(rows.speed.shape, dtype=bool)
-    most = ACTIVE_SHARE
-    return np.concatenate([none, acceleration > most * shares.acceleration, jerk > most * shares.jerk], axis=1)
+    active = acceleration > ACTIVE_SHARE * shares.acceleration, jerk > ACTIVE_SHARE * shares.jerk
+    return np.concatenate([np.zeros(rows.speed.shape, dtype=bool), *active], axis=1)

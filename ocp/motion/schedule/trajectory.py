@@ -17,8 +17,6 @@ from ocp.motion.schedule.planner import Schedule
 from ocp.motion.tasks.speed_profile import Array, LineMotion
 from ocp.storage import checked_path, column_name, joint_name, write_text
 
-__all__ = ["JointTrajectory", "joint_motion", "joint_trajectory"]
-
 MAX_FILE_BYTES = 2**26
 KINDS = ("positions", "velocities", "accelerations")
 

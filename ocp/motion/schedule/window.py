@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple, TypeAlias
@@ -12,10 +13,6 @@ from numpy.typing import NDArray
 from ocp.motion.schedule.grid import Grid
 from ocp.motion.schedule.limits import Rows, limit_rows, torque_rows
 from ocp.motion.tasks.speed_profile import Array, LineMotion, SpeedProfile, profile_through
-
-__all__ = [
-    "HELD", "INSIDE", "Ends", "EnforcedRows", "Margins", "Motion", "Stretch", "Window", "limit_usage", "motion_profile",
-]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -47,7 +44,7 @@ SETTINGS = WindowSettings()
 
 INSIDE = (0.25, 0.5, 0.75)
 """Positions inside each interval at which limits are evaluated, as fractions of the length of the interval."""
-HELD = (0, 1, 3, 4)
+ENFORCED_AT = (0, 1, 3, 4)
 """Indices in (0, *INSIDE, 1) of the positions where limits are enforced: all but the middle, where the jerk may jump.
 """
 
@@ -79,13 +76,12 @@ class Window(Stretch):
 
     Attributes:
         rows: Limit rows where intervals begin, `INSIDE` them, and where they end. Shape (N,) each.
-        bends: Largest errors of parabolas through the limit rows of acceleration and of jerk at three of these
-            positions. Shape (N, L, 3) and (N, P, 3).
+        bends: Largest errors of parabolas through the limit rows at three of these positions, 0 for speed. Shape (N,).
         close: Cache of limit rows at a finer spacing, by interval of the grid and whether with torques.
     """
 
-    rows: tuple[Rows, ...] = ()
-    bends: tuple[Array, Array] = (np.zeros((0, 0, 3)), np.zeros((0, 0, 3)))
+    rows: tuple[Rows, ...] = field(kw_only=True)
+    bends: Rows = field(kw_only=True)
     close: dict[tuple[int, bool], Rows] = field(default_factory=dict)
 
     @classmethod
@@ -98,11 +94,9 @@ class Window(Stretch):
         rows = limit_rows(grid.path, grid.limits, grid.joints, places)
         inside = [rows.take(slice(k * len(h), (k + 1) * len(h))) for k in range(len(INSIDE))]
         every = (left, *inside, right)
-        bends = (
-            _parabola_errors([each.acceleration for each in every]),
-            _parabola_errors([each.jerk for each in every]),
-        )
-        return cls(grid, first, last, ends, every, bends)
+        kinds = ([each.acceleration for each in every], [each.jerk for each in every])
+        bends = Rows(np.zeros_like(left.speed), *map(_parabola_errors, kinds))
+        return cls(grid, first, last, ends, rows=every, bends=bends)
 
     def fine_rows(self, intervals: NDArray[np.intp], torques: bool) -> Rows:
         """Return the coefficients of all limits at closely spaced points in intervals, ordered by point, then interval.
@@ -159,7 +153,7 @@ class EnforcedRows:
     Attributes:
         margins: Usable shares of the limits, lowered where limits are violated although they are enforced there.
         times: Number of reductions of each margin.
-        held: Which rows are enforced at the `HELD` positions of each interval, upwards and downwards.
+        mask: Which rows are enforced at the `ENFORCED_AT` positions of each interval, upwards and downwards.
             Shape (4, 2, N, K + L + P).
         speeds: Speeds at these positions over those to which the jerk there is proportional. Shape (4, N).
         inherited: Number of intervals taken over from the previous window.
@@ -167,7 +161,7 @@ class EnforcedRows:
 
     margins: Margins
     times: Margins
-    held: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
     speeds: Array
     inherited: int = 0
 
@@ -177,27 +171,25 @@ class EnforcedRows:
         count, rows = window.last - window.first, window.rows[0]
         shapes = (count,), (count, rows.acceleration.shape[1]), (count, rows.jerk.shape[1])
         margins, times = (Margins(*(np.full(shape, x) for shape in shapes)) for x in (1 - SETTINGS.room, 0.0))
-        held = np.zeros((len(HELD), 2, count, rows.total), dtype=bool)
-        return cls(margins, times, held, np.ones((len(HELD), count)))
+        mask = np.zeros((len(ENFORCED_AT), 2, count, rows.total), dtype=bool)
+        return cls(margins, times, mask, np.ones((len(ENFORCED_AT), count)))
 
     def after(self, first: int) -> EnforcedRows:
         """Return the enforced limits in the intervals from `first` on, as views of the same memory."""
         part = slice(first, None)
-        return EnforcedRows(self.margins.take(part), self.times.take(part), self.held[:, :, part], self.speeds[:, part])
+        return EnforcedRows(self.margins.take(part), self.times.take(part), self.mask[:, :, part], self.speeds[:, part])
 
-    def hold_near(self, used: Array, values: Array, jerks: Array) -> None:
+    def enforce_near(self, used: Array, values: Array, jerks: Array) -> None:
         """Enforce limits that a motion nearly reaches, also in adjacent intervals, and a jerk limit in each interval.
 
-        Args:
-            used, values: Usage of the limits, see `limit_usage`.
-            jerks: Coefficients of the jerk in the jerk limits. Shape (N, P).
+        `used` and `values` are those of `limit_usage`, `jerks` (N, P) the coefficients of the jerk in its limits.
         """
         close = used > SETTINGS.near
         close[:, 1:] |= close[:, :-1].copy()
         close[:, :-1] |= close[:, 1:].copy()
-        self.held[[0, -1]] |= close
-        self.hold(close, values)
-        self.hold_jerk(jerks)
+        self.mask[[0, -1]] |= close
+        self.enforce(close, values)
+        self.enforce_jerk(jerks)
 
     def release(self, values: Array, jerks: Array, seam: int) -> None:
         """Stop enforcing limits that a motion does not come near, but keep at least one jerk limit in each interval.
@@ -205,16 +197,16 @@ class EnforcedRows:
         Intervals shared with the previous or next window keep all rows.
         """
         own = slice(self.inherited, seam)
-        self.held[:, :, own] &= np.stack([values, -values], axis=1)[:, :, own] > SETTINGS.near
-        self.hold_jerk(jerks)
+        self.mask[:, :, own] &= np.stack([values, -values], axis=1)[:, :, own] > SETTINGS.near
+        self.enforce_jerk(jerks)
 
-    def hold_jerk(self, jerks: Array) -> None:
+    def enforce_jerk(self, jerks: Array) -> None:
         """Enforce at least one jerk limit in every interval, to bound the second derivative of the squared speed."""
-        first = self.held.shape[3] - jerks.shape[1]
-        sign, free = np.nonzero(~self.held[:, :, :, first:].any(axis=(0, 3)))
-        self.held[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
+        first = self.mask.shape[3] - jerks.shape[1]
+        sign, free = np.nonzero(~self.mask[:, :, :, first:].any(axis=(0, 3)))
+        self.mask[1, sign, free, first + np.abs(jerks[free]).argmax(axis=1)] = True
 
-    def hold(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
+    def enforce(self, rows: NDArray[np.bool_], values: Array) -> NDArray[np.bool_]:
         """Add limits as constraints at the point of an interval where each is nearest; return which were there already.
 
         Masks of shape (2, N, K + L + P).
@@ -222,21 +214,18 @@ class EnforcedRows:
         already = np.zeros(rows.shape, dtype=bool)
         sign, at, row = np.nonzero(rows)
         place = (values[:, at, row] * (1 - 2 * sign)).argmax(axis=0)
-        already[sign, at, row] = self.held[place, sign, at, row]
-        self.held[place, sign, at, row] = True
+        already[sign, at, row] = self.mask[place, sign, at, row]
+        self.mask[place, sign, at, row] = True
         return already
 
-    def lower(self, used: Array, held: NDArray[np.bool_], rows: Rows, seam: int) -> None:
+    def lower(self, used: Array, mask: NDArray[np.bool_], rows: Rows, seam: int) -> None:
         """Tighten the limits that are violated although they are enforced, by more at each call.
 
-        Args:
-            used: Usage of the limits. Shape (2, N, K + L + P).
-            held: Which rows are enforced. Shape (2, N, K + L + P).
-            rows: Rows of the window.
-            seam: Interval at which the next window begins.
+        `used` is the usage of the limits and `mask` tells which are enforced. Shape (2, N, K + L + P). The next window
+        begins at the interval `seam`.
         """
         ends = np.cumsum([0, *(kind.shape[1] for kind in rows)])
-        largest = np.where(held, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
+        largest = np.where(mask, np.minimum(used, SETTINGS.lowered), 0.0).max(axis=0)
         largest[:, : ends[1]] = np.minimum(used[0, :, : ends[1]], SETTINGS.lowered)
         for margin, times, (a, z) in zip(self.margins, self.times, pairwise(ends), strict=True):
             ratio = largest[:, a:z] if margin.ndim == 2 else largest[:, a:z].max(axis=1, initial=0.0)
@@ -246,11 +235,11 @@ class EnforcedRows:
             if margin.ndim == 2:
                 # the next window starts on this motion with these margins and must keep them at all positions
                 inherited = at[0] >= seam
-                self.held[:, :, at[0][inherited], a + at[1][inherited]] = True
+                self.mask[:, :, at[0][inherited], a + at[1][inherited]] = True
 
 
 def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
-    """Return the speed profile through given squared speeds and derivatives at the first nodes of a part."""
+    """Return the speed profile through squared speeds and their derivatives at the first nodes of a part of a path."""
     s = stretch.grid.distance[stretch.first : stretch.first + len(x)]
     return profile_through(s, np.sqrt(x), slope[: len(x)] / 2)
 
@@ -258,7 +247,7 @@ def motion_profile(stretch: Stretch, x: Array, slope: Array) -> SpeedProfile:
 def limit_usage(
     window: Window, profile: SpeedProfile, which: NDArray[np.intp], closely: bool = True
 ) -> tuple[Array, Array]:
-    """Return the largest ratio of each limited quantity to its limit in given intervals, and the ratios at `HELD`.
+    """Return the largest ratio of each quantity to its limit in given intervals, and the ratios at `ENFORCED_AT`.
 
     Shapes (2, N, K + L + P), upwards and downwards, and (4, N, K + L + P), zero in the other intervals.
 
@@ -303,12 +292,11 @@ def limit_usage(
     shares = (zero, INSIDE[0] + zero, f, f, INSIDE[2] + zero, zero + 1)
     places_of = [place[at_row[0]] for place in shares]
     for three in (slice(0, 3), slice(3, 6)):
-        peak = _vertex(high[three], places_of[three])
+        peak = parabola_peak(high[three], places_of[three])
         for side, value in zip(used, (peak, -peak), strict=True):
             side[at_row] = np.maximum(side[at_row], value)
     if closely:
-        bends = window.bends if every else (window.bends[0][which], window.bends[1][which])
-        missed = _inaccurate_rows(bends, used, (first, met, last))
+        missed = _inaccurate_rows(window.bends if every else window.bends.take(which), used, (first, met, last))
         inaccurate, by_torques = missed.any(axis=1), missed[:, window.torques].any(axis=1)
         for torques, these in ((False, np.flatnonzero(inaccurate & ~by_torques)), (True, np.flatnonzero(by_torques))):
             if these.size:
@@ -317,11 +305,11 @@ def limit_usage(
                 if not torques:
                     finer[:, :, window.torques] = used[:, these, window.torques]
                 used[:, these] = finer
-    held_values = values[[0, 1, 4, 5]]
+    point_values = values[[0, 1, 4, 5]]
     if every:
-        return used, held_values
-    everywhere = [np.zeros((len(kind), window.last - window.first, kind.shape[2])) for kind in (used, held_values)]
-    for kind, compact in zip(everywhere, (used, held_values), strict=True):
+        return used, point_values
+    everywhere = [np.zeros((len(kind), window.last - window.first, kind.shape[2])) for kind in (used, point_values)]
+    for kind, compact in zip(everywhere, (used, point_values), strict=True):
         kind[:, which] = compact
     return everywhere[0], everywhere[1]
 
@@ -336,33 +324,19 @@ def _parabola_errors(rows: list[Array]) -> Array:
     return np.asarray(np.maximum(np.abs(d - a + 3 * (b - c)), np.abs(e - b + 3 * (c - d))) / (9 * np.sqrt(3)))
 
 
-def _inaccurate_rows(bends: tuple[Array, Array], used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
+def _inaccurate_rows(bends: Rows, used: Array, motions: tuple[LineMotion, ...]) -> NDArray[np.bool_]:
     """Return which limits a motion may exceed within the errors of interpolation. Shape (N, K + L + P)."""
-    v, a, j = (
-        np.max([np.abs(getattr(motion, kind)) for motion in motions], axis=0)[:, None]
-        for kind in ("speed", "acceleration", "jerk")
-    )
-    acceleration, jerk = bends
-    errors = [
-        np.zeros((len(v), used.shape[2] - acceleration.shape[1] - jerk.shape[1])),
-        acceleration[:, :, 0] * a + acceleration[:, :, 1] * v**2 + acceleration[:, :, 2],
-        jerk[:, :, 0] * j + jerk[:, :, 1] * v * a + jerk[:, :, 2] * v**3,
-    ]
-    error = np.concatenate(errors, axis=1)
+    error = bends.usage(LineMotion(*np.abs(motions).max(axis=0)))
     return np.asarray((error > SETTINGS.bend) & (used.max(axis=0) + error > 1))
 
 
 def _fine_usage(
     window: Window, profile: SpeedProfile, intervals: NDArray[np.intp], f: Array, known: Array, torques: bool
 ) -> Array:
-    """Return the largest fraction used of each limit, in both directions, from dense samples. Shape (2, B, R).
+    """Return the largest fraction used of each limit in B intervals, in both directions, from dense samples.
 
-    Args:
-        window, profile: As for `limit_usage`.
-        intervals: The intervals. Shape (B,).
-        f: Positions in them, 0..1, at which the jerk changes. Shape (B,).
-        known: Usage at their beginning, before and after that change, and at their end. Shape (4, B, R).
-        torques: Whether the limits of torques are evaluated.
+    The jerk changes at the fraction `f` (B,) of each interval. `known` contains the usage at the beginning of each
+    interval, before and after that change, and at the end. Shape (4, B, R). The result has shape (2, B, R).
     """
     parts, half = SETTINGS.fine, SETTINGS.fine // 2
     places = window.nodes[intervals] + np.arange(1, parts)[:, None] / parts * np.diff(window.nodes)[intervals]
@@ -378,12 +352,12 @@ def _fine_usage(
     ):
         used = np.maximum(used, [values.max(axis=0), -values.min(axis=0)])
         for k in range(0, half, 2):
-            peak = _vertex(values[k : k + 3], [place[:, None] for place in at[k : k + 3]])
+            peak = parabola_peak(values[k : k + 3], [place[:, None] for place in at[k : k + 3]])
             used = np.maximum(used, [peak, -peak])
     return used
 
 
-def _vertex(values: Array, places: list[Array]) -> Array:
+def parabola_peak(values: Array, places: Sequence[Array | float]) -> Array:
     """Return the extreme value of the parabola through three points if it lies between them, else the first value."""
     (a, b, c), (at, inside, end) = values, places
     slope = (b - a) / (inside - at)

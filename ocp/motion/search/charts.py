@@ -29,7 +29,7 @@ from ocp.motion.tasks.equations import TaskEquations
 from ocp.problem.values import Sampler
 from ocp.tolerances import ROUNDING_SHARE
 
-__all__ = ["ChartSettings", "Charts", "SelfMotionManifolds", "SplitCharts", "TimeSample", "point_chart"]
+__all__ = ["ChartSettings", "Charts", "SelfMotionManifolds", "SplitCharts", "TimeSample", "concatenate", "point_chart"]
 
 Indices = NDArray[np.intp]
 

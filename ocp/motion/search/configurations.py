@@ -73,7 +73,6 @@ class PlannerSettings:
         max_separations: Largest number of solves of one candidate with more, or wider, separation constraints.
         max_cost_ratio: A local motion whose cost exceeds that of the best solve by this factor is not solved.
         gain: Relative cost reduction that a motion must promise to be solved with its start fixed.
-        near_bound: A plan whose cost is within this factor of its lower bound is accepted.
     """
 
     ik_starts: int = 64
@@ -103,7 +102,6 @@ class PlannerSettings:
     max_separations: int = 12
     max_cost_ratio: float = 10.0
     gain: float = 0.01
-    near_bound: float = 1.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,13 +25,15 @@ from numpy.typing import NDArray
 
 from models import CollisionScene
 from models.checks import Array
+from ocp.console import TimeLimitReached
 from ocp.errors import BoundWarning
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.local.inverse_kinematics import Unreachable
-from ocp.motion.search.charts import Charts, SplitCharts, TimeSample, point_chart
+from ocp.motion.search.charts import Charts, SplitCharts, TimeSample, concatenate, point_chart
 from ocp.motion.search.joint_space import MAX_STEP, TOLERANCE, JointSpace
+from ocp.motion.search.shortening import PENALTY, PathProblem, shorten_path
 from ocp.motion.search.steps import QuadraticBounds, Steps
-from ocp.motion.search.value import PENALTY, ChartGraph, shorten_path
+from ocp.motion.search.value import ChartGraph
 from ocp.tolerances import ROUNDING_SHARE
 
 __all__ = ["MAX_FREE_DIRECTIONS", "AtlasSearch", "SearchSettings", "checked_bound"]
@@ -50,6 +52,7 @@ class SearchSettings:
         charts_without_path: The same while no path is known. In a narrow passage, neither a path nor a proof that there
             is none may then be found.
         finest: Charts of a smaller radius are not split, rad or m.
+        least_split: Least share of the charts that an iteration of the branch and bound halves; it ends otherwise.
         gaps: Relative gap between cost and bound at which the search stops, by the dimension of the manifold.
         max_classes: Largest number of paths of locally least cost that are returned.
         max_cost_ratio: Paths that cost more than so many times the best one are not returned.
@@ -61,6 +64,7 @@ class SearchSettings:
     charts: int = 40_000
     charts_without_path: int = 10_000
     finest: float = 1e-6
+    least_split: float = 0.25
     gaps: tuple[float, float, float] = (0.01, 0.01, 0.04)
     max_classes: int = 12
     max_cost_ratio: float = 3.0
@@ -87,6 +91,7 @@ class AtlasSearch:
     Attributes:
         atlas: Charts of each time sample.
         layers: The same without charts on which every configuration is in collision.
+        unresolved: Lower bound, time sample and a configuration of classes without a path in `class_representatives`.
     """
 
     def __init__(
@@ -117,8 +122,9 @@ class AtlasSearch:
             ProblemError: The atlas needs too many charts.
         """
         self.space, self.samples = space, samples
-        self.times, self.cost, self.limits = steps.times, steps.cost, steps.limits
+        self._steps, self.times, self.cost, self.limits = steps, steps.times, steps.cost, steps.limits
         self.start, self.scene, self.settings = start, scene, settings
+        self.unresolved = list[tuple[float, int, Array]]()
         self._cost_bounds: tuple[ChartGraph, list[QuadraticBounds], list[QuadraticBounds] | None] | None = None
         self.atlas = self._build_atlas(seeds)
         self.layers = [self.without_collisions(charts, k) for k, charts in enumerate(self.atlas)]
@@ -172,10 +178,6 @@ class AtlasSearch:
         max_costs = np.broadcast_to(max_costs, len(self.times) - 1)
         return ChartGraph(self.space, layers, self._steps, max_costs)
 
-    @property
-    def _steps(self) -> Steps:
-        return Steps(self.times, self.cost, self.limits)
-
     def full_graph(self) -> ChartGraph:
         """Return the graph of all possible steps between the initial charts of the self-motion manifolds."""
         return self.graph(self.layers)
@@ -184,6 +186,7 @@ class AtlasSearch:
         """Return the search restricted to the time samples from `first` to `last`, both included."""
         part, rows = copy(self), slice(first, last + 1)
         part.samples, part.times, part.limits = self.samples[rows], self.times[rows], self.limits[first:last]
+        part._steps = Steps(part.times, part.cost, part.limits)
         part.atlas, part.layers, part._cost_bounds = self.atlas[rows], self.layers[rows], None
         part.start = self.start if first == 0 else None
         return part
@@ -224,11 +227,14 @@ class AtlasSearch:
                 is_minimum[first[costs[first] > costs[second]]] = False
             minima += [(float(costs[i]), k, i) for i in np.flatnonzero(is_minimum).tolist()]
         paths: list[tuple[float, Array]] = []
+        self.unresolved = []
         for lower_bound, k, chart in sorted(minima):
-            too_costly = paths and lower_bound > settings.max_cost_ratio * paths[0][0]
-            if len(paths) == settings.max_classes or too_costly:
+            if paths and lower_bound > settings.max_cost_ratio * paths[0][0]:
                 break
-            path = self._path_through(graph, k, chart, cost_to_come, cost_to_go)
+            full = len(paths) == settings.max_classes
+            path = None if full else self._path_through(graph, k, chart, cost_to_come, cost_to_go)
+            if path is None:
+                self.unresolved.append((lower_bound, k, graph.layers[k].centers[chart]))
             differences = (np.abs(self.space.difference(path, known)).max() for _, known in paths if path is not None)
             if path is None or any(difference < self.settings.same_path for difference in differences):
                 continue
@@ -309,56 +315,84 @@ class AtlasSearch:
                 return path, bound
             # a motion with an excluded step costs more than `max_cost`
             cost, bound = np.inf if path is None else self.path_cost(path), min(bound, max_cost)
-            if path is not None and (cost <= max_cost or bound >= self._target_share * cost):
+            if path is not None and (cost <= max_cost or bound >= (1 - self.gap) * cost):
                 return path, bound
             max_cost = largest_step_cost if path is None else cost
 
     @property
-    def _target_share(self) -> float:
-        """Fraction of the path's cost that the lower bound must reach before the search ends."""
-        return 1 - self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
+    def gap(self) -> float:
+        """Relative gap between the path's cost and the lower bound at which the search ends."""
+        return self.settings.gaps[max(0, *(sample.manifolds.size for sample in self.samples))]
 
     def _solve(self, max_cost: float) -> tuple[Array | None, float]:
         """Return the best path without steps costlier than `max_cost`, and a lower cost bound of all such paths."""
-        target = self._target_share
         layers, best_path = self.find_path(max_cost)
         if not layers:
             return None, np.inf
         if best_path is None:
             graph = self.graph(layers, max_cost)
             return None, max(float(graph.minima(graph.cost_to_go()[0], 0).min()), 0.0)
-        best_cost = self.path_cost(best_path)
-        coarse, remaining = True, np.zeros(len(self.times) - 1)  # least cost before and after each step
+        return self._branch_and_bound(layers, max_cost, self.path_cost(best_path), best_path)
+
+    def lower_bound(self, known_cost: float) -> float:
+        """Return a lower bound of the cost of all paths, at most `known_cost` less the gap that ends the search.
+
+        No path is searched. The bound is what time limit and memory allow. `known_cost` is that of a known motion.
+        """
+        return self._branch_and_bound(self.layers, known_cost, known_cost, None)[1]
+
+    def _branch_and_bound(
+        self, layers: list[Charts], max_cost: float, best_cost: float, best_path: Array | None
+    ) -> tuple[Array | None, float]:
+        """Return the best path, which is improved if one is given, and a lower bound of the cost of all paths."""
+        target, bound = 1 - self.gap, 0.0
+        coarse = best_path is not None
+        remaining = np.zeros(len(self.times) - 1)  # least cost before and after each step
         known_bounds: list[QuadraticBounds] | None = None  # lower bounds of the cost-to-come
         while True:
             graph = self.graph(layers, min(max_cost, best_cost) - remaining)
             # bounds beyond the cutoff are not needed; at first it leaves a margin for other local minima
             cutoff = best_cost / target if coarse else target * best_cost
-            cost_to_go = graph.cost_to_go(known_bounds, cutoff)
-            if coarse:
-                self._cost_bounds = graph, cost_to_go, None
-            bound = float(graph.minima(cost_to_go[0], 0).min(initial=np.inf))
-            path = self._follow_bounds(graph, cost_to_go) if np.isfinite(bound) else None
-            if path is not None and (cost := self.path_cost(path)) < best_cost:
-                best_path, best_cost = path, cost
-            if bound >= target * best_cost:
-                return best_path, target * best_cost
-            cost_to_come = graph.cost_to_come(cost_to_go, cutoff)
+            try:
+                cost_to_go = graph.cost_to_go(known_bounds, cutoff)
+                if coarse:
+                    self._cost_bounds = graph, cost_to_go, None
+                bound = max(bound, float(graph.minima(cost_to_go[0], 0).min(initial=np.inf)))
+                path = self._follow_bounds(graph, cost_to_go) if best_path is not None and np.isfinite(bound) else None
+                if path is not None and (cost := self.path_cost(path)) < best_cost:
+                    best_path, best_cost = path, cost
+                if bound >= target * best_cost:
+                    return best_path, target * best_cost
+                cost_to_come = graph.cost_to_come(cost_to_go, cutoff)
+            except TimeLimitReached:
+                return best_path, bound
             if coarse:
                 self._cost_bounds, coarse = (graph, cost_to_go, cost_to_come), False
             through = [graph.cost_through(cost_to_come, cost_to_go, k) for k in range(len(layers))]
             bounds = cost_to_come, cost_to_go
             before, after = ([float(graph.minima(each, k).min()) for k, each in enumerate(v)] for v in bounds)
             remaining = np.maximum(remaining, np.array(before[:-1]) + np.array(after[1:]))
-            promising = [total < target * best_cost for total in through]
-            layers_left = [charts.select(rows) for charts, rows in zip(layers, promising, strict=True)]
-            if not all(len(charts) for charts in layers_left):
+            promising = [np.flatnonzero(total < target * best_cost) for total in through]
+            if not all(len(rows) for rows in promising):
                 return best_path, target * best_cost
-            if not self._can_split(layers_left, self.settings.charts):
-                return best_path, max(bound, 0.0)
+            layers = [charts.select(rows) for charts, rows in zip(layers, promising, strict=True)]
             come = [values.select(rows) for values, rows in zip(cost_to_come, promising, strict=True)]
-            refined = [self._refine(charts, k, come[k]) for k, charts in enumerate(layers_left)]
+            through = [total[rows] for total, rows in zip(through, promising, strict=True)]
+            limit = self._splitting_limit(layers, through)
+            if limit <= bound:
+                return best_path, bound
+            refined = [self._refine(charts, k, come[k], through[k] <= limit) for k, charts in enumerate(layers)]
             layers, known_bounds = [charts for charts, _ in refined], [values for _, values in refined]
+
+    def _splitting_limit(self, layers: list[Charts], through: list[Array]) -> float:
+        """Return the bound up to which charts can be halved within memory; -inf if they are too small or too many."""
+        costs, growth = np.sort(np.concatenate(through)), 2 ** layers[-1].tangents.shape[2] - 1
+        if max(float(charts.radii.max()) for charts in layers) < self.settings.finest:
+            return -np.inf
+        count = (self.settings.charts - len(costs)) // max(growth, 1)
+        if count < self.settings.least_split * len(costs):
+            return -np.inf
+        return np.inf if count >= len(costs) else float(costs[count])
 
     def find_path(self, max_cost: float) -> tuple[list[Charts], Array | None]:
         """Find a path whose steps each cost at most `max_cost`; return the charts such paths may use, and the path.
@@ -431,13 +465,12 @@ class AtlasSearch:
 
     def _shorten(self, path: Array | None, layers: list[Charts]) -> Array | None:
         """Shorten a path on the manifolds if the result is valid; return None if the path then exceeds step limits."""
-        bounds = self.space.lower, self.space.upper
         if path is None:
             return None
         if self.start is None:
             radius = max(float(charts.radii.max()) for charts in layers)
-            options: dict[str, Any] = {"bounds": bounds, "scene": self.scene, "widths": (radius / 2, radius / 64)}
-            shortened = shorten_path(path, self.samples, self._steps, **options)
+            problem = PathProblem(self.samples, self._steps, self.space.lower, self.space.upper, self.scene)
+            shortened = shorten_path(path, problem, (radius / 2, radius / 64))
             valid = all(self._project(k, joints) is not None for k, joints in enumerate(shortened))
             path = shortened if valid else path
         return path if (np.abs(np.diff(path, axis=0)) <= self.limits + TOLERANCE).all() else None
@@ -452,9 +485,15 @@ class AtlasSearch:
         numbered = replace(charts, layer=np.full(len(charts), self.samples[k].row))
         return self.samples[k].manifolds.split(numbered)
 
-    def _refine(self, charts: Charts, k: int, values: QuadraticBounds) -> tuple[Charts, QuadraticBounds]:
-        """Halve manifold charts; return the halves not entirely in collision, and lower cost bounds on these halves."""
-        halves = self._split(charts, k)
+    def _refine(
+        self, charts: Charts, k: int, values: QuadraticBounds, chosen: NDArray[np.bool_]
+    ) -> tuple[Charts, QuadraticBounds]:
+        """Halve the chosen charts; return all charts not entirely in collision, and lower cost bounds on them."""
+        rows = np.flatnonzero(chosen)
+        halves = self._split(charts.select(rows), k)
         free = self._collision_free(halves.charts, k)
-        values, low, high = values.select(halves.owners[free]), halves.low[free], halves.high[free]
-        return halves.charts.select(free), QuadraticBounds.constant(values.minimum(low, high)[0], low.shape[1])
+        part, low, high = values.select(rows[halves.owners[free]]), halves.low[free], halves.high[free]
+        part = QuadraticBounds.constant(part.minimum(low, high)[0], low.shape[1])
+        kept, others = charts.select(~chosen), values.select(~chosen)
+        together = QuadraticBounds(*(np.concatenate(pair) for pair in zip(part, others, strict=True)))
+        return concatenate([halves.charts.select(free), kept]), together

@@ -1,8 +1,8 @@
 """Lower bounds of the cost of straight steps between charts of the self-motion manifold, as functions of the start.
 
-The integral of half the squared rates is no less than |dq|^2 / (2 dt), the length no less than |dq|_1. Charts are
-tangent to the manifold; its measured deviation is taken into account, and assumed to be no larger within a box than at
-its rim.
+The integral of half the squared rates is no less than |dq|^2 / (2 dt). `lengths` bounds the length, no less than
+|dq|_1. Charts are tangent to the manifold; its measured deviation is taken into account, and assumed to be no larger
+within a box than at its rim.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -18,12 +18,10 @@ from models.checks import Array
 from ocp.motion.search.charts import Charts
 
 __all__ = [
-    "CurvedCharts", "Homogeneous", "LargestMotion", "PathLength", "QuadraticBounds", "SquaredRates", "StepBounds",
-    "StepCost", "least_in_box",
+    "CurvedCharts", "QuadraticBounds", "SquaredRates", "StepBounds", "StepCost", "Steps", "apply", "apply_transposed",
+    "dot", "least_in_box", "lowest_eigenvalue", "multiply_transposed", "rows_first", "rows_last",
 ]  # fmt: skip
 
-MAX_CUTS = 8
-"""Number of tangents with which the minimum of a piecewise linear step cost is bracketed; each joint adds a kink."""
 MAX_CONCAVITY = 0.5
 """Largest concavity of a cost bound, relative to the curvature of a step's cost; more concave bounds are flattened."""
 
@@ -96,6 +94,26 @@ class CurvedCharts(NamedTuple):
         return CurvedCharts(self.charts.select(rows), self.bends[rows], self.rest[rows])
 
 
+class StepBounds(Protocol):
+    """Lower bounds of the costs of P steps plus the costs after the steps, as functions of the start coordinates.
+
+    Each point p yields a quadratic function that is a lower bound everywhere, by the value and slope at p and `curve`.
+    """
+
+    @property
+    def curve(self) -> Array:
+        """Symmetric matrices of the quadratic terms. Shape (P, r, r)."""
+
+    def select(self, rows: Any) -> Self:
+        """Return the bounds of the steps with the given indices."""
+
+    def at(self, places: Array) -> tuple[Array, Array]:
+        """Return values (P,) and gradients (P, r) of the bounds at start coordinates (P, r)."""
+
+    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
+        """Return coordinates nearer to a minimum of the bounds minus slope . t + t . curve . t / 2, or the same."""
+
+
 class StepCost(ABC):
     """Cost of a straight step between configurations, and its lower bounds over manifold charts (base class)."""
 
@@ -116,6 +134,15 @@ class StepCost(ABC):
 
         The centres of the charts are `delta` (P, n) apart.
         """
+
+    def quick_bounds(
+        self, delta: Array, spans: Array, source: Charts, target: Charts, *, after: QuadraticBounds
+    ) -> Array:
+        """Return constant lower bounds (P,) of `lower_bounds` over the source box that take little time.
+
+        The displacements of the joints differ from `delta` by at most `spans` (P, n).
+        """
+        return np.full(len(delta), -np.inf)
 
     @abstractmethod
     def evaluate(self, delta: Array, seconds: Any) -> Array:
@@ -157,63 +184,64 @@ class SquaredRates(StepCost):
         self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
     ) -> StepBounds:
         start, end = source.charts, target.charts
-        displacement, column_weights = _rows_last(delta), self.weights[:, None]
-        start_tangents = _rows_last(start.tangents)
-        weighted_tangents = _rows_last(end.tangents) * column_weights[:, None]
-        slope, curve = _rows_last(after.slope), _rows_last(after.curve)
-        end_box = np.stack([_rows_last(end.low), _rows_last(end.high)])
-        start_box = np.stack([_rows_last(start.low), _rows_last(start.high)])
-        rotation = _multiply_transposed(weighted_tangents, start_tangents)
-        projection = _apply_transposed(weighted_tangents, displacement)
+        displacement, column_weights = rows_last(delta), self.weights[:, None]
+        start_tangents = rows_last(start.tangents)
+        weighted_tangents = rows_last(end.tangents) * column_weights[:, None]
+        slope, curve = rows_last(after.slope), rows_last(after.curve)
+        end_box = np.stack([rows_last(end.low), rows_last(end.high)])
+        start_box = np.stack([rows_last(start.low), rows_last(start.high)])
+        rotation = multiply_transposed(weighted_tangents, start_tangents)
+        projection = apply_transposed(weighted_tangents, displacement)
         start_place, end_place = _nearest_places(projection, rotation, start_box, end_box, slope, curve, seconds)
-        start_bends, end_bends = _rows_last(source.bends), _rows_last(target.bends)
-        relative_bend = _apply(_apply(end_bends, end_place), end_place)
-        relative_bend -= _apply(_apply(start_bends, start_place), start_place)
-        normal = displacement - _apply(start_tangents, start_place) + relative_bend / 2
-        normal -= _apply(_rows_last(end.tangents), _apply_transposed(weighted_tangents, normal))
+        start_bends, end_bends = rows_last(source.bends), rows_last(target.bends)
+        relative_bend = apply(apply(end_bends, end_place), end_place)
+        relative_bend -= apply(apply(start_bends, start_place), start_place)
+        normal = displacement - apply(start_tangents, start_place) + relative_bend / 2
+        normal -= apply(rows_last(end.tangents), apply_transposed(weighted_tangents, normal))
         multiplier = column_weights * normal / seconds
-        normal_cost = _dot(multiplier, normal)
-        loss = _support(_rows_last(source.rest), multiplier) + _support(_rows_last(target.rest), -multiplier)
+        normal_cost = dot(multiplier, normal)
+        loss = _support(rows_last(source.rest), multiplier) + _support(rows_last(target.rest), -multiplier)
         # the more the manifold may deviate across the charts, the smaller the multiplier
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.where(normal_cost > 0, np.clip(1 - loss / normal_cost, 0.0, 1.0), 0.0)
         multiplier *= share
-        curve, excess = _raise_eigenvalues(curve + _dot(end_bends, multiplier[:, None, None]), -MAX_CONCAVITY / seconds)
+        curve, excess = _raise_eigenvalues(curve + dot(end_bends, multiplier[:, None, None]), -MAX_CONCAVITY / seconds)
+        curve = _separate(curve)
         # the deviation also shifts the ends along the chart
-        slack = _symmetric_support(_rows_last(start.deviations), weighted_tangents)
-        slack += _symmetric_support(_rows_last(end.deviations), weighted_tangents)
+        slack = _symmetric_support(rows_last(start.deviations), weighted_tangents)
+        slack += _symmetric_support(rows_last(end.deviations), weighted_tangents)
         widened_box = np.stack([end_box[0] - slack, end_box[1] + slack])
         extent = np.abs(widened_box).max(axis=0)
-        loss = share * loss + excess * _dot(extent, extent) / 2
-        loss += _dot(slack, np.abs(slope) + _apply(np.abs(curve), extent + slack / 2))
-        start_curve = -_dot(start_bends, multiplier[:, None, None])
-        least = after.least + _dot(multiplier, displacement) - share**2 * normal_cost / 2 - loss
-        start_slope = -_apply_transposed(start_tangents, multiplier)
+        loss = share * loss + excess * dot(extent, extent) / 2
+        loss += dot(slack, np.abs(slope) + apply(np.abs(curve), extent + slack / 2))
+        start_curve = -dot(start_bends, multiplier[:, None, None])
+        least = after.least + dot(multiplier, displacement) - share**2 * normal_cost / 2 - loss
+        start_slope = -apply_transposed(start_tangents, multiplier)
         after_terms = projection, rotation, slope, curve, widened_box, start_box
         return SquaredRateBounds(seconds, least, start_slope, start_curve, *after_terms)
 
 
-def _rows_last(rows: Array) -> Array:
+def rows_last(rows: Array) -> Array:
     """Move the first axis (the steps) to the end, which vectorises sums over joints over all steps."""
     return np.ascontiguousarray(np.moveaxis(rows, 0, -1))
 
 
-def _apply(matrix: Array, vector: Array) -> Array:
+def apply(matrix: Array, vector: Array) -> Array:
     """Multiply P matrices (..., b, P) by P vectors (b, P)."""
     return np.asarray((matrix * vector).sum(axis=-2))
 
 
-def _apply_transposed(matrix: Array, vector: Array) -> Array:
+def apply_transposed(matrix: Array, vector: Array) -> Array:
     """Multiply P transposed matrices (a, b, P) by P vectors (a, P)."""
     return np.asarray((matrix * vector[:, None]).sum(axis=0))
 
 
-def _multiply_transposed(left: Array, right: Array) -> Array:
+def multiply_transposed(left: Array, right: Array) -> Array:
     """Multiply P transposed matrices (a, b, P) by P matrices (a, c, P)."""
     return np.asarray((left[:, :, None] * right[:, None]).sum(axis=0))
 
 
-def _dot(left: Array, right: Array) -> Array:
+def dot(left: Array, right: Array) -> Array:
     return np.asarray((left * right).sum(axis=0))
 
 
@@ -221,7 +249,7 @@ def _support(points: Array, direction: Array) -> Array:
     """Return the largest component, but at least 0, of each point set (c, n, P) along directions (n, P). Shape (P,)."""
     support = np.zeros(direction.shape[1])
     for point in points:
-        np.maximum(support, _dot(point, direction), out=support)
+        np.maximum(support, dot(point, direction), out=support)
     return support
 
 
@@ -229,7 +257,7 @@ def _symmetric_support(points: Array, directions: Array) -> Array:
     """Return the largest absolute component of each point set (c, n, P) along directions (n, r, P). Shape (r, P)."""
     support = np.zeros(directions.shape[1:])
     for point in points:
-        np.maximum(support, np.abs(_apply_transposed(directions, point)), out=support)
+        np.maximum(support, np.abs(apply_transposed(directions, point)), out=support)
     return support
 
 
@@ -238,8 +266,8 @@ def _nearest_places(
 ) -> tuple[Array, Array]:
     """Return start and end coordinates (r, P) of a low-cost step between the tangent boxes of each of P chart pairs."""
     square, middle = curve + np.eye(len(projection))[:, :, None] / seconds, (start_box[0] + start_box[1]) / 2
-    end_place = _least_in_box((projection - _apply(rotation, middle)) / seconds + slope, square, *end_box)[1]
-    slope, square = -_apply_transposed(rotation, projection + end_place), _multiply_transposed(rotation, rotation)
+    end_place = _least_in_box((projection - apply(rotation, middle)) / seconds + slope, square, *end_box)[1]
+    slope, square = -apply_transposed(rotation, projection + end_place), multiply_transposed(rotation, rotation)
     return _least_in_box(slope, square, *start_box)[1], end_place
 
 
@@ -276,174 +304,45 @@ class SquaredRateBounds:
 
     @property
     def curve(self) -> Array:
-        reduced = np.linalg.solve(_rows_first(self._square), _rows_first(self.after_curve)) / self.seconds
-        rotation = _rows_first(self.rotation)
-        return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + _rows_first(self.level))
+        reduced = np.linalg.solve(rows_first(self._square), rows_first(self.after_curve)) / self.seconds
+        rotation = rows_first(self.rotation)
+        return np.asarray(rotation.transpose(0, 2, 1) @ reduced @ rotation + rows_first(self.level))
 
     def _minimize_after(self, places: Array) -> tuple[Array, Array, Array]:
         """Minimise the bounds over the end of a step; return step to the chart centre, minimum and minimiser."""
-        start = self.projection - _apply(self.rotation, places)
+        start = self.projection - apply(self.rotation, places)
         return start, *_least_in_box(start / self.seconds + self.after, self._square, *self.end_box)
 
     def at(self, places: Array) -> tuple[Array, Array]:
-        """Return values (P,) and gradients (P, r) of the bounds at start coordinates (P, r)."""
-        places = _rows_last(places)
+        places = rows_last(places)
         start, after, end_place = self._minimize_after(places)
-        products = _apply(self.level, places)
-        value = self.least + after + _dot(start, start) / (2 * self.seconds)
-        slope = products + self.slope - _apply_transposed(self.rotation, start + end_place) / self.seconds
-        return value + _dot(places, products / 2 + self.slope), _rows_first(slope)
+        products = apply(self.level, places)
+        value = self.least + after + dot(start, start) / (2 * self.seconds)
+        slope = products + self.slope - apply_transposed(self.rotation, start + end_place) / self.seconds
+        return value + dot(places, products / 2 + self.slope), rows_first(slope)
 
     def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        """Improve start coordinates (P, r) towards a minimum of the bounds minus a quadratic function.
-
-        With start coordinates t, the quadratic function is slope . t + t . curve . t / 2.
-        """
-        end_place = self._minimize_after(_rows_last(places))[2]
-        gradient = -_apply_transposed(self.rotation, self.projection + end_place) / self.seconds
-        square = _multiply_transposed(self.rotation, self.rotation) / self.seconds + self.level - _rows_last(curve)
-        return _rows_first(_least_in_box(gradient + self.slope - _rows_last(slope), square, *self.start_box)[1])
+        if places.shape[1] > 2:
+            return places
+        end_place = self._minimize_after(rows_last(places))[2]
+        gradient = -apply_transposed(self.rotation, self.projection + end_place) / self.seconds
+        square = multiply_transposed(self.rotation, self.rotation) / self.seconds + self.level - rows_last(curve)
+        return rows_first(_least_in_box(gradient + self.slope - rows_last(slope), square, *self.start_box)[1])
 
 
-def _rows_first(columns: Array) -> Array:
-    """Move the last axis (the steps) to the front, which is the inverse of `_rows_last`."""
+def rows_first(columns: Array) -> Array:
+    """Move the last axis (the steps) to the front, which is the inverse of `rows_last`."""
     return np.ascontiguousarray(np.moveaxis(columns, -1, 0))
 
 
-@dataclass(frozen=True, eq=False)
-class Homogeneous(StepCost):
-    """Step cost proportional to the length of the step; its lower bounds on charts of dimension 0 or 1 are affine.
-
-    Attributes:
-        weights: Weights of the joint displacements, 0 to ignore a joint. Shape (n,).
-    """
-
-    weights: Array
-
-    @abstractmethod
-    def gradient(self, displacement: Array) -> Array:
-        """Return the gradients (P, n) of the cost with respect to the joint displacements (P, n)."""
-
-    def minimize(self, delta: Array, target: Charts, after: QuadraticBounds) -> tuple[Array, Array, Array]:
-        """Return lower bounds (P,) of step costs plus later costs, cost gradients (P, n), and step ends (P, 1)."""
-        count = len(delta)
-        if not target.tangents.shape[2]:
-            return self.evaluate(delta, 1.0) + after.least, self.gradient(delta), np.zeros((count, 0))
-        along, slope = target.tangents[:, :, 0], after.slope[:, 0]
-        box = target.low[:, 0], target.high[:, 0]
-
-        def linearize(place: Array) -> list[Array]:
-            """Return the tangent of the cost at coordinates: these, cost gradient, value at 0 and total slope."""
-            gradient = self.gradient(delta + along * place[:, None])
-            return [place, gradient, (gradient * delta).sum(axis=1), (gradient * along).sum(axis=1) + slope]
-
-        def intersect() -> Array:
-            """Return where the tangents at the ends of the bracket intersect, or the end at which the cost is least."""
-            with np.errstate(divide="ignore", invalid="ignore"):
-                crossing = np.clip(np.nan_to_num((first[2] - last[2]) / (last[3] - first[3])), first[0], last[0])
-            return np.where(first[3] >= 0, first[0], np.where(last[3] <= 0, last[0], crossing))
-
-        # each tangent cuts off a part of the bracket of the convex function
-        first, last = (linearize(place.copy()) for place in box)
-        for _ in range(MAX_CUTS):
-            tangent = linearize(intersect())
-            falling = (tangent[3] < 0) & (first[3] < 0) & (last[3] > 0)
-            rising = (tangent[3] >= 0) & (first[3] < 0) & (last[3] > 0)
-            for end, mask in ((first, falling), (last, rising)):
-                for part, new in zip(end, tangent, strict=True):
-                    part[mask] = new[mask]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share_at_crossing = np.nan_to_num(last[3] / (last[3] - first[3]))
-        share = np.where(first[3] >= 0, 1.0, np.where(last[3] <= 0, 0.0, share_at_crossing))
-        gradient, place = share[:, None] * first[1] + (1 - share[:, None]) * last[1], intersect()
-        slope_left = (gradient * along).sum(axis=1) + slope
-        least = np.minimum(slope_left * box[0], slope_left * box[1])
-        return (gradient * delta).sum(axis=1) + least + after.least, gradient, place[:, None]
-
-    def minimal_steps(
-        self, delta: Array, target: Charts, after: QuadraticBounds, seconds: float
-    ) -> tuple[Array, Array]:
-        cost, _, place = self.minimize(delta, target, after)
-        return cost, place
-
-    def lower_bounds(
-        self, delta: Array, source: CurvedCharts, target: CurvedCharts, after: QuadraticBounds, *, seconds: float
-    ) -> StepBounds:
-        return HomogeneousBounds(self, delta, source, target, after)
-
-
-class PathLength(Homogeneous):
-    """Cost of a step: the weighted sum of the absolute joint displacements."""
-
-    def evaluate(self, delta: Array, seconds: Any) -> Array:
-        return np.asarray((self.weights * np.abs(delta)).sum(axis=-1))
-
-    def reach(self, cost: float, seconds: float) -> float:
-        return float(cost / self.weights.min()) if (self.weights > 0).all() else np.inf
-
-    def gradient(self, displacement: Array) -> Array:
-        return np.asarray(self.weights * np.sign(displacement))
-
-
-class LargestMotion(Homogeneous):
-    """Cost of a step: the largest weighted joint displacement; a duration if the weights are inverse rate limits."""
-
-    def evaluate(self, delta: Array, seconds: Any) -> Array:
-        return np.asarray((self.weights * np.abs(delta)).max(axis=-1))
-
-    def reach(self, cost: float, seconds: float) -> float:
-        return float(np.linalg.norm(cost / self.weights)) if (self.weights > 0).all() else np.inf
-
-    def gradient(self, displacement: Array) -> Array:
-        gradient, rows = np.zeros(displacement.shape), np.arange(len(displacement))
-        joint = (self.weights * np.abs(displacement)).argmax(axis=1)
-        gradient[rows, joint] = (self.weights * np.sign(displacement))[rows, joint]
-        return gradient
-
-
-@dataclass(frozen=True, eq=False)
-class HomogeneousBounds:
-    """Lower bounds of step costs proportional to length plus later costs, from `Homogeneous.lower_bounds`."""
-
-    cost: Homogeneous
-    delta: Array
-    source: CurvedCharts
-    target: CurvedCharts
-    after: QuadraticBounds
-
-    def select(self, rows: Any) -> HomogeneousBounds:
-        source, target, after = (self.source.select(rows), self.target.select(rows), self.after.select(rows))
-        return HomogeneousBounds(self.cost, self.delta[rows], source, target, after)
-
-    @property
-    def curve(self) -> Array:
-        r = self.source.charts.tangents.shape[2]
-        return np.zeros((len(self.delta), r, r))
-
-    def at(self, places: Array) -> tuple[Array, Array]:
-        source, target = self.source.charts, self.target.charts
-        start = np.einsum("pnr,pr->pn", source.tangents, places)
-        cost, gradient, _ = self.cost.minimize(self.delta - start, target, self.after)
-        end_loss = np.einsum("pcn,pn->pc", target.deviations, gradient).min(axis=1, initial=0.0)
-        loss = np.einsum("pcn,pn->pc", source.deviations, gradient).max(axis=1, initial=0.0) - end_loss
-        return cost - loss, -np.einsum("pnr,pn->pr", source.tangents, gradient)
-
-    def lower(self, places: Array, slope: Array, curve: Array) -> Array:
-        return places
-
-
-StepBounds: TypeAlias = SquaredRateBounds | HomogeneousBounds
-"""Lower bounds of the costs of P steps plus the costs after the steps, as functions of the start coordinates."""
-
-
 def least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the minima (P,) and minimisers (P, r) of P quadratic functions over boxes of at most two dimensions.
+    """Return the minima (P,) and minimisers (P, r) of P quadratic functions over boxes.
 
     The functions are slope . t + t . square . t / 2. Compared are the corners, the stationary points on the sides, and
-    the stationary point inside.
+    the stationary point inside. In more dimensions, the result is a lower bound of the minimum, see `_separate`.
     """
-    least, place = _least_in_box(_rows_last(slope), _rows_last(square), _rows_last(low), _rows_last(high))
-    return least, _rows_first(place)
+    least, place = _least_in_box(rows_last(slope), rows_last(square), rows_last(low), rows_last(high))
+    return least, rows_first(place)
 
 
 def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple[Array, Array]:
@@ -451,6 +350,10 @@ def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple
     r, count = slope.shape
     if not r:
         return np.zeros(count), np.zeros(slope.shape)
+    if r > 2:
+        square = _separate(square)
+        parts = [_least_in_box(slope[[a]], square[[a], a][:, None], low[[a]], high[[a]]) for a in range(r)]
+        return np.sum([least for least, _ in parts], axis=0), np.concatenate([place for _, place in parts])
     convex = all(bool((square[axis, axis] > 0).all()) for axis in range(r))  # then the sides include the corners
     places: list[Any] = [] if convex else [[*side] for side in product(*zip(low, high, strict=True))]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -478,17 +381,31 @@ def _least_in_box(slope: Array, square: Array, low: Array, high: Array) -> tuple
     return least, minimizer
 
 
-def _lowest_eigenvalue(square: Array) -> Array:
-    """Return the least eigenvalues of symmetric matrices (P, r, r) with r at most two. Shape (P,)."""
+def _separate(square: Array) -> Array:
+    """Return diagonal matrices (r, r, P) below symmetric matrices, which are returned themselves if r < 3 (Gershgorin).
+
+    Each mixed term is at least minus the mean of both squares.
+    """
+    if len(square) < 3:
+        return square
+    diagonal = np.einsum("aap->ap", square)
+    diagonal = diagonal + np.abs(diagonal) - np.abs(square).sum(axis=1)
+    return np.asarray(diagonal[:, None] * np.eye(len(square))[:, :, None])
+
+
+def lowest_eigenvalue(square: Array) -> Array:
+    """Return the least eigenvalues of symmetric matrices (P, r, r). Shape (P,)."""
     if square.shape[1] < 2:
         return np.asarray(square.sum(axis=(1, 2)))
+    if square.shape[1] > 2:
+        return np.asarray(np.linalg.eigvalsh(square)[:, 0])
     middle, half = (square[:, 0, 0] + square[:, 1, 1]) / 2, (square[:, 0, 0] - square[:, 1, 1]) / 2
     return np.asarray(middle - np.hypot(half, square[:, 0, 1]))
 
 
 def _raise_eigenvalues(square: Array, floor: float) -> tuple[Array, Array]:
     """Raise the eigenvalues of symmetric matrices (r, r, P) to at least `floor`; also return the largest increases."""
-    excess = np.maximum(floor - _lowest_eigenvalue(np.moveaxis(square, -1, 0)), 0.0)
+    excess = np.maximum(floor - lowest_eigenvalue(np.moveaxis(square, -1, 0)), 0.0)
     rows = np.flatnonzero(excess > 0)
     if rows.size:
         values, vectors = np.linalg.eigh(np.moveaxis(square[..., rows], -1, 0))

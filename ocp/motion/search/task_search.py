@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
+from warnings import warn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.checks import Array
-from ocp.errors import ProblemError
+from ocp.console import TimeLimitReached
+from ocp.errors import BoundWarning, ProblemError
 from ocp.motion.local.inverse_kinematics import Unreachable
 from ocp.motion.local.rates import LocalMotion
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
@@ -25,11 +27,12 @@ from ocp.motion.search.configurations import (
 from ocp.motion.search.dead_end import DeadEnd, dead_end
 from ocp.motion.search.joint_space import FULL_TURN, JointSpace
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
-from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch
-from ocp.motion.search.steps import SquaredRates, Steps
+from ocp.motion.search.search import MAX_FREE_DIRECTIONS, AtlasSearch, SearchSettings
+from ocp.motion.search.shortening import PathProblem
+from ocp.motion.search.steps import SquaredRates, StepCost, Steps
 from ocp.motion.tasks.equations import TaskEquations
 
-__all__ = ["TaskSearch"]
+__all__ = ["TOO_MANY_CHARTS", "TaskSearch", "choose_samples", "lower_bound_along"]
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,12 @@ class SampleSettings:
     near_position_limit: float = 1e-3
     subdivisions: int = 4
     motion_steps: int = 64
+
+
+TOO_MANY_CHARTS = "configurations"
+"""Value of the field `name` in the error of a search that needs too many charts of the self-motion manifold."""
+LARGER_CHARTS = (1.0, 2.0, 4.0)
+"""Factors by which charts are enlarged if there are too many of them."""
 
 
 class TaskSearch:
@@ -117,7 +126,8 @@ class TaskSearch:
             steps = int(np.ceil(settings.steps * stretch.duration / request.horizon))
             lost = settings.lost[max(free_directions, 0)]
             joints, periodic = motion.joints[best], self.space.periodic
-            chosen = choose_samples(motion.t, joints, request.weights, lost, min_steps=steps, periodic=periodic)
+            cost = SquaredRates(request.weights)
+            chosen = choose_samples(motion.t, joints, cost, lost, min_steps=steps, periodic=periodic)
             shared = bool(times) and chosen[0] <= times[-1][-1]  # the stretch before ends there
             times.append(chosen[1:] if shared else chosen)
         if not times:
@@ -200,15 +210,28 @@ class TaskSearch:
         """Return the sample times of each interval with active tasks after inserting additional times."""
         return [np.union1d(own, times[(times > own[0]) & (times < own[-1])]) for own in self._times_by_stretch]
 
-    def refine_samples(self) -> bool:
-        """Add time samples where the best path is near a limit, and search again; return whether any were added."""
+    @property
+    def near_cost(self) -> float:
+        """Cost up to which a motion counts as close to the bound: twice the gap at which the search ends."""
+        return self.bound / (1 - 2 * self._search.gap)
+
+    def unresolved(self, cost: float) -> list[tuple[float, float, Array]]:
+        """Return the classes of motions without a path that may cost less than `cost`: bound, time, configuration."""
+        return [(bound, float(self.times[k]), joints) for bound, k, joints in self._search.unresolved if bound < cost]
+
+    def refine_samples(self, everywhere: bool = False) -> bool:
+        """Add time samples where the best path is near a limit, or `everywhere`, and search again.
+
+        Returns:
+            Whether any were added.
+        """
         if self._path is None:
             return False
         settings, bounds, path = self._settings, self.request.bounds, self._path
         margins = np.minimum(path - bounds.lower, bounds.upper - path).min(axis=1)
         at_limit = margins < settings.near_position_limit
         fast = np.abs(np.diff(path, axis=0)) >= settings.near_speed_limit * self._search.limits
-        critical = (fast.any(axis=1) | at_limit[1:] | at_limit[:-1]) & self._can_subdivide
+        critical = (everywhere | fast.any(axis=1) | at_limit[1:] | at_limit[:-1]) & self._can_subdivide
         if not critical.any():
             return False
         self._search_at(self._with_samples((self.times[:-1] + self.times[1:])[critical] / 2))
@@ -251,7 +274,7 @@ class TaskSearch:
 
 
 def choose_samples(
-    t: Array, joints: Array, weights: Array, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
+    t: Array, joints: Array, step_cost: StepCost, share: float, *, min_steps: int, periodic: NDArray[np.bool_]
 ) -> Array:
     """Choose few sample times of a motion such that straight steps between them cost at most a given fraction less.
 
@@ -261,7 +284,7 @@ def choose_samples(
     chosen = list(range(len(t)))
 
     def cost(a: int, b: int) -> float:
-        return float((weights * (joints[b] - joints[a]) ** 2).sum() / (2 * (t[b] - t[a])))
+        return float(step_cost.evaluate(joints[b] - joints[a], t[b] - t[a]))
 
     def loss(i: int) -> float:
         a, b, c = chosen[i - 1 : i + 2]
@@ -281,3 +304,48 @@ def choose_samples(
             if 0 < k < len(chosen) - 1:
                 losses[k] = loss(k)
     return np.asarray(t[chosen])
+
+
+def lower_bound_along(
+    problem: PathProblem, path: Array, loss: float, *, seeds: Callable[[int], Array], settings: SearchSettings
+) -> float:
+    """Return a lower bound of the cost of all paths, from the samples between which a good path hardly reverses.
+
+    The bound is what the time limit and the largest number of charts allow. It is 0, with a warning, if even large
+    charts are too many.
+
+    Args:
+        problem: Manifolds, steps and scene; the manifolds are those of one task.
+        path: Path of low cost. Shape (K, n).
+        loss: Share of its cost that straight steps between the chosen samples may lose.
+        seeds: Function that returns configurations at a sample, see `AtlasSearch`.
+        settings: Settings of the search.
+
+    Warns:
+        BoundWarning: There is no bound.
+    """
+    times, whole = problem.steps.times, problem.samples[0].manifolds
+    options: dict[str, Any] = {"min_steps": 1, "periodic": whole.space.periodic}
+    chosen = np.flatnonzero(np.isin(times, choose_samples(times, path, problem.steps.cost, loss, **options)))
+    manifolds = SelfMotionManifolds(whole.space, whole.equations, whole.targets[chosen])
+    limits = np.add.reduceat(problem.steps.limits, chosen[:-1], axis=0)
+    steps, samples = (
+        Steps(times[chosen], problem.steps.cost, limits),
+        [TimeSample(manifolds, k) for k in range(len(chosen))],
+    )
+    for growth in LARGER_CHARTS:
+        point, curve, surface = (growth * radius for radius in settings.radii)
+        larger = replace(settings, radii=(point, curve, surface))
+        try:
+            search = AtlasSearch(
+                whole.space, samples, steps, seeds=lambda k: seeds(int(chosen[k])), scene=problem.scene, settings=larger
+            )
+            return search.lower_bound(problem.cost(path))
+        except TimeLimitReached:
+            return 0.0
+        except ProblemError as error:
+            if error.name != TOO_MANY_CHARTS:
+                raise
+            refusal = error
+    warn(BoundWarning(f"there is no lower bound of the cost: {refusal}", **vars(refusal)), stacklevel=2)
+    return 0.0

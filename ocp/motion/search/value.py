@@ -1,4 +1,4 @@
-"""Dynamic programming over charts of the self-motion manifold: lower bounds of the cost-to-go, and shortening of paths.
+"""Dynamic programming over charts of the self-motion manifold: lower bounds of the cost-to-go.
 
 Between two time samples a motion costs at least what the straight step costs: the integral of half the squared rates is
 no less than |dq|^2 / (2 dt), the length no less than |dq|_1. The least cost over all sequences of configurations, one
@@ -10,33 +10,25 @@ gives one such function for each corner by its multipliers, all with nearly the 
 lowest-cost step they are affine, and their minimum is concave. An affine function below a concave one at the corners of
 a box lies below it everywhere. The loss is of third order in the size of the charts for squared rates, and of second
 order for lengths, whose bounds are affine.
-
-Paths are shortened by dynamic programming as well. At every sample, some configurations on either side of the path are
-taken, and the lowest-cost path through them replaces it. Their spacing is reduced once the path no longer runs along
-their edge. Violations are penalised, so that a path can move out of them. A path that no longer changes is optimal
-among its neighbours, whatever kinks its cost has.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models import CollisionScene
 from models.checks import Array
-from ocp.motion.local.collisions import distances_along
-from ocp.motion.search.charts import Charts, TimeSample
+from ocp.console import check_time
+from ocp.motion.search.charts import Charts
 from ocp.motion.search.joint_space import MAX_STEP, JointSpace
 from ocp.motion.search.steps import CurvedCharts, QuadraticBounds, StepBounds, Steps
-from ocp.tolerances import CLEARANCE_TOLERANCE_M
 
-__all__ = ["PENALTY", "ChartGraph", "GraphSettings", "ShorteningSettings", "shorten_path"]
+__all__ = ["ChartGraph", "GraphSettings"]
 
 Indices = NDArray[np.intp]
 
@@ -206,6 +198,7 @@ class ChartGraph:
         places = np.clip(0.0, target.low, target.high)
         lowest, middle = self.minima(after, neighbour), after.at(places)
         for i, j in self.edges(k, neighbour):
+            check_time()
             feasible = np.isfinite(after.least[j]) & (known_costs[i] + lowest[j] < max_cost)
             i, j = i[feasible], j[feasible]
             if not i.size:
@@ -213,11 +206,19 @@ class ChartGraph:
             delta = self.space.difference(target.centers[j], source.centers[i])
             distances, spans = np.abs(delta), start_spans[i] + end_spans[j]
             lower = self.cost.evaluate(np.maximum(distances - spans, 0.0), seconds) + lowest[j]
-            upper = self.cost.evaluate(distances + spans, seconds) + middle[j]
+            upper = self.cost.evaluate(distances + start_spans[i], seconds) + middle[j]
+            upper = np.minimum(_least_of_groups(upper, i), max_cost - known_costs[i])
+            rows = np.flatnonzero(lower <= upper)
+            i, j, delta, upper, lower = i[rows], j[rows], delta[rows], upper[rows], lower[rows]
+            boxes = source.select(i), target.select(j)
+            quick = self.cost.quick_bounds(delta, spans[rows], *boxes, after=after.select(j))
+            lower = np.maximum(lower, quick)
             floor = np.full(len(source), np.inf)
             np.minimum.at(floor, i, lower)
-            promising = (lower <= _least_of_groups(upper, i)) & (known_costs[i] + lower < max_cost)
-            i, j, delta = i[promising], j[promising], delta[promising]
+            rows = np.flatnonzero((lower <= upper) & (known_costs[i] + lower < max_cost))
+            i, j, delta = i[rows], j[rows], delta[rows]
+            if not i.size:
+                continue
             ends = self.curved[k].select(i), self.curved[neighbour].select(j)
             steps = self.cost.lower_bounds(delta, *ends, after.select(j), seconds=seconds)
             if known_bounds is not None:
@@ -378,105 +379,3 @@ def _secant_slopes(values: list[Array], half: Array) -> Array:
         flat = np.clip(0.0, first, np.maximum(first, last))
         slopes[:, axis] = np.where(half[:, axis] > 0, np.where(first < last, flat, (first + last) / 2), 0.0)
     return slopes
-
-
-PENALTY = 1e6
-"""Penalty for each rad or m by which a limit is violated; the penalty exceeds the cost of any path."""
-
-
-@dataclass(frozen=True)
-class ShorteningSettings:
-    """Settings of `shorten_path`, such as the number of neighbouring configurations that are tried.
-
-    Attributes:
-        neighbours: Number of configurations on either side of the path, by the dimension of the manifold.
-        margin: Distance by which the clearance is exceeded, m.
-        max_moves: Largest number of iterations with one spacing.
-        least_gain: Relative cost reduction below which the spacing is reduced though the path runs along the edge.
-    """
-
-    neighbours: tuple[int, int, int] = (0, 5, 2)
-    margin: float = CLEARANCE_TOLERANCE_M
-    max_moves: int = 10
-    least_gain: float = 1e-4
-
-
-def shorten_path(
-    path: Array,
-    samples: Sequence[TimeSample],
-    steps: Steps,
-    *,
-    bounds: tuple[Array, Array],
-    scene: CollisionScene | None,
-    widths: tuple[float, float],
-    settings: ShorteningSettings = ShorteningSettings(),
-) -> Array:
-    """Return a path near the given path that has a lower cost or smaller violations of limits. Shape (K, n).
-
-    Args:
-        path: Configurations that do the tasks at the samples. Shape (K, n).
-        samples: Manifolds of the samples, all of dimension one or all of two; others leave the path unchanged.
-        steps: Steps between the samples.
-        bounds: Lower and upper limits of the joints. Shape (n,) each.
-        scene: Collision scene, or None.
-        widths: Initial and final spacing of the configurations, in the metric.
-    """
-    joints, (width, finest), best_cost, moves = path, widths, np.inf, 0
-    times, cost, limits = steps.times, steps.cost, steps.limits
-    manifolds = {sample.manifolds for sample in samples}
-    sizes = {manifold.size for manifold in manifolds}
-    if sizes not in ({1}, {2}):
-        return path
-    dimension = sizes.pop()
-    count_per_side = settings.neighbours[dimension]
-    count = (2 * count_per_side + 1) ** dimension
-    shifts = np.array(list(product(np.arange(-count_per_side, count_per_side + 1.0), repeat=dimension)))
-    rows = [(manifold, np.flatnonzero([sample.manifolds is manifold for sample in samples])) for manifold in manifolds]
-    indices = np.array([sample.row for sample in samples])
-    tangents: dict[int, Array] = {}
-    while width > finest:
-        candidates, valid = np.empty((len(joints), count, joints.shape[1])), np.empty((len(joints), count), bool)
-        for part, (manifold, those) in enumerate(rows):
-            tangents[part] = manifold.tangents_at(indices[those], joints[those], tangents.get(part))
-            tangent_points = joints[those, None] + width * np.einsum("knr,sr->ksn", tangents[part], shifts)
-            flat = tangent_points.reshape(-1, tangent_points.shape[2])
-            projected, converged = manifold.project(np.repeat(indices[those], count), flat)
-            valid[those] = converged.reshape(len(those), -1)
-            projected = projected.reshape(tangent_points.shape)
-            candidates[those] = np.where(valid[those][:, :, None], projected, tangent_points)
-        violations = np.where(valid, _violation(candidates, times, bounds, scene, settings.margin), 1.0)
-        values, back_pointers = PENALTY * violations[0], []
-        for k in range(1, len(joints)):
-            displacements = candidates[k][None] - candidates[k - 1][:, None]
-            excess = np.maximum(np.abs(displacements) - limits[k - 1], 0.0).sum(axis=2)
-            costs = values[:, None] + cost.evaluate(displacements, times[k] - times[k - 1]) + PENALTY * excess
-            back_pointers.append(costs.argmin(axis=0))
-            values = costs.min(axis=0) + PENALTY * violations[k]
-        choice = [int(values.argmin())]
-        for pointers in reversed(back_pointers):
-            choice.append(int(pointers[choice[-1]]))
-        joints = candidates[np.arange(len(joints)), choice[::-1]]
-        at_edge, current_cost = np.abs(shifts[choice]).max() == count_per_side, float(values.min())
-        moves += 1
-        if not (at_edge and current_cost < best_cost * (1 - settings.least_gain) and moves < settings.max_moves):
-            width, moves = width / 2, 0
-        best_cost = min(best_cost, current_cost)
-    return joints
-
-
-def _violation(
-    candidates: Array, times: Array, bounds: tuple[Array, Array], scene: CollisionScene | None, margin: float
-) -> Array:
-    """Return the amounts (K, s), rad and m, by which configurations (K, s, n) violate joint limits and clearance."""
-    excess = np.maximum(np.maximum(candidates - bounds[1], bounds[0] - candidates), 0.0).sum(axis=2)
-    if scene is None:
-        return np.asarray(excess)
-    required, middle, base = scene.clearance + margin, candidates[:, candidates.shape[1] // 2], np.zeros(0)
-    span = np.abs(candidates - middle[:, None]).max(axis=1) @ scene.levers.joints.T
-    distances = distances_along(scene, base, middle, times, cutoff=required + float(span.max(initial=0.0)))
-    close = np.flatnonzero((distances - span < required).any(axis=1))  # at the other samples all candidates are clear
-    count = candidates.shape[1]
-    joints, repeated_times = candidates[close].reshape(-1, candidates.shape[2]), np.repeat(times[close], count)
-    distances = distances_along(scene, base, joints, repeated_times, cutoff=required)
-    excess[close] += np.maximum(required - distances, 0.0).max(axis=1, initial=0.0).reshape(len(close), count)
-    return np.asarray(excess)

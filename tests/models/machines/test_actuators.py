@@ -12,7 +12,7 @@ import pytest
 
 from models import FreeFloating, Joint, Link, ModelError, Robot, Wrench, find_wheels, with_wheels
 from ocp import ProblemError, joint_torques
-from tests.models.robot.oracles import mujoco_model
+from scripts.robots.simulation import mujoco_model
 from tests.models.robot.trees import Array
 
 AXES = np.array([[1.0, 0.2, 0.0], [0.0, 2.0, 0.3], [0.0, 0.1, 1.0], [1.0, 1.0, 1.0]])

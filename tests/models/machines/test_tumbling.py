@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from models import FreeFloating, Link, Robot
 from models.spatial import angular_velocity_from_quaternion
 from ocp import ProblemError, TipTask, dynamics_problem, inverse_kinematics, minimum_velocity_problem
-from tests.models.robot.oracles import mujoco_model
+from scripts.robots.simulation import mujoco_model
 from tests.models.robot.trees import Array
 
 INERTIA = np.diag([5.0, 8.0, 6.0])

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio
 
 from models import Robot, Wrench
+from scripts.robots.simulation import mujoco_model
 from tests.models.robot.trees import Array, numeric_poses, random_inertia
 
 
@@ -54,44 +55,6 @@ def pinocchio_dynamics(
         outside[index] += data.oMi[index].actInv(pinocchio.Force(force, moment + np.cross(point, force)))
     needed = pinocchio.rnea(model, data, configuration, velocity, acceleration, outside)
     return np.array(needed[6:]), np.concatenate([needed[3:6], needed[0:3]])
-
-
-def mujoco_model(
-    robot: Robot, ground: str = "", foot: str = "", options: str = "", *, fixed: bool = False
-) -> mujoco.MjModel:
-    """The robot on a free joint, or `fixed`. `ground` and `foot` are geoms of the world and of the root, as MJCF."""
-    return mujoco.MjModel.from_xml_string(mjcf_text(robot, ground, foot, options, fixed=fixed))
-
-
-def mjcf_text(robot: Robot, ground: str = "", foot: str = "", options: str = "", *, fixed: bool = False) -> str:
-    """The same as text."""
-
-    def numbers(values: Array) -> str:
-        return " ".join(repr(float(value)) for value in np.ravel(values))
-
-    def quaternion(matrix: Array) -> Array:
-        result = np.zeros(4)
-        mujoco.mju_mat2Quat(result, np.ascontiguousarray(matrix).ravel())
-        return result
-
-    def body(name: str, head: str) -> str:
-        link = robot.link(name)
-        inertia = link.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        own = f'<inertial pos="{numbers(link.center_of_mass)}" mass="{link.mass!r}" fullinertia="{numbers(inertia)}"/>'
-        below = ""
-        for joint in robot.joints:
-            if joint.parent == name:
-                place = f'pos="{numbers(joint.translation)}" quat="{numbers(quaternion(joint.rotation))}"'
-                moving = ""
-                if joint.moves:
-                    kind = "slide" if joint.kind == "prismatic" else "hinge"
-                    moving = f'<joint name="{joint.name}" type="{kind}" axis="{numbers(joint.axis)}"/>'
-                below += f'<body name="{joint.child}" {place}>{moving}{body(joint.child, "")}</body>'
-        return head + own + below
-
-    root = f'<body name="{robot.root}">{body(robot.root, foot if fixed else "<freejoint/>" + foot)}</body>'
-    settings = f'<compiler angle="radian" boundmass="0"/><option {options}/>'
-    return f"<mujoco>{settings}<worldbody>{ground}{root}</worldbody></mujoco>"
 
 
 def mujoco_dynamics(

@@ -27,7 +27,8 @@ from models import (
     mass_matrix,
     tip_pose,
 )
-from tests.models.robot.oracles import mjcf_text, with_masses
+from scripts.robots.simulation import mjcf_text
+from tests.models.robot.oracles import with_masses
 from tests.models.robot.trees import numeric, random_robot, refused, seeds
 
 GRAVITY = np.array([0.3, -0.2, -9.81])

@@ -82,7 +82,7 @@ def test_an_error_reports_the_outcome_of_every_start() -> None:
         solve(problem, Collocation(5))
     lines = [line for line in str(caught.value).splitlines() if line.startswith("from the ")]
     assert [line.split(":")[0].removeprefix("from the ") for line in lines] == [
-        "guess", "zeros", "roll-out", "elastic plan"
+        "guess", "displaced guess", "zeros", "roll-out", "elastic plan"
     ]  # fmt: skip
     assert all(line.endswith("iterations") for line in lines)
 

@@ -6,56 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ocp import Problem
 from ocp.indirect.hamiltonian import Extremal, Hamiltonian
-from ocp.indirect.method import hamiltonian_defect, null_space
+from ocp.indirect.method import hamiltonian_defect
 from ocp.problem.formulation import Formulation
-from tests.ocp.problems import Array
-
-seeds = st.integers(0, 2**32 - 1)
-
-
-def of_rank(rng: np.random.Generator, m: int, n: int, rank: int, size: float) -> Array:
-    """A random matrix (m, n) of the given rank, with singular values within a factor of ten of each other."""
-    left, right = (np.linalg.qr(rng.normal(size=(k, k)))[0][:, :rank] for k in (m, n))
-    return np.asarray(size * left @ np.diag(rng.uniform(1, 10, rank)) @ right.T)
-
-
-@given(seeds, st.integers(1, 6), st.integers(1, 6), st.integers(0, 6), st.integers(-6, 12))
-def test_a_null_space_is_orthonormal_unseen_and_as_large_as_the_rank_leaves_it(
-    seed: int, m: int, n: int, rank: int, power: int
-) -> None:
-    rng = np.random.default_rng(seed)
-    rank, size = min(rank, m, n), 10.0**power
-    rows = of_rank(rng, m, n, rank, size)
-    result = null_space(rows)
-    assert result.shape == (n, n - rank)
-    assert result.T @ result == pytest.approx(np.eye(n - rank), abs=1e-12)
-    assert rows @ result == pytest.approx(np.zeros((m, n - rank)), abs=1e-12 * size)
-
-
-@given(seeds, st.integers(1, 5), st.integers(2, 6))
-def test_zero_rows_and_rows_repeated_in_another_unit_change_no_null_space(seed: int, m: int, n: int) -> None:
-    rng = np.random.default_rng(seed)
-    rows = rng.normal(size=(m, n))
-    result = null_space(rows)
-    for other in (
-        np.vstack([rows, np.zeros((2, n))]),
-        np.vstack([rows, rng.normal(size=(m, m)) @ rows]),
-        10.0 ** rng.uniform(-3, 3, (m, 1)) * rows,
-    ):
-        same = null_space(other)
-        assert same @ same.T == pytest.approx(result @ result.T, abs=1e-9)
-
-
-@pytest.mark.parametrize("n", [1, 4])
-def test_without_rows_or_with_zeros_alone_every_direction_is_free(n: int) -> None:
-    for rows in (np.zeros((0, n)), np.zeros((3, n))):
-        result = null_space(rows)
-        assert result.T @ result == pytest.approx(np.eye(n), abs=0)
 
 
 def verdict(

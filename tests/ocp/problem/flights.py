@@ -36,7 +36,8 @@ def equinoctial_rates(x: Any, thrust: Any) -> Any:
     """d/dt of the modified equinoctial elements (p, f, g, h, k, L), in radii and their time.
 
     Args:
-        thrust: Acceleration and its angles out of and within the plane of velocity and radius; None where it is off.
+        thrust: Acceleration as a function of the unit vector up, the velocity and the unit vector along the momentum;
+            None where it is off.
     """
     p, f, g, h, k, L = ca.vertsplit(x)
     c, s = ca.cos(L), ca.sin(L)
@@ -57,11 +58,7 @@ def equinoctial_rates(x: Any, thrust: Any) -> Any:
     pull = sum((j + 1) * r ** -(j + 2) * legendre[j] * ZONAL[j] for j in ZONAL) * up
     pull -= sum(r ** -(j + 2) * slopes[j] * ZONAL[j] for j in ZONAL) * north
     if thrust is not None:
-        size_of, out, within = thrust
-        ahead, side = velocity / ca.norm_2(velocity), -normal
-        pull += size_of * (
-            ca.cos(out) * (ca.cos(within) * ahead + ca.sin(within) * side) + ca.sin(out) * ca.cross(ahead, side)
-        )
+        pull += thrust(up, velocity, normal)
     radial, along, across = ca.dot(up, pull), ca.dot(ca.cross(normal, up), pull), ca.dot(normal, pull)
     root, tilt = ca.sqrt(p), h * s - k * c
     return ca.vertcat(
@@ -74,13 +71,24 @@ def equinoctial_rates(x: Any, thrust: Any) -> Any:
     )
 
 
+def steered(acceleration: Any, out: Any, within: Any) -> Callable[[Any, Any, Any], Any]:
+    """Acceleration at angles out of and within the plane of velocity and radius, as `equinoctial_rates` takes it."""
+
+    def thrust(up: Any, velocity: Any, normal: Any) -> Any:
+        ahead, side = velocity / ca.norm_2(velocity), -normal
+        turned = ca.cos(within) * ahead + ca.sin(within) * side
+        return acceleration * (ca.cos(out) * turned + ca.sin(out) * ca.cross(ahead, side))
+
+    return thrust
+
+
 def flown() -> dict[str, Callable[[float], Any]]:
     """Elements over the time of each leg, with the guessed thrust: where the search starts."""
     state = np.array([*PARKING, 1.0])
     by_name: dict[str, Callable[[float], Any]] = {}
     y = ca.SX.sym("y", 7)
     for name, (_, _, duration, angles) in LEGS.items():
-        thrust = None if angles is None else (_acceleration(y[6]), *np.deg2rad(angles))
+        thrust = None if angles is None else steered(_acceleration(y[6]), *np.deg2rad(angles))
         rate = ca.vertcat(equinoctial_rates(y[:6], thrust) / TIME, -THRUST / IMPULSE if angles else 0)
         times = np.linspace(0.0, duration, 61)
         run = ca.integrator("leg", "cvodes", {"x": y, "ode": rate}, 0.0, times[1:].tolist())
@@ -114,7 +122,7 @@ def two_burns() -> Phases:
             out, within = (leg.control(each, guess=np.deg2rad(a), lower=-np.pi, upper=np.pi)
                            for each, a in zip(("out", "within"), angles, strict=True))  # fmt: skip
             leg.dynamics(w, -THRUST / IMPULSE)
-            thrust = _acceleration(w), out, within
+            thrust = steered(_acceleration(w), out, within)
             if name == "insert":
                 leg.minimize(terminal=-w)
         leg.dynamics(x, equinoctial_rates(x, thrust) / TIME)

@@ -312,6 +312,7 @@ START: Bad = {
     "number as name": {3: 1.0},
 }
 FRONT: dict[str, Bad] = {"problem": INSTANCE | {"unfinished": blank()}, "solver": CHOICE, "options": OPTIONS}
+METHOD = {name: bad for name, bad in INSTANCE.items() if bad is not None}  # without a method solve chooses one
 WITHOUT_SOLVER = {name: bad for name, bad in FRONT.items() if name != "solver"}
 SOLVED = {"method": PLAN, "parameters": {"p": 1.0}}
 
@@ -323,9 +324,7 @@ def on_line(call: Any, good: dict[str, Any], /, **bad: Bad) -> Case:
 
 FRONTS = [
     on_line(prepare, {"method": PLAN}, **FRONT, method=INSTANCE, compiled=FLAG, scaling=FLAG),
-    on_line(
-        solve, SOLVED, **FRONT, method=INSTANCE, parameters=PARAMETERS, guess=START, check=FLAG, time_limit=POSITIVE
-    ),
+    on_line(solve, SOLVED, **FRONT, method=METHOD, parameters=PARAMETERS, guess=START, check=FLAG, time_limit=POSITIVE),
     on_line(
         refine,
         SOLVED,

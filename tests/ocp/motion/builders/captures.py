@@ -14,7 +14,7 @@ from models import FreeFloating, Joint, Link, Robot, planar_chain, with_wheels
 from models.paths.splines import exponential
 from ocp import Capture, Cone, Cost, FreeTime, Grasp, Solution
 from ocp.motion.builders.space.pair import join_target, pair_momentum
-from tests.models.robot.oracles import mujoco_model
+from scripts.robots.simulation import mujoco_model
 from tests.models.robot.trees import Array
 
 PLANAR_START = np.array([1.2, -2.0, 0.6, 0.0])

@@ -18,7 +18,7 @@ from models import FixedBase, FreeFloating, simplify
 from models.checks import Array
 from ocp import Solution, joint_torques
 from ocp.curves import quadrature_weights
-from tests.models.robot.oracles import mujoco_model
+from scripts.robots.simulation import mujoco_model
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from models import Standing
 from models.machines.standing import External, StandingMotion
-from tests.models.robot.oracles import mujoco_model
+from scripts.robots.simulation import mujoco_model
 from tests.models.robot.trees import Array
 
 FOOT_MASS = 1.0  # kg; the simulator takes no body without mass

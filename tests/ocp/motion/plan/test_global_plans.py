@@ -13,6 +13,7 @@ from ocp import BoundWarning, Candidate, Cost, Plan, ProblemError, TipTask, Unre
 from ocp.motion.plan.candidate_solver import CandidateSolver
 from ocp.motion.result.candidate import Reason, Rejection
 from ocp.motion.search.search import AtlasSearch, checked_bound
+from ocp.motion.search.steps import SquaredRates
 from ocp.motion.search.task_search import choose_samples
 from tests.families import some
 from tests.ocp.motion.search.test_charts import moved, planar
@@ -166,7 +167,9 @@ NONE = np.zeros(2, dtype=bool)
 def test_time_samples_are_omitted_up_to_a_share_of_the_cost() -> None:
     t = np.linspace(0, 2, 81)
     perturbed = np.column_stack([np.abs(t - 1), np.where(t < 1, 0.0, 2 * (t - 1))])
-    assert choose_samples(t, perturbed, np.ones(2), 1e-9, min_steps=2, periodic=NONE) == pytest.approx([0, 1, 2])
+    assert choose_samples(t, perturbed, SquaredRates(np.ones(2)), 1e-9, min_steps=2, periodic=NONE) == pytest.approx(
+        [0, 1, 2]
+    )
     round_way = np.column_stack([np.sin(3 * t), np.cos(3 * t)])
     weights = np.array([1.0, 1.0])
 
@@ -175,19 +178,19 @@ def test_time_samples_are_omitted_up_to_a_share_of_the_cost() -> None:
         return float((weights * np.diff(at, axis=0) ** 2 / (2 * np.diff(times)[:, None])).sum())
 
     for share in (0.1, 0.01):
-        kept = choose_samples(t, round_way, weights, share, min_steps=2, periodic=NONE)
+        kept = choose_samples(t, round_way, SquaredRates(weights), share, min_steps=2, periodic=NONE)
         assert cost(kept) >= (1 - share) * cost(t)
         assert len(kept) <= 2 * np.sqrt(3 * 3 * 4 / (24 * share)) + 3
-    assert len(choose_samples(t, round_way, weights, 0.9, min_steps=10, periodic=NONE)) == 11
+    assert len(choose_samples(t, round_way, SquaredRates(weights), 0.9, min_steps=10, periodic=NONE)) == 11
 
 
 def test_a_joint_without_end_turns_by_less_than_half_a_turn_in_a_step() -> None:
     """Else which way round it turned would be lost: 5 rad in steady motion."""
     t = np.linspace(0.0, 1.0, 65)
     turning = np.column_stack([5.0 * t, 0.0 * t])
-    kept = choose_samples(t, turning, np.ones(2), 1e-3, min_steps=2, periodic=~NONE)
+    kept = choose_samples(t, turning, SquaredRates(np.ones(2)), 1e-3, min_steps=2, periodic=~NONE)
     assert np.abs(np.diff(np.interp(kept, t, turning[:, 0]))).max() <= np.pi / 2
-    assert len(choose_samples(t, turning, np.ones(2), 1e-3, min_steps=2, periodic=NONE)) == 3
+    assert len(choose_samples(t, turning, SquaredRates(np.ones(2)), 1e-3, min_steps=2, periodic=NONE)) == 3
 
 
 def line(first: np.ndarray, way: tuple[float, float], seconds: float) -> Any:

@@ -47,7 +47,7 @@ def test_rows_are_those_of_a_matrix(seed: int, count: int) -> None:
     values = np.random.default_rng(seed).uniform(0.1, 1.0, len(gap))
     assert every.weighted_gradients(values) == pytest.approx(matrix.T @ values, abs=1e-9)
     normal = matrix.T @ (values[:, None] * matrix)
-    for k, diagonal in enumerate(every.squares(values)):
+    for k, diagonal in enumerate(every.outer_products(values)):
         assert diagonal == pytest.approx(np.diag(normal, k), abs=1e-9)
     step = 1e-6 * np.random.default_rng(seed + 1).normal(size=len(b))
     change = matrix @ step
@@ -70,7 +70,7 @@ def test_steps_preserve_positive_variables(seed: int, count: int, share: float, 
     rates = np.random.default_rng(seed).normal(size=len(every.interval)) * 10.0 ** np.random.default_rng(seed).uniform(
         -1, 1
     )
-    steps = every.longest(rates, share, of_positive)
+    steps = every.step_lengths(rates, share, of_positive)
     most = np.where(np.arange(len(rates)) < count, of_positive, share)
     gone = -rates * steps[every.interval] / most
     assert gone.max() <= 1 + 1e-12

@@ -20,9 +20,10 @@ from ocp.motion.local.closed_forms import closed_forms
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.search.charts import SelfMotionManifolds, TimeSample
 from ocp.motion.search.joint_space import JointSpace
+from ocp.motion.search.lengths import PathLength
 from ocp.motion.search.reconfigurations import fewest_segments, segment_ends
 from ocp.motion.search.search import AtlasSearch
-from ocp.motion.search.steps import PathLength, Steps
+from ocp.motion.search.steps import Steps
 from ocp.motion.tasks.equations import bind
 from tests.ocp.motion.local.test_closed_forms import chain_of
 from tests.ocp.motion.search.test_charts import planar

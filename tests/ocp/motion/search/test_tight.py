@@ -14,8 +14,9 @@ from models import CollisionScene, CollisionShape, FixedBase, MovingObstacle, Sp
 from models.checks import Array
 from ocp.motion.local.collisions import distances_along
 from ocp.motion.search.charts import TimeSample
-from ocp.motion.search.steps import PathLength, SquaredRates, Steps
-from ocp.motion.search.value import shorten_path
+from ocp.motion.search.lengths import PathLength
+from ocp.motion.search.shortening import PathProblem, shorten_path
+from ocp.motion.search.steps import SquaredRates, Steps
 from tests.ocp.motion.search.test_charts import moved, planar, sets_of
 
 START = np.array([0.5, 1.2, -1.4])
@@ -62,11 +63,8 @@ def tight(obstacle: Any = None, later: float = 0.0) -> Array:
     """The way drawn tight, so much later than its task."""
     robot = MACHINE.robot
     around = None if obstacle is None else CollisionScene(MACHINE, [obstacle], clearance=CLEARANCE)
-    far, bounds = np.full((len(TIMES) - 1, robot.dof), 1.0), (robot.lower, robot.upper)
-    cost = PathLength(np.ones(robot.dof))
-    return shorten_path(
-        followed(), TIME_SAMPLES, Steps(TIMES + later, cost, far), bounds=bounds, scene=around, widths=(0.1, 1e-3)
-    )
+    steps = Steps(TIMES + later, PathLength(np.ones(robot.dof)), np.full((len(TIMES) - 1, robot.dof), 1.0))
+    return shorten_path(followed(), PathProblem(TIME_SAMPLES, steps, robot.lower, robot.upper, around), (0.1, 1e-3))
 
 
 def random_problem(
@@ -77,9 +75,8 @@ def random_problem(
     steps = np.full((len(TIMES) - 1, robot.dof), far)
     bounds = np.maximum(robot.lower, lower), np.minimum(robot.upper, upper)
     cost = cost or PathLength(np.ones(robot.dof))
-    return shorten_path(
-        followed(start), TIME_SAMPLES, Steps(times, cost, steps), bounds=bounds, scene=None, widths=(0.1, 1e-3)
-    )
+    problem = PathProblem(TIME_SAMPLES, Steps(times, cost, steps), *bounds, None)
+    return shorten_path(followed(start), problem, (0.1, 1e-3))
 
 
 def length(path: Array) -> float:

@@ -1,0 +1,202 @@
+"""Adaptive collocation: a problem is solved without a mesh and without a guess, to a requested accuracy of its cost.
+
+Coarse meshes forgive bad guesses: a nonlinear program of a few hundred variables has few stationary points, and its
+solution is the guess on the finer mesh. The first mesh on which the solver succeeds counts. It starts from the guess
+(without one: straight lines between fixed ends, the middle of bounds) and from the guess displaced by seeded random
+amounts, because the straight lines share the symmetries of a problem, along which a stationary plan may be a saddle.
+The plan of lower cost is refined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ocp.console import interruptible, report, shown_progress, time_left, time_limited
+from ocp.direct.discretisation import Collocation, MultipleShooting
+from ocp.direct.guess import guessed_names
+from ocp.direct.prepared import DirectMethod, Prepared
+from ocp.errors import SolveError, checked_time_limit, require
+from ocp.methods import descend
+from ocp.problem.formulation import Formulation
+from ocp.problem.problem import Problem
+from ocp.refinement import RefinementSettings, refine
+from ocp.solution import ByName, Guess, Solution
+from ocp.tolerances import SOLVER_SHARE
+
+__all__ = ["AdaptiveCollocation", "default_method"]
+
+FIRST_MESHES: tuple[DirectMethod, ...] = (
+    Collocation(12), Collocation(20), MultipleShooting(40, steps=2), Collocation(40), Collocation(120, 4)
+)  # fmt: skip
+"""First meshes in the order in which they are tried. Shooting holds the dynamics at every iterate of its integrator."""
+FIRST_OPTIONS = {"max_iter": 500}
+"""Options of the solver on the first meshes: a start that succeeds there takes tens to a few hundred iterations."""
+FIRST_STARTS = ("guess", "displaced guess")
+
+
+@dataclass(frozen=True)
+class AdaptiveCollocation:
+    """Collocation on a mesh that is chosen and refined until the cost is known; the method of ``solve(problem)``.
+
+    Attributes:
+        accuracy: Accuracy of the cost: largest relative cost that the controls may lose, and largest relative
+            integration error.
+        max_intervals: Maximum number of intervals.
+        progress: As of :func:`ocp.motion.plan.plan`: a function that is called with the name of each stage, True for a
+            line on the terminal, False for nothing; None shows the line after two seconds.
+
+    Raises:
+        ProblemError: accuracy is not between 0 and 1, or max_intervals is no positive integer.
+    """
+
+    accuracy: float = SOLVER_SHARE
+    max_intervals: int = 400
+    progress: Callable[[str], Any] | bool | None = None
+
+    def __post_init__(self) -> None:
+        require.positive("AdaptiveCollocation: accuracy", self.accuracy, below=1.0)
+        least = max(mesh.intervals for mesh in FIRST_MESHES)
+        require.count("AdaptiveCollocation: max_intervals", self.max_intervals, least=least)
+
+    def prepare(
+        self,
+        problem: Problem,
+        *,
+        solver: str = "ipopt",
+        options: ByName = None,
+        compiled: bool = False,
+        scaling: bool = True,
+    ) -> AdaptiveProblem:
+        """Return the problem with the options of its solves; see :func:`ocp.methods.prepare`.
+
+        ``compiled`` and ``scaling`` apply to the first mesh, where most of the iterations take place.
+        """
+        own = require.mapping("options", options)
+        return AdaptiveProblem(problem, self, own, {"solver": solver, "compiled": compiled, "scaling": scaling})
+
+
+def default_method() -> AdaptiveCollocation:
+    """Return the method by which :func:`ocp.methods.solve` solves a problem without a method."""
+    return AdaptiveCollocation()
+
+
+class AdaptiveProblem:
+    """A problem that adaptive collocation solves, on as many meshes as it takes."""
+
+    def __init__(
+        self, problem: Problem, method: AdaptiveCollocation, options: dict[str, Any], how: dict[str, Any]
+    ) -> None:
+        self.problem, self.method, self.formulation = problem, method, Formulation.of(problem)
+        self._options, self._how = options, how
+
+    @interruptible
+    def solve(
+        self, parameters: ByName = None, guess: Guess = None, check: bool = True, *, time_limit: float | None = None
+    ) -> Solution:
+        """Solve the problem, refine its mesh, and return the last plan; its ``refinement`` records the rounds.
+
+        Args:
+            parameters, guess, time_limit: As of :func:`ocp.methods.solve`.
+            check: Without effect: every solve on the way is checked.
+
+        Raises:
+            SolveError: No plan on any of the first meshes; states what each solve ended with, and what to try.
+
+        Warns:
+            RefinementWarning: As of :func:`ocp.refinement.refine`.
+        """
+        title = f"solve {self.problem.name!r}"
+        with time_limited(checked_time_limit(time_limit)), shown_progress(title, self.method.progress):
+            ends: list[str] = []
+            best: Solution | None = None
+            for mesh in FIRST_MESHES:
+                plan = self._first_plan(mesh, parameters, (guess, best), ends)
+                if plan is not None and plan.success:
+                    best = plan
+                    try:
+                        return self._refined(mesh, plan, parameters)
+                    except SolveError as error:
+                        ends.append(f"{_label(mesh)}, refined: {str(error).splitlines()[0]}")
+                if time_left() <= 0:
+                    break
+            if best is not None:
+                return best
+            raise self._failure(parameters, guess, ends)
+
+    def _refined(self, mesh: DirectMethod, plan: Solution, parameters: ByName) -> Solution:
+        """Return the plan of a first mesh after refinement by collocation."""
+        report(f"refining a plan of cost {plan.cost:.6g}")
+        settings = RefinementSettings(
+            limits={"lost": self.method.accuracy}, max_intervals=self.method.max_intervals, solver=self._how["solver"]
+        )
+        options = {"max_iter": FIRST_OPTIONS["max_iter"], **self._options}
+        result = refine(
+            self.problem,
+            mesh if isinstance(mesh, Collocation) else Collocation(mesh.intervals),
+            tolerance=self.method.accuracy,
+            parameters=parameters,
+            options=options,
+            guess=plan,
+            settings=settings,
+        )
+        return replace(result, start=plan.start)
+
+    def _first_plan(
+        self, mesh: DirectMethod, parameters: ByName, guesses: tuple[Guess, Solution | None], ends: list[str]
+    ) -> Solution | None:
+        """Return the plan of lowest cost to which the starts on a first mesh lead; None if all of them fail.
+
+        ``guesses`` are the user's, and the plan of a coarser mesh, if any. How each start ended is added to ``ends``.
+        """
+        prepared = mesh.prepare(self.problem, options={**FIRST_OPTIONS, **self._options}, **self._how)
+        starts: list[tuple[str, Guess]] = [(start, guesses[0]) for start in FIRST_STARTS]
+        if guesses[1] is not None:
+            starts = [("guess", guesses[1]), *starts]
+        plans = []
+        for start, guess in starts:
+            report(f"{_label(mesh)} from the {start}")
+            try:
+                plan = prepared.solve(parameters, guess, check=False, start=start)
+            except SolveError as error:
+                ends.append(f"{_label(mesh)} from the {start}: {str(error).splitlines()[0]}")
+                continue
+            ends.append(f"{_label(mesh)} from the {start}: {plan.status} after {plan.iterations} iterations")
+            if plan.success:
+                plans.append(_descended(prepared, plan))
+            elif time_left() <= 0:
+                break
+        return min(plans, key=lambda plan: plan.cost, default=None)
+
+    def _failure(self, parameters: ByName, guess: Guess, ends: list[str]) -> SolveError:
+        """Return the error that no first mesh has a plan, with the conflicting constraints that a last solve finds."""
+        lines = [f"problem {self.problem.name!r} has no plan on any of the meshes tried"]
+        try:
+            Collocation(20).prepare(self.problem, options=FIRST_OPTIONS).solve(parameters, guess)
+            cause = SolveError()
+        except SolveError as error:
+            cause = error
+            lines += str(error).splitlines()
+        unknown = [name for name in self.formulation.states if name not in guessed_names(self.formulation, guess)]
+        hint = f" states {', '.join(unknown)} have no guess" if unknown else ""
+        free = self.formulation.horizon_is_free and "horizon" not in guessed_names(self.formulation, guess)
+        hint += ", the free horizon has none either" if free else ""
+        advice = (
+            f"give a guess ({hint.strip(', ')}), bounds on both sides of what may grow without bound" if hint else ""
+        )
+        lines += [*ends, advice or "give another guess, or a method: solve(problem, Collocation(...), guess=...)"]
+        details = {"name": cause.name, "value": cause.value, "limit": cause.limit, "time": cause.time}
+        return SolveError("\n".join(lines), cause.solution, cause.conflicts, **details)
+
+
+def _label(mesh: DirectMethod) -> str:
+    return f"{type(mesh).__name__}({mesh.intervals})"
+
+
+def _descended(prepared: Prepared, plan: Solution) -> Solution:
+    """Return the plan, or one of lower cost next to it if it is a saddle; the plan itself if none is found."""
+    try:
+        return descend(prepared, plan) if plan.regularised else plan
+    except SolveError:
+        return plan

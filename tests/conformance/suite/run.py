@@ -1,0 +1,187 @@
+"""One problem of a suite: solved, refined, audited, confirmed by a second method, and solved by rockit.
+
+Each problem is done by a process of its own, forked from one that has solved a problem, so that seconds contain no
+imports. It sends what it has after every stage: what a limit of processor time ends leaves the stages before it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import os
+import resource
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ocp import Collocation, Indirect, MultipleShooting, Problem, RefinementSettings, Solution, refine, solve
+
+from .entry import Entry, Method
+
+MOST_SECONDS = 100
+"""Of the processor for all stages of a problem; what is not done by then stays out."""
+FINER = 4
+"""How many times as many intervals as the given mesh a refined one may have."""
+DEVIATION = 1e-4
+"""Relative deviation from a printed cost that counts as agreement, if its digits promise no less."""
+SHARE = 0.1
+"""Of a deviation from a printed cost, the most by which two methods may differ that confirm it."""
+Row = dict[str, Any]
+
+
+def refined(problem: Problem, method: Method) -> Solution:
+    """The plan on a mesh that is refined by its audits; by the minimum principle where that is the method."""
+    if isinstance(method, Indirect):
+        return solve(problem, method)
+    settings = RefinementSettings(max_intervals=FINER * method.intervals)
+    return refine(problem, method, settings=settings)
+
+
+def confirmed(entry: Entry, first: Solution) -> Row:
+    """Cost by the second method from the guess of the problem; from the first plan if that ends elsewhere."""
+    row: Row = {"second": named(entry.second), "second_start": "guess"}
+    try:
+        cost = refined(entry.build(), entry.second).cost
+    except Exception as error:  # the first plan is another start
+        cost = math.nan
+        row["second_failed"] = words(error)
+    if not digits(first.cost, cost) >= 2 and not isinstance(entry.second, Indirect):
+        row |= {"second_start": "first plan", "second_from_guess": cost}
+        try:
+            cost = solve(entry.build(), entry.second, guess=first).cost
+        except Exception as error:
+            row["second_failed"] = words(error)
+    return row | {"second_cost": cost, "digits": digits(first.cost, cost)}
+
+
+def digits(one: float, other: float) -> float:
+    """How many leading digits two costs have in common; absolute where they are less than 1e-6; nan without one."""
+    if not math.isfinite(one) or not math.isfinite(other):
+        return math.nan
+    size = max(abs(one), abs(other))
+    return min(-math.log10(max(abs(one - other) / (size if size > 1e-6 else 1.0), 1e-15)), 15.0)
+
+
+def verdict(cost: float, printed: float | str | None, second: float) -> str:
+    """What the cost says of a printed one: "agrees", "below" or "above" if both methods say so, else "open".
+
+    Without a printed cost "confirmed" or "open", by whether both methods agree within DEVIATION.
+    """
+    if printed is None:
+        return "confirmed" if digits(cost, second) >= -math.log10(DEVIATION) else "open"
+    published = float(printed)
+    if abs(cost - published) <= max(DEVIATION * abs(published), last_digit(printed) / 2, 1e-9):
+        return "agrees"
+    if not abs(cost - second) <= SHARE * abs(cost - published):
+        return "open"
+    return "below" if cost < published else "above"
+
+
+def last_digit(number: float | str) -> float:
+    """The unit of the last digit of a number as it is printed."""
+    mantissa, _, exponent = str(number).partition("e")
+    return float(10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2])))
+
+
+def named(method: Method) -> str:
+    """Scheme, degree and number of intervals."""
+    if isinstance(method, Collocation):
+        return f"{method.scheme} {method.degree}, {method.intervals}" + ", held" * (method.control == "held")
+    if isinstance(method, MultipleShooting):
+        return f"shooting, {method.intervals}, {method.control}"
+    return "minimum principle"
+
+
+def words(error: Exception) -> str:
+    """The kind of an error and the first line of what it says."""
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"[:200]
+
+
+def stages(entry: Entry) -> list[Callable[[Row, dict[str, Any]], Row]]:
+    """What is done for a problem, in order; each takes the row so far and what stages hand on, and adds to the row."""
+
+    def solved(row: Row, kept: dict[str, Any]) -> Row:
+        began = time.process_time()
+        kept["plan"] = plan = solve(entry.build(), entry.method)
+        seconds = time.process_time() - began
+        return {"method": named(entry.method), "cost": plan.cost, "seconds": seconds, "iterations": plan.iterations}
+
+    def finer(row: Row, kept: dict[str, Any]) -> Row:
+        began = time.process_time()
+        with contextlib.suppress(Exception):
+            kept["plan"] = plan = refined(entry.build(), entry.method)
+            row |= {"refined_cost": plan.cost, "intervals": plan.method["intervals"]}
+        return {"refined_seconds": time.process_time() - began}
+
+    def audited(row: Row, kept: dict[str, Any]) -> Row:
+        audit = kept["plan"].audit()
+        failed = "; ".join(finding.name for finding in audit.failures)
+        reason = failed or ("" if audit.optimal is True else str(audit.undecided or ""))
+        return {"feasible": audit.feasible, "optimal": audit.optimal, "reason": reason[:300]}
+
+    def again(row: Row, kept: dict[str, Any]) -> Row:
+        cost = kept["plan"].cost
+        second = confirmed(entry, kept["plan"])
+        printed = next(iter(entry.published.values()), None)
+        return second | {"verdict": verdict(cost, printed, second["second_cost"])}
+
+    def peer(row: Row, kept: dict[str, Any]) -> Row:
+        if not isinstance(entry.method, Collocation):
+            return {"rockit_failed": "not posed: a mesh of shooting"}
+        from .peer import rockit_cost
+
+        began = time.process_time()
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):
+                cost = rockit_cost(entry.build(), entry.method)
+        except Exception as error:
+            return {"rockit_failed": words(error), "rockit_seconds": time.process_time() - began}
+        return {"rockit_cost": cost, "rockit_seconds": time.process_time() - began}
+
+    return [solved, finer, audited, again, peer]
+
+
+def warm_up(known: Mapping[str, Entry]) -> None:
+    """Solve a problem by every tool, so that what they import is there."""
+    warnings.simplefilter("ignore")
+    entry = known["mineng_di"]
+    solve(entry.build(), entry.method).audit()
+    with contextlib.suppress(Exception), contextlib.redirect_stdout(io.StringIO()):
+        from .peer import rockit_cost
+
+        rockit_cost(entry.build(), Collocation(2, 2))
+
+
+def done(entry: Entry) -> Row:
+    """All stages of a problem, in a process of its own."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS + 5))
+        with os.fdopen(writer, "w") as sink:
+            _stages(entry, lambda row: print(json.dumps(row), file=sink, flush=True))
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as source:
+        lines = source.read().splitlines()
+    os.waitpid(child, 0)
+    rows = [json.loads(line) for line in lines if line.endswith("}")]
+    return rows[-1] if rows else {"failed": f"no plan within {MOST_SECONDS} s of the processor"}
+
+
+def _stages(entry: Entry, send: Callable[[Row], None]) -> None:
+    """Do every stage and send the row so far after each."""
+    row: Row = {"name": entry.name}
+    kept: dict[str, Any] = {}
+    for stage in stages(entry):
+        try:
+            row |= stage(row, kept)
+        except Exception as error:
+            row["failed"] = f"{stage.__name__}: {words(error)}"
+            if "plan" not in kept:
+                break
+        send(row)
+    send(row)
