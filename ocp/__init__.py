@@ -61,6 +61,7 @@ __version__ = "0.1.0"
 _register("audit", "ocp.audit.audit")
 _register("default_method", "ocp.adaptive")
 _register("sensitivity", "ocp.direct.sensitivity")
+_register("margin_of_plan", "ocp.motion.result.margin")
 _register("load_plan", "ocp.motion.plan.dispatch")
 for _drawing in ("plot_solution", "html_of_solution", "plot_plan", "html_of_plan"):
     _register(_drawing, "ocp.app.view.plots")

@@ -27,6 +27,7 @@ from ocp.app.subcommands import (
     run_check,
     run_completion,
     run_export,
+    run_margin,
     run_plan,
     run_report,
     run_view,
@@ -199,6 +200,14 @@ REPORT = """Write one HTML file about a plan: the verdict in a sentence, picture
 units. The file loads nothing from another host."""
 REPORT_EXAMPLES = """examples:
   selfmotion report seam.npz seam.html --title "Seam 4, cell 2\""""
+MARGIN = """Print how far payload, friction and placements may differ from the model of a plan until it violates a limit
+of torque, power, ground reaction, clearance or deviation of the tip: each alone, and all together.
+
+The exit status is 0 if the plan covers all sizes given by --size at once. Names: payload (kg), friction (share of the
+torque limits), base-position, obstacle-position and tool-offset (m, in any direction)."""
+MARGIN_EXAMPLES = """examples:
+  selfmotion margin seam.npz
+  selfmotion margin seam.npz --size payload=1.5 --size base-position=0.004 --tolerance 0.005"""
 VIEW = """Show motions: the robot with its meshes, the required and the actual path, frames, ghosts, curves of joints
 and torques with their limits, cost, manipulability, momentum or zero moment point, the closest bodies, and the audit.
 
@@ -267,6 +276,12 @@ def subcommands(parser: argparse.ArgumentParser) -> None:
     _force(report)
     report.add_argument("--period", type=float, default=0.01, metavar="S", help="sampling period, s (default: 0.01)")
     report.add_argument("--title", help="title of the report (default: the robot and the plan's file)")
+    margin = _command(commands, "margin", "how far the model may be wrong", MARGIN, MARGIN_EXAMPLES, run_margin)
+    _file(margin, "plan", "file of a plan (.npz)")
+    size: dict[str, Any] = {"type": _named_number, "action": "append", "default": [], "metavar": "NAME=VALUE"}
+    margin.add_argument("--size", **size, help="size that the plan shall cover; repeatable")
+    margin.add_argument("--tolerance", type=float, metavar="M", help="allowed deviation of the tip, m (default: any)")
+    margin.set_defaults(called={"tolerance=...": "--tolerance M"})
     view = _command(commands, "view", "play motions in a browser", VIEW, VIEW_EXAMPLES, run_view)
     _file(view, "plan", "file of a plan, or of a solution with --robot (.npz)")
     _file(view, "beside", "plans, or trajectories of the same robot, to compare with it", nargs="*", default=[])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import cos, pi
 from pathlib import Path
@@ -337,6 +337,24 @@ def checked_shape(label: str, value: Any) -> Shape:
         names = ", ".join(kind.__name__ for kind in KINDS)
         raise require.invalid(label, f"a shape ({names})", value, names)
     return value
+
+
+def enlarge_shape(shape: Shape, by: float) -> Shape:
+    """Return a shape of the same kind that contains all points within a distance (m) of a shape.
+
+    Raises:
+        ModelError: The shape is a mesh.
+    """
+    if isinstance(shape, HalfSpace):
+        return replace(shape, point=shape.point + by * np.asarray(shape.normal))
+    if isinstance(shape, Box):
+        return replace(shape, size=shape.size + 2 * by)
+    if isinstance(shape, Mesh):
+        message = "a mesh cannot be enlarged; enclose it in boxes, capsules or cylinders"
+        raise ModelError(message, name="obstacles", value=shape)
+    if isinstance(shape, Cylinder):
+        return replace(shape, radius=shape.radius + by, length=shape.length + 2 * by)
+    return replace(shape, radius=shape.radius + by)
 
 
 def _checked_position(value: ArrayInput, owner: str, what: str = "position") -> Array:

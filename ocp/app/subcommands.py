@@ -128,6 +128,16 @@ def run_report(options: argparse.Namespace, progress: Progress) -> tuple[int, st
     return (0 if report.passed else 1), f"{report.verdict}\nwritten: {options.file}", data
 
 
+def run_margin(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
+    """Run `selfmotion margin`: print how far payload, friction and placements may differ from the model of a plan."""
+    plan = Plan.load(options.plan)
+    progress("margin")
+    margin = plan.margin({name.replace("-", " "): size for name, size in options.size}, options.tolerance)
+    alone = {name: each._asdict() for name, each in margin.alone.items()}
+    data = {"covers": margin.covers_stated, "sentence": margin.sentence, "together": margin.together, "alone": alone}
+    return (0 if margin.covers_stated else 1), str(margin), data
+
+
 def run_view(options: argparse.Namespace, progress: Progress) -> tuple[int, str, Any]:
     """Run `selfmotion view`: write or serve an HTML page that shows motions."""
     if options.page is not None:
@@ -271,10 +281,12 @@ def run_task(
     write(result, outputs)
     hint = "no file is written: give -o FILE.npz, or [output] in the task file"
     written = [f"written: {file}" for file in outputs.values()] or [hint]
-    lines = [str(result), f"The plan {audit.sentence}.", *written]
+    margin = result.margin().sentence if audit.passed else ""
+    lines = [str(result), f"The plan {audit.sentence}.", *([f"It {margin}."] if margin else []), *written]
     data = {
         "passed": audit.passed,
         "verdict": audit.sentence,
+        "margin": margin,
         "cost": result.cost,
         "bound": result.bound,
         "duration": result.horizon,

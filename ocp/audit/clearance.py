@@ -14,7 +14,7 @@ function of time is bounded over each whole interval, kinks and jumps included (
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import comb
 from typing import NamedTuple
@@ -162,6 +162,24 @@ def clearance(form: Formulation, apart: Separation, solution: Solution, p: np.nd
         p: Parameters. Shape (np,).
     """
     return clearance_along(apart, _track_of(form, apart, solution, p) if len(apart) else None)
+
+
+def clearance_of_pairs(problem: Problem, solution: Solution, name: str, pairs: Sequence[int]) -> Clearance:
+    """Return the `clearance` of some pairs of bodies of a separation constraint, whose bound is tight for the closest.
+
+    Args:
+        problem: The problem.
+        solution: A plan of the problem.
+        name: Name of the separation constraint.
+        pairs: Indices of the pairs.
+
+    Raises:
+        ProblemError: The plan does not belong to the problem.
+    """
+    form = Formulation.of(problem)
+    check_variables_match(form, solution)
+    p = form.parameter_vector(solution.parameters)
+    return clearance(form, problem.declared.apart[name].of(pairs), match_order(form, solution), p)
 
 
 def clearance_along(apart: Separation, track: Track | None, settings: ProofSettings = ProofSettings()) -> Clearance:

@@ -379,10 +379,12 @@ class PlanVerdict:
     Attributes:
         audit: Audit of the plan against its problem.
         check: Check of the plan's samples against the machine's limits of joints, velocities and torques.
+        margin: What the plan withstands, as a sentence with the plan as its subject; "" for a plan that fails.
     """
 
     audit: Audit
     check: Check
+    margin: str = ""
 
     @property
     def passed(self) -> bool:
@@ -400,7 +402,7 @@ class PlanVerdict:
 
 
 def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> PlanVerdict:
-    """Audit a plan, and check samples of the plan against the limits of the machine.
+    """Audit a plan, check samples of the plan against the limits of the machine, and evaluate its margin.
 
     Args:
         plan: The plan.
@@ -408,7 +410,8 @@ def verdict_of(plan: Plan, sample: PlanSample, name: str, **settings: Any) -> Pl
         name: Name of the plan.
         settings: Settings of the audit.
     """
-    return PlanVerdict(plan.audit(**settings), _check(plan, sample, name))
+    verdict = PlanVerdict(plan.audit(**settings), _check(plan, sample, name))
+    return replace(verdict, margin=plan.margin().sentence) if verdict.passed else verdict
 
 
 def _check(plan: Plan, sample: PlanSample, name: str) -> Check:

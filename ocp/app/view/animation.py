@@ -416,7 +416,8 @@ def _audit_verdict(solutions: Sequence[Solution], judge: Callable[[], Audit | Pl
     verdict = judge()
     audit = verdict.audit if isinstance(verdict, PlanVerdict) else verdict
     rows = sorted(audit_rows(audit), key=lambda row: -row.urgency)
-    return {"verdict": f"The plan {verdict.sentence}.", "passed": verdict.passed, "rows": tuple(rows)}
+    margin = f" It {verdict.margin}." if isinstance(verdict, PlanVerdict) and verdict.margin else ""
+    return {"verdict": f"The plan {verdict.sentence}.{margin}", "passed": verdict.passed, "rows": tuple(rows)}
 
 
 def _problem_curves(solution: Solution, fractions: Array, times: Array) -> list[Curve]:

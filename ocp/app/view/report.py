@@ -195,7 +195,7 @@ def report_of_plan(plan: Plan, period: float, title: str) -> Report:
     count = [f"{len(plan.candidates)} candidates"] if len(plan.candidates) > 1 else []
     return Report(
         title,
-        f"The plan {verdict.sentence}.",
+        f"The plan {verdict.sentence}." + (f" It {verdict.margin}." if verdict.margin else ""),
         verdict.passed,
         (robot.name, f"{plan.horizon:.5g} s", f"{robot.dof} joints", cost, *count),
         tuple(str(fault) for fault in check.faults),

@@ -153,12 +153,14 @@ def clearance_of(
     rates: Array,
     seconds: Array,
     smooth: bool,
+    pairs: Sequence[int] | None = None,
 ) -> Clearance:
     """Prove the clearance of each pair of bodies during a motion of a machine on a fixed base among fixed obstacles.
 
     Args:
         joints: Function of fractions of the horizon (M,) that returns joint positions (M, n).
         breaks, horizon, rates, seconds, smooth: Properties of this function, see `ocp.audit.clearance.Track`.
+        pairs: Indices of the only pairs that count; all if None.
 
     Raises:
         ModelError: A prismatic joint has no limits.
@@ -180,7 +182,7 @@ def clearance_of(
     )
     sampler = Sampler([q], [placements])
     frames = Track(breaks, horizon, rates, seconds, smooth, lambda at: frames_of(sampler(joints(at))[0]))
-    return clearance_along(separation, frames)
+    return clearance_along(separation if pairs is None else separation.of(pairs), frames)
 
 
 def _check_limits(scene: CollisionScene, joints: Variable) -> None:

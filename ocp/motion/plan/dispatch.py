@@ -7,10 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
-from models import FixedBase, FreeFloating, Machine, Standing
+import numpy as np
+
+from models import FixedBase, FreeFloating, Machine, MovingObstacle, Standing
 from models.checks import NOT_NUMBERS, check_entries
+from models.shapes.shapes import checked_shape, enlarge_shape
 from ocp.console import TimeLimitReached, interruptible, shown_progress, time_limited
-from ocp.errors import ProblemError, SolveError, checked_time_limit, require
+from ocp.errors import ProblemError, SolveError, checked_time_limit, problem_errors, require
 from ocp.motion.builders.clearance import ClearanceConstraints
 from ocp.motion.builders.dynamics import DynamicsSetup, dynamics_problem
 from ocp.motion.builders.dynamics_plan import dynamics_phases
@@ -32,9 +35,11 @@ from ocp.motion.plan.declared_plans import (
 from ocp.motion.plan.planner import PlanOptions, checked_request, clearance_for, plan_request
 from ocp.motion.plan.sequence import plan_consecutive, plan_in_segments
 from ocp.motion.plan.waypoints import plan_path
+from ocp.motion.result.margin import LOADS, checked_uncertainty, tightened_torques
 from ocp.motion.result.path_plan import PathPlan
 from ocp.motion.result.plan import Plan
-from ocp.motion.result.segmented_plan import SegmentedPlan, SequencePlan
+from ocp.motion.result.request import RESERVE, request_of
+from ocp.motion.result.segmented_plan import ConsecutivePlans, SegmentedPlan, SequencePlan
 from ocp.motion.result.solved_plan import PHASED, PhasedPlan, SolvedPlan
 from ocp.motion.tasks.goals import Cost, Goal, Scene, Start, Waypoints
 from ocp.motion.tasks.limits import Limits
@@ -44,6 +49,8 @@ from ocp.storage import read_arrays
 
 __all__ = ["Search", "load_plan", "plan", "plan_problem"]
 
+MAX_TIGHTENINGS = 6
+"""Largest number of motions that are planned, each with tighter torque limits, until one covers its uncertainties."""
 Search: TypeAlias = Literal["start", "configurations", "global", "segments"]
 Parts: TypeAlias = Sequence[Goal | TipTask | Sequence[TipTask]]
 Tasks: TypeAlias = TipTask | Goal | Waypoints | Steps | Capture | Sequence[TipTask] | Sequence[Goal] | Parts
@@ -87,6 +94,8 @@ def plan(
         limits: Limits of joint positions and rates; the robot's own if None. Limits of acceleration, jerk, torque or
             power, if given, hold at all times together with the robot's own torque limits, at the same cost (see
             `plan.actuators`). Rates are then continuous, and the joints rest at the start or the end if the tips do.
+            With `robust`, the plan's margin covers these sizes: obstacles are enlarged by the sum of all misplacements,
+            and torque limits are tightened until the torques that payload and friction add fit in.
         scene: Obstacles, the clearance that is kept from them and between links, and external wrenches; None: the links
             of the machine do not touch. False: collisions are not checked.
         search: "start": from the given start, or from the best conditioned solution of inverse kinematics.
@@ -118,7 +127,10 @@ def plan(
     require.count("seed", seed, 0, LARGEST_SEED)
     with time_limited(checked_time_limit(time_limit)), shown_progress("plan", progress):
         try:
-            return _plan(machine, tasks, horizon, scene, PlanOptions(start, cyclic, cost, limits, search, seed))
+            options = PlanOptions(start, cyclic, cost, limits, search, seed)
+            if isinstance(limits, Limits) and limits.robust is not None:
+                return _plan_robustly(machine, tasks, horizon, scene, options)
+            return _plan(machine, tasks, horizon, scene, options)
         except TimeLimitReached as error:
             if time_limit is None:  # that of an outer call
                 raise
@@ -168,6 +180,59 @@ def _plan(machine: Machine, tasks: Any, horizon: Any, scene: Any, options: PlanO
         return plan_to_stand(machine, tasks, horizon, options, constraints=constraints, wrenches=wrenches)
     request = checked_request(machine, tasks, horizon, options)
     return plan_request(replace(request, clearance_constraints=constraints))
+
+
+def _plan_robustly(machine: Machine, tasks: Any, horizon: Any, scene: Any, options: PlanOptions) -> Plan:
+    """Plan with enlarged obstacles and tightened torque limits until the margin of the plan covers the uncertainties.
+
+    Raises:
+        SolveError: No such plan was found; names the limit that is violated first.
+    """
+    limits = replace(options.limits, robust=None)
+    sizes = {name: size for name, size in checked_uncertainty(options.limits.robust).items() if size is not None}
+    if isinstance(tasks, Waypoints) or not sizes:
+        words = "limits: robust needs the sizes of uncertainties, and tasks with times; for a path through waypoints, "
+        words += "add the misplacement of its obstacles to Scene(clearance=...)"
+        raise ProblemError(words, name="robust", value=options.limits.robust)
+    torque = limits.bounds(machine).torque
+    reserve = {"distance": sum(size for name, size in sizes.items() if name not in LOADS), "torque": torque}
+    if isinstance(scene, Scene) and reserve["distance"]:
+        by = reserve["distance"]
+        single = not isinstance(scene.obstacles, list | tuple)
+        obstacles: Any = (scene.obstacles,) if single else scene.obstacles
+        with problem_errors():
+            enlarged = [
+                replace(each, shape=enlarge_shape(each.shape, by))
+                if isinstance(each, MovingObstacle)
+                else enlarge_shape(checked_shape("scene: obstacle", each), by)
+                for each in obstacles
+            ]
+        scene = replace(scene, obstacles=enlarged)
+    tightened = torque
+    for _ in range(MAX_TIGHTENINGS):
+        own = limits if tightened is torque else replace(limits, torque=tightened)
+        try:
+            result = _plan(machine, tasks, horizon, scene, replace(options, limits=own))
+        except SolveError as error:
+            words = (
+                f"obstacles enlarged by {reserve['distance']:g} m and torque limits {tightened.tolist()} leave room "
+            )
+            words += f"for the uncertainties, but {error}"
+            fields = {key: getattr(error, key) for key in ("name", "value", "limit", "time")}
+            raise SolveError(words, error.solution, **fields) from error
+        parts = [piece.plan for piece in result.pieces] if isinstance(result, ConsecutivePlans) else [result]
+        for problem in (part.solution.problem for part in parts):
+            if (request := request_of(problem)) is not None:
+                problem.origin = replace(request, arguments={**request.arguments, RESERVE: reserve})
+        margin = result.margin(sizes)
+        if margin.covers_stated:
+            return result
+        lower = tightened_torques(result, sizes)
+        if not lower:
+            break
+        tightened = np.minimum(tightened, [lower.get(name, np.inf) for name in machine.robot.joint_names])
+    words = f"no motion keeps all limits for the stated uncertainties: the best one found {margin.sentence}"
+    raise SolveError(words, name=margin.factor.limit, value=margin.factor.size, limit=1.0, time=margin.factor.time)
 
 
 def _are_separate(goals: Sequence[Any]) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -130,8 +130,11 @@ class PathPlan(Plan):
 
     # ---- audit -------------------------------------------------------------------------------------------------------
 
-    def clearance(self) -> Clearance | None:
-        """Return the proven clearance between waypoints, except in reconfigurations; None if clearance is unchecked."""
+    def clearance(self, pairs: Sequence[int] | None = None) -> Clearance | None:
+        """Return the proven clearance between waypoints, except in reconfigurations; None if clearance is unchecked.
+
+        `pairs` are the indices of the only pairs of bodies that count; all count if it is None.
+        """
         if self.constraints is None:
             return None
         t, horizon = self.t, self.horizon
@@ -144,7 +147,7 @@ class PathPlan(Plan):
             ends = t[interval + np.where(waiting, 0, 1)]
             return self._values_at("joints", np.clip(fractions * horizon, t[interval], ends))
 
-        bounds: dict[str, Any] = {"rates": rates, "seconds": np.zeros_like(rates), "smooth": False}
+        bounds: dict[str, Any] = {"rates": rates, "seconds": np.zeros_like(rates), "smooth": False, "pairs": pairs}
         return clearance_of(self.constraints.scene, joints_at, breaks, horizon, **bounds)
 
     def _audit(self, **settings: Any) -> Audit:

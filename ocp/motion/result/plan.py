@@ -218,6 +218,30 @@ class Plan(ABC):
         """Return the unit of a joint's position."""
         return ("rad", "m")[self.machine.robot.moving_joints[joint].kind == "prismatic"]
 
+    def margin(self, uncertainty: Mapping[str, Any] | None = None, tolerance: float | None = None) -> Any:
+        """Return how far payload, friction and placements may differ from the model before the plan breaks a limit.
+
+        The joints move as planned. Limits are those of torque and power, of the ground reaction of a standing machine,
+        the clearances that the plan keeps, and the tolerance of the tip. See `ocp.motion.result.margin`.
+
+        Args:
+            uncertainty: By name, the size to cover at once with the others, or (0, size), or None for as much as
+                possible; None: all that a limit of the plan depends on, as much as possible. The names are "payload"
+                (kg, a point mass at the tip, besides what the robot carries), "friction" (Coulomb friction in any
+                direction in all joints, as a share of their torque limits), "base position", "obstacle position" (of
+                each obstacle) and "tool offset" (of the tip and of the shapes of the link that carries it), which are
+                misplaced by up to a distance, m, in any direction. Pairs of bodies that the plan does not check, such
+                as an immobile link and an obstacle, do not count.
+            tolerance: Allowed deviation of the tip from its planned position, m; None: unlimited.
+
+        Returns:
+            The `ocp.motion.result.margin.Margin`, whose text states the largest sizes.
+
+        Raises:
+            ProblemError: An unknown name, a size that is not positive, or no limit of the plan depends on a named one.
+        """
+        return call_registered("margin_of_plan", self, uncertainty, tolerance)
+
     @property
     def audits(self) -> tuple[Audit, ...]:
         """Cached audits, in the order in which they were made."""

@@ -62,7 +62,7 @@ from ocp.problem.problem import Problem
 from ocp.problem.record_reader import RECORD_ERRORS, FunctionReader
 from ocp.problem.record_writer import FunctionWriter
 
-__all__ = ["MotionRequest", "declared_motion", "request_of", "restored_request", "stored_request"]
+__all__ = ["RESERVE", "MotionRequest", "declared_motion", "request_of", "restored_request", "stored_request"]
 
 SHAPES = (Box, Capsule, Cylinder, HalfSpace, Mesh, Sphere)
 PARTS = (Robot, Link, Joint, Mimic, CollisionShape, VisualShape, Support)
@@ -72,6 +72,9 @@ DYNAMICS = (Actuation, ClearanceConstraints, JointFriction, DynamicsSetup, Captu
 ARGUMENTS = (TipTask, Goal, Start, Limits, Cost, *DYNAMICS, *STANDING, *STEPS)
 MACHINES = (FixedBase, FreeFloating, Standing, Stance)
 KINDS = {kind.__name__: kind for kind in (*MACHINES, *PARTS, *SHAPES, *ARGUMENTS, MovingObstacle, Body)}
+RESERVE = "reserve"
+"""Name among the arguments of a request under which robust plans store by how much the problem is stricter than the
+plan must be: the "distance" by which obstacles are enlarged, m, and the "torque" limits of the joints, shape (n,)."""
 SYMBOLS = {"SX": ca.SX, "MX": ca.MX}
 TRACKS = {TipTask: ("velocity", "position", "orientation", "direction"), MovingObstacle: ("position", "rotation")}
 """Fields of tasks and moving obstacles that may be functions of time."""
@@ -93,7 +96,7 @@ class MotionRequest:
     Attributes:
         builder: Name of the builder in BUILDERS.
         arguments: Arguments of the builder, by name. All but the tasks are for the machine with the joints in "held"
-            locked at these positions.
+            locked at these positions. RESERVE is no argument of the builder.
     """
 
     builder: str
@@ -125,7 +128,8 @@ class MotionRequest:
         Raises:
             ProblemError: As the builder.
         """
-        problem: Problem = BUILDERS[self.builder](**self.arguments)
+        arguments = {name: value for name, value in self.arguments.items() if name != RESERVE}
+        problem: Problem = BUILDERS[self.builder](**arguments)
         problem.origin = self
         return problem
 

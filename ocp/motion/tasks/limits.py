@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias, get_args
 from warnings import warn
@@ -261,6 +261,8 @@ class Limits:
         vertical_force: Least vertical ground force on a standing machine, N; None for a tenth of its weight.
         friction: Friction coefficient of the ground.
         zmp: Rule for the zero moment point of a standing machine; None keeps it inside the foot.
+        robust: Sizes of uncertainties for which a plan must keep all limits, by name as in `Plan.margin`; only `plan`
+            takes them.
 
     Raises:
         ProblemError: A limit is not positive.
@@ -275,6 +277,7 @@ class Limits:
     vertical_force: float | None = None
     friction: float = np.inf
     zmp: ZmpRule | None = None
+    robust: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         for kind in LIMITED:
@@ -312,6 +315,9 @@ class Limits:
         Warns:
             ModelWarning: A used limit is not set here and 0 in the robot description, so that the joints are unlimited.
         """
+        if self.robust is not None:
+            words = "limits: robust is taken by plan alone; leave it out here, and see Plan.margin"
+            raise ProblemError(words, name="robust", value=self.robust)
         robot, n = machine.robot, machine.joint_size
         inf = np.full(n, np.inf)
         values = {"velocity": robot.velocity, "acceleration": inf, "jerk": inf, "torque": robot.effort, "power": inf}

@@ -10,9 +10,7 @@ import pytest
 from models import Path, Scara, SmoothPath, scara_along, smooth
 from models.machines.scara import ScaraPath
 from ocp import Collocation, ProblemError, minimum_time_problem, solve
-from ocp.motion.builders import timing_tables
-from ocp.motion.builders.timing import FastestMotion, solve_minimum_time
-from ocp.motion.builders.timing_tables import largest_demand, table
+from ocp.motion.builders.timing import FastestMotion, largest_demand, solve_minimum_time, table
 from ocp.motion.schedule import JointLimits, LineLimits, Schedule, ToolLimits, joint_motion, peak_acceleration, schedule
 from tests.models.paths.test_paths import example
 from tests.ocp.motion.schedule.test_schedule import line
@@ -144,7 +142,7 @@ def test_more_intervals_and_no_schedule_give_the_same_minimum(limited: Case, mon
             raise ProblemError("no schedule found")
         return schedule(path, limits, joints=joints)
 
-    monkeypatch.setattr(timing_tables, "schedule", none_with_joints)
+    monkeypatch.setattr("ocp.motion.builders.timing.schedule", none_with_joints)
     other = solve_minimum_time(limited.path, limited.limits, limited.joints, intervals=150)
     # held jerks lose time in proportion to the intervals' width
     assert other.duration == pytest.approx(limited.best.duration, rel=3e-3)
