@@ -73,6 +73,7 @@ CREATED_BY_THE_PACKAGE = {
     "SmoothPath",
     "Solution",
     "StepsMotion",
+    "Table",
     "TimedProgram",
     "Sensitivity",
 }

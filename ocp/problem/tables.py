@@ -17,9 +17,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from ocp.errors import ProblemError
-from ocp.problem.values import check_finite, numeric
-from ocp.problem.values import table as numbers
+from ocp.errors import ProblemError, require
 
 __all__ = ["Table", "table"]
 
@@ -73,17 +71,12 @@ def table(points: Any, values: Any) -> Table:
             is not finite.
     """
     axes = points if isinstance(points, tuple) else (points,)
-    arrays = [numeric(f"table: points of argument {k}", axis) for k, axis in enumerate(axes)]
-    data = numbers("table: values", values)
+    arrays = [require.array(f"points of argument {k}", axis, ("n",), least=2) for k, axis in enumerate(axes)]
     for k, axis in enumerate(arrays):
-        check_finite(f"table: points of argument {k}", axis)
-        if len(axis) < 2 or not (np.diff(axis) > 0).all():
-            words = f"table: points of argument {k} must be at least two increasing numbers, not {axis.tolist()}"
+        if not (np.diff(axis) > 0).all():
+            words = f"the points of argument {k} must increase, not {axis.tolist()}"
             raise ProblemError(words, name="points", value=axis.tolist())
-    if data.shape != (shape := tuple(len(axis) for axis in arrays)):
-        words = f"table: values have the shape {data.shape}, {shape} expected"
-        raise ProblemError(words, name="values", value=data.shape, limit=shape)
-    check_finite("table: values", data)
+    data = require.array("values", values, tuple(len(axis) for axis in arrays))
     return Table(arrays, data)
 
 

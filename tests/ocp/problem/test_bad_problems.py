@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ocp import (
+    AdaptiveCollocation,
     Collocation,
     Indirect,
     MultipleShooting,
@@ -21,6 +22,7 @@ from ocp import (
     prepare,
     refine,
     solve,
+    table,
     tighten,
 )
 from tests.bad_values import (
@@ -42,6 +44,7 @@ from tests.bad_values import (
     TEXT,
     Bad,
     Case,
+    array,
     assert_refused,
     but,
     good_calls,
@@ -250,6 +253,13 @@ METHODS = [
             "control": CHOICE,
             "mesh": MESH,
         },
+    ),
+    Case("AdaptiveCollocation", AdaptiveCollocation, {}, {"accuracy": SHARE, "max_intervals": COUNT | {"few": 2}}),
+    Case(
+        "table",
+        table,
+        {"points": np.arange(4.0), "values": np.ones(4)},
+        {"points": array(4) | {"falling": [0.0, 1.0, 3.0, 2.0], "repeated": [0.0, 1.0, 1.0, 2.0]}, "values": array(4)},
     ),
     Case(
         "MultipleShooting",

@@ -87,13 +87,13 @@ def test_a_plan_with_a_table_is_that_with_the_function_of_the_table(symbols: Any
 @pytest.mark.parametrize(
     ("points", "values", "message"),
     [
-        ([0.0, 0.0], [1.0, 2.0], "increasing"),
-        ([0.0], [1.0], "two"),
+        ([0.0, 0.0], [1.0, 2.0], "increase"),
+        ([0.0], [1.0], "2 at least"),
         ([0.0, np.nan], [1.0, 2.0], "finite"),
         ([0.0, 1.0], [1.0, np.inf], "finite"),
         ([0.0, 1.0], [1.0, 2.0, 3.0], "shape"),
         (([0.0, 1.0], [0.0, 1.0]), [1.0, 2.0], "shape"),
-        ("x", [1.0], "numbers"),
+        ("x", [1.0], "not numeric"),
     ],
 )
 def test_tables_that_are_none_are_refused(points: Any, values: Any, message: str) -> None:
